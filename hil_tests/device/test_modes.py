@@ -47,10 +47,10 @@ def test_unknown_modes_are_refused(radar: X4M300) -> None:
 def test_a_loaded_profile_does_not_run_yet(radar: X4M300) -> None:
     """Protocol reference 8.3: STOP unloads it again."""
     radar.request(m.LoadApp(profile_id=ProfileId.XTS_ID_APP_PRESENCE_2), 10.0)
-    assert radar.presence.profile_id() == ProfileId.XTS_ID_APP_PRESENCE_2
-    assert radar.presence.sensitivity() in range(10)
+    assert radar.profile.profile_id() == ProfileId.XTS_ID_APP_PRESENCE_2
+    assert radar.profile.sensitivity() in range(10)
     set_mode(radar, SensorMode.XTID_SM_STOP)
-    assert radar.presence.profile_id() == 0
+    assert radar.profile.profile_id() == 0
     with pytest.raises(DeviceError):
         radar.request(m.GetSensitivity())
 
@@ -59,7 +59,7 @@ def test_profiles_of_other_products_are_refused(radar: X4M300) -> None:
     """Protocol reference 4.3."""
     with pytest.raises(DeviceError):
         radar.request(m.LoadApp(profile_id=0x12345678), 10.0)
-    assert radar.presence.profile_id() == 0
+    assert radar.profile.profile_id() == 0
 
 
 def test_frames_that_stop_leave_it_in_manual(radar: X4M300, frame_rate_hz: float) -> None:

@@ -25,8 +25,8 @@ pytestmark = [pytest.mark.requires("settings"), pytest.mark.requires("profiles")
 
 def test_zone_limits(radar: X4M300) -> None:
     """Protocol reference 4.4: 0.40 ... 9.40 m on a grid of 5.14 cm."""
-    radar.presence.load()
-    limits = radar.presence.zone_limits()
+    radar.profile.load()
+    limits = radar.profile.zone_limits()
     assert limits.min_m == pytest.approx(0.40, abs=0.06)
     assert limits.max_m == pytest.approx(9.40, abs=0.06)
     assert limits.step_m == pytest.approx(0.0514, abs=0.0001)
@@ -35,58 +35,58 @@ def test_zone_limits(radar: X4M300) -> None:
 @pytest.mark.parametrize("zone_m", [(0.4, 5.0), (1.0, 2.0), (2.5, 9.4)])
 def test_zones_are_snapped_outward(radar: X4M300, zone_m: tuple[float, float]) -> None:
     """Protocol reference 4.4: by less than a step of 5.14 cm on each side."""
-    radar.presence.load()
-    start_m, end_m = radar.presence.set_zone(*zone_m)
+    radar.profile.load()
+    start_m, end_m = radar.profile.set_zone(*zone_m)
     assert zone_m[0] - 0.0515 < start_m <= zone_m[0] + 1e-4
     assert zone_m[1] - 1e-4 <= end_m < zone_m[1] + 0.0515
-    assert radar.presence.zone() == (start_m, end_m)
+    assert radar.profile.zone() == (start_m, end_m)
 
 
 def test_profile_settings_read_back(radar: X4M300) -> None:
-    radar.presence.load()
+    radar.profile.load()
     for sensitivity in range(10):
-        radar.presence.set_sensitivity(sensitivity)
-        assert radar.presence.sensitivity() == sensitivity
+        radar.profile.set_sensitivity(sensitivity)
+        assert radar.profile.sensitivity() == sensitivity
     for band in (4, 3):
-        radar.presence.set_band(band)
-        assert radar.presence.band() == band
+        radar.profile.set_band(band)
+        assert radar.profile.band() == band
     for mode in LedMode:
-        radar.presence.set_led(mode)
-        assert radar.presence.led() is mode
+        radar.profile.set_led(mode)
+        assert radar.profile.led() is mode
     for control in (2, 3, 6, 7):
-        radar.presence.set_noise_map(NoiseMapControl(control))
-        assert radar.presence.noise_map() == control
+        radar.profile.set_noise_map(NoiseMapControl(control))
+        assert radar.profile.noise_map() == control
 
 
 def test_outputs_read_back_and_exclude_each_other(radar: X4M300) -> None:
     """Protocol reference 4.7: baseband as I and Q, or as amplitude and phase."""
-    radar.presence.load()
+    radar.profile.load()
     iq, ap = OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE
-    radar.presence.set_output(iq)
-    assert (radar.presence.output(iq), radar.presence.output(ap)) == (1, 0)
-    radar.presence.set_output(ap)
-    assert (radar.presence.output(iq), radar.presence.output(ap)) == (0, 1)
-    radar.presence.set_output(iq, 0)
-    assert (radar.presence.output(iq), radar.presence.output(ap)) == (0, 0)
+    radar.profile.set_output(iq)
+    assert (radar.profile.output(iq), radar.profile.output(ap)) == (1, 0)
+    radar.profile.set_output(ap)
+    assert (radar.profile.output(iq), radar.profile.output(ap)) == (0, 1)
+    radar.profile.set_output(iq, 0)
+    assert (radar.profile.output(iq), radar.profile.output(ap)) == (0, 0)
 
 
 def test_zones_outside_the_limits_are_not_sent(radar: X4M300) -> None:
-    radar.presence.load()
+    radar.profile.load()
     with pytest.raises(LocalProtocolError, match="does not lie within"):
-        radar.presence.set_zone(0.1, 5.0)
+        radar.profile.set_zone(0.1, 5.0)
     with pytest.raises(LocalProtocolError, match="smaller than"):
-        radar.presence.set_zone(1.0, 1.1)
+        radar.profile.set_zone(1.0, 1.1)
 
 
 @pytest.mark.writes_flash
 def test_settings_are_refused_while_it_runs(radar: X4M300) -> None:
     """Protocol reference 8.3."""
-    radar.presence.load()
-    radar.presence.run()
+    radar.profile.load()
+    radar.profile.run()
     with pytest.raises(DeviceError):
-        radar.presence.set_sensitivity(3)
+        radar.profile.set_sensitivity(3)
     assert radar.request(m.GetMode()).values[0] == SensorMode.XTID_SM_RUN
-    radar.presence.stop()
+    radar.profile.stop()
 
 
 @pytest.mark.writes_flash
@@ -94,11 +94,11 @@ def test_it_reports_once_a_second_while_it_starts(
     radar: X4M300, radar_place: RadarUnderTest, measure: Measure
 ) -> None:
     """Protocol reference 7.3, 8.1: INITIALIZING for up to 20 s, at 1 Hz, judged in virtual time."""
-    radar.presence.load()
-    radar.presence.set_zone(0.4, 5.0)
-    radar.presence.set_noise_map(NoiseMapControl(6))
-    radar.presence.set_output(OutputFeature.PRESENCE_SINGLE)
-    radar.presence.run()
+    radar.profile.load()
+    radar.profile.set_zone(0.4, 5.0)
+    radar.profile.set_noise_map(NoiseMapControl(6))
+    radar.profile.set_output(OutputFeature.PRESENCE_SINGLE)
+    radar.profile.run()
     arrivals_ns: list[int] = []
 
     def hear(message: m.Response, arrival_ns: int) -> None:
@@ -106,10 +106,8 @@ def test_it_reports_once_a_second_while_it_starts(
             arrivals_ns.append(arrival_ns)
 
     radar.listener = hear
-    messages = [
-        message for message in radar.presence.messages(3) if isinstance(message, m.PresenceSingle)
-    ]
-    radar.presence.stop()
+    messages = [message for message in radar.messages(3) if isinstance(message, m.PresenceSingle)]
+    radar.profile.stop()
     assert {message.state for message in messages} == {PresenceState.INITIALIZING}
     counters = [message.counter for message in messages]
     assert counters == sorted(set(counters))
@@ -123,9 +121,9 @@ def test_it_reports_once_a_second_while_it_starts(
 @pytest.mark.slow_hw(seconds=30)
 def test_it_says_within_20_s_whether_somebody_is_there(radar: X4M300, measure: Measure) -> None:
     """Protocol reference 4.6, 8.1: with the default noise map, start-up takes 20 s."""
-    radar.presence.load()
-    radar.presence.set_noise_map(NoiseMapControl(6))
-    radar.presence.set_output(OutputFeature.PRESENCE_SINGLE)
+    radar.profile.load()
+    radar.profile.set_noise_map(NoiseMapControl(6))
+    radar.profile.set_output(OutputFeature.PRESENCE_SINGLE)
     seconds = 0
 
     def count(message: m.Response, arrival_ns: int) -> None:
@@ -133,9 +131,9 @@ def test_it_says_within_20_s_whether_somebody_is_there(radar: X4M300, measure: M
         seconds += isinstance(message, m.PresenceSingle)
 
     radar.listener = count
-    radar.presence.run()
-    message = radar.presence.wait_until_initialized(timeout_s=30.0)
-    radar.presence.stop()
+    radar.profile.run()
+    message = radar.profile.wait_until_initialized(timeout_s=30.0)
+    radar.profile.stop()
     assert isinstance(message, m.PresenceSingle | m.PresenceMovingList)
     assert message.state in {PresenceState.NO_PRESENCE, PresenceState.PRESENCE}
     measure("presence_messages_until_initialized", seconds, limit=(15, 25))
@@ -149,9 +147,9 @@ def test_baseband_frames_of_the_profile(
 
     The rate is judged in virtual time: a busy host sees frames late and then in a bunch.
     """
-    radar.presence.load()
-    radar.presence.set_zone(0.4, 2.0)
-    radar.presence.set_noise_map(NoiseMapControl(6))
+    radar.profile.load()
+    radar.profile.set_zone(0.4, 2.0)
+    radar.profile.set_noise_map(NoiseMapControl(6))
     heard: list[m.BasebandIq] = []
     arrivals_ns: list[int] = []
 
@@ -161,10 +159,10 @@ def test_baseband_frames_of_the_profile(
             arrivals_ns.append(arrival_ns)
 
     radar.listener = hear
-    radar.presence.set_output(OutputFeature.BASEBAND_IQ)
-    radar.presence.run()
+    radar.profile.set_output(OutputFeature.BASEBAND_IQ)
+    radar.profile.run()
     list(radar.frames(20, timeout_s=10.0))
-    radar.presence.stop()
+    radar.profile.stop()
     first = heard[0]
     assert first.bin_length_m == pytest.approx(0.0514403, abs=1e-6)
     assert first.carrier_frequency_hz == pytest.approx(7.29e9)
@@ -181,23 +179,23 @@ def test_baseband_frames_of_the_profile(
 @pytest.mark.writes_flash
 def test_idle_pauses_and_run_goes_on(radar: X4M300) -> None:
     """Protocol reference 8.3."""
-    radar.presence.load()
-    radar.presence.set_noise_map(NoiseMapControl(6))
-    radar.presence.set_output(OutputFeature.PRESENCE_SINGLE)
-    radar.presence.run()
-    list(radar.presence.messages(1))
-    radar.presence.idle()
+    radar.profile.load()
+    radar.profile.set_noise_map(NoiseMapControl(6))
+    radar.profile.set_output(OutputFeature.PRESENCE_SINGLE)
+    radar.profile.run()
+    list(radar.messages(1))
+    radar.profile.idle()
     assert radar.request(m.GetMode()).values[0] == SensorMode.XTID_SM_IDLE
-    radar.presence.run()
-    assert isinstance(next(iter(radar.presence.messages(1))), m.PresenceSingle)
-    radar.presence.stop()
+    radar.profile.run()
+    assert isinstance(next(iter(radar.messages(1))), m.PresenceSingle)
+    radar.profile.stop()
 
 
 @pytest.mark.writes_flash
 @pytest.mark.writes_factory_settings
 def test_factory_preset_restores_the_defaults(radar: X4M300) -> None:
     """Protocol reference 4.4: sensitivity 5, zone 0.40 ... 9.40 m."""
-    radar.presence.load()
-    radar.presence.set_sensitivity(8)
-    radar.presence.factory_preset()
-    assert radar.presence.sensitivity() == 5
+    radar.profile.load()
+    radar.profile.set_sensitivity(8)
+    radar.profile.factory_preset()
+    assert radar.profile.sensitivity() == 5

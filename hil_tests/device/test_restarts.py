@@ -28,7 +28,7 @@ def test_it_is_ready_again_after_a_reset(
     assert radar.info().serial_number == serial
     assert radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values == (0.0,)
     radar.configure_raw()
-    assert radar.x4_settings()[X4Setting.ITERATIONS] == 16
+    assert radar.x4.settings()[X4Setting.ITERATIONS] == 16
     measure("reset_to_ready", ready_s, unit="s", limit=(2.0, None))
 
 

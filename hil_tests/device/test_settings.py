@@ -27,7 +27,7 @@ def test_defaults_after_init(radar: X4M300) -> None:
     """Protocol reference 9.3."""
     radar.configure_raw()
     radar.request(m.X4DriverInit(), 10.0)
-    settings = radar.x4_settings()
+    settings = radar.x4.settings()
     assert settings[X4Setting.FPS] == 0
     assert settings[X4Setting.PULSESPERSTEP] == 10
     assert settings[X4Setting.ITERATIONS] == 8
@@ -44,7 +44,7 @@ def test_defaults_after_init(radar: X4M300) -> None:
 
 def test_the_working_point_reads_back(radar: X4M300) -> None:
     radar.configure_raw()
-    settings = radar.x4_settings()
+    settings = radar.x4.settings()
     assert settings[X4Setting.DACMIN] == 949
     assert settings[X4Setting.DACMAX] == 1100
     assert settings[X4Setting.ITERATIONS] == 16

@@ -65,7 +65,7 @@ def info(arguments: Namespace) -> int:
     with module_at(port, arguments.baudrate) as module:
         state = _STATE[module.ping()]
         about = {"port": port, "state": state, **asdict(module.info())}
-        chip = {setting.name: value for setting, value in module.x4_settings().items()}
+        chip = {setting.name: value for setting, value in module.x4.settings().items()}
     if arguments.json:
         print_json({**about, "x4": chip})
         return 0

@@ -76,16 +76,16 @@ class Presence(Listen):
     profile_id = ProfileId.XTS_ID_APP_PRESENCE_2
 
     def prepare(self, radar: X4M300) -> None:
-        radar.presence.load()
+        radar.profile.load()
 
     def start(self, radar: X4M300) -> float:
-        radar.presence.run()
+        radar.profile.run()
         return 10.0
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
         """Take a message, and the frames that the profile sends if its outputs are on."""
         with suppress(ResponseTimeout):
-            next(radar.presence.messages(1, timeout_s))
+            radar.read_message(m.Response, timeout_s)
         with suppress(ResponseTimeout):
             for _ in radar.frames(_FRAMES_AT_ONCE, timeout_s=0.0):
                 pass

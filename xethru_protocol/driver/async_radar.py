@@ -4,6 +4,7 @@
 
     async with AsyncX4M300.open(port, reconnect_s=20.0) as radar:
         await radar.configure_raw()
+        await radar.x4.iterations.set(8)
         await radar.start(17.0)
         async for frame in radar.frames():
             ...
@@ -21,6 +22,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Self
 
 from xethru_protocol.driver import raw_mode, reconnect
+from xethru_protocol.driver.board import AsyncDiagnostics, AsyncPins
+from xethru_protocol.driver.chip import AsyncPostprocessing, AsyncRegisters, AsyncX4
 from xethru_protocol.driver.files import AsyncFiles
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
@@ -39,18 +42,30 @@ from xethru_protocol.driver.link import (
     T,
     Write,
 )
-from xethru_protocol.driver.profiles import AsyncPresence
-from xethru_protocol.driver.radar import RadarState, known_ports
+from xethru_protocol.driver.profiles import (
+    MESSAGE_TIMEOUT_S,
+    AsyncProfile,
+    MessageT,
+    messages_waiting,
+    set_mode,
+    wait_for_message,
+)
+from xethru_protocol.driver.radar import X4M300, RadarState, known_ports
 from xethru_protocol.transport import AsyncSerialTransport, AsyncTransport
-from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.codes import PongCode, SensorMode
 from xethru_protocol.wire.errors import Disconnected, XeThruError
-from xethru_protocol.wire.messages import Command, X4Value
+from xethru_protocol.wire.messages import Command, Response
 
 _LONGEST_WAIT_S = 86400.0
 
 
 class AsyncX4M300(RadarState):
-    """One module at the other end of a transport of asyncio; all members as of `X4M300`."""
+    """One module at the other end of a transport of asyncio; all members as of `X4M300`.
+
+    A chip setting has coroutines: ``await radar.x4.iterations.get()``, ``.set(8)``.
+    """
+
+    _fields = X4M300._fields
 
     _port_type = AsyncSerialTransport
     _transport: AsyncTransport
@@ -79,8 +94,13 @@ class AsyncX4M300(RadarState):
         self._sleep = sleep
         self._one_at_a_time = asyncio.Lock()
         self._reading: asyncio.Future[None] | None = None
-        self.presence = AsyncPresence(self._call, self._listen)
+        self.x4 = AsyncX4(self._call)
+        self.profile = AsyncProfile(self._call, self._listen)
+        self.pins = AsyncPins(self._call)
         self.files = AsyncFiles(self._call, self._call_once)
+        self.registers = AsyncRegisters(self._call)
+        self.postprocessing = AsyncPostprocessing(self._call)
+        self.diagnostics = AsyncDiagnostics(self._call)
 
     async def __aenter__(self) -> Self:
         return self
@@ -112,9 +132,13 @@ class AsyncX4M300(RadarState):
         """Read what the module reports about itself; see `X4M300.info`."""
         return await self._call(Link.info)
 
-    async def x4_settings(self) -> dict[X4Setting, X4Value | None]:
-        """Read every X4 setting that has a getter; see `X4M300.x4_settings`."""
-        return await self._call(Link.x4_settings)
+    async def mode(self) -> SensorMode:
+        """Ask for the module's mode; see `X4M300.mode`."""
+        return await self._call(Link.mode)
+
+    async def set_mode(self, mode: SensorMode, parameter: int | None = None) -> None:
+        """Change the module's mode; see `X4M300.set_mode`."""
+        await self._call(set_mode, mode, parameter)
 
     # --- the line -------------------------------------------------------------------------------
 
@@ -157,6 +181,30 @@ class AsyncX4M300(RadarState):
         """Iterate over frames; ``count`` of them, or without end; see `X4M300.frames`."""
         for _ in itertools.count() if count is None else range(count):
             yield await self.read_frame(timeout_s)
+
+    async def frames_waiting(self) -> int:
+        """Count the frames not taken yet; see `X4M300.frames_waiting`."""
+        await self._listen(Link.take_stale_input)
+        return len(self._link.frames)
+
+    # --- other messages -------------------------------------------------------------------------
+
+    async def read_message(
+        self, kind: type[MessageT], timeout_s: float = MESSAGE_TIMEOUT_S
+    ) -> MessageT:
+        """Next message of a class; see `X4M300.read_message`."""
+        return await self._listen(wait_for_message, kind, timeout_s)
+
+    async def messages(
+        self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
+    ) -> AsyncIterator[Response]:
+        """Iterate over what comes besides frames and answers; see `X4M300.messages`."""
+        for _ in itertools.count() if count is None else range(count):
+            yield await self.read_message(Response, timeout_s)
+
+    async def messages_waiting(self, kind: type[Response] = Response) -> int:
+        """Count the messages not taken yet; see `X4M300.messages_waiting`."""
+        return await self._listen(messages_waiting, kind)
 
     # --- carrying out steps ---------------------------------------------------------------------
 

@@ -1,13 +1,18 @@
-"""Files in the module's flash as part of a driver: ``radar.files``.
-
-A transfer is not repeated when the line breaks: it raises `Disconnected`.
-"""
+"""Files in the module's flash as part of a driver: ``radar.files``."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncCall, Call, Link, Steps
+from xethru_protocol.driver.link import (
+    SLOW_TIMEOUT_S,
+    AsyncCall,
+    AsyncPart,
+    Call,
+    Link,
+    Part,
+    Steps,
+)
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FileError
 from xethru_protocol.wire.errors import DeviceError, RemoteProtocolError, XeThruError
@@ -60,10 +65,16 @@ def read(
     link: Link, file_type: int, identifier: int, on_progress: OnProgress | None = None
 ) -> Steps[bytes]:
     total = yield from length(link, file_type, identifier)
-    yield from _open(link, file_type, identifier)
-    chunk = m.GetFileData(file_type=file_type, identifier=identifier, offset=0, length=0)
-    body = _read_chunks(link, chunk, total, on_progress)
-    return (yield from _then_close(link, file_type, identifier, body))
+    whole = m.GetFileData(file_type=file_type, identifier=identifier, offset=0, length=total)
+    return (yield from read_part(link, whole, on_progress))
+
+
+def read_part(
+    link: Link, part: m.GetFileData, on_progress: OnProgress | None = None
+) -> Steps[bytes]:
+    yield from _open(link, part.file_type, part.identifier)
+    body = _read_chunks(link, part, part.length, on_progress)
+    return (yield from _then_close(link, part.file_type, part.identifier, body))
 
 
 def write(
@@ -77,7 +88,8 @@ def write(
         m.CreateFile(file_type=file_type, identifier=identifier, length=len(data)),
         SLOW_TIMEOUT_S,
     )
-    body = _write_chunks(link, file_type, identifier, data, on_progress)
+    whole = m.SetFileData(file_type=file_type, identifier=identifier, offset=0, data=data)
+    body = _write_chunks(link, whole, on_progress)
     try:
         yield from _then_close(link, file_type, identifier, body)
     except GeneratorExit:
@@ -85,6 +97,18 @@ def write(
     except BaseException:
         yield from _clean_up(link, delete(link, file_type, identifier))
         raise
+
+
+def write_part(link: Link, part: m.SetFileData) -> Steps[None]:
+    yield from _open(link, part.file_type, part.identifier)
+    body = _write_chunks(link, part, None)
+    yield from _then_close(link, part.file_type, part.identifier, body)
+
+
+def create(link: Link, file_type: int, identifier: int, size: int) -> Steps[None]:
+    command = m.CreateFile(file_type=file_type, identifier=identifier, length=size)
+    yield from link.request(command, SLOW_TIMEOUT_S)
+    yield from link.request(m.CloseFile(file_type=file_type, identifier=identifier))
 
 
 def delete(link: Link, file_type: int, identifier: int) -> Steps[None]:
@@ -130,27 +154,26 @@ def _read_chunks(
         wanted = min(CHUNK_BYTES, total - len(data))
         if not wanted:
             return bytes(data)
-        got = (yield from link.request(replace(chunk, offset=len(data), length=wanted))).values
+        at = chunk.offset + len(data)
+        got = (yield from link.request(replace(chunk, offset=at, length=wanted))).values
         if len(got) != wanted:
             raise RemoteProtocolError(
-                f"{link.path} sent {len(got)} bytes from {len(data)} on, not {wanted}"
+                f"{link.path} sent {len(got)} bytes from {at} on, not {wanted}"
             )
         data += got
 
 
-def _write_chunks(
-    link: Link, file_type: int, identifier: int, data: bytes, on_progress: OnProgress | None
-) -> Steps[None]:
-    for offset in range(0, len(data), CHUNK_BYTES):
+def _write_chunks(link: Link, part: m.SetFileData, on_progress: OnProgress | None) -> Steps[None]:
+    total = len(part.data)
+    for done in range(0, total, CHUNK_BYTES):
         if on_progress is not None:
-            on_progress(offset, len(data))
-        piece = data[offset : offset + CHUNK_BYTES]
-        command = m.SetFileData(
-            file_type=file_type, identifier=identifier, offset=offset, data=piece
+            on_progress(done, total)
+        piece = part.data[done : done + CHUNK_BYTES]
+        yield from link.request(
+            replace(part, offset=part.offset + done, data=piece), SLOW_TIMEOUT_S
         )
-        yield from link.request(command, SLOW_TIMEOUT_S)
     if on_progress is not None:
-        on_progress(len(data), len(data))
+        on_progress(total, total)
 
 
 def _then_close(link: Link, file_type: int, identifier: int, body: Steps[T]) -> Steps[T]:
@@ -175,11 +198,16 @@ def _clean_up(link: Link, procedure: Steps[object]) -> Steps[None]:
         link.warn(f"could not clean up: {error}")
 
 
-class Files:
-    """The file system of a module behind an `X4M300`."""
+class Files(Part):
+    """The file system of a module behind an `X4M300`. Protocol reference 4.11.
+
+    A transfer is not repeated when the line breaks: it raises `Disconnected`.
+    """
+
+    __slots__ = ("_call_once",)
 
     def __init__(self, call: Call, call_once: Call) -> None:
-        self._call = call
+        super().__init__(call)
         self._call_once = call_once
 
     def find_all(self) -> tuple[FileName, ...]:
@@ -194,7 +222,7 @@ class Files:
         return self._call(length, file_type, identifier)
 
     def read(self, file_type: int, identifier: int, on_progress: OnProgress | None = None) -> bytes:
-        """Read a file.
+        """Read a whole file.
 
         ``on_progress`` is called with the bytes read so far and their total: at the start and after
         each chunk. Raises `DeviceError`, whose code is a `FileError`, if the file does not exist or
@@ -212,6 +240,22 @@ class Files:
         exists already, there is no room, or the module cannot write.
         """
         self._call_once(write, file_type, identifier, data, on_progress)
+
+    def read_part(self, file_type: int, identifier: int, offset: int, count: int) -> bytes:
+        """Read ``count`` bytes of a file from ``offset`` on."""
+        part = m.GetFileData(
+            file_type=file_type, identifier=identifier, offset=offset, length=count
+        )
+        return self._call_once(read_part, part)
+
+    def write_part(self, file_type: int, identifier: int, offset: int, data: bytes) -> None:
+        """Write into a file that exists, from ``offset`` on; it does not grow."""
+        part = m.SetFileData(file_type=file_type, identifier=identifier, offset=offset, data=data)
+        self._call_once(write_part, part)
+
+    def create(self, file_type: int, identifier: int, size: int) -> None:
+        """Create an erased file of ``size`` bytes, for `write_part`."""
+        self._call_once(create, file_type, identifier, size)
 
     def delete(self, file_type: int, identifier: int) -> None:
         self._call_once(delete, file_type, identifier)
@@ -232,11 +276,13 @@ class Files:
         self._call_once(Link.request, m.ClearCrashDump(), SLOW_TIMEOUT_S)
 
 
-class AsyncFiles:
+class AsyncFiles(AsyncPart):
     """The file system of a module behind an `AsyncX4M300`; methods as of `Files`."""
 
+    __slots__ = ("_call_once",)
+
     def __init__(self, call: AsyncCall, call_once: AsyncCall) -> None:
-        self._call = call
+        super().__init__(call)
         self._call_once = call_once
 
     async def find_all(self) -> tuple[FileName, ...]:
@@ -257,6 +303,19 @@ class AsyncFiles:
         self, file_type: int, identifier: int, data: bytes, on_progress: OnProgress | None = None
     ) -> None:
         await self._call_once(write, file_type, identifier, data, on_progress)
+
+    async def read_part(self, file_type: int, identifier: int, offset: int, count: int) -> bytes:
+        part = m.GetFileData(
+            file_type=file_type, identifier=identifier, offset=offset, length=count
+        )
+        return await self._call_once(read_part, part)
+
+    async def write_part(self, file_type: int, identifier: int, offset: int, data: bytes) -> None:
+        part = m.SetFileData(file_type=file_type, identifier=identifier, offset=offset, data=data)
+        await self._call_once(write_part, part)
+
+    async def create(self, file_type: int, identifier: int, size: int) -> None:
+        await self._call_once(create, file_type, identifier, size)
 
     async def delete(self, file_type: int, identifier: int) -> None:
         await self._call_once(delete, file_type, identifier)

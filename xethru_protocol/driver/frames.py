@@ -185,6 +185,24 @@ class FrameGeometry:
     downconversion: bool
 
     @property
+    def ranges_m(self) -> NDArray[np.float64]:
+        """Range of each bin, shape (n_bins,) [module metres].
+
+        >>> geometry = FrameGeometry(
+        ...     range_start_m=0.5, bin_length_m=0.25, n_bins=3, downconversion=False
+        ... )
+        >>> geometry.ranges_m.tolist()
+        [0.5, 0.75, 1.0]
+        """
+        return self.range_start_m + np.arange(self.n_bins, dtype=np.float64) * self.bin_length_m
+
+    @property
+    def area_m(self) -> tuple[float, float]:
+        """Frame area as GET FRAMEAREA answers it [module metres]. Protocol reference 9.4."""
+        steps = self.n_bins - 1 if self.downconversion else self.n_bins
+        return self.range_start_m, self.range_start_m + steps * self.bin_length_m
+
+    @property
     def n_values(self) -> int:
         """Numbers in a radar frame: one per RF bin, I and Q per baseband bin."""
         return 2 * self.n_bins if self.downconversion else self.n_bins
@@ -237,6 +255,11 @@ class Frame:
     samples: Samples
     geometry: FrameGeometry
     arrival_ns: int
+
+    @property
+    def ranges_m(self) -> NDArray[np.float64]:
+        """Range of each sample, shape (geometry.n_bins,) [module metres]."""
+        return self.geometry.ranges_m
 
 
 def _complex(i: Float32s, q: Float32s) -> NDArray[np.complex64]:

@@ -99,14 +99,29 @@ _WARNINGS = 1000  # kept; a radar may run for months
 _MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
 
 
+CONFIG_SETTINGS = {
+    "dac_min": X4Setting.DACMIN,
+    "dac_max": X4Setting.DACMAX,
+    "dac_step": X4Setting.DACSTEP,
+    "iterations": X4Setting.ITERATIONS,
+    "pulses_per_step": X4Setting.PULSESPERSTEP,
+    "prf_div": X4Setting.PRFDIV,
+    "tx_center_frequency": X4Setting.TXCENTERFREQUENCY,
+    "tx_power": X4Setting.TXPOWER,
+    "downconversion": X4Setting.DOWNCONVERSION,
+    "offset_m": X4Setting.FRAMEAREAOFFSET,
+    "frame_area_m": X4Setting.FRAMEAREA,
+}
+"""Fields of `RawConfig`, in the order of the vendor's recipe, which lacks two of them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RawConfig:
     """Settings of raw radar mode; the defaults are those of the vendor's example.
 
     ``frame_area_m`` and ``offset_m`` are module metres. ``dac_step`` 0 ... 3 means steps of
     1, 2, 4, 8 levels; ``prf_div`` divides the 243 MHz clock (16: the one regulators allow).
-    Numbers the chip would cut to other ones raise `LocalProtocolError`. Protocol reference 4.9,
-    9.3.
+    Numbers outside `x4.LIMITS` raise `LocalProtocolError`. Protocol reference 4.9, 9.3.
     """
 
     frame_area_m: tuple[float, float] = (0.2, 9.4)
@@ -122,31 +137,14 @@ class RawConfig:
     tx_center_frequency: int = 3
 
     def __post_init__(self) -> None:
-        # the module does not check: it keeps the low bits of any number
-        for name, value, smallest, largest in (
-            ("iterations", self.iterations, 1, 255),
-            ("pulses_per_step", self.pulses_per_step, 1, 65535),
-            ("dac_step", self.dac_step, 0, 3),
-            ("prf_div", self.prf_div, 4, 255),
-        ):
-            if not smallest <= value <= largest:
-                raise LocalProtocolError(f"{name} must be {smallest} ... {largest}, not {value}")
+        for name, setting in CONFIG_SETTINGS.items():
+            if setting in x4.LIMITS:
+                x4.check_setting(setting, name, getattr(self, name))
 
     def settings(self) -> tuple[tuple[X4Setting, m.X4Value], ...]:
-        """X4 settings in the order in which the vendor's recipe sends them, and two more."""
-        return (
-            (X4Setting.DACMIN, self.dac_min),
-            (X4Setting.DACMAX, self.dac_max),
-            (X4Setting.DACSTEP, self.dac_step),
-            (X4Setting.ITERATIONS, self.iterations),
-            (X4Setting.PULSESPERSTEP, self.pulses_per_step),
-            (X4Setting.PRFDIV, self.prf_div),
-            (X4Setting.TXCENTERFREQUENCY, self.tx_center_frequency),
-            (X4Setting.TXPOWER, self.tx_power),
-            (X4Setting.DOWNCONVERSION, int(self.downconversion)),
-            (X4Setting.FRAMEAREAOFFSET, self.offset_m),
-            (X4Setting.FRAMEAREA, self.frame_area_m),
-        )
+        """X4 settings in the order in which they are sent."""
+        values = ((setting, getattr(self, name)) for name, setting in CONFIG_SETTINGS.items())
+        return tuple((at, int(value) if isinstance(value, bool) else value) for at, value in values)
 
     def check_area(self) -> None:
         """Raise `LocalProtocolError` if a module would make no bin of the frame area."""
@@ -632,6 +630,12 @@ class Link:
         names = [field.name for field in fields(ModuleInfo)]
         return ModuleInfo(**dict(zip(names, [*texts, mode], strict=True)))
 
+    def mode(self) -> Steps[SensorMode]:
+        values = (yield from self.request(m.GetMode())).values
+        if len(values) != 1 or values[0] not in set(SensorMode):
+            raise RemoteProtocolError(f"{self.name} reports mode {values.hex() or 'nothing'}")
+        return SensorMode(values[0])
+
     def info_text(self, item: InfoItem) -> Steps[str | None]:
         try:
             return (yield from self.request(m.SystemGetInfo(item=item))).text
@@ -726,3 +730,21 @@ class AsyncCall(Protocol):
     def __call__(
         self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs
     ) -> Awaitable[T]: ...
+
+
+class Part:
+    """Something that a blocking driver consists of."""
+
+    __slots__ = ("_call",)
+
+    def __init__(self, call: Call) -> None:
+        self._call = call
+
+
+class AsyncPart:
+    """Something that an asyncio driver consists of."""
+
+    __slots__ = ("_call",)
+
+    def __init__(self, call: AsyncCall) -> None:
+        self._call = call

@@ -1,23 +1,23 @@
-"""Profiles of a module: load, set up, run, receive; as part of a driver, ``radar.presence``.
+"""Profiles of a module: load, set up, run; as part of a driver, ``radar.profile``.
 
 ::
 
     with X4M300.open(port) as radar:
-        radar.presence.load()
-        zone_m = radar.presence.set_zone(0.4, 5.0)
-        radar.presence.set_output(OutputFeature.PRESENCE_SINGLE)
-        radar.presence.run()
-        radar.presence.wait_until_initialized()
-        for message in radar.presence.messages():
+        radar.profile.load()
+        zone_m = radar.profile.set_zone(0.4, 5.0)
+        radar.profile.set_output(OutputFeature.PRESENCE_SINGLE)
+        radar.profile.run()
+        radar.profile.wait_until_initialized()
+        for message in radar.messages():
             ...
 """
 
-import itertools
 from collections import deque
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
-from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncCall, Call, Link, Steps
+from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncCall, AsyncPart, Link, Part, Steps
 from xethru_protocol.driver.reconnect import await_restart
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
@@ -35,6 +35,8 @@ from xethru_protocol.wire.errors import (
     RemoteProtocolError,
     ResponseTimeout,
 )
+
+MessageT = TypeVar("MessageT", bound=m.Response)
 
 MESSAGE_TIMEOUT_S = 3.0  # presence messages come once a second
 _START_S = 20.0  # to fill the slow matrix
@@ -156,9 +158,26 @@ def factory_preset(link: Link) -> Steps[None]:
         link.plan = replace(link.plan, settings={})
 
 
-def output(link: Link, feature: OutputFeature) -> Steps[int]:
-    command = m.OutputGetControl(feature=feature)
-    return (yield from _value(link, command, f"control of output {feature}")) & 0xFFFFFFFF
+def output(link: Link, question: m.OutputGetControl | m.DebugOutputGetControl) -> Steps[int]:
+    what = f"control of output {question.feature:08X}h"
+    return (yield from _value(link, question, what)) & 0xFFFFFFFF
+
+
+def parameter_file(link: Link, name: str) -> Steps[str]:
+    yield from _need_profile(link)
+    reply = yield from link.request(m.GetParameterFile(name=name))
+    match reply:
+        case m.ReplyString(text=content) | m.ParameterFile(data=content):
+            pass
+        case m.ReplyByte(values=content):
+            pass
+    text = content if isinstance(content, str) else content.decode("latin-1")
+    return text.rstrip("\0")
+
+
+def set_parameter_file(link: Link, name: str, data: str | bytes) -> Steps[None]:
+    yield from _need_profile(link)
+    yield from link.request(m.SetParameterFile(name=name, data=data), SLOW_TIMEOUT_S)
 
 
 # --- running ------------------------------------------------------------------------------------
@@ -183,11 +202,36 @@ def stop(link: Link) -> Steps[None]:
     link.plan = None
 
 
-def wait_for_message(link: Link, timeout_s: float) -> Steps[m.Response]:
+def set_mode(link: Link, mode: SensorMode, parameter: int | None = None) -> Steps[None]:
+    yield from link.request(m.SetMode(mode=mode, param=parameter), SLOW_TIMEOUT_S)
+    plan = link.plan
+    if mode in {SensorMode.XTID_SM_RUN, SensorMode.XTID_SM_IDLE} and isinstance(plan, ProfilePlan):
+        link.plan = replace(plan, mode=mode)
+        return
+    link.plan = None  # nothing that this driver set up is sure to be there
+    link.raw_mode = mode == SensorMode.XTID_SM_MANUAL
+
+
+def wait_for_message(link: Link, kind: type[MessageT], timeout_s: float) -> Steps[MessageT]:
+    """Take the oldest message of a kind; those of others stay."""
     waiting = keep_messages(link)
-    if not waiting and not (yield from link.listen(lambda: bool(waiting), timeout_s)):
+
+    def find() -> MessageT | None:
+        return next((message for message in waiting if isinstance(message, kind)), None)
+
+    if find() is None:
+        yield from link.listen(lambda: find() is not None, timeout_s)
+    message = find()
+    if message is None:
         raise _no_message(link, timeout_s)
-    return waiting.popleft()
+    waiting.remove(message)
+    return message
+
+
+def messages_waiting(link: Link, kind: type[m.Response]) -> Steps[int]:
+    waiting = keep_messages(link)
+    yield from link.take_stale_input()
+    return sum(isinstance(message, kind) for message in waiting)
 
 
 def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[m.Response]:
@@ -249,8 +293,8 @@ def _set(link: Link, command: m.Command[m.Ack]) -> Steps[None]:
     plan = link.plan
     if isinstance(plan, ProfilePlan):
         kind: object = type(command)
-        if isinstance(command, m.OutputSetControl):
-            kind = (m.OutputSetControl, command.feature)
+        if isinstance(command, m.OutputSetControl | m.DebugOutputSetControl):
+            kind = (type(command), command.feature)
         kept = {key: value for key, value in plan.settings.items() if key != kind}
         link.plan = replace(plan, settings={**kept, kind: command})
 
@@ -280,11 +324,14 @@ def _value(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt], what: str) 
     return values[0]
 
 
-class Presence:
-    """The profile of a module behind an `X4M300`."""
+class Profile(Part):
+    """The profile of a module behind an `X4M300`: load, set up, run.
 
-    def __init__(self, call: Call) -> None:
-        self._call = call
+    Presence on an X4M300, respiration and sleep on an X4M200. What it sends comes by
+    `X4M300.messages`, its BASEBAND_IQ by `X4M300.frames`.
+    """
+
+    __slots__ = ()
 
     def load(self, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> None:
         """Stop whatever runs and load a profile, not running yet, with its own last settings.
@@ -350,6 +397,14 @@ class Presence:
         value = self._call(_setting, m.NoiseMapGetControl(), "noise map control")
         return NoiseMapControl(value)
 
+    def set_noise_map_interval(self, minutes: int) -> None:
+        """Choose how often the running profile stores its noise map [min] (16)."""
+        self._call(_set, m.NoiseMapSetPeriodicStore(interval_min=minutes))
+
+    def noise_map_interval(self) -> int:
+        """Ask how often the noise map is stored [min]."""
+        return self._call(_setting, m.NoiseMapGetPeriodicStore(), "noise map interval")
+
     def store_noise_map(self) -> None:
         """Store the noise map for later starts."""
         self._call(Link.request, m.StoreNoiseMap(), SLOW_TIMEOUT_S)
@@ -380,7 +435,29 @@ class Presence:
 
     def output(self, feature: OutputFeature) -> int:
         """Ask whether a message is on: its control bits."""
-        return self._call(output, feature)
+        return self._call(output, m.OutputGetControl(feature=feature))
+
+    def set_debug_output(self, feature: OutputFeature, control: int = 1) -> None:
+        """Switch a message on or off on the module's debug line; as `set_output`."""
+        self._call(_set, m.DebugOutputSetControl(feature=feature, control=control))
+
+    def debug_output(self, feature: OutputFeature) -> int:
+        """Ask whether a message is on on the debug line: its control bits."""
+        return self._call(output, m.DebugOutputGetControl(feature=feature))
+
+    def set_parameter_file(self, name: str, data: str | bytes) -> None:
+        """Store the profile's parameter file."""
+        self._call(set_parameter_file, name, data)
+
+    def parameter_file(self, name: str) -> str:
+        """Read the profile's parameter file, one character per byte.
+
+        Raises
+        ------
+        DeviceError
+            If there is none of this name.
+        """
+        return self._call(parameter_file, name)
 
     # --- running ---
 
@@ -416,19 +493,14 @@ class Presence:
         """
         return self._call(wait_until_initialized, timeout_s)
 
-    def messages(
-        self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
-    ) -> Iterator[m.Response]:
-        """Iterate over what the profile sends, except frames; raises `ResponseTimeout`."""
-        for _ in itertools.count() if count is None else range(count):
-            yield self._call(wait_for_message, timeout_s)
 
+class AsyncProfile(AsyncPart):
+    """The profile of a module behind an `AsyncX4M300`; methods as of `Profile`."""
 
-class AsyncPresence:
-    """The profile of a module behind an `AsyncX4M300`; methods as of `Presence`."""
+    __slots__ = ("_listen",)
 
     def __init__(self, call: AsyncCall, listen: AsyncCall) -> None:
-        self._call = call
+        super().__init__(call)
         self._listen = listen
 
     async def load(self, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> None:
@@ -473,6 +545,12 @@ class AsyncPresence:
         value = await self._call(_setting, m.NoiseMapGetControl(), "noise map control")
         return NoiseMapControl(value)
 
+    async def set_noise_map_interval(self, minutes: int) -> None:
+        await self._call(_set, m.NoiseMapSetPeriodicStore(interval_min=minutes))
+
+    async def noise_map_interval(self) -> int:
+        return await self._call(_setting, m.NoiseMapGetPeriodicStore(), "noise map interval")
+
     async def store_noise_map(self) -> None:
         await self._call(Link.request, m.StoreNoiseMap(), SLOW_TIMEOUT_S)
 
@@ -489,7 +567,19 @@ class AsyncPresence:
         await self._call(_set, m.OutputSetControl(feature=feature, control=control))
 
     async def output(self, feature: OutputFeature) -> int:
-        return await self._call(output, feature)
+        return await self._call(output, m.OutputGetControl(feature=feature))
+
+    async def set_debug_output(self, feature: OutputFeature, control: int = 1) -> None:
+        await self._call(_set, m.DebugOutputSetControl(feature=feature, control=control))
+
+    async def debug_output(self, feature: OutputFeature) -> int:
+        return await self._call(output, m.DebugOutputGetControl(feature=feature))
+
+    async def set_parameter_file(self, name: str, data: str | bytes) -> None:
+        await self._call(set_parameter_file, name, data)
+
+    async def parameter_file(self, name: str) -> str:
+        return await self._call(parameter_file, name)
 
     # --- running ---
 
@@ -503,11 +593,5 @@ class AsyncPresence:
         await self._call(stop)
 
     async def wait_until_initialized(self, timeout_s: float | None = None) -> m.Response:
-        """See `Presence.wait_until_initialized`; other tasks may send commands meanwhile."""
+        """See `Profile.wait_until_initialized`; other tasks may send commands meanwhile."""
         return await self._listen(wait_until_initialized, timeout_s)
-
-    async def messages(
-        self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
-    ) -> AsyncIterator[m.Response]:
-        for _ in itertools.count() if count is None else range(count):
-            yield await self._listen(wait_for_message, timeout_s)

@@ -1,4 +1,4 @@
-"""Driver of one X4M300: raw radar mode, profiles, files. Pull-driven, no threads.
+"""Driver of one X4M300: raw radar mode, profiles, everything else. Pull-driven, no threads.
 
 `AsyncX4M300` has the same methods as coroutines.
 """
@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar, Self
 
 from xethru_protocol.driver import raw_mode, reconnect
+from xethru_protocol.driver.board import Diagnostics, Pins
+from xethru_protocol.driver.chip import X4, Postprocessing, Registers
 from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
@@ -33,7 +35,14 @@ from xethru_protocol.driver.link import (
     T,
     Write,
 )
-from xethru_protocol.driver.profiles import Presence
+from xethru_protocol.driver.profiles import (
+    MESSAGE_TIMEOUT_S,
+    MessageT,
+    Profile,
+    messages_waiting,
+    set_mode,
+    wait_for_message,
+)
 from xethru_protocol.transport import (
     AsyncSerialTransport,
     AsyncTransport,
@@ -43,10 +52,10 @@ from xethru_protocol.transport import (
     find_ports,
     set_rate,
 )
-from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.codes import PongCode, SensorMode
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
-from xethru_protocol.wire.messages import Command, X4Value
+from xethru_protocol.wire.messages import Command, Response
 
 
 def known_ports() -> Sequence[str]:
@@ -209,12 +218,36 @@ class RadarState:
 
 
 class X4M300(RadarState):
-    """One module at the other end of a transport.
+    """One radar module on a port. Ranges are in metres as the module counts them.
+
+    Raw frames, one float32 per range bin::
+
+        with X4M300.open("/dev/ttyACM0") as radar:     # `xethru list` shows the ports
+            radar.configure_raw(RawConfig(frame_area_m=(0.2, 9.4)))
+            radar.start(17)
+            for frame in radar.frames(100):
+                print(frame.counter, frame.ranges_m, frame.samples)
+
+    What the module computes itself: presence, or respiration on an X4M200::
+
+        with X4M300.open("/dev/ttyACM0") as radar:
+            radar.profile.load()
+            radar.profile.set_zone(0.4, 5.0)
+            radar.profile.set_output(OutputFeature.PRESENCE_SINGLE)
+            radar.profile.run()
+            for message in radar.messages():
+                print(message)
+
+    A chip setting is an attribute, ``radar.x4.iterations = 8``; ``help(radar.x4)`` lists them with
+    units and limits. All that is not a method here is in a part, see Attributes.
+
+    What goes wrong raises an `XeThruError`: `DeviceError` if the module refuses, `ResponseTimeout`
+    if it is silent, `Disconnected` if it is gone, `LocalProtocolError` if a value makes no sense.
 
     Parameters
     ----------
     transport
-        An open line.
+        An open line; `open` makes one from the name of a port.
     clock
         Monotonic time [ns].
     observer
@@ -233,12 +266,27 @@ class X4M300(RadarState):
 
     Attributes
     ----------
-    presence
-        Profiles: load, set up, run, receive.
+    x4
+        `X4`: settings of the radar chip.
+    profile
+        `Profile`: load, set up and run what the module computes itself; noise maps, parameter file.
+    pins
+        `Pins`: IO pins.
     files
-        Files in the module's flash, and its crash dump.
+        `Files`: files in the module's flash, and its crash dump.
+    registers
+        `Registers`: of the radar chip.
+    postprocessing
+        `Postprocessing`: what newer firmware does to frames.
+    diagnostics
+        `Diagnostics`: system tests, trace output, injected frames.
     """
 
+    _fields = (  # the order in which help() lists them
+        *("configure_raw", "start", "read_frame", "frames", "frames_waiting", "stop"),
+        *("read_message", "messages", "messages_waiting", "close"),
+        *("ping", "info", "mode", "set_mode", "set_baud_rate", "reset", "reconnect", "request"),
+    )
     _port_type = SerialTransport
     _transport: Transport
 
@@ -264,8 +312,13 @@ class X4M300(RadarState):
         )
         self._open_port = open_port
         self._sleep = sleep
-        self.presence = Presence(self._call)
+        self.x4 = X4(self._call)
+        self.profile = Profile(self._call)
+        self.pins = Pins(self._call)
         self.files = Files(self._call, self._call_once)
+        self.registers = Registers(self._call)
+        self.postprocessing = Postprocessing(self._call)
+        self.diagnostics = Diagnostics(self._call)
 
     def __enter__(self) -> Self:
         return self
@@ -318,9 +371,21 @@ class X4M300(RadarState):
         """Read what the module reports about itself."""
         return self._call(Link.info)
 
-    def x4_settings(self) -> dict[X4Setting, X4Value | None]:
-        """Read every X4 setting that has a getter; None where the module refuses."""
-        return self._call(Link.x4_settings)
+    def mode(self) -> SensorMode:
+        """Ask for the module's mode; `DeviceError` if its firmware has none (bare XEP)."""
+        return self._call(Link.mode)
+
+    def set_mode(self, mode: SensorMode, parameter: int | None = None) -> None:
+        """Change the module's mode. Protocol reference 4.2, 8.3.
+
+        `configure_raw` and the methods of `profile` do so by themselves.
+
+        Parameters
+        ----------
+        parameter
+            Only of the modes NORMAL (`NormalModeParam`) and REG (`RegModeParam`, certification).
+        """
+        self._call(set_mode, mode, parameter)
 
     # --- the line -------------------------------------------------------------------------------
 
@@ -435,6 +500,37 @@ class X4M300(RadarState):
         """
         for _ in itertools.count() if count is None else range(count):
             yield self.read_frame(timeout_s)
+
+    def frames_waiting(self) -> int:
+        """Receive what the line has, without waiting, and count the frames not taken yet."""
+        self._call(Link.take_stale_input)
+        return len(self._link.frames)
+
+    # --- other messages -------------------------------------------------------------------------
+
+    def read_message(self, kind: type[MessageT], timeout_s: float = MESSAGE_TIMEOUT_S) -> MessageT:
+        """Next message of a class of `xethru_protocol.wire.messages`; others stay.
+
+        Raises
+        ------
+        ResponseTimeout
+            If none comes in time.
+        """
+        return self._call(wait_for_message, kind, timeout_s)
+
+    def messages(
+        self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
+    ) -> Iterator[Response]:
+        """Iterate over what comes besides frames and answers: messages of a profile, debug text.
+
+        ``count`` of them, or without end; raises `ResponseTimeout` if none comes in time.
+        """
+        for _ in itertools.count() if count is None else range(count):
+            yield self.read_message(Response, timeout_s)
+
+    def messages_waiting(self, kind: type[Response] = Response) -> int:
+        """Receive what the line has, without waiting, and count the messages not taken yet."""
+        return self._call(messages_waiting, kind)
 
     # --- carrying out steps ---------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from xethru_protocol.driver.frames import FrameGeometry
-from xethru_protocol.driver.link import SLOW_TIMEOUT_S, Link, RawConfig, Steps
+from xethru_protocol.driver.link import CONFIG_SETTINGS, SLOW_TIMEOUT_S, Link, RawConfig, Steps
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError
@@ -52,7 +52,8 @@ def _apply(link: Link, config: RawConfig) -> Steps[FrameGeometry]:
     for setting, value in config.settings():
         if setting is not X4Setting.FRAMEAREA:
             _check(link, setting, value, (yield from link.x4_get(setting)))
-    geometry = yield from _read_geometry(link, config)
+    geometry = yield from read_geometry(link, config.downconversion)
+    _check_geometry(link, geometry, config)
     link.plan = RawPlan(config=config)
     link.frames.break_off()
     link.frames.geometry = geometry
@@ -71,12 +72,20 @@ def _check(link: Link, setting: X4Setting, wanted: X4Value, found: X4Value) -> N
         )
 
 
-def _read_geometry(link: Link, config: RawConfig) -> Steps[FrameGeometry]:
+def read_geometry(link: Link, downconversion: bool) -> Steps[FrameGeometry]:
+    """Ask where the bins of the frames lie that come from now on."""
     area = yield from link.x4_get(X4Setting.FRAMEAREA)
     n_bins = yield from link.x4_get(X4Setting.FRAMEBINCOUNT)
     if not isinstance(area, tuple) or not isinstance(n_bins, int) or n_bins <= 0:
         raise RemoteProtocolError(f"{link.name} reads back frame area {area} with {n_bins} bins")
-    start_m, end_m = float(area[0]), float(area[1])
+    return FrameGeometry.from_read_back(
+        area_m=(float(area[0]), float(area[1])), n_bins=n_bins, downconversion=downconversion
+    )
+
+
+def _check_geometry(link: Link, geometry: FrameGeometry, config: RawConfig) -> None:
+    """Warn if the bins do not lie where the frame area that was asked for puts them."""
+    (start_m, end_m), n_bins = geometry.area_m, geometry.n_bins
     if end_m < config.frame_area_m[1] - _QUANTISATION_M:
         link.warn(f"the module's frame ends at {end_m:.4f} m, not at {config.frame_area_m[1]:g} m")
     predicted = x4.frame_area(*config.frame_area_m, config.offset_m, config.downconversion)
@@ -88,18 +97,29 @@ def _read_geometry(link: Link, config: RawConfig) -> Steps[FrameGeometry]:
             f"area, where {predicted.n_bins} over {predicted.start_m:.4f} ... "
             f"{predicted.end_m:.4f} m were expected; its own values are used"
         )
-    return FrameGeometry.from_read_back(
-        area_m=(start_m, end_m), n_bins=n_bins, downconversion=config.downconversion
-    )
 
 
 def start(link: Link, fps: float) -> Steps[float]:
     if not fps > 0:
         raise LocalProtocolError(f"a frame rate must be positive, not {fps}; stop() stops")
+    if link.frames.geometry is None:
+        yield from _take_over(link)
     _warn_of_rate(link, fps)
     yield from link.take_stale_input()
     link.frames.new_stream()  # a late frame of the last stream would make a false gap
     return (yield from _run_at(link, fps))
+
+
+def _take_over(link: Link) -> Steps[None]:
+    """Take the settings that the module has for those the user wants."""
+    values: dict[str, X4Value] = {}
+    for name, setting in CONFIG_SETTINGS.items():
+        values[name] = yield from link.x4_get(setting)
+    values["downconversion"] = bool(values["downconversion"])
+    config = RawConfig(**values)  # type: ignore[arg-type] # by the answers' types
+    link.frames.geometry = yield from read_geometry(link, config.downconversion)
+    link.frames.lattice = config.lattice
+    link.plan = RawPlan(config=config)
 
 
 def _run_at(link: Link, fps: float) -> Steps[float]:

@@ -5,10 +5,12 @@ propagation speed of exactly 3.0e8 m/s. Converting to true metres is the applica
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.errors import LocalProtocolError
 
 MODULE_SPEED_MPS = 3.0e8  # what the firmware uses for light
@@ -24,6 +26,21 @@ DEFAULT_PRF_DIV = 16
 DEFAULT_OFFSET_M = 0.18  # frame area offset the firmware sets for the X4M300 board
 CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}  # by TXCENTERFREQUENCY
 FULL_AREA_M = (0.0, 9.8765432)  # requested area after INIT
+LIMITS: Mapping[X4Setting, tuple[int, int]] = {
+    X4Setting.PULSESPERSTEP: (1, 65535),
+    X4Setting.ITERATIONS: (1, 255),
+    X4Setting.DOWNCONVERSION: (0, 1),
+    X4Setting.DACSTEP: (0, 3),
+    X4Setting.DACMIN: (0, 2047),
+    X4Setting.DACMAX: (0, 2047),
+    X4Setting.TXCENTERFREQUENCY: (3, 4),
+    X4Setting.TXPOWER: (0, 3),
+    X4Setting.PRFDIV: (4, 255),
+}
+"""Smallest and largest useful value of whole-number settings. Protocol reference 4.9.
+
+The module checks only some of them: of others it keeps the low bits.
+"""
 
 _MAX_LENGTH_M = (float(np.float32(9.8765432)), float(np.float32(9.6707819)))
 _SNAP = 1e-4  # of a bin: how close a request must be to a bin to be taken as that bin
@@ -118,6 +135,25 @@ def frame_area(
         requested_start_m=start,
         requested_end_m=end,
     )
+
+
+def check_setting(setting: X4Setting, name: str, value: int | float | tuple[float, float]) -> None:
+    """Raise `LocalProtocolError` if a setting cannot have this value. Protocol reference 4.9.
+
+    >>> check_setting(X4Setting.DACSTEP, "dac_step", 4)
+    Traceback (most recent call last):
+    xethru_protocol.wire.errors.LocalProtocolError: dac_step must be 0 ... 3, not 4
+    """
+    if isinstance(value, tuple):
+        start_m, end_m = value
+        if start_m > end_m:
+            raise LocalProtocolError(
+                f"{name} {start_m} ... {end_m} m starts behind its end; swap the limits"
+            )
+    elif setting in LIMITS:
+        smallest, largest = LIMITS[setting]
+        if not smallest <= value <= largest:
+            raise LocalProtocolError(f"{name} must be {smallest} ... {largest}, not {value}")
 
 
 def real_frame_rate(requested_hz: float) -> float:

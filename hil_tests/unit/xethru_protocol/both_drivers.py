@@ -7,6 +7,8 @@ from typing import Any, Self, cast
 
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
 from xethru_protocol.driver.async_radar import AsyncX4M300
+from xethru_protocol.driver.chip import AsyncSetting, Setting
+from xethru_protocol.driver.link import AsyncPart
 from xethru_protocol.driver.radar import X4M300
 
 
@@ -46,12 +48,15 @@ class Blocking:
             return lambda *args, **kwargs: self.runner.run(value(*args, **kwargs))
         if inspect.isasyncgenfunction(value):
             return lambda *args, **kwargs: self._iterate(value(*args, **kwargs))
-        if name in {"presence", "files"}:
-            return Blocking(value, self.runner)
-        return value
+        if isinstance(value, AsyncSetting):
+            return self.runner.run(value.get())
+        return Blocking(value, self.runner) if isinstance(value, AsyncPart) else value
 
     def __setattr__(self, name: str, value: object) -> None:
-        setattr(self.target, name, value)
+        if isinstance(getattr(type(self.target), name, None), Setting):
+            self.runner.run(getattr(self.target, name).set(value))
+        else:
+            setattr(self.target, name, value)
 
     def __enter__(self) -> Self:
         self.runner.run(self.target.__aenter__())

@@ -32,13 +32,13 @@ def emulated(driver_on: DriverOn) -> Emulated:
 
 @pytest.fixture
 def loaded(emulated: Emulated) -> Emulated:
-    emulated[0].presence.load()
+    emulated[0].profile.load()
     return emulated
 
 
 @pytest.fixture
 def running(loaded: Emulated) -> Emulated:
-    loaded[0].presence.run()
+    loaded[0].profile.run()
     return loaded
 
 

@@ -23,11 +23,11 @@ def presence(counter: int, state: int) -> m.PresenceSingle:
 
 def test_profile_is_set_up_and_run_by_the_recipe(loaded: Emulated) -> None:
     radar, _, module = loaded
-    radar.presence.set_sensitivity(8)
-    radar.presence.set_noise_map(NoiseMapControl.NO_DEFAULT | NoiseMapControl.ADAPTIVE)
-    radar.presence.set_led(LedMode.OFF)
-    radar.presence.set_output(OutputFeature.PRESENCE_SINGLE)
-    radar.presence.run()
+    radar.profile.set_sensitivity(8)
+    radar.profile.set_noise_map(NoiseMapControl.NO_DEFAULT | NoiseMapControl.ADAPTIVE)
+    radar.profile.set_led(LedMode.OFF)
+    radar.profile.set_output(OutputFeature.PRESENCE_SINGLE)
+    radar.profile.run()
     assert module.received == [
         m.Ping(),
         m.SetMode(mode=STOP),
@@ -42,31 +42,31 @@ def test_profile_is_set_up_and_run_by_the_recipe(loaded: Emulated) -> None:
 
 def test_settings_are_read_as_they_were_set(loaded: Emulated) -> None:
     radar, _, _ = loaded
-    radar.presence.set_sensitivity(2)
-    radar.presence.set_band(4)
-    radar.presence.set_led(LedMode.SIMPLE)
-    radar.presence.set_noise_map(NoiseMapControl.ADAPTIVE)
-    radar.presence.set_output(OutputFeature.PULSEDOPPLER_FLOAT, 3)
-    assert radar.presence.sensitivity() == 2
-    assert radar.presence.band() == 4
-    assert radar.presence.led() is LedMode.SIMPLE
-    assert radar.presence.noise_map() == NoiseMapControl.ADAPTIVE
-    assert radar.presence.output(OutputFeature.PULSEDOPPLER_FLOAT) == 3
-    assert radar.presence.output(OutputFeature.PULSEDOPPLER_BYTE) == 0
-    assert radar.presence.profile_id() == 0x014D4AB8
+    radar.profile.set_sensitivity(2)
+    radar.profile.set_band(4)
+    radar.profile.set_led(LedMode.SIMPLE)
+    radar.profile.set_noise_map(NoiseMapControl.ADAPTIVE)
+    radar.profile.set_output(OutputFeature.PULSEDOPPLER_FLOAT, 3)
+    assert radar.profile.sensitivity() == 2
+    assert radar.profile.band() == 4
+    assert radar.profile.led() is LedMode.SIMPLE
+    assert radar.profile.noise_map() == NoiseMapControl.ADAPTIVE
+    assert radar.profile.output(OutputFeature.PULSEDOPPLER_FLOAT) == 3
+    assert radar.profile.output(OutputFeature.PULSEDOPPLER_BYTE) == 0
+    assert radar.profile.profile_id() == 0x014D4AB8
 
 
 def test_zone_is_checked_against_the_modules_limits_and_read_back_snapped(
     loaded: Emulated,
 ) -> None:
     radar, _, module = loaded
-    limits = radar.presence.zone_limits()
+    limits = radar.profile.zone_limits()
     assert (limits.min_m, limits.max_m) == pytest.approx((0.4, 9.4))
     assert limits.step_m == pytest.approx(STEP_M)
-    start_m, end_m = radar.presence.set_zone(1.0, 5.0)
+    start_m, end_m = radar.profile.set_zone(1.0, 5.0)
     assert 1.0 - STEP_M < start_m <= 1.0
     assert 5.0 <= end_m < 5.0 + STEP_M
-    radar.presence.set_zone(0.4, 9.4)  # the limits themselves
+    radar.profile.set_zone(0.4, 9.4)  # the limits themselves
     module.received.clear()
     for start, end, why in [
         (0.3, 5.0, "does not lie within 0.4 ... 9.4 m"),
@@ -75,7 +75,7 @@ def test_zone_is_checked_against_the_modules_limits_and_read_back_snapped(
         (1.0, 1.1, "is smaller than 0.2 m"),
     ]:
         with pytest.raises(LocalProtocolError, match=why):
-            radar.presence.set_zone(start, end)
+            radar.profile.set_zone(start, end)
     assert not any(isinstance(c, m.SetDetectionZone) for c in module.received)
 
 
@@ -86,7 +86,7 @@ def test_values_no_module_has_are_not_sent(loaded: Emulated, verb: str, value: i
     radar, _, module = loaded
     sent = len(module.received)
     with pytest.raises(LocalProtocolError, match="must be"):
-        getattr(radar.presence, verb)(value)
+        getattr(radar.profile, verb)(value)
     assert len(module.received) == sent
 
 
@@ -94,29 +94,29 @@ def test_without_a_profile_nothing_is_asked_that_gets_no_answer(emulated: Emulat
     radar, line, _ = emulated
     for verb in ("zone", "zone_limits", "sensitivity", "led", "noise_map", "run", "idle"):
         with pytest.raises(LocalProtocolError, match=r"no profile is loaded; load\(\) one first"):
-            getattr(radar.presence, verb)()
+            getattr(radar.profile, verb)()
     assert line.now_ns < 1e9  # no timeout among them
 
 
 def test_profile_that_was_found_running_is_used_as_it_is(driver_on: DriverOn) -> None:
     module = EmulatedModule(stopped=False)  # as a stock module powers up
     radar, line = driver_on(module)
-    assert radar.presence.sensitivity() == 5
+    assert radar.profile.sensitivity() == 5
     line.say(presence(1, NO_PRESENCE))
     radar.ping()
     line.say(presence(2, PRESENCE))
-    assert list(radar.presence.messages(1)) == [presence(2, PRESENCE)]  # heard since asked for
+    assert list(radar.messages(1)) == [presence(2, PRESENCE)]  # heard since asked for
     assert not any(isinstance(c, m.LoadApp | m.SetMode) for c in module.received)
 
 
 def test_refusals_are_the_modules_own(driver_on: DriverOn) -> None:
     radar, _ = driver_on(EmulatedModule())
     with pytest.raises(DeviceError, match="APP_INVALID"):
-        radar.presence.load(0x064E57AD)
-    radar.presence.load()
-    radar.presence.run()
+        radar.profile.load(0x064E57AD)
+    radar.profile.load()
+    radar.profile.run()
     with pytest.raises(DeviceError, match="COMMAND_FAILED"):
-        radar.presence.set_sensitivity(1)
+        radar.profile.set_sensitivity(1)
 
 
 def test_messages_come_typed_and_in_order_and_frames_stay_frames(running: Emulated) -> None:
@@ -141,21 +141,21 @@ def test_messages_come_typed_and_in_order_and_frames_stay_frames(running: Emulat
         q=np.array([3, 4], np.float32),
     )
     line.say(presence(2, PRESENCE), baseband, moving)
-    assert list(radar.presence.messages(2)) == [presence(2, PRESENCE), moving]
+    assert list(radar.messages(2)) == [presence(2, PRESENCE), moving]
     assert radar.read_frame().counter == 9
     with pytest.raises(ResponseTimeout, match="no message of the profile from the port within 3 s"):
-        next(radar.presence.messages())
+        next(radar.messages())
 
 
 def test_messages_of_what_ran_before_are_not_the_loaded_profiles(loaded: Emulated) -> None:
     radar, line, _ = loaded
     line.say(presence(1, PRESENCE))
-    radar.presence.load()
+    radar.profile.load()
     line.say(presence(2, PRESENCE))
     # what came is heard without waiting
-    assert next(radar.presence.messages(timeout_s=0.0)) == presence(2, PRESENCE)
+    assert next(radar.messages(timeout_s=0.0)) == presence(2, PRESENCE)
     with pytest.raises(ResponseTimeout):
-        next(radar.presence.messages(timeout_s=0.0))
+        next(radar.messages(timeout_s=0.0))
 
 
 def test_messages_are_kept_only_if_they_are_asked_for(raw: Scripted) -> None:
@@ -181,12 +181,12 @@ def test_start_is_waited_for_as_long_as_it_may_take(
     loaded: Emulated, control: int, limit_s: float
 ) -> None:
     radar, line, _ = loaded
-    radar.presence.set_noise_map(NoiseMapControl(control))
-    radar.presence.run()
+    radar.profile.set_noise_map(NoiseMapControl(control))
+    radar.profile.run()
     for second in range(1, 200):
         line.say_later(second, presence(second, INITIALIZING))
     with pytest.raises(ResponseTimeout, match=rf"no end of the profile's start .* {limit_s:g} s"):
-        radar.presence.wait_until_initialized()
+        radar.profile.wait_until_initialized()
     assert limit_s <= line.now_ns * 1e-9 < limit_s + 2
 
 
@@ -195,8 +195,8 @@ def test_end_of_the_start_is_the_first_message_of_another_state(running: Emulate
     for second in range(1, 19):
         line.say_later(second, presence(second, INITIALIZING))
     line.say_later(19, presence(19, NO_PRESENCE), presence(20, PRESENCE))
-    assert radar.presence.wait_until_initialized() == presence(19, NO_PRESENCE)
-    assert list(radar.presence.messages(1)) == [presence(20, PRESENCE)]
+    assert radar.profile.wait_until_initialized() == presence(19, NO_PRESENCE)
+    assert list(radar.messages(1)) == [presence(20, PRESENCE)]
 
 
 def test_module_that_falls_silent_while_it_starts_is_not_waited_for_all_the_time(
@@ -204,7 +204,7 @@ def test_module_that_falls_silent_while_it_starts_is_not_waited_for_all_the_time
 ) -> None:
     radar, line, _ = running
     with pytest.raises(ResponseTimeout, match="does it run, and is an output switched on"):
-        radar.presence.wait_until_initialized()
+        radar.profile.wait_until_initialized()
     assert line.now_ns < 4e9
 
 
@@ -212,11 +212,11 @@ def test_module_that_restarts_to_change_its_profile_is_waited_for(driver_on: Dri
     module = EmulatedModule()
     module.run_errors = [0x22]
     radar, line = driver_on(module)
-    radar.presence.load()
-    radar.presence.set_sensitivity(1)
+    radar.profile.load()
+    radar.profile.set_sensitivity(1)
     line.say_later(2.5, m.System(code=0x10), m.System(code=0x11))
     module.received.clear()
-    radar.presence.run()
+    radar.profile.run()
     assert module.received == [
         m.SetMode(mode=RUN),
         m.SetMode(mode=STOP),
@@ -230,30 +230,30 @@ def test_module_that_restarts_to_change_its_profile_is_waited_for(driver_on: Dri
 
 def test_profile_pauses_goes_on_and_stops(running: Emulated) -> None:
     radar, _, module = running
-    radar.presence.idle()
-    radar.presence.run()
-    radar.presence.stop()
+    radar.profile.idle()
+    radar.profile.run()
+    radar.profile.stop()
     modes = [c.mode for c in module.received if isinstance(c, m.SetMode)]
     assert modes == [STOP, RUN, IDLE, RUN, STOP]
     with pytest.raises(LocalProtocolError, match="no profile is loaded"):
-        radar.presence.run()
+        radar.profile.run()
 
 
 def test_running_profile_is_left_running_at_the_end(emulated: Emulated) -> None:
     radar, line, module = emulated
     with radar:
-        radar.presence.load()
-        radar.presence.run()
+        radar.profile.load()
+        radar.profile.run()
     assert module.module.modes.mode == RUN
     assert line.closed
 
 
 def test_noise_map_and_factory_preset(loaded: Emulated) -> None:
     radar, _, module = loaded
-    radar.presence.store_noise_map()
-    radar.presence.load_noise_map()
-    radar.presence.delete_noise_map()
-    radar.presence.factory_preset()
+    radar.profile.store_noise_map()
+    radar.profile.load_noise_map()
+    radar.profile.delete_noise_map()
+    radar.profile.factory_preset()
     assert module.received[3:] == [
         m.StoreNoiseMap(),
         m.LoadNoiseMap(),

@@ -35,7 +35,7 @@ def test_a_stock_module_sees_the_visitor_of_the_corridor() -> None:
     transport = transport_of_the_corridor()
     with X4M300(transport, clock=transport.clock_ns) as radar:
         seen = []
-        for message in radar.presence.messages(140):
+        for message in radar.messages(140):
             assert isinstance(message, m.PresenceSingle)
             seen.append((transport.clock_ns() / SECOND, message))
     for time_s, message in seen:
@@ -56,13 +56,13 @@ def test_settings_of_a_host_reach_the_profile() -> None:
     with X4M300(transport, clock=transport.clock_ns) as radar:
         states = {}
         for zone in ((0.5, 1.2), (0.5, 6.0)):
-            radar.presence.stop()
-            radar.presence.load()
-            radar.presence.set_noise_map(NoiseMapControl(6))
-            radar.presence.set_zone(*zone)
-            radar.presence.run()
+            radar.profile.stop()
+            radar.profile.load()
+            radar.profile.set_noise_map(NoiseMapControl(6))
+            radar.profile.set_zone(*zone)
+            radar.profile.run()
             while True:
-                (message,) = radar.presence.messages(1)
+                (message,) = radar.messages(1)
                 clock_s = transport.clock_ns() / SECOND
                 if clock_s > (145 if zone[1] < 2 else 175):
                     break

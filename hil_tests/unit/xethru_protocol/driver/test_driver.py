@@ -73,6 +73,7 @@ def test_start_returns_the_timers_rate_where_the_read_back_has_a_fraction(
 ) -> None:
     answer = m.ReplyFloat(content_id=X4Setting.FPS, values=(50.5,))
     radar, _ = driver_on(PlainModule(instead={GET_FPS: [answer]}))
+    radar.configure_raw()
     assert radar.start(50.5) == 50.0
 
 
@@ -82,6 +83,7 @@ def test_rate_that_is_none_is_the_modules_fault(
 ) -> None:
     answer = m.ReplyFloat(content_id=X4Setting.FPS, values=values)
     radar, _ = driver_on(PlainModule(instead={GET_FPS: [answer]}))
+    radar.configure_raw()
     with pytest.raises(RemoteProtocolError, match="the port reads back"):
         radar.start(17.0)
 
@@ -346,7 +348,7 @@ def test_info_has_what_the_module_tells(driver_on: DriverOn) -> None:
     radar, _ = driver_on()
     info = radar.info()
     assert (info.serial_number, info.mode, info.order_code) == ("123456789012", "MANUAL", None)
-    settings = radar.x4_settings()
+    settings = radar.x4.settings()
     assert settings[X4Setting.FRAMEBINCOUNT] == 1431
     assert settings[X4Setting.DACMIN] is None
     assert X4Setting.ENABLE not in settings

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
@@ -39,9 +39,9 @@ def test_frame_shorter_than_asked_for_is_warned_of(driver_on: DriverOn) -> None:
     ("fps", "made"), [(1e-9, "1"), (17.5, "17"), (70000.0, "65535"), (17.0, None)]
 )
 def test_rate_that_the_timer_cannot_make_is_warned_of(
-    driver_on: DriverOn, fps: float, made: str | None
+    raw: Scripted, fps: float, made: str | None
 ) -> None:
-    radar, _ = driver_on()
+    radar, _ = raw
     radar.start(fps)
     warned = [text for text in radar.warnings if "whole numbers" in text]
     assert [text.rpartition(" ")[2] for text in warned] == ([] if made is None else [made])

@@ -314,12 +314,12 @@ def test_module_that_refuses_its_settings_after_a_return_says_so(
 def test_profile_is_set_up_again_after_a_return(plugged: DriverOn, machine: Machine) -> None:
     machine.plug(HOME, PlainModule())
     radar, line = plugged(reconnect_s=9.0)
-    radar.presence.load()
-    radar.presence.set_output(OutputFeature.PULSEDOPPLER_BYTE, 1)
-    radar.presence.set_sensitivity(3)
-    radar.presence.set_sensitivity(7)
-    radar.presence.set_output(OutputFeature.PULSEDOPPLER_BYTE, 3)
-    radar.presence.run()
+    radar.profile.load()
+    radar.profile.set_output(OutputFeature.PULSEDOPPLER_BYTE, 1)
+    radar.profile.set_sensitivity(3)
+    radar.profile.set_sensitivity(7)
+    radar.profile.set_output(OutputFeature.PULSEDOPPLER_BYTE, 3)
+    radar.profile.run()
     unplug(line)
     radar.ping()
     said = machine.lines[-1].received

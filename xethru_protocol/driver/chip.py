@@ -1,0 +1,465 @@
+"""The radar chip of a module: its settings as attributes, and its registers.
+
+::
+
+    radar.x4.iterations = 8                      # X4M300
+    print(radar.x4.frame_area_m)
+    await radar.x4.iterations.set(8)             # AsyncX4M300
+    print(await radar.x4.frame_area_m.get())
+    chip_id = radar.registers.read("spi", 3)
+
+A setting is one row of `X4Settings` or `PostprocessingSettings`, from which both drivers take it.
+"""
+
+import operator
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final, Generic, Literal, Self, TypeVar, overload
+
+from xethru_protocol.driver import raw_mode
+from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncPart, Link, Part, Steps
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.codes import FramePostprocessing, X4Setting
+from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError
+
+V = TypeVar("V")
+RegisterSpace = Literal["spi", "pif", "xif"]
+
+_SPACES: Final[dict[str, X4Setting]] = {
+    "spi": X4Setting.SPIREGISTER,
+    "pif": X4Setting.PIFREGISTER,
+    "xif": X4Setting.XIFREGISTER,
+}
+# A longer burst fails, and no radar frame comes until the module is reset (Protocol reference 4.9).
+_LONGEST_READ = 6143
+_LONGEST_WRITE = 6142
+_MOVES_BINS: Final = frozenset(
+    {X4Setting.FRAMEAREA, X4Setting.FRAMEAREAOFFSET, X4Setting.DOWNCONVERSION}
+)
+
+
+class Setting(Generic[V]):
+    """A value in the module: a plain attribute of a `Part`, an `AsyncSetting` of an `AsyncPart`.
+
+    ``of_answer`` makes the value of the module's answer.
+    """
+
+    name: str
+
+    def __init__(self, of_answer: Callable[[Any], V], doc: str) -> None:
+        self.of_answer = of_answer
+        self.__doc__ = doc
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, part: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, part: Part, owner: type) -> V: ...
+    @overload
+    def __get__(self, part: AsyncPart, owner: type) -> "AsyncSetting[V]": ...
+    def __get__(self, part: Part | AsyncPart | None, owner: type) -> "Self | V | AsyncSetting[V]":
+        if part is None:
+            return self
+        return AsyncSetting(part, self) if isinstance(part, AsyncPart) else part._call(self.read)
+
+    def __set__(self, part: Part, value: V) -> None:
+        if not isinstance(part, Part):
+            raise AttributeError(f"this driver sets {self.name} by: await ... .{self.name}.set()")
+        part._call(self.write, value)
+
+    def read(self, link: Link) -> Steps[V]:
+        raise NotImplementedError
+
+    def write(self, link: Link, value: V) -> Steps[None]:
+        raise NotImplementedError
+
+
+class AsyncSetting(Generic[V]):
+    """A value in the module, read and set by coroutines."""
+
+    __slots__ = ("_part", "_setting")
+
+    def __init__(self, part: AsyncPart, setting: Setting[V]) -> None:
+        self._part = part
+        self._setting = setting
+
+    async def get(self) -> V:
+        return await self._part._call(self._setting.read)
+
+    async def set(self, value: V) -> None:
+        await self._part._call(self._setting.write, value)
+
+
+class X4Row(Setting[V]):
+    """A setting of X4DRIVER SET and GET, within the limits of `x4.LIMITS` if it has any there."""
+
+    def __init__(self, setting: X4Setting, of_answer: Callable[[Any], V], doc: str) -> None:
+        limits = x4.LIMITS.get(setting)
+        super().__init__(of_answer, f"{doc} {limits[0]} ... {limits[1]}." if limits else doc)
+        self.setting = setting
+
+    def read(self, link: Link) -> Steps[V]:
+        return self.of_answer((yield from link.x4_get(self.setting)))
+
+    def write(self, link: Link, value: V) -> Steps[None]:
+        if self.setting is X4Setting.FRAMEBINCOUNT:
+            raise LocalProtocolError(f"{self.name} follows from frame_area_m; set that")
+        wanted = self._checked(value)
+        if self.setting is X4Setting.FPS:
+            yield from (raw_mode.start(link, wanted) if wanted > 0 else raw_mode.stop(link))
+            return
+        plan = link.plan
+        yield from link.request(m.X4DriverSet(setting=self.setting, value=wanted))
+        if isinstance(plan, raw_mode.RawPlan):
+            changed: dict[str, Any] = {self.name: self.of_answer(wanted)}
+            config = replace(plan.config, **changed)
+            link.plan = replace(plan, config=config)
+            link.frames.lattice = config.lattice
+        geometry = link.frames.geometry
+        if self.setting in _MOVES_BINS and geometry is not None:
+            baseband = geometry.downconversion
+            if self.setting is X4Setting.DOWNCONVERSION:
+                baseband = bool(wanted)
+            link.frames.geometry = yield from raw_mode.read_geometry(link, baseband)
+
+    def _checked(self, value: Any) -> Any:  # noqa: ANN401 - a user may give anything
+        """Return what is sent for ``value``; `LocalProtocolError` if it cannot be."""
+        try:
+            if self.setting is X4Setting.FRAMEAREA:
+                start_m, end_m = value
+                value = float(start_m), float(end_m)
+            elif self.setting in x4.LIMITS:
+                value = operator.index(value)
+            else:
+                value = float(value)
+        except (TypeError, ValueError):
+            raise LocalProtocolError(f"{self.name} cannot be {value!r}: {self.__doc__}") from None
+        x4.check_setting(self.setting, self.name, value)
+        return value
+
+
+class PostprocessingRow(Setting[int]):
+    """A setting of frame post-processing."""
+
+    def __init__(self, setting: FramePostprocessing, doc: str) -> None:
+        super().__init__(int, doc)
+        self.setting = setting
+
+    def read(self, link: Link) -> Steps[int]:
+        return self.of_answer((yield from _postprocessing(link, self.setting)))
+
+    def write(self, link: Link, value: int) -> Steps[None]:
+        yield from link.request(m.FramePostprocessingSet(setting=self.setting, value=value))
+
+
+def _postprocessing(link: Link, setting: FramePostprocessing) -> Steps[float]:
+    values = (yield from link.request(m.FramePostprocessingGet(setting=setting))).values
+    if len(values) != 1:
+        raise RemoteProtocolError(f"{link.name} reads back {setting.name} as {values!r}")
+    return values[0]
+
+
+def _flag(answer: m.X4Value) -> bool:
+    return bool(answer)
+
+
+def _pair(answer: tuple[float, float]) -> tuple[float, float]:
+    return answer
+
+
+class X4Settings:
+    """Settings of the X4 chip. Protocol reference 4.9, 9.3 to 9.7.
+
+    A value outside the limits raises `LocalProtocolError`, a refusal of the module `DeviceError`.
+    Most settings take effect at once, also while frames come: stop, set, start. After a reconnect
+    the driver sets them again if `configure_raw` or `start` was called before.
+    """
+
+    __slots__ = ()
+    _fields = (  # the order in which help() lists them
+        *("frame_area_m", "fps", "downconversion", "iterations", "pulses_per_step"),
+        *("dac_min", "dac_max", "dac_step", "tx_power", "tx_center_frequency", "prf_div"),
+        *("offset_m", "frame_bin_count"),
+    )
+
+    fps = X4Row(
+        X4Setting.FPS,
+        float,
+        "Frames per second [Hz]; 0 stops. The timer takes whole numbers up to 65535. Read below "
+        "35, it is the rate at which the chip really runs.",
+    )
+    frame_area_m = X4Row(
+        X4Setting.FRAMEAREA,
+        _pair,
+        "Start and end of the frame, a tuple [module metres]; the end not before the start. Read, "
+        "it is as the module quantised it: RF ends one bin behind the last, baseband at the last.",
+    )
+    offset_m = X4Row(
+        X4Setting.FRAMEAREAOFFSET,
+        float,
+        "Range of the antenna in the chip's own count (vendor: frame area offset) [m]. The module "
+        "has it from its calibration; another value moves every echo.",
+    )
+    downconversion = X4Row(
+        X4Setting.DOWNCONVERSION,
+        _flag,
+        "Whether frames are complex baseband of 51.4 mm bins, not RF of 6.43 mm bins.",
+    )
+    iterations = X4Row(
+        X4Setting.ITERATIONS,
+        int,
+        "How often the sweep of the sampler's threshold is repeated in a frame; a multiple of 4 "
+        "is best. More: less noise, a lower highest frame rate.",
+    )
+    pulses_per_step = X4Row(
+        X4Setting.PULSESPERSTEP,
+        int,
+        "Pulses per step of the threshold. More: less noise, a lower highest frame rate.",
+    )
+    dac_min = X4Row(X4Setting.DACMIN, int, "Lowest threshold of the sweep, in DAC levels.")
+    dac_max = X4Row(X4Setting.DACMAX, int, "Highest threshold of the sweep, in DAC levels.")
+    dac_step = X4Row(
+        X4Setting.DACSTEP, int, "Step of the sweep: 0, 1, 2, 3 are 1, 2, 4, 8 DAC levels."
+    )
+    tx_power = X4Row(X4Setting.TXPOWER, int, "Transmitter power, a `TxPower`: off, low ... high.")
+    tx_center_frequency = X4Row(
+        X4Setting.TXCENTERFREQUENCY,
+        int,
+        "Band, a `TxCenterFrequency`: 3 is 7.29 GHz, 4 is 8.748 GHz.",
+    )
+    prf_div = X4Row(
+        X4Setting.PRFDIV,
+        int,
+        "Divider of the 243 MHz clock that makes the pulse repetition frequency; 16, 15.1875 MHz, "
+        "is the one that regulators allow.",
+    )
+    frame_bin_count = X4Row(
+        X4Setting.FRAMEBINCOUNT,
+        int,
+        "Bins of a frame, complex ones in baseband; cannot be set.",
+    )
+
+
+def _forget_raw_mode(link: Link) -> None:
+    """Take note that the chip lost its settings and that its frame counter restarts."""
+    if isinstance(link.plan, raw_mode.RawPlan):
+        link.plan = None
+    link.frames.break_off()
+    link.frames.geometry = None
+    link.frames.lattice = None
+
+
+def init_x4(link: Link) -> Steps[None]:
+    yield from link.request(m.X4DriverInit(), SLOW_TIMEOUT_S)
+    _forget_raw_mode(link)
+
+
+def enable_x4(link: Link, on: bool) -> Steps[None]:
+    yield from link.request(m.X4DriverSet(setting=X4Setting.ENABLE, value=int(on)))
+    if not on:
+        _forget_raw_mode(link)
+
+
+class X4(X4Settings, Part):
+    """The radar chip behind an `X4M300`: each setting is an attribute."""
+
+    __slots__ = ()
+
+    def init(self) -> None:
+        """Restart the chip with its default settings; frames stop, and count from 1 again."""
+        self._call(init_x4)
+
+    def enable(self, on: bool = True) -> None:
+        """Switch the chip on or off; after off, `init` brings it back. It cannot be read."""
+        self._call(enable_x4, on)
+
+    def settings(self) -> dict[X4Setting, m.X4Value | None]:
+        """Read every setting that has a getter; None where the module refuses."""
+        return self._call(Link.x4_settings)
+
+
+class AsyncX4(X4Settings, AsyncPart):
+    """The radar chip behind an `AsyncX4M300`: ``await radar.x4.iterations.set(8)``."""
+
+    __slots__ = ()
+
+    async def init(self) -> None:
+        await self._call(init_x4)
+
+    async def enable(self, on: bool = True) -> None:
+        await self._call(enable_x4, on)
+
+    async def settings(self) -> dict[X4Setting, m.X4Value | None]:
+        return await self._call(Link.x4_settings)
+
+
+class PostprocessingSettings:
+    """What the module does to frames before it sends them; newer sensor firmware only.
+
+    Others answer `DeviceError` 1. The meaning of the values is not documented beyond their names.
+    Protocol reference 16.
+    """
+
+    __slots__ = ()
+
+    normalisation = PostprocessingRow(
+        FramePostprocessing.NORMALISATION, "Whether samples are normalised, a byte."
+    )
+    decimation_factor = PostprocessingRow(
+        FramePostprocessing.DECIMATION_FACTOR, "Decimation of the frames in time."
+    )
+    number_format = PostprocessingRow(
+        FramePostprocessing.NUMBER_FORMAT, "Format of the samples, a byte."
+    )
+    legacy_output = PostprocessingRow(
+        FramePostprocessing.LEGACY_OUTPUT, "Whether frames come as DATA FLOAT, a byte."
+    )
+
+
+def set_phase_noise_correction(link: Link, on: bool, distance_m: float) -> Steps[None]:
+    setting = FramePostprocessing.PHASE_NOISE_CORRECTION
+    yield from link.request(
+        m.FramePostprocessingSet(setting=setting, value=(int(on), float(distance_m)))
+    )
+
+
+def phase_noise_correction_distance(link: Link) -> Steps[float]:
+    return (yield from _postprocessing(link, FramePostprocessing.PHASE_NOISE_CORRECTION))
+
+
+class Postprocessing(PostprocessingSettings, Part):
+    """Post-processing of frames in the module behind an `X4M300`."""
+
+    __slots__ = ()
+
+    def set_phase_noise_correction(self, on: bool, distance_m: float) -> None:
+        """Switch the correction of phase noise by the echo at a distance [m] on or off."""
+        self._call(set_phase_noise_correction, on, distance_m)
+
+    def phase_noise_correction_distance(self) -> float:
+        """Ask for the distance [m]; whether the correction is on cannot be asked."""
+        return self._call(phase_noise_correction_distance)
+
+
+class AsyncPostprocessing(PostprocessingSettings, AsyncPart):
+    """Post-processing of frames behind an `AsyncX4M300`; methods as of `Postprocessing`."""
+
+    __slots__ = ()
+
+    async def set_phase_noise_correction(self, on: bool, distance_m: float) -> None:
+        await self._call(set_phase_noise_correction, on, distance_m)
+
+    async def phase_noise_correction_distance(self) -> float:
+        return await self._call(phase_noise_correction_distance)
+
+
+# --- registers ----------------------------------------------------------------------------------
+
+
+def read_register(link: Link, space: RegisterSpace, address: int) -> Steps[int]:
+    command = m.X4DriverGet(setting=_space(space), address=_byte("address", address))
+    values = (yield from link.request(command)).values
+    if len(values) != 1:
+        raise RemoteProtocolError(f"{link.name} reads {space} register {address} as {values!r}")
+    return int(values[0])
+
+
+def write_register(link: Link, space: RegisterSpace, address: int, value: int) -> Steps[None]:
+    wanted = (_byte("address", address), _byte("value", value))
+    yield from link.request(m.X4DriverSet(setting=_space(space), value=wanted))
+
+
+def read_burst(link: Link, address: int, length: int) -> Steps[bytes]:
+    if not 1 <= length <= _LONGEST_READ:
+        raise LocalProtocolError(f"a burst reads 1 ... {_LONGEST_READ} bytes, not {length}")
+    command = m.X4DriverRead(address=_byte("address", address), length=length)
+    return (yield from link.request(command)).values
+
+
+def write_burst(link: Link, address: int, data: bytes) -> Steps[None]:
+    if not 1 <= len(data) <= _LONGEST_WRITE:
+        raise LocalProtocolError(f"a burst writes 1 ... {_LONGEST_WRITE} bytes, not {len(data)}")
+    command = m.X4DriverWrite(address=_byte("address", address), values=bytes(data))
+    yield from link.request(command)
+
+
+def read_i2c(link: Link, length: int) -> Steps[bytes]:
+    return (yield from link.request(m.X4DriverReadI2c(length=length))).values
+
+
+def write_i2c(link: Link, address: int, data: bytes) -> Steps[None]:
+    command = m.X4DriverWriteI2c(address=_byte("address", address), values=bytes(data))
+    yield from link.request(command)
+
+
+def _space(name: str) -> X4Setting:
+    if name not in _SPACES:
+        raise LocalProtocolError(f"registers lie in {', '.join(_SPACES)}, not in {name!r}")
+    return _SPACES[name]
+
+
+def _byte(what: str, value: int) -> int:
+    if not 0 <= value <= 255:
+        raise LocalProtocolError(f"a register's {what} is 0 ... 255, not {value}")
+    return value
+
+
+class Registers(Part):
+    """Registers of the radar chip behind an `X4M300`. Protocol reference 4.9.
+
+    The firmware does not notice what is written here: read back, settings, geometry and
+    normalisation stay as they were, and a reconnect does not restore it.
+    """
+
+    __slots__ = ()
+
+    def read(self, space: RegisterSpace, address: int) -> int:
+        """Read one register, 0 ... 255, of the space ``"spi"``, ``"pif"`` or ``"xif"``."""
+        return self._call(read_register, space, address)
+
+    def write(self, space: RegisterSpace, address: int, value: int) -> None:
+        """Write one register, 0 ... 255."""
+        self._call(write_register, space, address, value)
+
+    def read_burst(self, address: int, length: int) -> bytes:
+        """Read 1 ... 6143 bytes, all from the one SPI register, such as the frame FIFO's."""
+        return self._call(read_burst, address, length)
+
+    def write_burst(self, address: int, data: bytes) -> None:
+        """Write 1 ... 6142 bytes, all into the one SPI register."""
+        self._call(write_burst, address, data)
+
+    def read_i2c(self, length: int) -> bytes:
+        """Read bytes from the module's I2C device; newer sensor firmware (16)."""
+        return self._call(read_i2c, length)
+
+    def write_i2c(self, address: int, data: bytes) -> None:
+        """Write bytes to the I2C register ``address``; newer sensor firmware (16)."""
+        self._call(write_i2c, address, data)
+
+
+class AsyncRegisters(AsyncPart):
+    """Registers of the radar chip behind an `AsyncX4M300`; methods as of `Registers`."""
+
+    __slots__ = ()
+
+    async def read(self, space: RegisterSpace, address: int) -> int:
+        return await self._call(read_register, space, address)
+
+    async def write(self, space: RegisterSpace, address: int, value: int) -> None:
+        await self._call(write_register, space, address, value)
+
+    async def read_burst(self, address: int, length: int) -> bytes:
+        return await self._call(read_burst, address, length)
+
+    async def write_burst(self, address: int, data: bytes) -> None:
+        await self._call(write_burst, address, data)
+
+    async def read_i2c(self, length: int) -> bytes:
+        return await self._call(read_i2c, length)
+
+    async def write_i2c(self, address: int, data: bytes) -> None:
+        await self._call(write_i2c, address, data)
