@@ -104,7 +104,9 @@ class ChipStream(MessageStream):
         return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def take(self) -> Response:
-        return self._module.chip.next_frame()
+        message = self._module.chip.next_frame()
+        self._was_streaming = self.streaming  # a transmitter that saw nothing for long is off now
+        return message
 
     def skip_due_before(self, time_ns: int) -> None:
         due_ns = self.next_due_ns()
@@ -124,11 +126,14 @@ class ChipStream(MessageStream):
             self.skip_due_before(now_ns)
         self._was_streaming = streaming
 
+    def restarted(self, ready_ns: int) -> None:
+        self._was_streaming = False
+
 
 class CombinedStream(MessageStream):
     """Messages of a module in any mode; at most one of its two streams has any.
 
-    When the next one is due changes with a message, a restart, and commands that change modes or
+    When the next step is due changes with a step, a restart, and commands that change modes or
     settings, so it is computed then and kept.
     """
 
@@ -141,9 +146,9 @@ class CombinedStream(MessageStream):
     def next_due_ns(self) -> int | None:
         return self._due_ns
 
-    def take(self) -> Response:
+    def take(self) -> Response | None:
         message = self._active.take()
-        self._choose()  # a transmitter that saw nothing for long is off now
+        self._choose()
         return message
 
     def skip_due_before(self, time_ns: int) -> None:
@@ -152,7 +157,7 @@ class CombinedStream(MessageStream):
             self._due_ns = self._active.next_due_ns()
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
-        # a silent profile catches up with every command
+        # a silent profile notes the time of every command
         if self._due_ns is not None and group_of(command) is Group.BASIC:
             return
         self._raw.command_done(command, now_ns)
@@ -160,6 +165,7 @@ class CombinedStream(MessageStream):
         self._choose()
 
     def restarted(self, ready_ns: int) -> None:
+        self._raw.restarted(ready_ns)
         self._profile.restarted(ready_ns)
         self._choose()
 

@@ -272,19 +272,22 @@ class MessageKind(Enum):
 
 
 class MessageStream(ABC):
-    """Unsolicited messages of a module, each with the time it falls due."""
+    """Unsolicited messages of a module, made in steps that fall due one after the other."""
 
     @abstractmethod
     def next_due_ns(self) -> int | None:
-        """Return when the next message is due; None while nothing streams."""
+        """Return when the next step is due; None while nothing streams."""
 
     @abstractmethod
-    def take(self) -> m.Response:
-        """Return the next message and move on."""
+    def take(self) -> m.Response | None:
+        """Take the next step, at most the work of one frame; return its message if it has one."""
 
     @abstractmethod
     def skip_due_before(self, time_ns: int) -> None:
-        """Give up every message due before a time; frame counters run on."""
+        """Give up every message due before a time; frame counters run on.
+
+        Steps without a message may remain due.
+        """
 
     @abstractmethod
     def command_done(self, command: m.Command[m.Response], now_ns: int) -> None:
@@ -351,6 +354,10 @@ class LosslessOutbox(Outbox):
 
     MOST_REPLIES = 50
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._wants_step = False  # the line takes more, and the last step brought nothing
+
     @property
     def takes_replies(self) -> bool:
         return len(self._queue) < self.MOST_REPLIES
@@ -359,15 +366,25 @@ class LosslessOutbox(Outbox):
         self._queue.append(_Queued(kind, message))
 
     def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
-        if not self._queue:
-            due_ns = stream.next_due_ns()
-            if due_ns is not None and due_ns <= now_ns:
-                self._queue.append(_Queued(MessageKind.FRAME, stream.take()))
+        self._wants_step = False
+        due_ns = None if self._queue else stream.next_due_ns()
+        if due_ns is None or due_ns > now_ns:
+            return
+        message = stream.take()
+        if message is None:
+            self._wants_step = True
+        else:
+            self._queue.append(_Queued(MessageKind.FRAME, message))
+
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
+        """Fetch nothing; who advances the device asks for a packet if the line takes one."""
+        self._wants_step = False
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
-        """Return the next due time if it lies ahead; what is already due waits for the line."""
+        """Return when the next step is due; a message that is due already waits for the line."""
         due_ns = stream.next_due_ns()
-        return due_ns if due_ns is not None and due_ns > now_ns else None
+        waits_for_line = due_ns is not None and due_ns <= now_ns and not self._wants_step
+        return None if waits_for_line else due_ns
 
 
 class FirmwareOutbox(Outbox):
@@ -385,8 +402,8 @@ class FirmwareOutbox(Outbox):
     SLOTS = 50
     FREE_AFTER_PURGE = SLOTS // 4
     STALL_NS = NS_PER_S
-    # One visit synthesises no more than this, so that one fast radar cannot hold up the others.
-    FRAMES_PER_REFILL = 8
+    # One visit takes no more steps than this, so that one fast radar cannot hold up the others.
+    STEPS_PER_REFILL = 8
 
     def __init__(self) -> None:
         super().__init__()
@@ -414,15 +431,16 @@ class FirmwareOutbox(Outbox):
         """Queue every frame due by now; without a free slot, lose it unsynthesised."""
         # A module that fell more than a second behind its own clock lost those frames.
         stream.skip_due_before(now_ns - self.STALL_NS)
-        for _ in range(self.FRAMES_PER_REFILL):
-            due_ns = stream.next_due_ns()
-            if due_ns is None or due_ns > now_ns:
-                return
+        for _ in range(self.STEPS_PER_REFILL):
             stalled = now_ns - self._waiting_since_ns >= self.STALL_NS
             if len(self._queue) >= self.SLOTS and not stalled:
                 stream.skip_due_before(now_ns + 1)
+            due_ns = stream.next_due_ns()
+            if due_ns is None or due_ns > now_ns:
                 return
-            self.put(MessageKind.FRAME, stream.take(), now_ns)
+            message = stream.take()
+            if message is not None:
+                self.put(MessageKind.FRAME, message, now_ns)
 
     def take(self, now_ns: int) -> m.Response | None:
         """Return the oldest message; the host has proved that it reads."""

@@ -8,9 +8,11 @@ A matrix is hundreds of messages, a range bin each; they are spread evenly over 
 the next one, so that the module's queue of 50 slots can take them. Pulse-Doppler matrices are sent
 from when they are full, noise maps from when they are in use.
 
-Frames without a message to the host are not synthesised: a run that must catch up with a long
-silence goes through the frames that fill the matrices (and those that make the noise map), which
-leaves the same state but for the noise map's adaptation.
+Every frame is a step of its own, due when its time has come, whether it brings a message or not;
+no call does more than one. A profile whose outputs are all off takes no steps. When one is switched
+on, the frames since then are due at once and send nothing, as are those of messages that a stalled
+host lost; of many the run goes through the last that fill the matrices (and those that make the
+noise map), which leaves the same state but for the noise map's adaptation.
 
 The radar runs on the emulator's clock under both paces: a presence message a second is what makes
 a profile useful to a host. Under `Pace.REALTIME` counter k is due at
@@ -36,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip import Pace
-from emulator.chip.chip import EchoSource, ModuleClock, Refusal
+from emulator.chip.chip import NS_PER_S, EchoSource, ModuleClock, Refusal
 from emulator.module.module import NOISE_MAPS, MessageStream, Module
 from emulator.profiles.doppler import (
     FRAME_RATE_HZ,
@@ -79,6 +81,7 @@ _PRESENCE = (OutputFeature.PRESENCE_SINGLE, OutputFeature.PRESENCE_MOVINGLIST)
 _NOISE_MAPS = (OutputFeature.NOISEMAP_FLOAT, OutputFeature.NOISEMAP_BYTE)
 # Ticks and the matrices' periods repeat after it, so leaving out multiples shifts nothing.
 _CYCLE = SLOW.frames
+_CYCLES_KEPT = 2
 
 
 def baseband(
@@ -214,30 +217,36 @@ class ProfileRun:
         self._zero_ns = zero_ns
         self._clock = clock
         self._taken = 0  # frames so far
+        self._muted_before_ns = zero_ns
         self._ready: deque[Response] = deque()
         self._spread: dict[tuple[int, Matrix], deque[Response]] = {}
 
     def next_due_ns(self) -> int | None:
+        """Return when the next step is due: a message that is ready, or a frame."""
         if self._ready:
             return self._due_ns(self._taken - 1)
-        index = self._next_index()
-        return None if index is None else self._due_ns(index)
+        return None if self.silent else self._due_ns(self._taken)
 
-    def take(self) -> Response:
-        while not self._ready:
+    @property
+    def silent(self) -> bool:
+        """Whether all outputs are off."""
+        matrices = any(map(self._instances, MATRIX_REPORTS))
+        return not (matrices or any(map(self._on, (*_BASEBAND, *_PRESENCE))))
+
+    def take(self) -> Response | None:
+        """Take one step: return a message that is ready, or go through one frame first."""
+        if not self._ready:
+            self._skip_far_behind()
+            muted = self._due_ns(self._taken) < self._muted_before_ns
             self._frame()
-        return self._ready.popleft()
+            if muted:
+                self._ready.clear()
+        return self._ready.popleft() if self._ready else None
 
-    def skip_before(self, time_ns: int) -> None:
-        while (due_ns := self.next_due_ns()) is not None and due_ns < time_ns:
-            self._jump(time_ns)
-            self.take()
-
-    def pass_before(self, time_ns: int) -> None:
-        """Go through every frame due before a time without a message."""
-        while self._due_ns(self._taken) < time_ns:
-            self._jump(time_ns)
-            self._frame()
+    def mute_before(self, time_ns: int) -> None:
+        """Send nothing of frames that were due before a time."""
+        self._muted_before_ns = max(time_ns, self._muted_before_ns)
+        if self._ready and self._due_ns(self._taken - 1) < time_ns:
             self._ready.clear()
 
     def _due_ns(self, index: int) -> int:
@@ -246,25 +255,6 @@ class ProfileRun:
 
     def _on(self, feature: int) -> int:
         return self._module.profile.outputs.get(feature, 0)
-
-    def _next_index(self) -> int | None:
-        """Return the frame that brings the next message."""
-        candidates: list[int] = []
-        waiting = any(
-            self._spread[feature, matrix]
-            for feature, matrix in self._spread
-            if matrix in self._instances(feature)  # else the output was switched off meanwhile
-        )
-        if waiting or any(map(self._on, _BASEBAND)):
-            candidates.append(self._taken)
-        if any(map(self._on, _PRESENCE)):
-            candidates.append(_next_multiple(self._taken, FRAMES_PER_TICK))
-        for feature in MATRIX_REPORTS:
-            for matrix in self._instances(feature):
-                # not before the matrix is full, so that its first frame brings a message
-                start = max(self._taken, matrix.frames - 1)
-                candidates.append(_next_multiple(start, matrix.period))
-        return min(candidates, default=None)
 
     def _instances(self, feature: int) -> list[Matrix]:
         control = MatrixControl(self._on(feature))
@@ -321,23 +311,16 @@ class ProfileRun:
             for _ in range(min(share, len(waiting))):
                 self._ready.append(waiting.popleft())
 
-    def _jump(self, time_ns: int) -> None:
-        """Skip frames whose messages are not sent, if there are many."""
+    def _skip_far_behind(self) -> None:
+        """Leave out whole cycles of muted frames, but for the last that fill the matrices."""
         if not self.processing.noise_map.complete:
             return
-        cycles = 0
-        while self._due_ns(self._taken + (cycles + 3) * _CYCLE) < time_ns:
-            cycles += 1
-        if cycles:
+        behind_ns = self._muted_before_ns - self._due_ns(self._taken)
+        cycles = int(behind_ns * FRAME_RATE_HZ / NS_PER_S) // _CYCLE - _CYCLES_KEPT
+        if cycles > 0:
             self._taken += cycles * _CYCLE
             self.processing.refill()
-            self._ready.clear()
             self._spread.clear()
-
-
-def _next_multiple(taken: int, period: int) -> int:
-    """Return the index of the first frame, from `taken` on, that completes a period."""
-    return taken + (-(taken + 1)) % period
 
 
 class ProfileStream(MessageStream):
@@ -374,7 +357,7 @@ class ProfileStream(MessageStream):
         run = self._running
         return None if run is None else run.next_due_ns()
 
-    def take(self) -> Response:
+    def take(self) -> Response | None:
         run = self._running
         assert run is not None
         message = run.take()
@@ -383,10 +366,8 @@ class ProfileStream(MessageStream):
 
     def skip_due_before(self, time_ns: int) -> None:
         run = self._running
-        if run is None or self._pace is Pace.ASAP:
-            return
-        run.skip_before(time_ns)
-        self._keep_created_map()
+        if run is not None and self._pace is not Pace.ASAP:
+            run.mute_before(time_ns)
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Start, pause, resume or end with the mode; catch up when an output is switched on."""
@@ -417,9 +398,8 @@ class ProfileStream(MessageStream):
         if self._paused:
             self._start(now_ns, run.processing.noise_map)
         elif self._was_silent:
-            run.pass_before(now_ns)
-            self._keep_created_map()
-        self._was_silent = run.next_due_ns() is None
+            run.mute_before(now_ns)
+        self._was_silent = run.silent
 
     def _start(self, now_ns: int, noise_map: NoiseMap | None = None) -> None:
         settings = self._module.profile
@@ -445,7 +425,7 @@ class ProfileStream(MessageStream):
         )
         self._creating = not self._run.processing.noise_map.complete
         self._paused = False
-        self._was_silent = self._run.next_due_ns() is None
+        self._was_silent = self._run.silent
 
     def _first_map(self, sweep: ProfileSweep) -> NoiseMap:
         settings = self._module.profile

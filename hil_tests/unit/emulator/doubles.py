@@ -85,8 +85,16 @@ class BareHost:
         self.device.receive_data(self._line.send(command), self.now_ns)
 
     def hear(self, most: int = 1000) -> list[m.Message]:
+        """Return the messages that are due now, as an owner of the line that has room gets them."""
         heard: list[m.Message] = []
-        while len(heard) < most and (packet := self.device.next_packet(self.now_ns)) is not None:
+        while len(heard) < most:
+            packet = self.device.next_packet(self.now_ns)
+            if packet is None:
+                wake_ns = self.device.wake_ns(self.now_ns)
+                if wake_ns is None or wake_ns > self.now_ns:
+                    break
+                self.device.advance(self.now_ns)
+                continue
             self._line.receive_data(packet)
             event = self._line.next_event()
             assert isinstance(event, m.Message), event

@@ -8,6 +8,7 @@ from emulator.chip import Pace
 from emulator.chip.chip import ModuleClock
 from emulator.device import radar_device
 from emulator.module.memory import Identity
+from emulator.module.settings import DeviceOptions
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
@@ -282,6 +283,18 @@ def test_a_late_start_in_realtime_skips_what_is_past() -> None:
     (frame,) = host.frames(10)
     assert frame.info == 501
     assert source.scene_times_ns[501] == 501 * SECOND // 50
+
+
+def test_a_stream_after_a_reset_begins_with_the_first_frame_ahead() -> None:
+    """On the bare firmware nothing but the reset says that the stream before it ended."""
+    host = BareHost(ramp_device(Pace.REALTIME, options=DeviceOptions(firmware="xep")))
+    host.set(X4Setting.FPS, 50.0)
+    assert host.at(SECOND // 10)
+    assert host.ask(m.ModReset()) == m.Ack()
+    for now_ns in (SECOND, 10 * SECOND + 1):
+        host.at(now_ns)
+    host.set(X4Setting.FPS, 50.0)
+    assert len(host.at(host.now_ns + SECOND // 50)) == 1, "and not what a second before it missed"
 
 
 def test_realtime_frames_equal_asap_frames() -> None:

@@ -98,7 +98,7 @@ def test_a_stalled_host_leaves_gaps_and_bounded_memory() -> None:
 def test_one_visit_makes_a_bounded_number_of_frames() -> None:
     outbox, ticker = FirmwareOutbox(), Ticker(period_ns=1)
     outbox.refill_on_time(ticker, SECOND // 2)
-    assert ticker.taken == FirmwareOutbox.FRAMES_PER_REFILL
+    assert ticker.taken == FirmwareOutbox.STEPS_PER_REFILL
 
 
 def test_what_fell_due_more_than_a_second_ago_is_lost() -> None:

@@ -62,7 +62,13 @@ def profile(
 def heard_until(stream: ProfileStream, end_ns: int) -> Iterator[tuple[float, m.Response]]:
     """Yield due time [s] and message of everything due before a time."""
     while (due_ns := stream.next_due_ns()) is not None and due_ns < end_ns:
-        yield due_ns / SECOND, stream.take()
+        message = stream.take()
+        if message is not None:
+            yield due_ns / SECOND, message
+
+
+def first_message(stream: ProfileStream) -> m.Response:
+    return next(message for _, message in heard_until(stream, 10**18))
 
 
 def presence_until(stream: ProfileStream, end_s: float) -> list[tuple[float, m.PresenceSingle]]:

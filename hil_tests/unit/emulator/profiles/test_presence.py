@@ -9,6 +9,7 @@ from hil_tests.unit.emulator.profiles.doubles import (
     BIN_M,
     FRAME_HZ,
     SECOND,
+    first_message,
     heard_until,
     presence_until,
     profile,
@@ -145,7 +146,7 @@ def test_the_list_names_everybody_and_the_interval_they_are_in() -> None:
 
 def test_initialising_lists_are_empty_of_movement() -> None:
     stream, _ = profile(room(standing(2.0)), outputs={int(OutputFeature.PRESENCE_MOVINGLIST): 1})
-    message = stream.take()
+    message = first_message(stream)
     assert isinstance(message, m.PresenceMovingList)
     assert message.state == PresenceState.INITIALIZING
     assert message.detection_distance_m == ()
