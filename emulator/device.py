@@ -28,7 +28,7 @@ from emulator.module.module import (
 )
 from emulator.module.settings import DeviceOptions
 from emulator.profiles.run import ProfileStream
-from xethru_protocol.wire.codec import encode
+from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.codes import SystemCode
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import NeedData
@@ -255,6 +255,11 @@ class Device:
         """Take bytes from the host and carry out the commands they complete."""
         self.advance(now_ns)
         if not self.listens:
+            return
+        if self.module.state is State.BOOTLOADER:
+            for payload in self.module.receive_in_bootloader(data):
+                self._outbox.put(MessageKind.REPLY, decode_response(payload), now_ns)
+            self._plan_restart(now_ns)
             return
         self._connection.receive_data(data)
         self._carry_out_commands(now_ns)

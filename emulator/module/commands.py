@@ -45,7 +45,6 @@ TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
 LONGEST_READ = 4096
 """Register bytes one READ may ask for; the firmware checks nothing, its reply buffer would end."""
-FIRST_PAGE = 128
 _FEATURES: frozenset[int] = frozenset(OutputFeature)
 _BYTE_REPLIES = frozenset(
     {
@@ -84,7 +83,7 @@ def _signed(value: int) -> int:
     return value - (1 << 32) if value >> 31 else value
 
 
-# --- modes, profiles, restarts (4.1 to 4.3, 4.5, 4.12)
+# --- modes, profiles, restarts (4.1 to 4.3, 4.5)
 
 
 @answers(m.Ping)
@@ -101,7 +100,7 @@ def _reset(module: Module, command: m.ModReset) -> None:
 @answers(m.StartBootloader)
 def _start_bootloader(module: Module, command: m.StartBootloader) -> None:
     if command.key != BootloaderKey.CURRENT:
-        module.notices.append(m.DataString(text="Wrong bootloader key."))
+        module.notices.append(m.DataString(text="Unknown start_bootloader key."))
         raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
     module.request_restart(into_bootloader=True)
 
@@ -143,38 +142,6 @@ def _debug_level(module: Module, command: m.DebugLevel) -> None:
     if command.level > HIGHEST_TRACE_LEVEL:
         raise Refusal(module.options.bad_value_error)
     module.trace_level = command.level
-
-
-@answers(m.BootloaderGetDeviceInfo)
-def _device_info(module: Module, command: m.Message) -> m.Response:
-    text = f"XETHRU OPENBOOTLOADER V:0.1.2 ID:{module.identity.serial:>016} "
-    return m.BootloaderSuccess(data=text.encode())
-
-
-@answers(m.BootloaderWritePage)
-def _write_page(module: Module, command: m.BootloaderWritePage) -> m.Response:
-    return m.BootloaderSuccess(data=b"\x33" if command.page >= FIRST_PAGE else b"")
-
-
-@answers(m.BootloaderPageSize)
-def _page_size(module: Module, command: m.BootloaderPageSize) -> m.Response:
-    return m.BootloaderSuccess(data=(512).to_bytes(2, "little"))
-
-
-@answers(m.BootloaderPageCount)
-def _page_count(module: Module, command: m.BootloaderPageCount) -> m.Response:
-    return m.BootloaderSuccess(data=(3712).to_bytes(2, "little"))
-
-
-@answers(m.BootloaderEcho)
-def _echo(module: Module, command: m.BootloaderEcho) -> m.Response:
-    return m.BootloaderEchoed(data=command.data)
-
-
-@answers(m.BootloaderStartApp)
-def _start_app(module: Module, command: m.BootloaderStartApp) -> m.Response:
-    module.request_restart()
-    return m.BootloaderSuccess()
 
 
 # --- files (4.10 and 4.11)

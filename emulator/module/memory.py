@@ -48,6 +48,11 @@ class Identity:
         if len(self.serial) != 12 or not self.serial.isascii() or not self.serial.isdigit():
             raise ValueError(f"serial number {self.serial!r}: an X4M300 has 12 digits")
 
+    @property
+    def core_id(self) -> str:
+        """The microcontroller's own number, 16 characters."""
+        return f"EMUL{self.serial}"
+
     def info(self, item: int, *, base_firmware: bool = False) -> str | None:
         """Return the text of one info item; None for an item this firmware does not know.
 
@@ -69,8 +74,8 @@ class Identity:
             InfoItem.XTID_SSIC_VERSION: version,
             InfoItem.XTID_SSIC_BUILD: f"{version}+0.sha.{self.build}",
             InfoItem.XTID_SSIC_VERSIONLIST: parts,
-            InfoItem.XTID_SSIC_SYSTEMCOREID: f"emulated-{self.serial}",
-            InfoItem.XTID_SSIC_BOOTLOADER: "unknown",
+            InfoItem.XTID_SSIC_SYSTEMCOREID: self.core_id,
+            InfoItem.XTID_SSIC_BOOTLOADER: "XETHRU OPENBOOTLOADER",
         }
         # the application id list is answered with an error by released firmware
         if not base_firmware:
@@ -199,6 +204,8 @@ class SavedState:
         Settings of each profile as of its last start, by profile id.
     files
         Content of the file system; noise maps and the crash dump are files.
+    unfinished_update
+        Whether the bootloader left the flash unlocked.
     """
 
     start: Start = field(default_factory=Start)
@@ -206,6 +213,7 @@ class SavedState:
     files: Mapping[FileKey, bytes] = field(default_factory=dict)
     parameter_file_name: str = ""
     certification: bool = False
+    unfinished_update: bool = False
 
 
 class Memory(Protocol):

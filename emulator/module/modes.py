@@ -5,7 +5,8 @@ of commands. Assumed: MANUAL and REG unload the profile (their GETs answer as if
 IDLE pauses a profile that was loaded but never run, and is refused like RUN when none is loaded.
 
 Rows and columns of the table are those of protocol reference 8.3, with columns for certification
-mode (as MANUAL), the bare base firmware (2) and the bootloader (4.12) added.
+mode (as MANUAL), the bare base firmware (2) and the bootloader added, whose own commands
+`emulator.module.bootloader` answers.
 
 Source: protocol reference 2, 4.2, 4.3, 8.2, 8.3 and 8.5.
 """
@@ -199,7 +200,6 @@ class Group(Enum):
     PRESENCE_OUTPUT = "output control of presence messages"
     STREAM_OUTPUT = "output control of baseband, pulse-Doppler, noise maps"
     RADAR = "X4 driver"
-    BOOTLOADER = "bootloader"
     UNHANDLED = "handled by no firmware"
 
 
@@ -246,7 +246,6 @@ _ROWS: dict[Group, tuple[Verdict, ...]] = {
     Group.PRESENCE_OUTPUT: (Verdict.RUNNING_OUTPUT,
                                    _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
     Group.STREAM_OUTPUT:   (_OK,   _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
-    Group.BOOTLOADER:      (_UNKNOWN,) * 8 + (_OK,),
     Group.UNHANDLED:       _NOWHERE,
 }
 # fmt: on
@@ -297,12 +296,12 @@ GROUPS: dict[type[m.Message], Group] = {
     m.X4DriverGet: Group.RADAR,
     m.X4DriverWrite: Group.RADAR,
     m.X4DriverRead: Group.RADAR,
-    m.BootloaderGetDeviceInfo: Group.BOOTLOADER,
-    m.BootloaderPageSize: Group.BOOTLOADER,
-    m.BootloaderPageCount: Group.BOOTLOADER,
-    m.BootloaderWritePage: Group.BOOTLOADER,
-    m.BootloaderStartApp: Group.BOOTLOADER,
-    m.BootloaderEcho: Group.BOOTLOADER,
+    m.BootloaderGetDeviceInfo: Group.UNHANDLED,
+    m.BootloaderPageSize: Group.UNHANDLED,
+    m.BootloaderPageCount: Group.UNHANDLED,
+    m.BootloaderWritePage: Group.UNHANDLED,
+    m.BootloaderStartApp: Group.UNHANDLED,
+    m.BootloaderEcho: Group.UNHANDLED,
     m.AppPoll: Group.UNHANDLED,
     m.Hil: Group.UNHANDLED,
     m.SetCom: Group.UNHANDLED,

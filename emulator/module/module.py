@@ -17,6 +17,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from emulator.chip.chip import Chip, Refusal
+from emulator.module.bootloader import PAGE_COUNT, SMALL_PAGE_COUNT, Bootloader
 from emulator.module.memory import FileSystem, Identity, Memory, SavedState
 from emulator.module.modes import ModeMachine, State
 from emulator.module.pins import IoPins
@@ -38,6 +39,10 @@ SAFE_MODE_FAULTS = 10
 """Consecutive faults that start safe mode."""
 BOOTLOADER_FAULTS = 15
 """Faults that are still answered with safe mode; the next one ends in the bootloader."""
+APP_START_NS = NS_PER_S // 10
+"""From the answer to START_APP to the start of the application."""
+LARGE_STORAGE = 0x48000
+"""File storage of a microcontroller with 2 MB of flash."""
 BAUDRATE_DELAY_NS = NS_PER_S // 2
 """From the ACK of SETBAUDRATE to the switch."""
 
@@ -106,6 +111,12 @@ class Module:
         self.modes = ModeMachine(self.options, saved.start)
         self.files = FileSystem(self.options.storage_bytes, saved.files)
         self.certification = saved.certification
+        small = self.options.storage_bytes < LARGE_STORAGE
+        self.bootloader = Bootloader(
+            identity.core_id,
+            page_count=SMALL_PAGE_COUNT if small else PAGE_COUNT,
+            unlocked=saved.unfinished_update,
+        )
         self.parameter_file_name = saved.parameter_file_name
         self.pins = IoPins(base_firmware=self.options.firmware == "xep")
         self._faults = 0  # in a row
@@ -185,6 +196,16 @@ class Module:
         if into_bootloader:
             self._faults = 0
 
+    def receive_in_bootloader(self, data: bytes) -> list[bytes]:
+        """Take bytes that the bootloader answers, and return the payloads of its answers."""
+        unfinished = self.bootloader.stays
+        answers = list(self.bootloader.receive(data))
+        if self.bootloader.started and self.restart is None:
+            self.restart = Restart(at_ns=self.now_ns + APP_START_NS)
+        if self.bootloader.stays is not unfinished:
+            self.save()
+        return answers
+
     def load_profile(self, profile_id: int) -> None:
         """Load a profile with its own last settings, or raise `Refusal`."""
         self.modes.load_profile(profile_id)
@@ -215,6 +236,7 @@ class Module:
                 files=self.files.contents,
                 parameter_file_name=self.parameter_file_name,
                 certification=self.certification,
+                unfinished_update=self.bootloader.stays,
             )
         )
 
@@ -238,12 +260,13 @@ class Module:
         self._noise_map_stored_ns = self.now_ns
         self.files.close_all()
         self.pins.reset()
+        self.bootloader.power_up()
         self._working: dict[int, ProfileSettings] = {}
         self.modes.power_up(self._first_state(into_bootloader))
         self.profile = self._settings_of(self.modes.start.profile_id)
 
     def _first_state(self, into_bootloader: bool) -> State | None:
-        if into_bootloader:
+        if into_bootloader or self.bootloader.stays:
             return State.BOOTLOADER
         if self._faults >= SAFE_MODE_FAULTS:
             return State.SAFE

@@ -193,6 +193,7 @@ class _State(_Document):
     files: list[_File] = Field(max_length=MAX_FILES)
     parameter_file_name: str
     certification: bool
+    unfinished_update: bool = False
 
 
 def make_state_directory(directory: Path) -> None:
@@ -279,6 +280,7 @@ def _document(state: SavedState, serial: str) -> _State:
         ],
         parameter_file_name=state.parameter_file_name,
         certification=state.certification,
+        unfinished_update=state.unfinished_update,
     )
 
 
@@ -302,4 +304,5 @@ def _saved(state: _State) -> SavedState:
         },
         parameter_file_name=state.parameter_file_name,
         certification=state.certification,
+        unfinished_update=state.unfinished_update,
     )

@@ -15,8 +15,15 @@ from xethru_protocol.wire.rows import ROWS, Command
 
 UNHANDLED = [v for v in KNOWN if v.from_host and type(message_of(v)) not in HANDLERS]
 
-# 2 and 4.10: defined but handled by no firmware; HIL always ERROR 1; X2 codes
+# 2 and 4.10: defined but handled by no firmware; HIL always ERROR 1; X2 codes; 4.12: the
+# bootloader's commands, which it takes as bytes
 HANDLED_BY_NO_FIRMWARE = {
+    m.BootloaderEcho,
+    m.BootloaderGetDeviceInfo,
+    m.BootloaderPageCount,
+    m.BootloaderPageSize,
+    m.BootloaderStartApp,
+    m.BootloaderWritePage,
     m.AppPoll,
     m.Hil,
     m.LegacyDirCommand,
