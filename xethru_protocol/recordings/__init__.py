@@ -22,7 +22,7 @@ from xethru_protocol.recordings.records import (
     RecordingFacts,
     RecordingFault,
 )
-from xethru_protocol.recordings.vendor.writer import RecordingWriter, Split
+from xethru_protocol.recordings.vendor.writer import RecordingWriter, Split, session_directory
 from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chunks, read_note
 
 __all__ = [
@@ -45,4 +45,5 @@ __all__ = [
     "recording_facts",
     "recording_format",
     "recording_radars",
+    "session_directory",
 ]

@@ -1,8 +1,9 @@
 """Every kind of recording: which kind a path is, its messages, its summary, conversion.
 
 What is lost, and nothing else: vendor directories cut times to 1 ms, know none before the first
-message's, give a message without a time that of the one before, and have no place for answers,
-system messages and the like; text files of theirs lose the payload bits of a NaN. Only wire
+message's, give a message without a time that of the one before, have no place for answers, system
+messages and the like, nor for the counter of RESP_STATUS; text files of theirs lose the payload
+bits of a NaN. A recording that was split into files or directories comes out as one. Only wire
 captures hold what the host sent and how messages lay in packets. Messages are written as the
 message table encodes them: with a trailer or NUL that was left out, without what lies behind the
 last field.

@@ -61,12 +61,14 @@ def writing(path: object) -> Iterator[None]:
 class GrowingFile:
     """A new file that grows by whole pieces, each handed to the operating system at once.
 
-    Creating it and every method raise RecordingError if the file cannot be made or written.
+    With ``flush`` each piece is on the disk before `append` returns. Creating it and every method
+    raise RecordingError if the file cannot be made or written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, flush: bool = False) -> None:
         self.path = path
         self.size = 0
+        self._flush = flush
         with writing(path):
             self._stream = FileIO(path, "x")
 
@@ -87,6 +89,8 @@ class GrowingFile:
             try:
                 while view:
                     view = view[self._stream.write(view) :]
+                if self._flush:
+                    os.fsync(self._stream.fileno())
             except OSError:
                 with suppress(OSError):  # the disk itself may be gone
                     os.ftruncate(self._stream.fileno(), self.size)  # no part of a piece stays

@@ -1,15 +1,16 @@
 """Layouts of the files in a recording directory: binary and text data files, and the meta file.
 
-The directory's files are named in Protocol reference 12. How each part is known: [OBS] seen in
-recordings of known content; [HDR] data type bit taken from the public header of the vendor's
-library, no sample at hand; [FMT] name from Protocol reference 12; [INF] inferred from the message's
-fields, or from what others report of such files.
+The directory's files are named in Protocol reference 12. Names, titles, bits and the meta file are
+those that the vendor's recorder wrote when it was given messages of known content, one of each kind
+(``fixtures/recordings``).
 
 A binary data file holds records without separators: a message's payload without its leading codes.
 
 A text file holds lines: an ISO time stamp and the message's fields, separated by ``;``, below a
-line of titles. Lists are in square brackets, separated by commas. Only PRESENCE_SINGLE is known
-from a recording; a line with other columns is reported and not interpreted.
+line of titles. Lists are in square brackets, separated by commas. A DATA STRING stands there as it
+came, line ends included. RESP_STATUS is stored without its counter, and SLEEPSTAGE with a
+confidence that the message does not have. A line with other columns is reported and not
+interpreted.
 
 The meta file was worked out from recordings that the vendor's library wrote from known messages; a
 real one of 2017 and those of 2026 agree in every byte. Its head has 0x59 bytes and the session id::
@@ -22,7 +23,7 @@ real one of 2017 and those of 2026 agree in every byte. Its head has 0x59 bytes 
     0x15 u64  size of all records, CSV and user headers included
     0x1D u64  where the index ends
     0x25 u32  data types, one bit each
-    0x29      8 x FF (meaning unknown)
+    0x29 i64  where the name of the next meta file stands, -1 if there is none
     0x31 u32  size of the largest record, a CSV header included
     0x35 u32  profile id
     0x39      28 x CD, the same from both systems that wrote our samples: reserved, not garbage
@@ -38,14 +39,13 @@ Index, 33 bytes per entry::
     u64  where the record begins in its file
     u64  where it ends, counted over all files
 
-After the index: u32 duration, u8 3, u32 number of files; of each u32 length and name, with NUL.
-
-Our samples have one file each, so they do not show the file number and the two origins of begin and
-end; these are what others report of split recordings in the same format.
+After the index: u32 duration, u8 3, u32 number of files; of each u32 length and name, with NUL. A
+recording split into directories has a meta file in each; behind the list of files stand length and
+name of the next one, ``../<directory>/xethru_recording_meta.dat``.
 """
 
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, tzinfo
 from typing import Any, ClassVar, NamedTuple
@@ -110,8 +110,8 @@ def _binary(name: str, bit: int, message: type[Response]) -> BinaryKind:
     header = [(part, f"<{kind.code}") for part, kind in kinds if isinstance(kind, fields.Number)]
     elements = [kind for _, kind in kinds if not isinstance(kind, fields.Number)]
     match elements[0]:
-        case fields.Bins(count_field=count):
-            values = "<f4"
+        case fields.Bins(count_field=count, dtype=dtype):
+            values = dtype.str
         case fields.Block(count=count):
             values = "u1"
         case fields.Elements(count_label=count, code=code):  # a u32 count comes before them
@@ -121,15 +121,18 @@ def _binary(name: str, bit: int, message: type[Response]) -> BinaryKind:
 
 
 BINARY_KINDS = (
-    _binary("baseband_ap", 0, messages.BasebandAp),  # bit [OBS], name [FMT]
-    _binary("baseband_iq", 1, messages.BasebandIq),  # bit, name and records [OBS]
-    _binary("pulsedoppler_float", 6, messages.PulseDopplerFloat),  # bit [OBS], name [FMT]
-    _binary("pulsedoppler_byte", 7, messages.PulseDopplerByte),  # bit [OBS], name [FMT]
-    # bits [HDR], names [FMT] (their endings inferred from pulse-Doppler)
+    _binary("baseband_ap", 0, messages.BasebandAp),
+    _binary("baseband_iq", 1, messages.BasebandIq),
+    _binary("pulsedoppler_float", 6, messages.PulseDopplerFloat),
+    _binary("pulsedoppler_byte", 7, messages.PulseDopplerByte),
     _binary("noisemap_float", 8, messages.NoiseMapFloat),
     _binary("noisemap_byte", 9, messages.NoiseMapByte),
-    _binary("datafloat", 10, messages.DataFloat),  # bit, name and records [OBS]
-    _binary("databyte", 11, messages.DataByte),  # bit [HDR], name [FMT]
+    _binary("datafloat", 10, messages.DataFloat),
+    _binary("databyte", 11, messages.DataByte),
+    _binary("radar_rf", 19, messages.RadarRf),
+    _binary("radar_rf_normalized", 20, messages.RadarRfNormalized),
+    _binary("radar_baseband_float", 21, messages.RadarBasebandFloat),
+    _binary("radar_baseband_q15", 22, messages.RadarBasebandQ15),
 )
 
 
@@ -167,25 +170,18 @@ def _list(text: str) -> tuple[float, ...]:
     return struct.unpack(layout, struct.pack(layout, *numbers))
 
 
-_ESCAPES = str.maketrans({"\\": "\\\\", "\n": "\\n", "\r": "\\r", ";": "\\x3b"})
-
-
-def _escaped(text: str) -> str:
-    return text.translate(_ESCAPES)
-
-
-def _unescaped(text: str) -> str:
-    return text.encode("latin-1").decode("unicode_escape")
-
-
 class _Column(NamedTuple):
-    """A column of a text file: its title, the message's field, the field as text and back."""
+    """A column of a text file: its title, the message's field, the field as text and back.
+
+    ``field`` is empty where the message has none; ``is_count``: the column counts the list
+    ``field``.
+    """
 
     title: str
     field: str
     text: Callable[[Any], str]
     value: Callable[[str], Any]
-    is_count: bool = False  # of the list ``field``
+    is_count: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +190,8 @@ class TextKind(_Kind):
 
     suffix: ClassVar[str] = ".csv"
     columns: tuple[_Column, ...]
+    absent: Mapping[str, Any]  # fields that the file has no column for, as they are read back
+    is_free_text: bool  # the last column may hold separators and line ends
 
     @property
     def titles(self) -> bytes:
@@ -203,7 +201,7 @@ class TextKind(_Kind):
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:
         """Return the line of a message and its time [ms since 1970], with its end of line."""
         time = (_UNIX + timedelta(milliseconds=time_ms)).astimezone(zone)
-        cells = (column.text(getattr(message, column.field)) for column in self.columns)
+        cells = (column.text(getattr(message, column.field, None)) for column in self.columns)
         return (";".join((time.isoformat(timespec="milliseconds"), *cells)) + "\n").encode(
             "latin-1"
         )
@@ -213,14 +211,16 @@ class TextKind(_Kind):
 
         ValueError, OverflowError or LocalProtocolError if the line is not of this kind.
         """
-        stamp, *cells = line.rstrip("\r\n").split(";")
+        line = line.removesuffix("\n") if self.is_free_text else line.rstrip("\r\n")
+        stamp, *cells = line.split(";", len(self.columns) if self.is_free_text else -1)
         if len(cells) != len(self.columns):
             n_columns = len(self.columns) + 1
             raise ValueError(f"{n_columns} columns were expected, not {len(cells) + 1}")
-        values: dict[str, Any] = {}
+        values: dict[str, Any] = dict(self.absent)
         counts: dict[str, int] = {}
         for (_, name, _, value_of, is_count), cell in zip(self.columns, cells, strict=True):
-            (counts if is_count else values)[name] = value_of(cell)
+            if name:
+                (counts if is_count else values)[name] = value_of(cell)
         for name, count in counts.items():
             if len(values[name]) != count:
                 raise ValueError(f"{name} has {len(values[name])} values, not {count}")
@@ -229,24 +229,33 @@ class TextKind(_Kind):
         return message, _time_ns(stamp)
 
 
-def _text(name: str, bit: int, message: type[Response], titles: dict[str, str]) -> TextKind:
-    """Return the kind whose columns have these titles and hold these fields, in their order."""
+def _text(
+    name: str, bit: int, message: type[Response], titles: dict[str, str], **absent: int
+) -> TextKind:
+    """Return the kind whose columns have these titles and hold these fields, in their order.
+
+    A column without a field is written as 0. ``absent`` are the fields without a column.
+    """
     kinds = dict(ROWS[message].kinds)
     columns = []
+    is_free_text = False
     for title, field_name in titles.items():
-        match kinds[field_name]:
+        match kinds[field_name] if field_name else None:
+            case None:
+                column = _Column(title, "", lambda _: "0", str)
             case fields.Number(code="f"):
                 column = _Column(title, field_name, float_text, _float32)
             case fields.Floats():
                 column = _Column(title, field_name, _list_text, _list)
             case fields.Elements():
-                column = _Column(title, field_name, _escaped, _unescaped)
+                is_free_text = True
+                column = _Column(title, field_name, str, str)
             case fields.Count(of=(counted, *_)):
                 column = _Column(title, counted, lambda of: str(len(of)), int, is_count=True)
             case _:
                 column = _Column(title, field_name, str, int)
         columns.append(column)
-    return TextKind(name, 1 << bit, message, tuple(columns))
+    return TextKind(name, 1 << bit, message, tuple(columns), absent, is_free_text)
 
 
 _UNIX = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
@@ -262,16 +271,8 @@ def _time_ns(stamp: str) -> int:
     return time_ms * MS_NS
 
 
-_FRAME_STATE = {"FrameCounter": "counter", "State": "state", "RPM": "rpm"}
-_MOVEMENT = {"MovementSlowItem": "movement_slow", "MovementFastItem": "movement_fast"}
-_DETECTION = {
-    "DetectionDistance": "detection_distance_m",
-    "DetectionRadarCrossSection": "detection_rcs",
-    "DetectionVelocity": "detection_velocity",
-}
-
 TEXT_KINDS = (
-    _text(  # bit, name and columns [OBS]
+    _text(
         "presence_single",
         12,
         messages.PresenceSingle,
@@ -283,7 +284,7 @@ TEXT_KINDS = (
             "SignalQuality": "signal_quality",
         },
     ),
-    _text(  # bit [OBS]; name, columns and brackets as others report them [INF]
+    _text(
         "presence_movinglist",
         13,
         messages.PresenceMovingList,
@@ -292,63 +293,80 @@ TEXT_KINDS = (
             "PresenceState": "state",
             "MovementIntervalCount": "interval_count",
             "DetectionCount": "detection_count",
-        }
-        | _MOVEMENT
-        | _DETECTION,
+            "MovementSlowItem": "movement_slow",
+            "MovementFastItem": "movement_fast",
+            "DetectionDistance": "detection_distance_m",
+            "DetectionRadarCrossSection": "detection_rcs",
+            "DetectionVelocity": "detection_velocity",
+        },
     ),
-    _text(  # bit [HDR]; name and columns as others report them, the last two [INF]
+    _text(
         "sleep",
         2,
         messages.SleepStatus,
-        _FRAME_STATE
-        | {
+        {
+            "FrameCounter": "counter",
+            "State": "state",
+            "RPM": "rpm",
             "ObjectDistance": "distance_m",
             "SignalQuality": "signal_quality",
             "MovementSlow": "movement_slow",
             "MovementFast": "movement_fast",
         },
     ),
-    _text(  # bit [HDR]; name as others report it, columns [INF]
+    _text(
         "respiration",
         3,
         messages.RespStatus,
-        _FRAME_STATE
-        | {
+        {
+            "State": "state",
+            "RPM": "rpm",
             "ObjectDistance": "distance_m",
             "ObjectMovement": "movement_mm",
             "SignalQuality": "signal_quality",
         },
+        counter=0,
     ),
-    # bits [HDR], names and columns [INF] from here on
     _text(
-        "string",
+        "datastring",
         5,
         messages.DataString,
-        {"ContentId": "content_id", "Info": "info", "Text": "text"},
+        {"ContentId": "content_id", "Info": "info", "Message": "text"},
     ),
     _text(
         "respiration_detectionlist",
         14,
         messages.RespirationDetectionList,
-        {"Counter": "counter", "DetectionCount": "detection_count"} | _DETECTION,
+        {
+            "Counter": "counter",
+            "DetectionCount": "detection_count",
+            "DetectionDistanceItems": "detection_distance_m",
+            "DetectionRadarCrossSectionItems": "detection_rcs",
+            "DetectionVelocityItems": "detection_velocity",
+        },
     ),
     _text(
         "respiration_movinglist",
         15,
         messages.RespirationMovingList,
-        {"Counter": "counter", "MovementIntervalCount": "interval_count"} | _MOVEMENT,
+        {
+            "Counter": "counter",
+            "MovementIntervalCount": "interval_count",
+            "MovementSlowItems": "movement_slow",
+            "MovementFastItems": "movement_fast",
+        },
     ),
     _text(
         "vitalsigns",
         16,
         messages.VitalSigns,
         {
-            "Counter": "counter",
+            "FrameCounter": "counter",
             "State": "state",
-            "RespirationRate": "respiration_rate",
-            "RespirationDistance": "respiration_distance_m",
+            "RPM": "respiration_rate",
+            "Distance": "respiration_distance_m",
             "RespirationConfidence": "respiration_confidence",
-            "HeartRate": "heart_rate",
+            "HeartBPM": "heart_rate",
             "HeartDistance": "heart_distance_m",
             "HeartConfidence": "heart_confidence",
             "NormalizedMovementSlow": "normalized_movement_slow",
@@ -361,7 +379,7 @@ TEXT_KINDS = (
         "sleepstage",
         17,
         messages.SleepStage,
-        {"Counter": "counter", "SleepStage": "stage"},
+        {"FrameCounter": "counter", "SleepStage": "stage", "Confidence": ""},
     ),
     _text(
         "respiration_normalizedmovementlist",
@@ -372,21 +390,28 @@ TEXT_KINDS = (
             "Start": "start_m",
             "BinLength": "bin_length_m",
             "Count": "count",
-            "MovementSlow": "movement_slow",
-            "MovementFast": "movement_fast",
+            "NormalizedMovementSlowItems": "movement_slow",
+            "NormalizedMovementFastItems": "movement_fast",
         },
     ),
 )
 
-KINDS: tuple[BinaryKind | TextKind, ...] = (*BINARY_KINDS, *TEXT_KINDS)
-"""All kinds. Bits 1 << 4 (performance status) and 1 << 19 ... 22 (frames of newer firmware) of the
-vendor's header have no row: their layout is not known (Protocol reference 7.5)."""
+Kind = BinaryKind | TextKind
+KINDS: tuple[Kind, ...] = (*BINARY_KINDS, *TEXT_KINDS)
+"""All kinds. The vendor's bit 1 << 4 (performance status) has no row: its layout is not known."""
 KIND_OF_MESSAGE = {kind.message: kind for kind in KINDS}
 KIND_OF_TYPE = {kind.data_type: kind for kind in KINDS}
+# The vendor's recorder closes files in the order of their bits, but for these.
+_CLOSED_AFTER = {1 << 14: 1 << 15, 1 << 18: (1 << 15) + 1}
 _LONGEST_FIRST = sorted(KINDS, key=lambda kind: -len(kind.name))
 
 
-def kind_of_file(name: str) -> BinaryKind | TextKind | None:
+def closing_order(kind: Kind) -> int:
+    """Sort key of data files that end together."""
+    return 2 * _CLOSED_AFTER.get(kind.data_type, kind.data_type) + (kind.data_type in _CLOSED_AFTER)
+
+
+def kind_of_file(name: str) -> Kind | None:
     for kind in _LONGEST_FIRST:
         if name.startswith(kind.file_prefix) and name.endswith(kind.suffix):
             return kind
@@ -399,13 +424,13 @@ VERSION = 13
 
 ALL_BITS = 0xFFFFFFFF
 _MAGIC = 0xA0B1C2D3
-_HEAD = struct.Struct("<IIqBIQQI8sII28sI")
+_HEAD = struct.Struct("<IIqBIQQIqII28sI")
 _ENTRY = struct.Struct("<IBIIIQQ")
 _FILES = struct.Struct("<IBI")
 _LENGTH = struct.Struct("<I")
 RECORD, CLOSED, _FILE_LIST = 1, 2, 3
 _UNKNOWN_BYTE = 1
-_UNKNOWN = b"\xff" * 8
+_NO_NEXT = -1
 _RESERVED = b"\xcd" * 28
 
 
@@ -428,8 +453,10 @@ class Entry(NamedTuple):
 class Meta:
     """A meta file.
 
-    ``index_end`` is 0 until the recording is closed. ``index`` holds the entries as they were read,
-    packed; ``complete``: the recording was closed and nothing is missing.
+    ``index_end`` is 0 until the recording is closed. ``next_name`` is the path of the next meta
+    file of a recording split into directories, from this one's directory on. ``index`` holds the
+    entries as they were read, packed; ``complete``: the recording was closed and nothing is
+    missing.
     """
 
     start_ms: int = 0
@@ -441,6 +468,7 @@ class Meta:
     profile_id: int = 0
     session_id: bytes = b""
     files: list[str] = field(default_factory=list)
+    next_name: str = ""
     index: bytes = b""
     complete: bool = False
 
@@ -459,7 +487,7 @@ class Meta:
             self.size,
             self.index_end,
             self.data_types,
-            _UNKNOWN,
+            self.index_end + len(self._pack_list()) if self.next_name else _NO_NEXT,
             self.largest_record,
             self.profile_id,
             _RESERVED,
@@ -468,20 +496,25 @@ class Meta:
         return head + text
 
     def pack_files(self) -> bytes:
-        """Return the bytes of the list of files, which ends the meta file."""
-        parts = [_FILES.pack(self.duration_ms, _FILE_LIST, len(self.files))]
-        for name in self.files:
-            text = name.encode() + b"\0"
-            parts.append(_LENGTH.pack(len(text)) + text)
-        return b"".join(parts)
+        """Return the bytes behind the index: the list of files and the next meta file."""
+        return self._pack_list() + (_counted(self.next_name) if self.next_name else b"")
+
+    def _pack_list(self) -> bytes:
+        head = _FILES.pack(self.duration_ms, _FILE_LIST, len(self.files))
+        return head + b"".join(map(_counted, self.files))
+
+
+def _counted(name: str) -> bytes:
+    text = name.encode() + b"\0"
+    return _LENGTH.pack(len(text)) + text
 
 
 def parse_meta(data: bytes) -> Meta:
     """Read a meta file, as much of it as is there; RecordingError if its head is damaged."""
     if len(data) < _HEAD.size:
         raise RecordingError(f"it is cut: {len(data)} of {_HEAD.size} bytes of its head are there")
-    (magic, version, start_ms, _, duration_ms, size, index_end, data_types, _, largest, profile, _,
-     length) = _HEAD.unpack_from(data)  # fmt: skip
+    (magic, version, start_ms, _, duration_ms, size, index_end, data_types, next_at, largest,
+     profile, _, length) = _HEAD.unpack_from(data)  # fmt: skip
     if magic != _MAGIC:
         raise RecordingError("it does not begin like a meta file of a recording")
     if version != VERSION:
@@ -506,6 +539,7 @@ def parse_meta(data: bytes) -> Meta:
         profile_id=profile,
         session_id=data[_HEAD.size : begin].rstrip(b"\0"),
         files=files or [],
+        next_name=_name_at(data, next_at)[0] if files and next_at > index_end else "",
         index=data[begin:end],
         complete=end == index_end and files is not None,
     )
@@ -516,13 +550,23 @@ def _parse_files(data: bytes, position: int) -> list[str] | None:
     names: list[str] = []
     try:
         _, kind, count = _FILES.unpack_from(data, position)
-        position += _FILES.size
-        while kind == _FILE_LIST and len(names) < count:
-            (length,) = _LENGTH.unpack_from(data, position)
-            position += _LENGTH.size + length
-            if position > len(data):
-                return None
-            names.append(data[position - length : position].rstrip(b"\0").decode())
-    except (struct.error, UnicodeDecodeError):
+    except struct.error:
         return None
+    position += _FILES.size
+    while kind == _FILE_LIST and len(names) < count:
+        name, position = _name_at(data, position)
+        if not name:
+            return None
+        names.append(name)
     return names if kind == _FILE_LIST else None
+
+
+def _name_at(data: bytes, position: int) -> tuple[str, int]:
+    """Return a name and the position behind it; an empty one if it is cut or damaged."""
+    try:
+        (length,) = _LENGTH.unpack_from(data, position)
+        end = position + _LENGTH.size + length
+        name = data[end - length : end].rstrip(b"\0").decode()
+    except (struct.error, UnicodeDecodeError):
+        return "", position
+    return (name, end) if end <= len(data) else ("", position)

@@ -7,6 +7,7 @@ among several files. An error in the index costs times, never messages.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -30,6 +31,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     PARAMETER_FILE_NAME,
     BinaryKind,
     Entry,
+    Kind,
     Meta,
     TextKind,
     kind_of_file,
@@ -43,14 +45,13 @@ _LONGEST_USER_HEADER = 4096  # bytes; searched where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16
 _LAST_CONTENT_ID = 14  # Protocol reference 6.1
 _DIRECTORY_PREFIX = "xethru_recording_"
+_STAMP = re.compile(rb"\d{4}-\d\d-\d\dT")
 
 
 class _DataFile:
-    """A data file, read from its beginning; its name gives its kind."""
+    """A data file, read from its beginning."""
 
-    def __init__(self, path: Path, on_fault: FaultHandler | None) -> None:
-        kind = kind_of_file(path.name)
-        assert kind is not None, path
+    def __init__(self, path: Path, kind: Kind, on_fault: FaultHandler | None) -> None:
         self.path = path
         self.kind = kind
         self.position = 0  # bytes read so far
@@ -116,6 +117,8 @@ class _DataFile:
     def _line(self, kind: TextKind) -> tuple[Response | None, int | None] | None:
         left = self._size - self.position
         line = self._stream.readline(left)
+        if kind.is_free_text:
+            line += self._continued()
         if not line.endswith(b"\n"):
             self._cut(left)
             return None
@@ -132,6 +135,14 @@ class _DataFile:
                 self.report(f"a line cannot be read: {error}")
         self.position += len(line)
         return found
+
+    def _continued(self) -> bytes:
+        """Read the lines without a time stamp that follow: the text of the record has them."""
+        begin = end = self._stream.tell()
+        while (line := self._stream.readline()) and not _STAMP.match(line):
+            end += len(line)
+        self._stream.seek(begin)
+        return self._stream.read(end - begin)
 
     def _cut(self, left: int) -> None:
         self.ended = True
@@ -150,7 +161,7 @@ class _DataFile:
         report(fault, self._on_fault)
 
 
-def _user_header_bytes(start: bytes, size: int, kind: BinaryKind | TextKind) -> int:
+def _user_header_bytes(start: bytes, size: int, kind: Kind) -> int:
     """Return the length of what precedes the first record, as far as the records show it.
 
     ``start`` is the beginning of the file of ``size`` bytes. 0 where records begin at once, and
@@ -183,11 +194,13 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     """Messages of a recording directory, of its meta file or of one data file, with times.
 
     In the order in which they were recorded; without a usable index, file by file. A directory
-    that holds only directories of one session (a recording split by directory) is read as one.
+    that holds only directories of one session (a recording split by directory) is read as one; a
+    meta file is read with those that follow it.
     """
     whole = path.is_dir() or path.name == META_NAME  # else one of several files is read
-    for directory, paths in _parts(path):
-        meta: Meta | None = None
+    meta: Meta | None = None
+    for directory, kinds in _parts(path):
+        meta = None
         try:
             meta = _read_meta(directory)
             if meta is None and whole:
@@ -197,7 +210,7 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
         if meta is not None and not meta.complete and whole:
             reason = "it was never completed: the recorder did not end as it should"
             _report_meta(reason, on_fault)
-        files = [_DataFile(file, on_fault) for file in paths]
+        files = [_DataFile(file, kind, on_fault) for file, kind in kinds.items()]
         try:
             if meta is not None:
                 file_of = _files_by_entry(directory, meta, files, on_fault, whole=whole)
@@ -207,6 +220,9 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
         finally:
             for file in files:
                 file.close()
+    if meta is not None and meta.next_name and path.name == META_NAME:
+        fault = f"the recording goes on in {meta.next_name}, which is missing"
+        report(RecordingFault(file=META_NAME, offset=0, reason=fault), on_fault)
 
 
 def _report_meta(reason: str, on_fault: FaultHandler | None) -> None:
@@ -265,7 +281,7 @@ def _files_by_entry(
     unlisted = [path.name for path in _data_files(directory)]
 
     def file_of(entry: Entry) -> _DataFile | None:
-        kind = KIND_OF_TYPE.get(entry.data_type) or KIND_OF_TYPE.get(entry.data_type ^ ALL_BITS)
+        kind = _kind_of_entry(entry)
         key = (kind.data_type if kind else entry.data_type, entry.file)
         if key in by_number:
             return by_number[key]
@@ -287,23 +303,29 @@ def _files_by_entry(
     return file_of
 
 
+def _kind_of_entry(entry: Entry) -> Kind | None:
+    return KIND_OF_TYPE.get(entry.data_type) or KIND_OF_TYPE.get(entry.data_type ^ ALL_BITS)
+
+
 def vendor_facts(path: Path) -> RecordingFacts:
     (directory, _), *rest = _parts(path)
     meta = _usable_meta(directory)
+    last = _usable_meta(rest[-1][0]) if rest else meta
     parameters = directory / PARAMETER_FILE_NAME
     with reading(parameters):
         parameter_file = parameters.read_bytes() if parameters.is_file() else None
     if meta is None:
         return RecordingFacts(parameter_file=parameter_file)
-    stops = [entry.since_start_ms for entry in meta.entries() if entry.kind == CLOSED]
-    at_once = not rest and meta.complete
+    ended = last if last is not None and last.complete else None
+    entries = ended.entries() if ended else ()
+    stops = [entry.since_start_ms for entry in entries if entry.kind == CLOSED]
     return RecordingFacts(
         session_id=meta.session_id.decode("utf-8", "replace"),
         profile_id=meta.profile_id or None,
         parameter_file=parameter_file,
         user_header=_user_header(directory, meta),
-        stopped_ns=_time_ns(meta, max(stops)) if stops and at_once else None,
-        closed_ns=_time_ns(meta, meta.duration_ms) if at_once else None,
+        stopped_ns=_time_ns(ended, max(stops)) if ended and stops else None,
+        closed_ns=_time_ns(ended, ended.duration_ms) if ended else None,
     )
 
 
@@ -328,33 +350,71 @@ def _user_header(directory: Path, meta: Meta) -> bytes:
     return b""
 
 
-def _parts(path: Path) -> list[tuple[Path, list[Path]]]:
-    """Return the directories of a recording in order, each with the data files to read in it."""
+_Part = tuple[Path, dict[Path, Kind]]
+"""A directory, and the data files to read in it."""
+
+
+def _parts(path: Path) -> list[_Part]:
+    """Return the directories of a recording in order."""
     with reading(path):
         if not path.exists():
             raise RecordingError(f"there is no recording {path}")
-        if not path.is_dir():
-            files = [path] if kind_of_file(path.name) else _data_files(path.parent)
-            parts = [(path.parent, files)]
-        else:
+        kind = kind_of_file(path.name)
+        if path.is_dir():
             parts = [(path, _data_files(path))]
             if not parts[0][1]:
                 parts = _split_directories(path)
+        elif kind is not None:
+            parts = [(path.parent, {path: kind})]
+        else:
+            parts = [(directory, _data_files(directory)) for directory in _chain(path.parent)]
     if not any(files for _, files in parts):
         wanted = "xethru_baseband_iq_*.dat, xethru_datafloat_*.dat or the like"
         raise RecordingError(f"{path} holds no recording this can read; it needs a file {wanted}")
     return parts
 
 
-def _data_files(directory: Path) -> list[Path]:
-    return sorted(
-        path for path in directory.iterdir() if kind_of_file(path.name) and path.is_file()
-    )
+def _data_files(directory: Path) -> dict[Path, Kind]:
+    """Return the data files of a directory: by their names, others by the index."""
+    found = {
+        path: kind for path in directory.iterdir() if (kind := kind_of_file(path.name)) is not None
+    }
+    meta = _usable_meta(directory)
+    if meta is not None:
+        listed = [directory / Path(name).name for name in meta.files]
+        others = {at: path for at, path in enumerate(listed) if path not in found}
+        for entry in meta.entries() if others else ():
+            if (kind := _kind_of_entry(entry)) is not None and entry.file in others:
+                found[others.pop(entry.file)] = kind
+    return {path: found[path] for path in sorted(found) if path.is_file()}
 
 
-def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
-    names = sorted(child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
-    parts = [(child, files) for child in names if child.is_dir() and (files := _data_files(child))]
+def _chain(directory: Path) -> list[Path]:
+    """Return a directory and those in which its recording goes on, by their meta files."""
+    found = [directory]
+    while (following := _next_directory(found[-1])) is not None and following not in found:
+        found.append(following)
+    return found
+
+
+def _next_directory(directory: Path) -> Path | None:
+    meta = _usable_meta(directory)
+    match meta.next_name.replace("\\", "/").split("/") if meta is not None else ():
+        case ["..", name, str(file)] if name not in {"", ".."} and file == META_NAME:
+            following = directory.resolve().parent / name
+            return following if following.is_dir() else None
+    return None
+
+
+def _split_directories(path: Path) -> list[_Part]:
+    """Return the directories of recordings in a directory, and in directories of theirs."""
+    parts: list[_Part] = []
+    names = (child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
+    for child in sorted(filter(Path.is_dir, names), key=_by_number):
+        files = _data_files(child)
+        inner = sorted(child.glob(f"{_DIRECTORY_PREFIX}*/"), key=_by_number) if not files else ()
+        parts += [(child, files)] if files else [(part, _data_files(part)) for part in inner]
+    parts = [(directory, files) for directory, files in parts if files]
     # Without a session id, two directories cannot be assigned to one radar.
     metas = ((directory, _usable_meta(directory)) for directory, _ in parts)
     sessions = {(meta.session_id if meta else b"") or directory for directory, meta in metas}
@@ -363,6 +423,11 @@ def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
             f"{path} holds {len(parts)} recordings of {len(sessions)} sessions; name one of them"
         )
     return parts
+
+
+def _by_number(path: Path) -> list[str | int]:
+    """Sort key of names that end in numbers: 2 comes before 10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
 
 
 def _usable_meta(directory: Path) -> Meta | None:

@@ -6,7 +6,10 @@ up to the last record and the index up to the last entry. Only the totals in the
 file and its list of files are missing then; the reader does without them.
 """
 
-from dataclasses import dataclass
+import re
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Self
@@ -19,57 +22,195 @@ from xethru_protocol.recordings.vendor.layouts import (
     META_NAME,
     PARAMETER_FILE_NAME,
     RECORD,
-    BinaryKind,
     Entry,
+    Kind,
     Meta,
-    TextKind,
+    closing_order,
 )
 from xethru_protocol.wire.rows import Response
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Split:
-    """When a data file ends and the next of its kind begins: at the first limit reached.
+    """When a data file, or a directory, ends and the next begins: at the first limit reached.
 
-    ``records`` and ``bytes`` count one file, ``seconds`` since its first record; None: no limit.
+    ``records`` and ``bytes`` count what it holds, ``seconds`` since its first record;
+    ``daily_hour``, 0 ... 23, is a time of day in the recorder's time zone. None: no limit.
     """
 
     records: int | None = None
     bytes: int | None = None
     seconds: float | None = None
+    daily_hour: int | None = None
 
     def __post_init__(self) -> None:
         for limit in (self.records, self.bytes, self.seconds):
             if limit is not None and not limit > 0:
                 raise RecordingError(f"a limit of a data file must be positive, not {limit}")
+        if self.daily_hour is not None and self.daily_hour not in range(24):
+            raise RecordingError(f"the hour of a day must be 0 ... 23, not {self.daily_hour}")
+
+    def is_full(self, records: int, size: int) -> bool:
+        """Whether so many records of ``size`` bytes in all are enough."""
+        return (self.records is not None and records >= self.records) or (
+            self.bytes is not None and size >= self.bytes
+        )
+
+    def is_over(self, first_ms: int, time_ms: int, zone: tzinfo | None) -> bool:
+        """Whether what began at one time has ended before another [ms since 1970]."""
+        if self.seconds is not None and time_ms - first_ms >= 1000 * self.seconds:
+            return True
+        if self.daily_hour is None:
+            return False
+        began = _local_time(first_ms, zone)
+        end = began.replace(hour=self.daily_hour, minute=0, second=0, microsecond=0)
+        if end <= began:
+            end += timedelta(days=1)
+        if zone is None:  # its offset may be another by then
+            end = end.replace(tzinfo=None).astimezone()
+        return _local_time(time_ms, zone) >= end
+
+
+FileListener = Callable[[type[Response], Path], None]
+MetaFileListener = Callable[[str, Path], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Options:
+    """How to write; as the parameters of `RecordingWriter`."""
+
+    parameter_file: bytes | None
+    user_header: bytes
+    split: Split
+    split_directories: Split | None
+    basenames: Mapping[type[Response], str]
+    flush_on_write: bool
+    timezone: tzinfo | None
+    on_file: FileListener | None
+    on_meta_file: MetaFileListener | None
 
 
 class _DataFile(GrowingFile):
     """One data file being written; ``number`` is its place in the list of files."""
 
-    def __init__(self, path: Path, number: int, first_ms: int) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, kind: Kind, number: int, first_ms: int, *, flush: bool) -> None:
+        super().__init__(path, flush=flush)
+        self.kind = kind
         self.number = number
         self.first_ms = first_ms
         self.records = 0
 
-    def is_full(self, split: Split, since_ms: int) -> bool:
-        return (
-            (split.records is not None and self.records >= split.records)
-            or (split.bytes is not None and self.size >= split.bytes)
-            or (split.seconds is not None and since_ms - self.first_ms >= 1000 * split.seconds)
+
+@dataclass(slots=True)
+class _Part:
+    """One directory being written; all of its recording unless that is split into directories."""
+
+    directory: Path
+    meta: Meta
+    options: _Options
+    records: int = 0
+    last_ms: int = 0  # of the last record, since the start
+    meta_file: GrowingFile = field(init=False)
+    files: dict[int, _DataFile] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        flush = self.options.flush_on_write
+        self.meta_file = GrowingFile(self.directory / META_NAME, flush=flush)
+        self.meta_file.append(self.meta.pack_head())
+
+    def write(self, message: Response, kind: Kind, time_ms: int) -> None:
+        options = self.options
+        since_ms = self.since(time_ms)
+        data = kind.record(message, self.meta.start_ms + since_ms, options.timezone)
+        file = self.files.get(kind.data_type)
+        if file is not None and options.split.is_over(file.first_ms, time_ms, options.timezone):
+            self._close_file(file, since_ms)
+            file = None
+        if file is None:
+            file = self._open_file(kind, since_ms)
+            if options.user_header:
+                self._append(file, options.user_header, kind.data_type ^ ALL_BITS, since_ms)
+            if kind.titles:
+                self._append(file, kind.titles, kind.data_type, since_ms)
+        self._append(file, data, kind.data_type, since_ms)
+        file.records += 1
+        self.records += 1
+        self.last_ms = max(self.last_ms, since_ms)
+        if options.split.is_full(file.records, file.size):
+            self._close_file(file, since_ms)
+
+    def close(self, stopped_ms: int, closed_ms: int, next_name: str = "") -> None:
+        """Write the totals; times are since the start, ``next_name`` is of the next meta file."""
+        meta = self.meta
+        meta.duration_ms = closed_ms
+        meta.next_name = next_name
+        try:
+            for file in sorted(self.files.values(), key=lambda file: closing_order(file.kind)):
+                self._close_file(file, stopped_ms)
+            self.meta_file.append(meta.pack_files())
+        finally:
+            # The head's bytes exist already, so this works on a full disk, too.
+            self.meta_file.finish(meta.pack_head())
+        if self.options.on_meta_file is not None:
+            self.options.on_meta_file(meta.session_id.decode(), self.meta_file.path)
+
+    def since(self, time_ms: int) -> int:
+        return min(max(time_ms - self.meta.start_ms, 0), ALL_BITS)
+
+    def _open_file(self, kind: Kind, since_ms: int) -> _DataFile:
+        time_ms = self.meta.start_ms + since_ms
+        base = self.options.basenames.get(kind.message, kind.file_prefix.removesuffix("_"))
+        stem = f"{base}_{_local_time(time_ms, self.options.timezone):%Y%m%d_%H%M%S}"
+        name = stem + kind.suffix
+        again_ms = time_ms % 1000
+        while name in self.meta.files:  # several files within one second
+            name = f"{stem}_{again_ms:03d}ms{kind.suffix}"
+            again_ms += 1
+        file = _DataFile(
+            self.directory / name,
+            kind,
+            len(self.meta.files),
+            time_ms,
+            flush=self.options.flush_on_write,
         )
+        self.meta.files.append(name)
+        self.files[kind.data_type] = file
+        self.meta.data_types |= kind.data_type
+        return file
+
+    def _append(self, file: _DataFile, data: bytes, data_type: int, since_ms: int) -> None:
+        begin = file.size
+        file.append(data)
+        self.meta.size += len(data)
+        self.meta.largest_record = max(self.meta.largest_record, len(data))
+        end = self.meta.size
+        self._index(Entry(since_ms, RECORD, data_type, len(data), file.number, begin, end))
+
+    def _close_file(self, file: _DataFile, since_ms: int) -> None:
+        del self.files[file.kind.data_type]
+        file.close()
+        end = self.meta.size
+        data_type = file.kind.data_type
+        self._index(Entry(since_ms, CLOSED, data_type, 0, file.number, file.size, end))
+        if self.options.on_file is not None:
+            self.options.on_file(file.kind.message, file.path)
+
+    def _index(self, entry: Entry) -> None:
+        self.meta_file.append(entry.pack())
+        self.meta.index_end = self.meta_file.size
 
 
 class RecordingWriter:
-    """Writes one recording directory; RecordingError if it cannot be made or holds a recording.
+    """Writes one recording; RecordingError if it cannot be made or there is one already.
 
     Parameters
     ----------
     directory
-        Where; made if missing. Must hold no recording yet.
+        Where; made if missing. Must hold no recording yet. The vendor's recorder takes one named
+        as `session_directory` does.
     session_id
-        The recorder's name for the session.
+        The recorder's name for the session; None or empty: a random UUID, as the vendor's recorder
+        gives. Its reader takes no recording without one.
     profile_id
         Profile that runs; None: written as 0.
     parameter_file
@@ -78,8 +219,21 @@ class RecordingWriter:
         Bytes to put before the records of each data file.
     split
         When to begin a new data file; None: never.
+    split_directories
+        When to begin a new directory; None: never. ``directory`` holds them then.
+    basenames
+        Beginnings of the names of data files, in place of the vendor's, by type of message.
+    interval_s
+        Messages of one type that come sooner after the one stored before are left out; None: all
+        are stored.
+    flush_on_write
+        Have each record on the disk before the next one is written; slow.
     timezone
         Of the stamps in file names and text files; None: this machine's.
+    on_file
+        Called with type of message and path of each data file that is complete.
+    on_meta_file
+        Called with session id and path of each meta file that is complete.
 
     Examples
     --------
@@ -96,21 +250,39 @@ class RecordingWriter:
         self,
         directory: Path | str,
         *,
-        session_id: str = "",
+        session_id: str | None = None,
         profile_id: int | None = None,
         parameter_file: bytes | str | None = None,
         user_header: bytes = b"",
         split: Split | None = None,
+        split_directories: Split | None = None,
+        basenames: Mapping[type[Response], str] | None = None,
+        interval_s: float | None = None,
+        flush_on_write: bool = False,
         timezone: tzinfo | None = None,
+        on_file: FileListener | None = None,
+        on_meta_file: MetaFileListener | None = None,
     ) -> None:
         self.directory = Path(directory)
-        self._user_header = user_header
-        self._split = split or Split()
-        self._zone = timezone
-        self._meta = Meta(session_id=session_id.encode(), profile_id=profile_id or 0)
-        self._meta_file: GrowingFile | None = None
-        self._files: dict[int, _DataFile] = {}
-        self._last_ms = 0
+        self.session_id = session_id or str(uuid.uuid4())
+        self._profile_id = profile_id or 0
+        self._options = _Options(
+            parameter_file=parameter_file.encode()
+            if isinstance(parameter_file, str)
+            else parameter_file,
+            user_header=user_header,
+            split=split or Split(),
+            split_directories=split_directories,
+            basenames=_checked_basenames(basenames or {}),
+            flush_on_write=flush_on_write,
+            timezone=timezone,
+            on_file=on_file,
+            on_meta_file=on_meta_file,
+        )
+        self._interval_ms = 0.0 if interval_s is None else 1000 * interval_s
+        self._stored_ms: dict[int, int] = {}  # when the last message of each kind was stored
+        self._part: _Part | None = None
+        self._parts = 0
         self._closed = False
         with writing(self.directory):
             self.directory.mkdir(parents=True, exist_ok=True)
@@ -118,10 +290,8 @@ class RecordingWriter:
                 raise RecordingError(
                     f"{self.directory} already holds a recording; name another directory"
                 )
-        if parameter_file is not None:
-            content = parameter_file.encode() if isinstance(parameter_file, str) else parameter_file
-            with GrowingFile(self.directory / PARAMETER_FILE_NAME) as file:
-                file.append(content)
+        if split_directories is None:
+            self._store_parameter_file(self.directory)
 
     def __enter__(self) -> Self:
         return self
@@ -146,26 +316,11 @@ class RecordingWriter:
         if kind is None:
             return False
         time_ms = t_ns // MS_NS
-        start_ms = time_ms if self._meta_file is None else self._meta.start_ms
-        data = kind.record(message, max(time_ms, start_ms), self._zone)
-        if self._meta_file is None:
-            self._meta.start_ms = start_ms
-            self._meta_file = GrowingFile(self.directory / META_NAME)
-            self._meta_file.append(self._meta.pack_head())
-        since_ms = self._since(time_ms)
-        file = self._files.get(kind.data_type)
-        if file is not None and file.is_full(self._split, since_ms):
-            self._close_file(kind.data_type, since_ms)
-            file = None
-        if file is None:
-            file = self._open_file(kind, since_ms)
-            if self._user_header:
-                self._append(file, self._user_header, kind.data_type ^ ALL_BITS, since_ms)
-            if kind.titles:
-                self._append(file, kind.titles, kind.data_type, since_ms)
-        self._append(file, data, kind.data_type, since_ms)
-        file.records += 1
-        self._last_ms = max(self._last_ms, since_ms)
+        stored_ms = self._stored_ms.get(kind.data_type)
+        if stored_ms is not None and 0 <= time_ms - stored_ms < self._interval_ms:
+            return False
+        self._part_at(time_ms).write(message, kind, time_ms)
+        self._stored_ms[kind.data_type] = time_ms
         return True
 
     def close(self, *, stopped_ns: int | None = None, closed_ns: int | None = None) -> None:
@@ -177,53 +332,75 @@ class RecordingWriter:
         if self._closed:
             return
         self._closed = True
-        if self._meta_file is None:
+        part = self._part
+        if part is None:
             return
-        stopped_ms = self._last_ms if stopped_ns is None else self._since(stopped_ns // MS_NS)
-        self._meta.duration_ms = (
-            stopped_ms if closed_ns is None else self._since(closed_ns // MS_NS)
+        stopped_ms = part.last_ms if stopped_ns is None else part.since(stopped_ns // MS_NS)
+        closed_ms = stopped_ms if closed_ns is None else part.since(closed_ns // MS_NS)
+        part.close(stopped_ms, closed_ms)
+
+    def _part_at(self, time_ms: int) -> _Part:
+        """Return the directory that takes the next record; a new one where the last is full."""
+        part, split, zone = self._part, self._options.split_directories, self._options.timezone
+        if part is not None and split is None:
+            return part
+        if (
+            part is not None
+            and split is not None
+            and not split.is_full(part.records, part.meta.size)
+            and not split.is_over(part.meta.start_ms, time_ms, zone)
+        ):
+            return part
+        directory = self.directory
+        if split is not None:
+            name = session_directory(directory, self.session_id, time_ms * MS_NS, zone).name
+            directory = directory / f"{name}_{self._parts}"
+            with writing(directory):
+                directory.mkdir()
+            self._store_parameter_file(directory)
+        if part is not None:
+            part.close(part.last_ms, part.last_ms, f"../{directory.name}/{META_NAME}")
+        meta = Meta(
+            session_id=self.session_id.encode(), profile_id=self._profile_id, start_ms=time_ms
         )
-        try:
-            for data_type in self._files:
-                self._close_file(data_type, stopped_ms)
-            self._meta_file.append(self._meta.pack_files())
-        finally:
-            # The head's bytes exist already, so this works on a full disk, too.
-            self._meta_file.finish(self._meta.pack_head())
+        self._parts += 1
+        self._part = _Part(directory, meta, self._options)
+        return self._part
 
-    def _since(self, time_ms: int) -> int:
-        return min(max(time_ms - self._meta.start_ms, 0), ALL_BITS)
+    def _store_parameter_file(self, directory: Path) -> None:
+        if self._options.parameter_file is not None:
+            with GrowingFile(directory / PARAMETER_FILE_NAME) as file:
+                file.append(self._options.parameter_file)
 
-    def _open_file(self, kind: BinaryKind | TextKind, since_ms: int) -> _DataFile:
-        seconds = (self._meta.start_ms + since_ms) // 1000
-        time = (datetime.fromtimestamp(0, UTC) + timedelta(seconds=seconds)).astimezone(self._zone)
-        stem = f"{kind.file_prefix}{time:%Y%m%d_%H%M%S}"
-        name = stem + kind.suffix
-        again = 0
-        while name in self._meta.files:  # several files within one second
-            again += 1
-            name = f"{stem}_{again:03d}{kind.suffix}"
-        file = _DataFile(self.directory / name, len(self._meta.files), since_ms)
-        self._meta.files.append(name)
-        self._files[kind.data_type] = file
-        self._meta.data_types |= kind.data_type
-        return file
 
-    def _append(self, file: _DataFile, data: bytes, data_type: int, since_ms: int) -> None:
-        begin = file.size
-        file.append(data)
-        self._meta.size += len(data)
-        self._meta.largest_record = max(self._meta.largest_record, len(data))
-        end = self._meta.size
-        self._index(Entry(since_ms, RECORD, data_type, len(data), file.number, begin, end))
+def session_directory(
+    folder: Path | str, session_id: str, t_ns: int, timezone: tzinfo | None = None
+) -> Path:
+    """Return the directory that the vendor's recorder makes in ``folder`` for a session.
 
-    def _close_file(self, data_type: int, since_ms: int) -> None:
-        file = self._files[data_type]
-        file.close()
-        end = self._meta.size
-        self._index(Entry(since_ms, CLOSED, data_type, 0, file.number, file.size, end))
+    ``t_ns`` is when the session begins [ns since 1970]. Characters of the id that do not belong
+    into names of files become ``_``.
 
-    def _index(self, entry: Entry) -> None:
-        assert self._meta_file is not None
-        self._meta_file.append(entry.pack())
-        self._meta.index_end = self._meta_file.size
+    >>> str(session_directory("recordings", "my session/1", 0, UTC))
+    'recordings/xethru_recording_19700101_000000_my_session_1'
+    """
+    stamp = _local_time(t_ns // MS_NS, timezone)
+    safe_id = re.sub(r"[^\w.+-]", "_", session_id)
+    return Path(folder) / f"xethru_recording_{stamp:%Y%m%d_%H%M%S}_{safe_id}"
+
+
+def _local_time(time_ms: int, zone: tzinfo | None) -> datetime:
+    return (datetime.fromtimestamp(0, UTC) + timedelta(milliseconds=time_ms)).astimezone(zone)
+
+
+def _checked_basenames(names: Mapping[type[Response], str]) -> Mapping[type[Response], str]:
+    for message, name in names.items():
+        if message not in KIND_OF_MESSAGE:
+            raise RecordingError(f"a recording has no file of {message.__name__}")
+        if not re.fullmatch(r"[\w.+-]+", name):
+            raise RecordingError(
+                f"{name!r} cannot begin the name of a file: use letters, digits, _"
+            )
+    if len(set(names.values())) < len(names):
+        raise RecordingError("two kinds of data file have the same base name")
+    return names

@@ -4,14 +4,19 @@ Binary records are the vectors' payloads without their leading codes (Protocol r
 lines, name and bit of a kind are written here by hand.
 """
 
+import re
 import struct
+from dataclasses import replace
 from datetime import UTC, timedelta, timezone
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hil_tests.golden.vectors import load
-from xethru_protocol.recordings import RecordingWriter, read_recording
+from hil_tests.paths import FIXTURES
+from xethru_protocol.recordings import RecordingWriter, read_recording, recording_facts
+from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import decode_response
 
@@ -29,6 +34,10 @@ BINARY = [
     ("appdata_pulsedoppler_byte", "pulsedoppler_byte", 7, 5),
     ("appdata_noisemap_float", "noisemap_float", 8, 5),
     ("appdata_noisemap_byte", "noisemap_byte", 9, 5),
+    ("appdata_radar_rf_2bins", "radar_rf", 19, 5),
+    ("appdata_radar_rf_normalized_2bins", "radar_rf_normalized", 20, 5),
+    ("appdata_radar_baseband_float_2bins", "radar_baseband_float", 21, 5),
+    ("appdata_radar_baseband_q15_4bins", "radar_baseband_q15", 22, 5),
 ]
 TEXT = [
     ("appdata_presence_single", "presence_single", 12, "1234;1;2.35;0;7"),
@@ -40,12 +49,11 @@ TEXT = [
     ),
     ("appdata_presence_movinglist_empty", "presence_movinglist", 13, "1236;2;0;0;[];[];[];[];[]"),
     ("appdata_sleep", "sleep", 2, "11;0;14.5;1.25;8;3;4"),
-    ("appdata_respiration", "respiration", 3, "10;0;15;1.25;2.5;9"),
-    ("data_string", "string", 5, "0;0;hello"),
+    ("data_string", "datastring", 5, "0;0;hello"),
     ("appdata_respiration_detectionlist", "respiration_detectionlist", 14, "15;1;[1.5];[-2];[0]"),
     ("appdata_respiration_movinglist", "respiration_movinglist", 15, "14;2;[1,2];[3,4]"),
     ("appdata_vital_signs", "vitalsigns", 16, "12;7;15;1.5;0.5;60;1.5;0.75;1;2;1;2"),
-    ("appdata_sleep_stage", "sleepstage", 17, "13;2"),
+    ("appdata_sleep_stage", "sleepstage", 17, "13;2;0"),
     (
         "appdata_respiration_normalizedmovementlist",
         "respiration_normalizedmovementlist",
@@ -91,12 +99,96 @@ def test_a_line_is_the_time_and_the_fields(
     assert header.count(";") == line.count(";")
 
 
-def test_text_with_separators_stays_in_its_cell(tmp_path: Path) -> None:
-    text = "a;b\n\\n\rü\x85;"
+def test_respiration_is_stored_without_its_counter(tmp_path: Path) -> None:
+    """As the vendor's recorder does: see `test_every_kind_is_read_as_it_was_sent`."""
+    message = message_of("appdata_respiration")
+    assert isinstance(message, m.RespStatus)
+    with RecordingWriter(tmp_path, timezone=UTC) as writer:
+        writer.write(message, TIME_NS)
+    file = tmp_path / "xethru_respiration_19700101_000001.csv"
+    assert file.read_text().splitlines()[1] == STAMP + "0;15;1.25;2.5;9"
+    assert list(read_recording(tmp_path)) == [(replace(message, counter=0), TIME_NS)]
+
+
+@pytest.mark.parametrize("text", ["a;b\n\\n\rü\x85;", "two\n\nlines\n", "\n", "TimeStamp;\nx", ""])
+def test_text_with_separators_and_line_ends_is_stored_as_it_is(text: str, tmp_path: Path) -> None:
     message = m.DataString(content_id=1, info=2, text=text)
-    content = written(message, tmp_path / "r", "string", 5, ".csv").decode("latin-1")
-    assert content.count("\n") == 2
-    assert content.split("\n")[1] == STAMP + "1;2;a\\x3bb\\n\\\\n\\rü\x85\\x3b"
+    with RecordingWriter(tmp_path, timezone=UTC) as writer:
+        for t_ns in (TIME_NS, TIME_NS + 1_000_000):
+            writer.write(message, t_ns)
+    content = (tmp_path / "xethru_datastring_19700101_000001.csv").read_bytes().decode("latin-1")
+    titles = "TimeStamp;ContentId;Info;Message\n"
+    assert content == f"{titles}{STAMP}1;2;{text}\n{STAMP.replace('002', '003')}1;2;{text}\n"
+    assert list(read_recording(tmp_path)) == [(message, TIME_NS), (message, TIME_NS + 1_000_000)]
+
+
+# The vendor's recorder was given these vectors, in this order and with range_idx 0 in the four
+# matrices, and then a text of its own.
+SENT = [
+    *("data_float_rf_3bins", "data_string", "data_byte", "appdata_baseband_iq_2bins"),
+    *("appdata_baseband_ap_2bins", "appdata_pulsedoppler_float", "appdata_pulsedoppler_byte"),
+    *("appdata_noisemap_float", "appdata_noisemap_byte", "appdata_presence_single"),
+    *("appdata_presence_movinglist", "appdata_respiration", "appdata_sleep"),
+    *("appdata_vital_signs", "appdata_sleep_stage", "appdata_respiration_movinglist"),
+    *("appdata_respiration_detectionlist", "appdata_respiration_normalizedmovementlist"),
+    *("appdata_radar_rf_2bins", "appdata_radar_rf_normalized_2bins"),
+    *("appdata_radar_baseband_float_2bins", "appdata_radar_baseband_q15_4bins"),
+]
+EVERY_KIND = FIXTURES / "recordings" / "every_kind"
+
+
+def sent() -> list[m.Response]:
+    messages = [message_of(name) for name in SENT]
+    for at, message in enumerate(messages):
+        if isinstance(message, m.RespStatus):
+            messages[at] = replace(message, counter=0)  # not stored
+        if isinstance(
+            message,
+            m.PulseDopplerFloat | m.PulseDopplerByte | m.NoiseMapFloat | m.NoiseMapByte,
+        ):
+            messages[at] = replace(message, range_idx=0)
+    return [*messages, m.DataString(content_id=0, info=7, text="two;cells\nand \\lines\n")]
+
+
+def test_every_kind_is_read_as_it_was_sent() -> None:
+    found = list(read_recording(EVERY_KIND))
+    assert [message for message, _ in found] == sent()
+    assert len({type(message) for message, _ in found}) == len(KINDS)
+
+
+def test_every_kind_is_written_as_the_vendor_does(tmp_path: Path) -> None:
+    """Text stamps, and times of titles in the index, may differ by 1 ms.
+
+    The vendor's recorder reads the clock more than once for a message.
+    """
+    facts = recording_facts(EVERY_KIND)
+    writer = RecordingWriter(tmp_path / "r", session_id=facts.session_id, timezone=UTC)
+    for message, t_ns in read_recording(EVERY_KIND):
+        assert t_ns is not None
+        writer.write(message, t_ns)
+    writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
+    for theirs in EVERY_KIND.iterdir():
+        ours = tmp_path / "r" / theirs.name
+        if theirs.suffix == ".csv":
+            stamp = rb"(\n\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d\d)\d"
+            assert re.sub(stamp, rb"\1", ours.read_bytes()) == re.sub(
+                stamp, rb"\1", theirs.read_bytes()
+            )
+        elif theirs.name == "xethru_recording_meta.dat":
+            assert_same_meta(ours.read_bytes(), theirs.read_bytes())
+        else:
+            assert ours.read_bytes() == theirs.read_bytes(), theirs.name
+
+
+def assert_same_meta(ours: bytes, theirs: bytes) -> None:
+    """Compare all but times; the id has its length at 0x55, the index its end at 0x1D."""
+    begin = 0x59 + int.from_bytes(theirs[0x55:0x59], "little")
+    end = int.from_bytes(theirs[0x1D:0x25], "little")
+    entry = np.dtype([("ms", "<i4"), ("rest", "V29")])
+    one, other = (np.frombuffer(meta[begin:end], entry) for meta in (ours, theirs))
+    assert (ours[:begin], ours[end:]) == (theirs[:begin], theirs[end:])
+    assert one["rest"].tobytes() == other["rest"].tobytes()
+    assert np.abs(one["ms"] - other["ms"]).max() <= 1
 
 
 def test_digits_beyond_six_are_written_where_the_bits_need_them(tmp_path: Path) -> None:

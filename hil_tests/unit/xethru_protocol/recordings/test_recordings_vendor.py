@@ -178,20 +178,25 @@ def test_split_files_are_read_as_one(tmp_path: Path, split: Split, files: int) -
     ]
 
 
-def test_a_split_closes_each_file_in_the_index_as_others_report_it(tmp_path: Path) -> None:
+def test_a_split_closes_a_full_file_at_once_in_the_index(tmp_path: Path) -> None:
     """Entries by hand: ms, kind, data type, size, file, begin in the file, end over all files."""
-    with RecordingWriter(tmp_path / "split", split=Split(records=1), timezone=UTC) as writer:
+    with RecordingWriter(
+        tmp_path / "split", session_id="s", split=Split(records=1), timezone=UTC
+    ) as writer:
         writer.write(frame(1), 5 * MS)
         writer.write(frame(2), 9 * MS)
     meta = (tmp_path / "split" / META).read_bytes()
-    index = meta[0x59 + 1 :]  # an empty session id is its NUL
+    index = meta[0x59 + 2 :]  # behind the session id and its NUL
     assert [struct.unpack_from("<IBIIIQQ", index, 33 * row) for row in range(4)] == [
         (0, 1, 1024, 24, 0, 0, 24),
-        (4, 2, 1024, 0, 0, 24, 24),
+        (0, 2, 1024, 0, 0, 24, 24),
         (4, 1, 1024, 24, 1, 0, 48),
         (4, 2, 1024, 0, 1, 24, 48),
     ]
-    names = b"xethru_datafloat_19700101_000000.dat\0", b"xethru_datafloat_19700101_000000_001.dat\0"
+    names = (
+        b"xethru_datafloat_19700101_000000.dat\0",
+        b"xethru_datafloat_19700101_000000_009ms.dat\0",
+    )
     assert index[4 * 33 :] == struct.pack("<IBI", 4, 3, 2) + b"".join(
         struct.pack("<I", len(name)) + name for name in names
     )
@@ -202,7 +207,7 @@ def test_one_of_several_files_has_its_own_times_without_a_list_of_files(tmp_path
     writer = RecordingWriter(tmp_path / "split", split=Split(records=1), timezone=UTC)
     for counter in range(3):
         writer.write(frame(counter), counter * 10 * MS)
-    last = tmp_path / "split" / "xethru_datafloat_19700101_000000_002.dat"
+    last = tmp_path / "split" / "xethru_datafloat_19700101_000000_020ms.dat"
     assert list(read_recording(last)) == [(frame(2), 20 * MS)]
     assert [t_ns for _, t_ns in read_recording(tmp_path / "split")] == [0, 10 * MS, 20 * MS]
     writer.close()
@@ -225,10 +230,14 @@ def test_directories_without_session_id_are_not_taken_for_one_recording(
     meta: bool, tmp_path: Path
 ) -> None:
     for radar in range(2):
-        with RecordingWriter(tmp_path / f"xethru_recording_{radar}") as writer:
+        folder = tmp_path / f"xethru_recording_{radar}"
+        with RecordingWriter(folder, session_id="x") as writer:
             writer.write(frame(radar), 0)
+        content = bytearray((folder / META).read_bytes())
+        content[0x59] = 0  # as earlier versions wrote
+        (folder / META).write_bytes(content)
         if not meta:
-            (tmp_path / f"xethru_recording_{radar}" / META).unlink()
+            (folder / META).unlink()
     with pytest.raises(RecordingError, match="holds 2 recordings of 2 sessions; name one"):
         list(read_recording(tmp_path))
     ((found, _),) = read_recording(tmp_path / "xethru_recording_1")
