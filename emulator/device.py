@@ -389,7 +389,8 @@ def radar_device(
     largest_block = ASAP_BLOCK if pace is Pace.ASAP else REALTIME_BLOCK
     # neighbours in a series of modules take turns in making blocks
     block_phase = None if pace is Pace.ASAP else int(identity.serial) % largest_block
-    chip = Chip(source, largest_block, block_phase)
+    options = options or DeviceOptions()
+    chip = Chip(source, largest_block, block_phase, options.board_offset_m)
     module = Module(identity, chip, options, memory)
     clock = clock or ModuleClock()
     profile = ProfileStream(

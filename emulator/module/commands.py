@@ -44,7 +44,7 @@ PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
 TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
 LONGEST_READ = 4096
-"""Register bytes one READ may ask for; the firmware checks nothing, its reply buffer would end."""
+"""Bytes that one READ_I2C may ask for; assumed, no source has the command."""
 _FEATURES: frozenset[int] = frozenset(OutputFeature)
 _BYTE_REPLIES = frozenset(
     {
@@ -501,18 +501,13 @@ def _x4_get(module: Module, command: m.X4DriverGet) -> m.Response:
 @answers(m.X4DriverWrite)
 def _x4_write(module: Module, command: m.X4DriverWrite) -> None:
     _check_block_access(command.setting)
-    # Assumed: consecutive registers, wrapping at 256; the reference names only the first.
-    for address, byte in enumerate(command.values, start=command.address):
-        module.chip.write_register(command.setting, address, byte)
+    module.chip.write_burst(command.address, command.values)
 
 
 @answers(m.X4DriverRead)
 def _x4_read(module: Module, command: m.X4DriverRead) -> m.Response:
     _check_block_access(command.setting)
-    if command.length > LONGEST_READ:
-        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    addresses = range(command.address, command.address + command.length)  # as in WRITE
-    values = bytes(module.chip.read_register(command.setting, address) for address in addresses)
+    values = module.chip.read_burst(command.address, command.length)
     return m.ReplyByte(content_id=command.setting, values=values)
 
 

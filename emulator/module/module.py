@@ -140,7 +140,7 @@ class Module:
 
     def power_up(self, *, into_bootloader: bool = False) -> None:
         """Restart: chip defaults, saved settings, and the mode the module was left in."""
-        self.chip.init()
+        self.chip.power_up()
         self._power_up_parts(into_bootloader=into_bootloader)
 
     def power_cycle(self, now_ns: int) -> None:

@@ -107,6 +107,9 @@ class DeviceOptions:
         Sampling-frequency field of baseband messages [Hz] (15, question 9).
     storage_bytes
         Size of the file storage: 0x48000, or 0x18000 with the small microcontroller (4.11).
+    board_offset_m
+        FRAMEAREAOFFSET stored on the board, which INIT restores [module metres] (9.3). The echoes
+        stay where they are: another value moves their ranges.
     noise_map_store_ns
         How long a noise map takes to store; another store meanwhile is refused (4.4).
     x4_init_ns
@@ -134,6 +137,7 @@ class DeviceOptions:
     parameter_file_reply: Literal["string", "appdata", "byte"] = "string"
     baseband_sampling_hz: float = 2.916e9
     storage_bytes: int = 0x48000
+    board_offset_m: float = x4.DEFAULT_OFFSET_M
     noise_map_store_ns: int = 100_000_000
     x4_init_ns: int = 0
     file_delete_ns: int = 100_000_000

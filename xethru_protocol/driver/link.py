@@ -119,13 +119,14 @@ CONFIG_SETTINGS = {
 class RawConfig:
     """Settings of raw radar mode; the defaults are those of the vendor's example.
 
-    ``frame_area_m`` and ``offset_m`` are module metres. ``dac_step`` 0 ... 3 means steps of
-    1, 2, 4, 8 levels; ``prf_div`` divides the 243 MHz clock (16: the one regulators allow).
+    ``frame_area_m`` and ``offset_m`` are module metres. ``offset_m`` None keeps the calibration
+    of the module's own antenna; another value moves every range. ``dac_step`` 0 ... 3 means steps
+    of 1, 2, 4, 8 levels; ``prf_div`` divides the 243 MHz clock (16: the one regulators allow).
     Numbers outside `x4.LIMITS` raise `LocalProtocolError`. Protocol reference 4.9, 9.3.
     """
 
     frame_area_m: tuple[float, float] = (0.2, 9.4)
-    offset_m: float = x4.DEFAULT_OFFSET_M
+    offset_m: float | None = None
     downconversion: bool = False
     iterations: int = 16
     pulses_per_step: int = 300
@@ -142,16 +143,23 @@ class RawConfig:
                 x4.check_setting(setting, name, getattr(self, name))
 
     def settings(self) -> tuple[tuple[X4Setting, m.X4Value], ...]:
-        """X4 settings in the order in which they are sent."""
+        """X4 settings in the order in which they are sent; None keeps what the module has."""
         values = ((setting, getattr(self, name)) for name, setting in CONFIG_SETTINGS.items())
-        return tuple((at, int(value) if isinstance(value, bool) else value) for at, value in values)
+        return tuple(
+            (setting, int(value) if isinstance(value, bool) else value)
+            for setting, value in values
+            if value is not None
+        )
 
-    def check_area(self) -> None:
-        """Raise `LocalProtocolError` if a module would make no bin of the frame area."""
-        area = x4.frame_area(*self.frame_area_m, self.offset_m, self.downconversion)
+    def area(self, offset_m: float) -> x4.FrameArea:
+        """Return the frame area as a module with this offset [module metres] quantises it.
+
+        Raises `LocalProtocolError` if it would make no bin of it.
+        """
+        area = x4.frame_area(*self.frame_area_m, offset_m, self.downconversion)
         if area.n_bins <= 0:
             start_m, end_m = self.frame_area_m
-            nearest_m = self.offset_m - x4.COARSE_STEP_M + area.bin_length_m
+            nearest_m = offset_m - x4.COARSE_STEP_M + area.bin_length_m
             longest_m = area.requested_end_m - area.requested_start_m
             cut = (
                 f", of which the module keeps {longest_m:.4f} m,"
@@ -162,6 +170,7 @@ class RawConfig:
                 f"frame area {start_m:g} ... {end_m:g} m{cut} has no bins; what is kept must be at "
                 f"least {area.bin_length_m:.4f} m long and end behind {nearest_m:.4f} m"
             )
+        return area
 
     @property
     def fps_max(self) -> float:

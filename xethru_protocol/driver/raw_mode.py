@@ -12,7 +12,6 @@ from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError
 from xethru_protocol.wire.messages import SetMode, X4DriverInit, X4DriverSet, X4Value
 
-_LARGEST_FPS = 65535  # 16 bits (Protocol reference 9.6)
 _QUANTISATION_M = 1e-5  # far below a bin, far above a float32 rounding
 _STOP = X4DriverSet(setting=X4Setting.FPS, value=0.0)
 
@@ -33,7 +32,10 @@ class RawPlan:
 
 def configure_raw(link: Link, config: RawConfig | None = None) -> Steps[FrameGeometry]:
     config = config or RawConfig()
-    config.check_area()
+    if config.offset_m is None:  # before the module is touched; its own offset tells about bins
+        x4.frame_area(*config.frame_area_m, downconversion=config.downconversion)
+    else:
+        config.area(config.offset_m)
     geometry = yield from _apply(link, config)
     link.frames.new_stream()  # those that wait are of older settings
     return geometry
@@ -47,13 +49,15 @@ def _apply(link: Link, config: RawConfig) -> Steps[FrameGeometry]:
     yield from link.set_mode_if_known(SensorMode.XTID_SM_STOP)
     yield from link.set_mode_if_known(SensorMode.XTID_SM_MANUAL)
     yield from link.request(X4DriverInit(), SLOW_TIMEOUT_S)
+    offset_m = yield from _offset_m(link, config)
+    predicted = config.area(offset_m)
     for setting, value in config.settings():
         yield from link.request(X4DriverSet(setting=setting, value=value))
     for setting, value in config.settings():
         if setting is not X4Setting.FRAMEAREA:
             _check(link, setting, value, (yield from link.x4_get(setting)))
     geometry = yield from read_geometry(link, config.downconversion)
-    _check_geometry(link, geometry, config)
+    _check_geometry(link, geometry, config, predicted)
     link.plan = RawPlan(config=config)
     link.frames.break_off()
     link.frames.geometry = geometry
@@ -72,6 +76,16 @@ def _check(link: Link, setting: X4Setting, wanted: X4Value, found: X4Value) -> N
         )
 
 
+def _offset_m(link: Link, config: RawConfig) -> Steps[float]:
+    """Return the offset that will hold; what INIT restored is of the module's own antenna (9.3)."""
+    if config.offset_m is not None:
+        return config.offset_m
+    offset_m = yield from link.x4_get(X4Setting.FRAMEAREAOFFSET)
+    if not isinstance(offset_m, float) or not math.isfinite(offset_m):
+        raise RemoteProtocolError(f"{link.name} reads back FRAMEAREAOFFSET as {offset_m}")
+    return offset_m
+
+
 def read_geometry(link: Link, downconversion: bool) -> Steps[FrameGeometry]:
     """Ask where the bins of the frames lie that come from now on."""
     area = yield from link.x4_get(X4Setting.FRAMEAREA)
@@ -83,12 +97,13 @@ def read_geometry(link: Link, downconversion: bool) -> Steps[FrameGeometry]:
     )
 
 
-def _check_geometry(link: Link, geometry: FrameGeometry, config: RawConfig) -> None:
+def _check_geometry(
+    link: Link, geometry: FrameGeometry, config: RawConfig, predicted: x4.FrameArea
+) -> None:
     """Warn if the bins do not lie where the frame area that was asked for puts them."""
     (start_m, end_m), n_bins = geometry.area_m, geometry.n_bins
     if end_m < config.frame_area_m[1] - _QUANTISATION_M:
         link.warn(f"the module's frame ends at {end_m:.4f} m, not at {config.frame_area_m[1]:g} m")
-    predicted = x4.frame_area(*config.frame_area_m, config.offset_m, config.downconversion)
     if n_bins != predicted.n_bins or not np.allclose(
         (start_m, end_m), (predicted.start_m, predicted.end_m), rtol=0.0, atol=_QUANTISATION_M
     ):
@@ -100,8 +115,10 @@ def _check_geometry(link: Link, geometry: FrameGeometry, config: RawConfig) -> N
 
 
 def start(link: Link, fps: float) -> Steps[float]:
-    if not fps > 0:
-        raise LocalProtocolError(f"a frame rate must be positive, not {fps}; stop() stops")
+    if not x4.timer_rate(fps):
+        raise LocalProtocolError(
+            f"a frame rate must be positive, not {fps:g}, at which the module stops; stop() stops"
+        )
     if link.frames.geometry is None:
         yield from _take_over(link)
     _warn_of_rate(link, fps)
@@ -149,9 +166,11 @@ def leave(link: Link) -> Steps[None]:
 
 
 def _warn_of_rate(link: Link, fps: float) -> None:
-    whole = max(math.floor(fps), 1) if fps < _LARGEST_FPS else _LARGEST_FPS
+    whole = x4.timer_rate(fps)
     if fps != whole:
-        link.warn(f"the module's timer takes whole numbers: {fps:g} frames/s will be {whole}")
+        link.warn(
+            f"the module's timer takes whole numbers of 16 bits: {fps:g} frames/s will be {whole}"
+        )
     config = link.plan.config if isinstance(link.plan, RawPlan) else None
     if config is not None and fps > config.fps_max:
         link.warn(

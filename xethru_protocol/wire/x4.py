@@ -15,15 +15,18 @@ from xethru_protocol.wire.errors import LocalProtocolError
 
 MODULE_SPEED_MPS = 3.0e8  # what the firmware uses for light
 SAMPLING_RATE_HZ = 23.328e9
-RF_BIN_M = 1.5e8 / SAMPLING_RATE_HZ
+SAMPLE_M = 1.5e8 / SAMPLING_RATE_HZ  # from one sample to the next
+# The firmware's own constant for it is a float32; its other lengths are multiples in double (9.4).
+RF_BIN_M = float(np.float32(SAMPLE_M))
 BASEBAND_DECIMATION = 8
-BASEBAND_BIN_M = BASEBAND_DECIMATION * 1.5e8 / SAMPLING_RATE_HZ
-COARSE_STEP_M = 96 * 1.5e8 / SAMPLING_RATE_HZ  # one step of the receive delay
+BASEBAND_BIN_M = BASEBAND_DECIMATION * RF_BIN_M
+COARSE_STEP_SAMPLES = 96
+COARSE_STEP_M = COARSE_STEP_SAMPLES * RF_BIN_M  # one step of the receive delay
 FRAME_SAMPLES = 1536  # RF samples the chip captures per frame
 BASEBAND_DISCARDED_LINES = 4  # filter fill at the start of a downconverted frame
 COMMON_PLL_HZ = 243e6
 DEFAULT_PRF_DIV = 16
-DEFAULT_OFFSET_M = 0.18  # frame area offset the firmware sets for the X4M300 board
+DEFAULT_OFFSET_M = 0.18  # frame area offset of a board that stores none (9.3)
 CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}  # by TXCENTERFREQUENCY
 FULL_AREA_M = (0.0, 9.8765432)  # requested area after INIT
 LIMITS: Mapping[X4Setting, tuple[int, int]] = {
@@ -43,15 +46,17 @@ The module checks only some of them: of others it keeps the low bits.
 """
 
 _MAX_LENGTH_M = (float(np.float32(9.8765432)), float(np.float32(9.6707819)))
-_SNAP = 1e-4  # of a bin: how close a request must be to a bin to be taken as that bin
+# Of a bin: how close a request must be to a bin to be taken as that bin.
+_SNAP = float(np.float32(1e-4))
 
-# What the chip's timer really does when asked for 1 ... 34 frames per second, measured.
+_STANDSTILL_FPS = float(np.finfo(np.float32).eps)  # a request not above it stops the timer
+# What the chip's timer really does when asked for 1 ... 34 frames per second, measured (9.6).
 _REAL_RATES_HZ = (
-    *(1.004108, 2.008015, 3.012023, 4.015228, 5.018533, 6.024046, 7.027351),
-    *(8.027246, 9.030652, 10.032053, 11.035258, 12.040869, 13.041668, 14.044873),
-    *(15.055598, 16.041667, 17.049379, 18.061303, 19.055188, 20.044080, 21.052587),
-    *(22.070515, 23.085254, 24.081739, 25.042607, 26.083338, 27.067616, 28.050517),
-    *(29.107494, 30.066123, 31.090047, 32.083339, 33.033175, 34.040967),
+    *(1.0041081, 2.0080154, 3.0120232, 4.015228, 5.018533, 6.024046, 7.0273514),
+    *(8.0272455, 9.030652, 10.032053, 11.035257, 12.040869, 13.041668, 14.044873),
+    *(15.055598, 16.041668, 17.04938, 18.061302, 19.055187, 20.044079, 21.052588),
+    *(22.070515, 23.085253, 24.08174, 25.042606, 26.083338, 27.067616, 28.050518),
+    *(29.107494, 30.066124, 31.090048, 32.08334, 33.033176, 34.040966),
 )
 
 
@@ -156,34 +161,49 @@ def check_setting(setting: X4Setting, name: str, value: int | float | tuple[floa
             raise LocalProtocolError(f"{name} must be {smallest} ... {largest}, not {value}")
 
 
-def real_frame_rate(requested_hz: float) -> float:
-    """Frame rate [Hz] the chip's timer runs at when asked for ``requested_hz``.
+def timer_rate(requested_hz: float) -> int:
+    """Whole number the chip's timer is set to when asked for ``requested_hz``; 0 stops it.
 
-    The same for a request and for its read-back, so that a host finds from GET FPS the identical
-    number the module computes with. Not positive: the request itself, which stops the chip.
-    Protocol reference 9.6.
+    It has the low 16 bits of the integer part, which is at least 1. Protocol reference 9.6.
 
-    >>> round(real_frame_rate(17.9), 6), real_frame_rate(200.5), real_frame_rate(0.0)
-    (17.049379, 200.0, 0.0)
+    >>> timer_rate(17.9), timer_rate(0.5), timer_rate(1e-8), timer_rate(65552)
+    (17, 1, 0, 16)
     """
-    requested = _f32(requested_hz)
-    if not requested > 0:
-        return requested
-    whole = max(int(min(requested, 65535.0)), 1)  # the firmware keeps 16 bits of the integer part
-    return _f32(_REAL_RATES_HZ[whole - 1]) if whole <= len(_REAL_RATES_HZ) else float(whole)
+    return _whole_rate(requested_hz) & 0xFFFF
+
+
+def real_frame_rate(requested_hz: float) -> float:
+    """Frame rate [Hz] the chip's timer runs at when asked for ``requested_hz``; 0 if it stops.
+
+    A request and its read-back give the same, so that a host finds from GET FPS the identical
+    number the module computes with. Protocol reference 9.6.
+
+    >>> round(real_frame_rate(17.9), 5), real_frame_rate(200.5), real_frame_rate(1e-8)
+    (17.04938, 200.0, 0.0)
+    """
+    whole = timer_rate(requested_hz)
+    return _f32(_REAL_RATES_HZ[whole - 1]) if 0 < whole <= len(_REAL_RATES_HZ) else float(whole)
 
 
 def frame_rate_read_back(requested_hz: float) -> float:
     """Answer to GET FPS [Hz], a float32 value, when ``requested_hz`` was set.
 
     It is the real rate below 35, else the request with its fraction, which the timer does not
-    have. Protocol reference 9.6.
+    have. A request that stops the timer reads back as it is, NaN too. Protocol reference 9.6.
 
-    >>> round(frame_rate_read_back(17.9), 6), frame_rate_read_back(200.5)
-    (17.049379, 200.5)
+    >>> round(frame_rate_read_back(17.9), 5), frame_rate_read_back(200.5)
+    (17.04938, 200.5)
     """
+    measured = 0 < _whole_rate(requested_hz) <= len(_REAL_RATES_HZ)
+    return real_frame_rate(requested_hz) if measured else _f32(requested_hz)
+
+
+def _whole_rate(requested_hz: float) -> int:
+    """Integer part of a request as the driver takes it, 32 bits, at least 1; 0 if it stops."""
     requested = _f32(requested_hz)
-    return real_frame_rate(requested) if requested < len(_REAL_RATES_HZ) + 1 else requested
+    if not requested > _STANDSTILL_FPS:
+        return 0
+    return max(int(min(requested, float((1 << 32) - 1))), 1)
 
 
 def frame_time_ns(counter: int, rate_hz: float) -> int:

@@ -114,14 +114,40 @@ def test_a_bad_checksum_is_not_answered(host: BareHost) -> None:
     assert host.device.faults_seen == 1
 
 
-def test_block_register_access(host: BareHost) -> None:
+def test_a_burst_goes_to_one_register(host: BareHost) -> None:
+    """4.9, SPI bursts: the address is sent once, and every byte belongs to it."""
     assert host.ask(m.X4DriverWrite(address=0x14, values=b"\x01\x02\x03")) == m.Ack()
-    reply = host.ask(m.X4DriverRead(address=0x13, length=4))
-    assert reply == m.ReplyByte(content_id=0x22, values=b"\x00\x01\x02\x03")
-    # behind FFh comes 00h: the constants 00, FF and the chip ids 01, 02
-    reply = host.ask(m.X4DriverRead(address=0xFF, length=5))
-    assert reply == m.ReplyByte(content_id=0x22, values=b"\x00\x00\xff\x01\x02")
-    assert host.ask(m.X4DriverRead(address=5, length=10**6)) == m.Error(code=1)
+    reply = host.ask(m.X4DriverRead(address=0x14, length=4))
+    assert reply == m.ReplyByte(content_id=0x22, values=b"\x03\x03\x03\x03")
+    reply = host.ask(m.X4DriverRead(address=0x15, length=2))
+    assert reply == m.ReplyByte(content_id=0x22, values=b"\x00\x00")
+    reply = host.ask(m.X4DriverRead(address=0x01, length=6175))
+    assert reply == m.ReplyByte(content_id=0x22, values=b"\xff" * 6175)
+    assert host.ask(m.X4DriverWrite(address=0x14, values=bytes(6174))) == m.Ack()
+    assert host.ask(m.X4DriverRead(address=5, length=1 << 31)) == m.Error(code=0x21)
+
+
+@pytest.mark.parametrize(
+    "burst",
+    [m.X4DriverRead(address=5, length=6176), m.X4DriverWrite(address=5, values=bytes(6175))],
+)
+def test_a_burst_that_is_too_long_ends_the_frames_until_reset(
+    host: BareHost, burst: m.Command[m.Response]
+) -> None:
+    """4.9: error 11, and the driver's lock is never given back; commands still work."""
+    host.stream()
+    assert host.hear(3)
+    assert host.ask(burst) == m.Error(code=11)
+    host.set(X4Setting.FPS, 17.0)
+    assert host.hear() == []
+    assert host.ask(m.X4DriverInit()) == m.Ack()
+    host.set(X4Setting.FPS, 17.0)
+    assert host.hear() == []
+    host.command(m.ModReset())
+    host.at(SECOND)
+    assert host.at(3 * SECOND) == [m.System(code=0x10), m.System(code=0x11)]
+    host.stream()
+    assert host.hear(1)
 
 
 def test_frames_flow_in_manual_mode_only(host: BareHost) -> None:

@@ -129,7 +129,7 @@ class PlainModule:
         self.serial = serial
         self.instead = instead or {}
         self.stream: tuple[m.Message, ...] = ()
-        self.settings: dict[X4Setting, m.X4Value] = {}
+        self.settings: dict[X4Setting, m.X4Value] = {X4Setting.FRAMEAREAOFFSET: 0.18}
 
     def __call__(  # noqa: PLR0911 - one return per command
         self, command: m.Message

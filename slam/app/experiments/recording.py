@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from emulator.chip import Pace
-from emulator.chip.downconversion import CHANNELS, LEAD_SAMPLES, TAP_COUNT
+from emulator.chip.downconversion import CHANNELS, TAP_COUNT
 from emulator.device import radar_device
 from emulator.echo.echo import SPEED_OF_LIGHT_MPS, echo_source
 from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
@@ -287,7 +287,7 @@ def emulate(scene: Scene, like: SlowTime, seed: int) -> SlowTime:
 def echo_gain() -> float:
     """Return the baseband amplitude of a pulse of RF amplitude 1 in the middle of a line."""
     taps = CHANNELS[3]
-    at = np.arange(-LEAD_SAMPLES, TAP_COUNT - LEAD_SAMPLES)
+    at = np.arange(TAP_COUNT) - taps.lead_samples
     cycles, samples = CARRIER_CYCLES_PER_SAMPLE[3]
     pulse = np.exp(
         -0.5 * (at / (SIGMA_S * SAMPLING_RATE_HZ)) ** 2 + 2j * np.pi * cycles / samples * at

@@ -1,11 +1,13 @@
 """Settings, checks and frames of the chip against the protocol reference's tables."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from emulator.chip.chip import Chip, Refusal, Timeline
 from hil_tests.unit.emulator.doubles import FormulaSource, RampSource, working_point
@@ -129,25 +131,45 @@ def test_counter_wraps_at_32_bits() -> None:
     assert [chip.next_frame().info for _ in range(2)] == [2**32 - 1, 0]
 
 
-def test_a_hundred_all_zero_frames_switch_the_transmitter_off() -> None:
-    """Protocol reference 8.4, transmitter guard."""
-    chip = working_point(Chip(FormulaSource(lambda index: 0 * index)))
+MIDDLE = 16 * 300 * 152 // 2
+"""Counters at the middle of the DAC range at the working point: values of 0 (9.7)."""
+
+
+def streaming(formula: Callable[[NDArray[np.float64]], NDArray[np.float64]], block: int) -> Chip:
+    chip = working_point(Chip(FormulaSource(formula), largest_block=block))
     chip.set(X4Setting.FPS, 17.0)
+    return chip
+
+
+@pytest.mark.parametrize("downconversion", [0, 1])
+def test_a_hundred_zero_frames_switch_the_transmitter_off(downconversion: int) -> None:
+    """8.4: zero are the normalised samples; no DC passes the filters of baseband (9.8)."""
+    level = MIDDLE if downconversion == 0 else 12345
+    chip = streaming(lambda index: 0 * index + level, 32)
+    chip.set(X4Setting.DOWNCONVERSION, downconversion)
     for _ in range(99):
-        chip.next_frame()
+        assert not chip.next_frame().values.any()
     assert chip.get(X4Setting.TXPOWER) == 2
     chip.next_frame()
     assert not chip.running
     assert chip.get(X4Setting.TXPOWER) == 0
+    assert chip.get(X4Setting.FPS) == 0
+
+
+def test_counters_of_zero_are_no_zero_frame() -> None:
+    """8.4: they are -0.074 when normalised; this test once had them for a dead receiver."""
+    chip = streaming(lambda index: 0 * index, 32)
+    for _ in range(150):
+        chip.next_frame()
+    assert (chip.running, chip.get(X4Setting.TXPOWER)) == (True, 2)
 
 
 def test_zero_frames_that_do_not_follow_each_other_switch_nothing_off() -> None:
     """Frame 50 alone is not zero: 99 zero frames behind it are allowed, and 50 before it."""
-    level = 0
-    chip = working_point(Chip(FormulaSource(lambda index: 0 * index + level), largest_block=1))
-    chip.set(X4Setting.FPS, 17.0)
+    level = MIDDLE
+    chip = streaming(lambda index: 0 * index + level, 1)
     for counter in range(150):
-        level = int(counter == 50)
+        level = MIDDLE + int(counter == 50)
         chip.next_frame()
     assert (chip.running, chip.get(X4Setting.TXPOWER)) == (True, 2)
     chip.next_frame()
@@ -182,34 +204,109 @@ REGISTER_WRITES: list[tuple[int, int, X4Setting, X4Value]] = [
     (0x65, 0x40, X4Setting.TXCENTERFREQUENCY, 4),
     (0x75, 0x70, X4Setting.TXPOWER, 3),
     (0x75, 0x10, X4Setting.TXPOWER, 0),
-    (0x0F, 0x01, X4Setting.DOWNCONVERSION, 1),
 ]
 
 
 @pytest.mark.parametrize(("address", "byte", "setting", "value"), REGISTER_WRITES)
-def test_writing_a_coupled_register_sets_its_setting_and_reads_back(
+def test_settings_that_are_read_from_registers_show_what_was_written(
     address: int, byte: int, setting: X4Setting, value: X4Value
 ) -> None:
+    """4.9, note on register writes."""
     chip = working_point(Chip(RampSource()))
     chip.set(X4Setting.PIFREGISTER, (address, byte))
     assert chip.get(setting) == value
     assert chip.read_register(X4Setting.PIFREGISTER, address) == byte
 
 
+def test_a_register_write_does_not_change_the_drivers_own_copy() -> None:
+    """4.9: downconversion, length, rate and area stay; so does normalisation until INIT.
+
+    The chip counts 16 times as long then, so the values are 16 times as large.
+    """
+    chip = working_point(Chip(FormulaSource(lambda index: 0 * index + 1000)))
+    chip.set(X4Setting.FPS, 17.0)
+    before = {one: chip.get(one) for one in KEPT}
+    for address, byte in ((0x0F, 1), (0x1B, 6), (0x35, 255), (0x42, 5)):
+        chip.set(X4Setting.PIFREGISTER, (address, byte))
+        assert chip.read_register(X4Setting.PIFREGISTER, address) == byte
+    assert {one: chip.get(one) for one in KEPT} == before
+    assert chip.get(X4Setting.ITERATIONS) == 255
+    values = chip.next_frame().values
+    expected = np.float32(1000) * np.float32(2.03450526e-07) - np.float32(0.07421875)
+    np.testing.assert_array_equal(values, np.full(1431, expected))
+    chip.set(X4Setting.DACMIN, 949)  # another SET takes nothing over
+    np.testing.assert_array_equal(chip.next_frame().values, values)
+    chip.init()
+    assert chip.get(X4Setting.ITERATIONS) == 8
+
+
+KEPT = (
+    X4Setting.DOWNCONVERSION,
+    X4Setting.FRAMEAREA,
+    X4Setting.FRAMEAREAOFFSET,
+    X4Setting.FRAMEBINCOUNT,
+    X4Setting.FPS,
+)
+
+
+def test_the_chip_does_what_its_registers_say() -> None:
+    """4.9 and 9.1: iterations, TX power, and a receive delay of 96 samples per step."""
+    source = RampSource()
+    chip = working_point(Chip(source))
+    chip.next_frame()
+    for address, byte in ((0x35, 32), (0x75, 0x30), (0x42, 3)):
+        chip.set(X4Setting.PIFREGISTER, (address, byte))
+    chip.next_frame()
+    before, after = source.captures
+    assert (before.iterations, before.tx_power) == (16, 2)
+    assert (after.iterations, after.tx_power) == (32, 1)
+    moved_m = after.first_sample_m - before.first_sample_m
+    assert moved_m == pytest.approx(2 * 96 * 1.5e8 / 23.328e9, abs=1e-12)
+
+
 def test_registers_that_follow_from_settings() -> None:
-    """Protocol reference 4.9 and 9.4: bytes per counter, and rx wait = 1 + delay steps."""
+    """Protocol reference 4.9 and 9.4: bytes per counter, and rx wait = tx wait + delay steps."""
     chip = Chip(RampSource())
     pif = X4Setting.PIFREGISTER
     # (start - 0.18 m) / 0.6173 m: -0.3, 0.03 and 7.8 coarse steps
     for start_m, rx_wait in ((0.0, 0), (0.2, 1), (5.0, 8)):
         chip.set(X4Setting.FRAMEAREA, (start_m, 9.4))
         assert chip.read_register(pif, 0x42) == rx_wait
+    chip.set(pif, (0x43, 3))
+    chip.set(X4Setting.FRAMEAREA, (5.0, 9.4))
+    assert chip.read_register(pif, 0x42) == 10
     assert chip.read_register(pif, 0x1B) == 3
     chip.set(X4Setting.DOWNCONVERSION, 1)
     assert chip.read_register(pif, 0x1B) == 6
-    chip.set(pif, (0x1B, 3))
-    assert chip.read_register(pif, 0x1B) == 6
-    assert chip.get(X4Setting.DOWNCONVERSION) == 1
+    assert chip.read_register(pif, 0x0F) == 1
+
+
+@pytest.mark.parametrize(
+    ("board_offset_m", "n_bins"), [(0.18, 1467), (0.0, 1535), (0.3, 1486)], ids=str
+)
+def test_init_restores_the_boards_own_offset(board_offset_m: float, n_bins: int) -> None:
+    """9.3; bins of 0 ... 9.8765 m as the vendor's compiled driver makes them (9.4)."""
+    chip = Chip(RampSource(), board_offset_m=board_offset_m)
+    for _ in range(2):
+        assert chip.get(X4Setting.FRAMEAREAOFFSET) == np.float32(board_offset_m)
+        assert chip.get(X4Setting.FRAMEBINCOUNT) == n_bins
+        chip.set(X4Setting.FRAMEAREAOFFSET, 0.5)
+        chip.init()
+
+
+@pytest.mark.parametrize(
+    ("fps", "runs"),
+    [(1e-8, False), (-1.0, False), (math.nan, False), (65536.0, False), (65552.0, True)],
+)
+def test_corner_values_of_the_rate_read_back_as_they_are(fps: float, runs: bool) -> None:
+    """9.6; at 65536 the timer's 16 bits are 0, and no frame comes (assumed)."""
+    chip = Chip(RampSource())
+    chip.set(X4Setting.FPS, 17.0)
+    chip.set(X4Setting.FPS, fps)
+    assert chip.running is runs
+    read_back = chip.get(X4Setting.FPS)
+    assert isinstance(read_back, float)
+    assert read_back == np.float32(fps) or (math.isnan(fps) and math.isnan(read_back))
 
 
 def test_registers_start_as_the_driver_leaves_them() -> None:

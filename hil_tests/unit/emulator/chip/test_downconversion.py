@@ -13,16 +13,54 @@ Samples = NDArray[np.float64]
 CYCLES_PER_SAMPLE = {3: 5 / 16, 4: 3 / 8}
 
 
-@pytest.mark.parametrize(("setting", "absolute_sum", "non_zero"), [(3, 306, 30), (4, 316, 28)])
-def test_taps_are_those_the_reference_describes(
-    setting: int, absolute_sum: int, non_zero: int
+# Protocol reference 9.8, taps 0...31 of the vendor's x4driver.c.
+# fmt: off
+TAPS = {
+    3: (
+        (1, -1, -1, 5, -3, -6, 12, -2, -16, 18, 6, -27, 16, 17, -31, 6,
+         25, -25, -5, 24, -13, -10, 16, -3, -7, 6, 0, -3, 1, 0, 0, 0),
+        (0, 1, -3, 0, 6, -7, -3, 16, -10, -13, 24, -5, -25, 25, 6, -31,
+         17, 16, -27, 6, 18, -16, -2, 12, -6, -3, 5, -1, -1, 1, 0, 0),
+    ),
+    4: (
+        (1, -2, 1, 3, -8, 11, -5, -8, 21, -24, 10, 12, -30, 31, -13, -12,
+         29, -27, 10, 8, -17, 15, -5, -3, 5, -4, 1, 0, 0, 0, 0, 0),
+        (0, 1, -4, 5, -3, -5, 15, -17, 8, 10, -27, 29, -12, -13, 31, -30,
+         12, 10, -24, 21, -8, -5, 11, -8, 3, 1, -2, 1, 0, 0, 0, 0),
+    ),
+}
+# fmt: on
+
+
+@pytest.mark.parametrize(("setting", "absolute_sum"), [(3, 306), (4, 316)])
+def test_taps_are_the_vendors(setting: int, absolute_sum: int) -> None:
+    taps = CHANNELS[setting]
+    assert (taps.i_taps, taps.q_taps) == TAPS[setting]
+    assert taps.absolute_sum == absolute_sum
+    assert sum(taps.i_taps) == sum(taps.q_taps) == 0
+
+
+@pytest.mark.parametrize(
+    ("setting", "gain", "rejection_db", "centre"), [(3, 0.782, 55, 14.5), (4, 0.768, 61, 13.5)]
+)
+def test_gain_image_and_delay_of_the_taps(
+    setting: int, gain: float, rejection_db: float, centre: float
 ) -> None:
-    taps = CHANNELS[setting].i_taps
-    assert len(taps) == 32
-    assert all(-32 <= tap <= 31 for tap in taps)
-    assert sum(taps) == 0
-    assert sum(abs(tap) for tap in taps) == CHANNELS[setting].absolute_sum == absolute_sum
-    assert sum(tap != 0 for tap in taps) == non_zero
+    """9.8: half of |I + jQ| at +fc, the ratio to -fc, and one delay at every frequency."""
+    taps = CHANNELS[setting]
+    pair = (np.array(taps.i_taps) - 1j * np.array(taps.q_taps)) / taps.absolute_sum
+
+    def response(cycles: float) -> complex:
+        return complex(np.dot(pair, np.exp(2j * np.pi * cycles * np.arange(32))))
+
+    carrier = CYCLES_PER_SAMPLE[setting]
+    wanted, image = abs(response(carrier)), abs(response(-carrier))
+    assert wanted / 2 == pytest.approx(gain, abs=5e-4)
+    assert 20 * np.log10(wanted / image) == pytest.approx(rejection_db, abs=0.5)
+    cycles = carrier + np.linspace(-0.03, 0.03, 13)
+    delayed = [response(f) * np.exp(-2j * np.pi * f * centre) for f in cycles]
+    np.testing.assert_allclose(np.angle(delayed / delayed[6]), 0.0, atol=1e-9)
+    assert (taps.centre, taps.lead_samples) == (centre, centre + 0.5)
 
 
 def baseband_of(setting: int, formula: FormulaSource) -> tuple[NDArray[np.complex128], Chip]:
@@ -83,18 +121,17 @@ def test_a_target_appears_at_its_labelled_range(line: int, setting: int) -> None
     assert label_m == pytest.approx(0.18 + 8 * line * 1.5e8 / 23.328e9, abs=1e-4)
 
 
-def test_filter_agrees_with_a_plain_sum() -> None:
+@pytest.mark.parametrize(("setting", "alternates"), [(3, -1), (4, 1)])
+def test_filter_agrees_with_a_plain_sum(setting: int, alternates: int) -> None:
+    """9.8: the second set is the first one negated (setting 3) or equal (setting 4)."""
     rng = np.random.default_rng(1)
     rf = rng.integers(0, 2**24, size=(2, 8 * 5 + 32))
-    i_raw, q_raw = downconvert(rf, CHANNELS[3], first_line=3)
-    taps = CHANNELS[3].i_taps
+    i_raw, q_raw = downconvert(rf, CHANNELS[setting], first_line=3)
+    i_taps, q_taps = TAPS[setting]
     for frame in range(2):
         for line in range(6):
             window = [int(value) for value in rf[frame, 8 * line : 8 * line + 32]]
-            sign = (-1) ** (3 + line)
-            assert i_raw[frame, line] == sign * sum(
-                t * x for t, x in zip(taps, window, strict=True)
-            )
-            assert q_raw[frame, line] == sign * sum(
-                t * x for t, x in zip(taps[::-1], window, strict=True)
-            )
+            sign = alternates ** (3 + line)
+            for raw, taps in ((i_raw, i_taps), (q_raw, q_taps)):
+                expected = sign * sum(t * x for t, x in zip(taps, window, strict=True))
+                assert raw[frame, line] == expected

@@ -32,6 +32,8 @@ def test_raw_mode_follows_the_recipe_of_the_reference(driver_on: DriverOn) -> No
         SensorMode.XTID_SM_STOP,
         SensorMode.XTID_SM_MANUAL,
     ]
+    # FRAMEAREAOFFSET is the module's own calibration: read, not set (9.3)
+    assert m.X4DriverGet(setting=X4Setting.FRAMEAREAOFFSET) in line.received
     assert [(c.setting.name, c.value) for c in sets] == [
         ("DACMIN", 949),
         ("DACMAX", 1100),
@@ -42,13 +44,33 @@ def test_raw_mode_follows_the_recipe_of_the_reference(driver_on: DriverOn) -> No
         ("TXCENTERFREQUENCY", 3),
         ("TXPOWER", 2),
         ("DOWNCONVERSION", 0),
-        ("FRAMEAREAOFFSET", float(np.float32(0.18))),
         ("FRAMEAREA", (float(np.float32(0.2)), float(np.float32(9.4)))),
         ("FPS", 17.0),
     ]
     assert (geometry.n_bins, geometry.range_start_m) == (1431, 0.19929012656211853)
     assert geometry.bin_length_m == pytest.approx(0.006430041, abs=1e-8)
     assert radar.warnings == []
+
+
+@pytest.mark.parametrize("offset_m", [None, 0.2])
+def test_the_modules_own_offset_stays_unless_the_user_sets_one(
+    driver_on: DriverOn, offset_m: float | None
+) -> None:
+    """9.3, 9.4: a board calibrated to 0.2 m gives 0.200000 ... 9.401389 m, as is expected then."""
+    own = m.ReplyFloat(content_id=X4Setting.FRAMEAREAOFFSET, values=(float(np.float32(0.2)),))
+    area = m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(0.2, 9.401389))
+    radar, line = driver_on(
+        PlainModule(
+            instead={
+                m.X4DriverGet(setting=X4Setting.FRAMEAREAOFFSET): [own],
+                m.X4DriverGet(setting=X4Setting.FRAMEAREA): [area],
+            }
+        )
+    )
+    radar.configure_raw(RawConfig(offset_m=offset_m))
+    assert radar.warnings == []
+    sets = [c.setting for c in line.received if isinstance(c, m.X4DriverSet)]
+    assert (X4Setting.FRAMEAREAOFFSET in sets) is (offset_m is not None)
 
 
 def test_firmware_without_modes_is_tolerated(driver_on: DriverOn) -> None:

@@ -21,11 +21,20 @@ def test_area_without_bins_is_refused_before_anything_is_sent(driver_on: DriverO
     with pytest.raises(
         LocalProtocolError, match=r"-3 \.\.\. -2 m has no bins; .* behind -0\.4309 m"
     ):
-        radar.configure_raw(RawConfig(frame_area_m=(-3.0, -2.0)))
+        radar.configure_raw(RawConfig(frame_area_m=(-3.0, -2.0), offset_m=0.18))
     cut = r"-1000 \.\.\. 1000 m, of which the module keeps 9\.8765 m, has no bins"
     with pytest.raises(LocalProtocolError, match=cut):
-        radar.configure_raw(RawConfig(frame_area_m=(-1000.0, 1000.0)))
+        radar.configure_raw(RawConfig(frame_area_m=(-1000.0, 1000.0), offset_m=0.18))
     assert line.received == []
+
+
+def test_area_without_bins_at_the_modules_own_offset_is_refused_before_a_setting(
+    driver_on: DriverOn,
+) -> None:
+    radar, line = driver_on()
+    with pytest.raises(LocalProtocolError, match=r"-3 \.\.\. -2 m has no bins"):
+        radar.configure_raw(RawConfig(frame_area_m=(-3.0, -2.0)))
+    assert not any(isinstance(command, m.X4DriverSet) for command in line.received)
 
 
 def test_frame_shorter_than_asked_for_is_warned_of(driver_on: DriverOn) -> None:
@@ -36,7 +45,7 @@ def test_frame_shorter_than_asked_for_is_warned_of(driver_on: DriverOn) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fps", "made"), [(1e-9, "1"), (17.5, "17"), (70000.0, "65535"), (17.0, None)]
+    ("fps", "made"), [(1e-6, "1"), (17.5, "17"), (70000.0, "4464"), (17.0, None)]
 )
 def test_rate_that_the_timer_cannot_make_is_warned_of(
     raw: Scripted, fps: float, made: str | None

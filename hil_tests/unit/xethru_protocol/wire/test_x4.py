@@ -1,5 +1,6 @@
 """X4 arithmetic against the tables of the Protocol reference, section 9."""
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -13,10 +14,12 @@ from xethru_protocol.wire.errors import LocalProtocolError
 # Worked table of 9.4: start, end, offset; RF bins and read-back; baseband bins and read-back.
 TABLE = [
     (0.2, 9.4, 0.18, 1431, 0.199290, 9.400679, 181, 0.180000, 9.439260),
-    (0.2, 9.4, 0, 1431, 0.199331, 9.400721, 181, 0.154321, 9.413580),
+    (0.2, 9.4, 0, 1431, 0.199331, 9.400720, 181, 0.154321, 9.413580),
     (0.2, 9.4, 0.2, 1431, 0.200000, 9.401389, 180, 0.200000, 9.407819),
     (-0.5, 9.4, 0.18, 1527, -0.437284, 9.381389, 188, -0.437284, 9.182057),
-    (-0.5, 9.4, 0, 1517, -0.501543, 9.252830, 186, -0.514403, 9.002058),
+    (-0.5, 9.4, 0, 1517, -0.501543, 9.252829, 186, -0.514403, 9.002057),
+    (0.5, 3.0, 0.18, 390, 0.495072, 3.002788, 50, 0.488642, 3.009218),
+    (0.7, 7.9, 0.18, 1121, 0.694403, 7.902479, 142, 0.694403, 7.947490),
     (0.4, 5.0, 0.18, 716, 0.398621, 5.002531, 91, 0.385761, 5.015391),
     (0.4, 5.0, 0, 716, 0.398663, 5.002572, 92, 0.360082, 5.041152),
     (0.4, 9.4, 0.18, 1400, 0.398621, 9.400679, 177, 0.385761, 9.439260),
@@ -38,8 +41,44 @@ def test_frame_area_is_quantised_as_in_the_worked_table(
     bins, read_start, read_end = row[6:] if downconversion else row[3:6]
     area = x4.frame_area(start, end, offset, downconversion)
     assert area.n_bins == bins
-    assert area.start_m == pytest.approx(read_start, abs=6e-7)
-    assert area.end_m == pytest.approx(read_end, abs=6e-7)
+    # the table has six digits; the area's first digits are a float32 further on
+    assert area.start_m == pytest.approx(read_start, abs=5.1e-7 + abs(read_start) * 2**-24)
+    assert area.end_m == pytest.approx(read_end, abs=5.1e-7 + abs(read_end) * 2**-24)
+
+
+def test_read_backs_are_to_the_last_bit_those_of_real_modules() -> None:
+    """9.4, table of real modules: the firmware's metres per bin are a float32."""
+    start_m = x4.frame_area(0.5, 3.0, 0.18).start_m
+    end_m = x4.frame_area(0.7, 7.9, 0.18).end_m
+    assert start_m == np.float32(0.495072007)
+    assert end_m == np.float32(7.902479172)
+
+
+# Computed by the vendor's own x4driver.c, compiled with the firmware's flags (9.4): request,
+# offset, downconversion; start, end and bins. In double arithmetic each differs in the last bit.
+COMPILED = [
+    (2.69, 4.37, 0.2, False, 2.6884258, 4.3730965, 262),
+    (-0.26, 3.48, 0.0, False, -0.26363167, 3.4850821, 583),
+    (0.19, 2.9, 0.2, False, 0.18713993, 2.9006171, 422),
+    (3.22, 4.71, 0.2, False, 3.2156892, 4.7138886, 233),
+    (3.43, 7.04, 0.18, True, 3.4207406, 7.073004, 72),
+    (1.29, 3.67, 0.2, True, 1.2802469, 3.6979423, 48),
+    (3.02, 8.27, 0.18, True, 3.009218, 8.307571, 104),
+    (1.21, 5.41, 0.18, True, 1.2088065, 5.4269133, 83),
+]
+
+
+@pytest.mark.parametrize("row", COMPILED, ids=lambda row: f"{row[0]}..{row[1]} m at {row[2]}")
+def test_read_backs_are_to_the_last_bit_those_of_the_compiled_driver(
+    row: tuple[float, float, float, bool, float, float, int],
+) -> None:
+    start, end, offset, downconversion, read_start, read_end, bins = row
+    area = x4.frame_area(start, end, offset, downconversion)
+    assert (area.start_m, area.end_m, area.n_bins) == (
+        float(np.float32(read_start)),
+        float(np.float32(read_end)),
+        bins,
+    )
 
 
 def test_area_after_init_has_1467_bins() -> None:
@@ -101,46 +140,54 @@ def test_quantised_area_covers_the_request_within_one_frame(
     )
 
 
+# 9.6: the chip timer's real rates, with digits enough for the exact float32.
+RATES = [
+    *(1.0041081, 2.0080154, 3.0120232, 4.015228, 5.018533, 6.024046, 7.0273514),
+    *(8.0272455, 9.030652, 10.032053, 11.035257, 12.040869, 13.041668, 14.044873),
+    *(15.055598, 16.041668, 17.04938, 18.061302, 19.055187, 20.044079, 21.052588),
+    *(22.070515, 23.085253, 24.08174, 25.042606, 26.083338, 27.067616, 28.050518),
+    *(29.107494, 30.066124, 31.090048, 32.08334, 33.033176, 34.040966),
+]
+
+
+@pytest.mark.parametrize("whole", range(1, 35))
+def test_rates_below_35_are_to_the_last_bit_those_measured(whole: int) -> None:
+    assert x4.frame_rate_read_back(whole) == np.float32(RATES[whole - 1])
+
+
+def test_rate_of_25_is_what_a_real_module_read_back() -> None:
+    assert x4.frame_rate_read_back(25.0) == 25.042606353759766
+
+
 @pytest.mark.parametrize(
-    ("requested", "real"),
+    ("requested", "real", "answer"),
     [
-        (1, 1.004108),
-        (0.5, 1.004108),
-        (7, 7.027351),
-        (8, 8.027246),
-        (15, 15.055598),
-        (17, 17.049379),
-        (17.9, 17.049379),
-        (29, 29.107494),
-        (34, 34.040967),
-        (35, 35),
-        (35.9, 35),
-        (50.5, 50),
-        (200.5, 200),
-        (0, 0),
-        (-2, -2),
+        (0.5, 1.0041081, 1.0041081),
+        (17.9, 17.04938, 17.04938),
+        (34.99, 34.040966, 34.040966),
+        (35, 35, 35),
+        (50.5, 50, 50.5),
+        (200.5, 200, 200.5),
+        (65535, 65535, 65535),
+        (65552, 16.041668, 65552),  # the chip has 16 bits
+        (65536, 0, 65536),
+        (1.2e-7, 1.0041081, 1.0041081),
+        (1.19e-7, 0, 1.19e-7),
+        (1e-8, 0, 1e-8),
+        (0, 0, 0),
+        (-2.5, 0, -2.5),
+        (math.inf, 65535, math.inf),
     ],
 )
-def test_real_frame_rate_is_the_chip_timers(requested: float, real: float) -> None:
+def test_corner_values_of_the_frame_rate(requested: float, real: float, answer: float) -> None:
+    """9.6: integer part, low 16 bits, at least 1; what is not above FLT_EPSILON stops."""
     assert x4.real_frame_rate(requested) == float(np.float32(real))
-
-
-@pytest.mark.parametrize(
-    ("requested", "answer"),
-    [
-        (0.5, 1.004108),
-        (17.9, 17.049379),
-        (34.99, 34.040967),
-        (35, 35),
-        (50.5, 50.5),
-        (0, 0),
-        (-2.5, -2.5),
-    ],
-)
-def test_frame_rate_reads_back_with_its_fraction_from_35_on(
-    requested: float, answer: float
-) -> None:
     assert x4.frame_rate_read_back(requested) == float(np.float32(answer))
+
+
+def test_not_a_number_stops_and_reads_back_as_such() -> None:
+    assert x4.real_frame_rate(math.nan) == 0
+    assert math.isnan(x4.frame_rate_read_back(math.nan))
 
 
 @given(st.floats(0.0078125, 1000, width=32) | st.integers(1, 400))
@@ -199,9 +246,11 @@ def test_full_scale_does_not_depend_on_the_dac_step(step: int) -> None:
 
 
 def test_bin_lengths_are_those_of_the_reference() -> None:
-    assert pytest.approx(0.006430041152, abs=1e-12) == x4.RF_BIN_M
-    assert pytest.approx(0.05144032922, abs=1e-11) == x4.BASEBAND_BIN_M
-    assert pytest.approx(0.6172839506, abs=1e-10) == x4.COARSE_STEP_M
+    """9.1; the firmware's own are float32 and its multiples."""
+    assert pytest.approx(0.006430041152, abs=1e-12) == x4.SAMPLE_M
+    assert x4.RF_BIN_M == 0.006430041044950485
+    assert x4.BASEBAND_BIN_M == 0.05144032835960388
+    assert pytest.approx(0.6172839506, abs=2e-8) == x4.COARSE_STEP_M
 
 
 @given(st.integers(0, 1 << 32), st.floats(1, 400))
