@@ -1,8 +1,9 @@
 """Recordings of everything a module sent: read, written, converted.
 
 `read_recording` takes any of them; `RecordingWriter` writes what the vendor's ModuleConnector
-does; `WireCapture` keeps the bytes of a port; `convert` goes from any to any. The rest is in the
-modules of this package: layouts and meta file of the vendor's format first.
+does, `Recorder` what a driver receives; `RecordingReader` reads one record by record, with seek,
+peek and filter; `WireCapture` keeps the bytes of a port; `convert` goes from any to any. The rest
+is in the modules of this package: layouts and meta file of the vendor's format first.
 """
 
 from xethru_protocol.recordings.formats import (
@@ -16,12 +17,14 @@ from xethru_protocol.recordings.formats import (
     recording_format,
     recording_radars,
 )
+from xethru_protocol.recordings.recorder import Recorder
 from xethru_protocol.recordings.records import (
     RadarFacts,
     RecordingError,
     RecordingFacts,
     RecordingFault,
 )
+from xethru_protocol.recordings.vendor.record_reader import Record, RecordingReader
 from xethru_protocol.recordings.vendor.writer import RecordingWriter, Split, session_directory
 from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chunks, read_note
 
@@ -29,10 +32,13 @@ __all__ = [
     "Chunk",
     "Conversion",
     "RadarFacts",
+    "Record",
+    "Recorder",
     "RecordingError",
     "RecordingFacts",
     "RecordingFault",
     "RecordingFormat",
+    "RecordingReader",
     "RecordingSummary",
     "RecordingWriter",
     "Split",

@@ -426,6 +426,11 @@ ALL_BITS = 0xFFFFFFFF
 _MAGIC = 0xA0B1C2D3
 _HEAD = struct.Struct("<IIqBIQQIqII28sI")
 _ENTRY = struct.Struct("<IBIIIQQ")
+ENTRY = np.dtype(
+    [("ms", "<u4"), ("kind", "u1"), ("data_type", "<u4"), ("size", "<u4"), ("file", "<u4"),
+     ("begin", "<u8"), ("end", "<u8")]
+)  # fmt: skip
+"""An entry of the index, as `Entry` names its parts."""
 _FILES = struct.Struct("<IBI")
 _LENGTH = struct.Struct("<I")
 RECORD, CLOSED, _FILE_LIST = 1, 2, 3

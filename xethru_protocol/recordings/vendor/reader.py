@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from xethru_protocol.recordings.records import (
     MS_NS,
     FaultHandler,
@@ -26,6 +28,7 @@ from xethru_protocol.recordings.records import (
 from xethru_protocol.recordings.vendor.layouts import (
     ALL_BITS,
     CLOSED,
+    ENTRY,
     KIND_OF_TYPE,
     META_NAME,
     PARAMETER_FILE_NAME,
@@ -199,10 +202,10 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     """
     whole = path.is_dir() or path.name == META_NAME  # else one of several files is read
     meta: Meta | None = None
-    for directory, kinds in _parts(path):
+    for directory, kinds in parts_of(path):
         meta = None
         try:
-            meta = _read_meta(directory)
+            meta = read_meta(directory)
             if meta is None and whole:
                 _report_meta("it is missing, so no message has a time", on_fault)
         except RecordingError as error:
@@ -276,31 +279,55 @@ def _files_by_entry(
 
     Where the ``whole`` recording is read, a file that is listed and not there is reported once.
     """
-    by_name = {file.path.name: file for file in files}
-    by_number: dict[tuple[int, int], _DataFile | None] = {}
-    unlisted = [path.name for path in _data_files(directory)]
+    by_path = {file.path: file for file in files}
+    found: dict[tuple[int, int], _DataFile | None] = {}
+    known = files_by_number(directory, meta)
 
     def file_of(entry: Entry) -> _DataFile | None:
         kind = _kind_of_entry(entry)
         key = (kind.data_type if kind else entry.data_type, entry.file)
-        if key in by_number:
-            return by_number[key]
-        if entry.file < len(meta.files):
-            name = Path(meta.files[entry.file]).name
-        elif kind is None:
-            name = f"of data type {entry.data_type}"
-        else:
-            numbered = sum(data_type == kind.data_type for data_type, _ in by_number)
-            names = [name for name in unlisted if kind_of_file(name) is kind]
-            name = names[numbered] if numbered < len(names) else f"{kind.file_prefix}*"
-        by_number[key] = by_name.get(name)
-        if by_number[key] is None and whole:
+        if key in found:
+            return found[key]
+        path = known[key][0] if key in known else _listed_path(directory, meta, key)
+        found[key] = by_path.get(path)
+        if found[key] is None and whole:
             problem = "it is missing" if kind is not None else "its layout is not known"
             reason = f"the index lists it, and {problem}"
-            report(RecordingFault(file=name, offset=0, reason=reason), on_fault)
-        return by_number[key]
+            report(RecordingFault(file=path.name, offset=0, reason=reason), on_fault)
+        return found[key]
 
     return file_of
+
+
+def files_by_number(directory: Path, meta: Meta) -> dict[tuple[int, int], tuple[Path, Kind]]:
+    """Return the data files of an index by data type and number.
+
+    Where the list of files is missing, those of a type in their order.
+    """
+    entries = np.frombuffer(meta.index, ENTRY)
+    on_disk = data_files(directory)
+    found: dict[tuple[int, int], tuple[Path, Kind]] = {}
+    for bit in map(int, np.unique(entries["data_type"])):
+        kind = KIND_OF_TYPE.get(bit)
+        if kind is None:
+            continue
+        same = [path for path, other in on_disk.items() if other is kind]
+        numbers = map(int, np.unique(entries["file"][entries["data_type"] == bit]))
+        for at, number in enumerate(numbers):
+            path = _listed_path(directory, meta, (bit, number))
+            if number >= len(meta.files) and at < len(same):
+                path = same[at]
+            found[bit, number] = path, kind
+    return found
+
+
+def _listed_path(directory: Path, meta: Meta, key: tuple[int, int]) -> Path:
+    """Return the path of a file by the list of files; without one, a name for reports."""
+    data_type, number = key
+    if number < len(meta.files):
+        return directory / Path(meta.files[number]).name
+    kind = KIND_OF_TYPE.get(data_type)
+    return directory / (f"{kind.file_prefix}*" if kind else f"of data type {data_type}")
 
 
 def _kind_of_entry(entry: Entry) -> Kind | None:
@@ -308,7 +335,7 @@ def _kind_of_entry(entry: Entry) -> Kind | None:
 
 
 def vendor_facts(path: Path) -> RecordingFacts:
-    (directory, _), *rest = _parts(path)
+    (directory, _), *rest = parts_of(path)
     meta = _usable_meta(directory)
     last = _usable_meta(rest[-1][0]) if rest else meta
     parameters = directory / PARAMETER_FILE_NAME
@@ -354,27 +381,27 @@ _Part = tuple[Path, dict[Path, Kind]]
 """A directory, and the data files to read in it."""
 
 
-def _parts(path: Path) -> list[_Part]:
+def parts_of(path: Path) -> list[_Part]:
     """Return the directories of a recording in order."""
     with reading(path):
         if not path.exists():
             raise RecordingError(f"there is no recording {path}")
         kind = kind_of_file(path.name)
         if path.is_dir():
-            parts = [(path, _data_files(path))]
+            parts = [(path, data_files(path))]
             if not parts[0][1]:
                 parts = _split_directories(path)
         elif kind is not None:
             parts = [(path.parent, {path: kind})]
         else:
-            parts = [(directory, _data_files(directory)) for directory in _chain(path.parent)]
+            parts = [(directory, data_files(directory)) for directory in _chain(path.parent)]
     if not any(files for _, files in parts):
         wanted = "xethru_baseband_iq_*.dat, xethru_datafloat_*.dat or the like"
         raise RecordingError(f"{path} holds no recording this can read; it needs a file {wanted}")
     return parts
 
 
-def _data_files(directory: Path) -> dict[Path, Kind]:
+def data_files(directory: Path) -> dict[Path, Kind]:
     """Return the data files of a directory: by their names, others by the index."""
     found = {
         path: kind for path in directory.iterdir() if (kind := kind_of_file(path.name)) is not None
@@ -411,9 +438,9 @@ def _split_directories(path: Path) -> list[_Part]:
     parts: list[_Part] = []
     names = (child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
     for child in sorted(filter(Path.is_dir, names), key=_by_number):
-        files = _data_files(child)
+        files = data_files(child)
         inner = sorted(child.glob(f"{_DIRECTORY_PREFIX}*/"), key=_by_number) if not files else ()
-        parts += [(child, files)] if files else [(part, _data_files(part)) for part in inner]
+        parts += [(child, files)] if files else [(part, data_files(part)) for part in inner]
     parts = [(directory, files) for directory, files in parts if files]
     # Without a session id, two directories cannot be assigned to one radar.
     metas = ((directory, _usable_meta(directory)) for directory, _ in parts)
@@ -432,12 +459,12 @@ def _by_number(path: Path) -> list[str | int]:
 
 def _usable_meta(directory: Path) -> Meta | None:
     try:
-        return _read_meta(directory)
+        return read_meta(directory)
     except RecordingError:
         return None
 
 
-def _read_meta(directory: Path) -> Meta | None:
+def read_meta(directory: Path) -> Meta | None:
     """Return the meta file of a directory; None if there is none, RecordingError if unusable."""
     path = directory / META_NAME
     with reading(path):

@@ -264,7 +264,7 @@ class RecordingWriter:
         on_meta_file: MetaFileListener | None = None,
     ) -> None:
         self.directory = Path(directory)
-        self.session_id = session_id or str(uuid.uuid4())
+        self.session_id = session_id or new_session_id()
         self._profile_id = profile_id or 0
         self._options = _Options(
             parameter_file=parameter_file.encode()
@@ -371,6 +371,11 @@ class RecordingWriter:
         if self._options.parameter_file is not None:
             with GrowingFile(directory / PARAMETER_FILE_NAME) as file:
                 file.append(self._options.parameter_file)
+
+
+def new_session_id() -> str:
+    """Return a random UUID, which a session without a name is called."""
+    return str(uuid.uuid4())
 
 
 def session_directory(
