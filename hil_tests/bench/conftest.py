@@ -18,7 +18,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     # the plugin shows extra_info only in its JSON
     session = getattr(terminalreporter.config, "_benchmarksession", None)
     timed = [
-        (benchmark.name.removeprefix("test_"), benchmark.extra_info["frames"], benchmark.stats)
+        (benchmark.name.removeprefix("test_"), benchmark.extra_info, benchmark.stats)
         for benchmark in getattr(session, "benchmarks", [])
         if "frames" in benchmark.extra_info
     ]
@@ -31,6 +31,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     )
     width = max(len(name) for name, _, _ in timed)
     terminalreporter.line(f"{'':{width}}  {'median':>9}  {'fastest':>9}")
-    for name, frames, stats in timed:
+    for name, info, stats in timed:
+        frames = info["frames"]
         rates = f"{frames / stats.median:>9,.0f}  {frames / stats.min:>9,.0f}"
-        terminalreporter.line(f"{name:{width}}  {rates}")
+        beside = f"  {info['ratio']:.2f} x {info['beside']}" if "ratio" in info else ""
+        terminalreporter.line(f"{name:{width}}  {rates}{beside}")

@@ -119,8 +119,32 @@ def _normal_end(data: bytes, at: int) -> tuple[bytes, int] | str | None:
     for byte in content:
         checksum ^= byte
     if data[position] == 0x7E and checksum == 0x7D and len(content) > 1:
-        return bytes(content[:-1]), position + 1
+        inside = _header_inside(data, at, position) if content[0] not in _KNOWN else False
+        if isinstance(inside, str):
+            return inside
+        return None if inside else (bytes(content[:-1]), position + 1)
     return None
+
+
+_KNOWN = (0x01, 0x10, 0x11, 0x12, 0x20, 0x30, 0x50, 0xA0)
+
+
+def _header_inside(data: bytes, start: int, end: int) -> bool | str:
+    """Whether a plausible NoEscape header begins between the ends of a packet."""
+    for at in range(start + 1, end):
+        if data[at : at + 4] != b"\x7c" * 4:
+            continue
+        if len(data) < at + 8:
+            return "more"
+        length = int.from_bytes(data[at + 4 : at + 8], "little")
+        if not 1 <= length <= 65535:
+            continue
+        payload = data[at + 9 : at + 9 + length]
+        if len(payload) < min(length, 14):
+            return "more"
+        if _plausible(length, payload):
+            return True
+    return False
 
 
 def _bulk_end(data: bytes, at: int) -> tuple[bytes, int] | str | None:
@@ -140,7 +164,7 @@ def _bulk_end(data: bytes, at: int) -> tuple[bytes, int] | str | None:
 
 
 def _plausible(length: int, payload: bytes) -> bool:  # noqa: PLR0911 - one return per rule
-    if payload[0] not in (0x01, 0x10, 0x11, 0x12, 0x20, 0x30, 0x50, 0xA0):
+    if payload[0] not in _KNOWN:
         return False
     if length < 14:
         return True

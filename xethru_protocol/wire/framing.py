@@ -19,10 +19,13 @@ The receiver guarantees, for any bytes in any chunks:
   packet became 7F, since the two checksums cancel) or a NoEscape header that happens to be
   consistent. Junk without a start cannot hide anything; a stray 7D delays what follows until
   it is refuted, by the next unescaped 7D or 7E or at the longest possible packet.
-- Every byte is searched and parsed a bounded number of times, also in input made to hurt.
+- A Normal packet of an unknown kind gives way to a plausible NoEscape header inside it: its
+  checksum fits by chance in 1 of 256 cases, a header in hardly any. A known one is data throughout.
+- Every byte is searched and parsed a bounded number of times, also in input made to hurt. In a
+  run of damaged packets all within one window are judged, and counted, together.
 - `LinkStatistics` counts every byte: in a packet, junk, or not judged yet.
 
-The last point rests on one fact. Let a Normal packet started at s be parsed up to its
+The last but one rests on one fact. Let a Normal packet started at s be parsed up to its
 terminator t. A 7D between the two was not a terminator, so it was escaped, so the parse is in
 the same state behind it as a parse started *at* it. Therefore all starts between s and t share
 the terminator t, and their contents are suffixes of the first's: one scan serves them all.
@@ -30,13 +33,14 @@ the terminator t, and their contents are suffixes of the first's: one scan serve
 
 import re
 import struct
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from xethru_protocol.wire.codes import AppDataId, CommandCode, ElementType, ResponseCode
 from xethru_protocol.wire.errors import LocalProtocolError
@@ -136,6 +140,7 @@ ESCAPE: Final = 0x7F
 NO_ESCAPE_START: Final = b"\x7c\x7c\x7c\x7c"
 NO_ESCAPE_HEADER_BYTES: Final = 9
 MAX_NORMAL_BYTES: Final = 7999  # payload and checksum, unescaped: the vendor's parser buffer
+MAX_NORMAL_WIRE_BYTES: Final = 2 * MAX_NORMAL_BYTES + 2  # all escaped, with start and end
 
 
 class Framing(Enum):
@@ -316,7 +321,9 @@ NEVER: Final = 1 << 62  # a stream offset that is not reached
 
 _NEAR: Final = 256  # in which most packets end: looked at before more is marked
 _WORTH_MARKING: Final = 2048  # fewer bytes are searched faster by a regular expression
+_WORTH_MARKING_DAMAGED: Final = 512  # there the next terminators are near, and many
 _WINDOW: Final = 65536  # most bytes marked at once
+_WINDOW_DAMAGED: Final = 8192  # fewer where most are looked at one by one
 # Greedy, but never tried again: what is in front of an unescaped 7D or 7E, or of a last 7F.
 _CONTENT = re.compile(rb"[^\x7d-\x7f]*(?:\x7f.[^\x7d-\x7f]*)*", re.DOTALL)
 
@@ -332,21 +339,19 @@ class PatternFinder:
         self._searched = 0
 
     def next(self, buffer: bytes, base: int, here: int, stop: int = NEVER) -> int:
-        """Find the first pattern at or after ``here``; NEVER if there is none before ``stop``.
-
-        No pattern may lie across ``stop``.
-        """
+        """Find the first pattern that begins at ``here`` or behind, before ``stop``; else NEVER."""
         if here <= self._found:
             return self._found if self._found < stop else NEVER
         begin = max(here, self._searched)
         if begin >= stop:
             return NEVER
         limit = base + len(buffer)
-        at = buffer.find(self._pattern, begin - base, min(stop, limit) - base)
+        across = len(self._pattern) - 1
+        at = buffer.find(self._pattern, begin - base, min(stop + across, limit) - base)
         if at >= 0:
             self._found = self._searched = base + at
             return self._found
-        self._searched = stop if stop < limit else max(begin, limit - len(self._pattern) + 1)
+        self._searched = max(begin, min(stop, limit - across))
         return NEVER
 
 
@@ -358,20 +363,24 @@ class TerminatorFinder:
     and those of a whole window can be marked at once.
 
     ``searched`` is the offset up to which the bytes are known; the byte there is not escaped.
+    ``window`` are the bytes that were marked last.
     """
 
-    __slots__ = ("_found", "_next", "_window", "searched")
+    __slots__ = ("_found", "_next", "searched", "window")
 
     def __init__(self) -> None:
         self._found: list[int] = []  # ascending
         self._next = 0  # index in it of the first behind the last start
-        self._window = _Window(b"", 0, 0)  # where they were found, unless there is only one
+        self.window = _Window(b"", 0, 0, 0)  # where they were found, unless there is only one
         self.searched = 0
 
-    def after(self, buffer: bytes, base: int, start: int, reach: int) -> int:
+    def after(
+        self, buffer: bytes, base: int, start: int, reach: int, *, damaged: bool = False
+    ) -> int:
         """Find the first terminator behind the packet start at ``start``.
 
         -1 if it is not in the buffer, or farther than ``reach`` bytes behind the start.
+        Where the stream is ``damaged``, the next ones are near and many.
         """
         while True:
             self._next = bisect_right(self._found, start, self._next)
@@ -381,24 +390,60 @@ class TerminatorFinder:
             left = len(buffer) - at
             if left <= 0 or base + at > start + reach:
                 return -1
-            stop = at + (left if left < _WORTH_MARKING else _NEAR)
-            content = _CONTENT.match(buffer, at, stop)
-            at = content.end() if content else at  # it always matches
-            self.searched = base + at
-            if at < stop and buffer[at] != ESCAPE:
-                self._found, self._next = [base + at], 0
-                self.searched += 1
-            elif stop == len(buffer):
-                return -1
-            else:
-                self._window = window = _Window(buffer, base, at)
-                self._found, self._next, self.searched = window.found, 0, window.end
+            few = left < (_WORTH_MARKING_DAMAGED if damaged else _WORTH_MARKING)
+            if few or not damaged:
+                stop = at + (left if few else _NEAR)
+                content = _CONTENT.match(buffer, at, stop)
+                at = content.end() if content else at  # it always matches
+                self.searched = base + at
+                if at < stop and buffer[at] != ESCAPE:
+                    self._found, self._next = [base + at], 0
+                    self.searched += 1
+                    continue
+                if stop == len(buffer):
+                    return -1
+            size = _WINDOW_DAMAGED if damaged else _WINDOW
+            self.window = window = _Window(buffer, base, at, size)
+            self._found, self._next, self.searched = window.found, 0, window.end
+
+    def follower(self, start: int) -> tuple[bytes, int] | None:
+        """Content and end of a packet that starts right behind the end found last, or None.
+
+        Only within the window; the end may be a 7D.
+        """
+        found, end = self._found, self._next + 2
+        if end < len(found) and found[end - 1] == start:
+            self._next = end
+            return self.window.content(end), found[end]
+        return None
 
     def content(self, buffer: bytes, base: int, start: int) -> bytes:
         """Unescape what lies between ``start`` and the terminator just found behind it."""
         if self._next and self._found[self._next - 1] == start:
-            return self._window.content(self._next)
+            return self.window.content(self._next)
         return unescape(buffer[start + 1 - base : self._found[self._next] - base])
+
+
+Bytes = NDArray[np.uint8]
+Places = NDArray[np.intp]
+
+
+def _mark(raw: Bytes) -> tuple[Places, Places]:
+    """Find terminators and escaping bytes; the first byte is not escaped."""
+    special = (raw - np.uint8(START) < 3).nonzero()[0]  # 7D to 7F; less wraps around
+    is_escape = raw[special] == ESCAPE
+    apart = special[1:] - special[:-1] != 1
+    apart |= ~is_escape[:-1]
+    # Behind a 7F that is not escaped itself stands one that is: pairs, from the left.
+    is_free = np.frombuffer(b"\1" + apart.tobytes().replace(b"\0\0", b"\0\1"), np.bool_)
+    return special[is_free > is_escape], special[is_free & is_escape]
+
+
+def _without(raw: Bytes, drop: Places) -> bytes:
+    """Drop the escaping bytes."""
+    keep = np.ones(raw.size, np.bool_)
+    keep[drop] = False
+    return raw[keep].tobytes()
 
 
 class _Window:
@@ -408,35 +453,86 @@ class _Window:
     window that is not escaped by it.
     """
 
-    __slots__ = ("_bounds", "_bytes", "_drop", "_places", "_unescaped", "end", "found")
+    __slots__ = ("_base", "_bounds", "_drop", "_judged", "_places", "_raw", "_rest", "end", "found")
 
-    def __init__(self, buffer: bytes, base: int, begin: int) -> None:
-        piece = buffer[begin : begin + _WINDOW]  # a copy: the buffer may be large, and done with
-        size = len(piece)
-        self._bytes = np.frombuffer(piece, np.uint8)
-        special = np.flatnonzero(self._bytes - np.uint8(START) < 3)  # 7D to 7F; less wraps around
-        is_escape = self._bytes[special] == ESCAPE
-        # A special byte is free if an even number of 7F stands right before it.
-        order = np.arange(special.size)
-        behind_escape = np.zeros(special.size, np.bool_)
-        behind_escape[1:] = is_escape[:-1] & (special[1:] - special[:-1] == 1)
-        free = (order - np.maximum.accumulate(np.where(behind_escape, 0, order))) & 1 == 0
-        self._places = special[free & ~is_escape]  # of the terminators
-        self._drop = special[free & is_escape]  # bytes that escape the next
-        self._unescaped = b""  # the window without those, made when the first packet asks
+    def __init__(self, buffer: bytes, base: int, begin: int, size: int) -> None:
+        piece = buffer[begin : begin + size]  # a copy: the buffer may be large, and done with
+        self._base = base + begin
+        self._raw = np.frombuffer(piece, np.uint8)
+        self._places, self._drop = _mark(self._raw)
+        self._rest = b""  # the window without escaping bytes, made when the first packet asks
         self._bounds: list[int] = []  # where the terminators lie in that
-        self.found: list[int] = (self._places + (base + begin)).tolist()
-        splits = self._drop.size and self._drop[-1] == size - 1
-        self.end = base + begin + size - (1 if splits else 0)
+        self._judged: _Judged | None = None
+        self.found: list[int] = (self._places + self._base).tolist()
+        splits = self._drop.size and self._drop[-1] == len(piece) - 1
+        self.end = self._base + len(piece) - (1 if splits else 0)
 
     def content(self, index: int) -> bytes:
         """Unescape what lies between the terminator before the ``index``-th and that one."""
-        if not self._unescaped:
-            keep = np.ones(self._bytes.size, np.bool_)
-            keep[self._drop] = False
-            self._unescaped = self._bytes[keep].tobytes()
+        if not self._rest:
+            self._rest = _without(self._raw, self._drop)
             self._bounds = (self._places - np.searchsorted(self._drop, self._places)).tolist()
-        return self._unescaped[self._bounds[index - 1] + 1 : self._bounds[index]]
+        return self._rest[self._bounds[index - 1] + 1 : self._bounds[index]]
+
+    def judged(self) -> "_Judged":
+        """Judge all starts in the window whose terminators lie in it, too."""
+        if self._judged is None:
+            self._judged = _judge(self._raw, self._places, self._drop, self._base)
+        return self._judged
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Judged:
+    """Packet starts in groups that share a terminator; lists with a value per group.
+
+    ``first`` is the offset of a group's first start, ``resume`` where to go on if all of its
+    starts are rejected, ``kind`` the index in _KINDS of what is reported then, ``resyncs`` the
+    number of starts rejected up to and with this group. ``special`` are the indices of groups
+    that need a closer look: a start that makes a packet, or a very long one. ``good`` are the
+    offsets of all starts that make a packet.
+    """
+
+    first: list[int]
+    resume: list[int]
+    kind: list[int]
+    resyncs: list[int]
+    special: list[int]
+    good: list[int]
+
+
+_KINDS = (None, FaultKind.TRUNCATED, FaultKind.EMPTY, FaultKind.CHECKSUM)  # None: doubled start
+
+
+def _judge(raw: Bytes, places: Places, drop: Places, base: int) -> _Judged:
+    """Judge the packet starts in ``raw``; its terminators and escaping bytes as of _mark()."""
+    content = np.frombuffer(_without(raw, drop), np.uint8)
+    ends = places - np.searchsorted(drop, places)
+    starts = np.flatnonzero(content == START)
+    group = np.searchsorted(ends, starts, side="right")  # the terminator behind each
+    n_starts = int(np.searchsorted(group, ends.size))
+    if not n_starts:
+        return _Judged(first=[], resume=[], kind=[], resyncs=[], special=[], good=[])
+    starts, group = starts[:n_starts], group[:n_starts]
+    offsets = np.flatnonzero(raw == START)[:n_starts] + base  # the same, with escaping bytes
+    end, end_offset = ends[group], places[group] + base
+    size = end - starts - 1
+    folded = np.bitwise_xor.accumulate(content)
+    fits = folded[end - 1] ^ folded[starts] == START  # False where there is no content
+    cut_short = content[end] == START
+    good = fits & ~cut_short & (size > 1)
+    doubled = cut_short & (size == 0)
+    kind = np.where(cut_short, np.where(doubled, 0, 1), np.where(fits | (size == 0), 2, 3))
+    long = end_offset - offsets > MAX_NORMAL_BYTES
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    last = np.append(first[1:], n_starts) - 1
+    return _Judged(
+        first=offsets[first].tolist(),
+        resume=(end_offset + ~cut_short)[first].tolist(),
+        kind=kind[first].tolist(),
+        resyncs=np.cumsum(~doubled)[last].tolist(),
+        special=np.flatnonzero(np.logical_or.reduceat(good | long, first)).tolist(),
+        good=offsets[good].tolist(),
+    )
 
 
 # --- the receiver
@@ -444,13 +540,19 @@ class _Window:
 Span = tuple[Framing, bytes, int, int, int]
 """Framing, buffer, payload start and end in it, offset of the packet in the stream."""
 
-MAX_NORMAL_WIRE_BYTES: Final = 2 * MAX_NORMAL_BYTES + 2  # all escaped, with start and end
-
-_JOIN_BYTES = 4096  # of the next chunk, to a Normal packet whose end is not known
+_JOIN_BYTES = 65536  # of what came next, to a Normal packet whose end is not known
 # Magic and length, then code, type and element count of a DATA FLOAT.
 _FRAME_HEADER = struct.Struct("<4sIxBB8xI")
 _ESCAPED = re.compile(rb"\x7f(.)", re.DOTALL)
 _RUN_OF_7C = re.compile(rb"\x7c{9,}")
+_RUN_OF_7D = re.compile(rb"\x7d+")
+_LONGEST_RUN = 1024  # of damaged packets that are reported together
+_SHORT = 256  # bytes of a packet whose starts are judged faster without numpy
+# A NoEscape start whose length may be right, or is not known yet.
+_HEADER_INSIDE = re.compile(rb"\x7c{4}(?:..\x00\x00|.{0,3}\Z)", re.DOTALL)
+_new_fault = object.__new__
+_set_kind = vars(FramingFault)["kind"].__set__
+_set_offset = vars(FramingFault)["offset"].__set__
 
 
 class PacketReader:
@@ -470,6 +572,7 @@ class PacketReader:
         statistics: LinkStatistics | None = None,
     ) -> None:
         self._direction = direction
+        self._known = _KNOWN[direction]
         self.statistics = LinkStatistics() if statistics is None else statistics
         self._buffer = b""  # what is being parsed, from _pos on; never changed in place
         self._pos = 0
@@ -485,7 +588,10 @@ class PacketReader:
         self._bulk_starts = PatternFinder(NO_ESCAPE_START)
         self._terminators = TerminatorFinder()
         self._judged = -1  # the last terminator for which a Normal start was judged
-        self._good_starts: frozenset[int] | None = None  # that share it and have a fitting checksum
+        # that share it and have a fitting checksum, ascending; None: not looked for yet
+        self._good_starts: list[int] | None = None
+        self._swallowed = -1  # a plausible NoEscape header in the packet judged last
+        self._faults: deque[FramingFault] = deque()  # found together, not returned yet
 
     def receive_data(self, data: bytes) -> None:
         """Take bytes as they come from the port, in chunks of any size.
@@ -515,6 +621,8 @@ class PacketReader:
 
     def next_span(self) -> Span | FramingFault | NeedData:
         """Like ``next_packet``, but returns where the payload lies instead of copying it."""
+        if self._faults:
+            return self._faults.popleft()
         while True:
             if self._missing and not self._refill():  # parsing would give nothing new
                 if not self._ended or not self.buffered:
@@ -523,7 +631,9 @@ class PacketReader:
                 if fault is not None:
                     return fault
             buffer, pos = self._buffer, self._pos
-            if len(buffer) - pos >= 23:
+            if len(buffer) - pos < 23:
+                pass
+            elif buffer[pos] != START:
                 # The way of nearly every byte: a consistent DATA FLOAT. It accepts nothing that
                 # _no_escape() would not.
                 magic, length, code, kind, count = _FRAME_HEADER.unpack_from(buffer, pos)
@@ -542,9 +652,34 @@ class PacketReader:
                     self._damage_end = -1
                     self.statistics.packets += 1
                     return Framing.NO_ESCAPE, buffer, pos + 9, end, self._base + pos
+            elif self._damage_end < 0:
+                packet = self._follower()
+                if packet is not None:
+                    return packet
             found = self._parse()
             if found is not NEED_DATA:
                 return found
+
+    def _follower(self) -> Span | None:
+        """Return the Normal packet here if its bytes were marked with those of the one before.
+
+        The way of an escaped frame. It accepts nothing that _normal() would not.
+        """
+        first = self._base + self._pos
+        follower = self._terminators.follower(first)
+        if follower is None:
+            return None
+        content, end = follower
+        if (
+            self._buffer[end - self._base] != END
+            or not 1 < len(content) <= MAX_NORMAL_BYTES
+            or content[0] not in self._known
+            or xor(content) != START
+        ):
+            return None
+        self._pos = end + 1 - self._base
+        self.statistics.packets += 1
+        return Framing.NORMAL, content, 0, len(content) - 1, first
 
     def _reject_last_start(self) -> FramingFault | None:
         """Give up a packet whose end will not come, with all that came of it."""
@@ -584,13 +719,55 @@ class PacketReader:
         tail = self._buffer[max(self._pos, len(self._buffer) - 3) :]
         return len(tail) - len(tail.rstrip(b"\x7c"))
 
-    def _reject(self, kind: FaultKind, first: int, covered_end: int) -> FramingFault | None:
-        """Give up a start and go on behind it; a fault unless these bytes had theirs."""
-        self._skip_to(first + 1)
-        self.statistics.resyncs += 1
+    def _reject(
+        self, kind: FaultKind, first: int, covered_end: int, resume: int = 0
+    ) -> FramingFault | None:
+        """Give up a start and go on behind it; a fault unless these bytes had theirs.
+
+        Normal starts before ``resume`` have the same fate and need no report of their own.
+        """
+        after, starts = first + 1, 1
+        if resume > after:
+            bulk = self._bulk_starts.next(self._buffer, self._base, after, resume)
+            at, after = first - self._base, min(resume, bulk)
+            doubled = self._buffer[resume - self._base : resume - self._base + 1] == b"\x7d"
+            stop = after - self._base - (doubled and after == resume)
+            starts = self._buffer.count(b"\x7d", at, stop)
+        self._skip_to(after)
+        self.statistics.resyncs += starts
         reported = first < self._damage_end
         self._damage_end = max(self._damage_end, covered_end)
         return None if reported else self._fault(kind, first)
+
+    def _reject_run(self, first: int) -> bool:
+        """Give up a run of damaged packets from ``first`` on; False if it is none."""
+        judged = self._terminators.window.judged()
+        begin = bisect_left(judged.first, first)
+        if begin == len(judged.first) or judged.first[begin] != first:
+            return False
+        stop = bisect_left(judged.special, begin)
+        end = judged.special[stop] if stop < len(judged.special) else len(judged.first)
+        bulk = self._bulk_starts.next(self._buffer, self._base, first, judged.resume[end - 1])
+        end = min(bisect_right(judged.resume, bulk, begin, end), begin + _LONGEST_RUN)
+        if end <= begin:
+            return False
+        self.statistics.resyncs += judged.resyncs[end - 1] - (
+            judged.resyncs[begin - 1] if begin else 0
+        )
+        begin = bisect_left(judged.first, self._damage_end, begin, end)  # those had their fault
+        kinds, append = judged.kind[begin:end], self._faults.append
+        for index, kind in enumerate(_KINDS):
+            if kind is not None:
+                self.statistics.faults[kind] += kinds.count(index)
+        for index, offset in zip(kinds, judged.first[begin:end], strict=True):
+            if index:
+                fault = _new_fault(FramingFault)
+                _set_kind(fault, _KINDS[index])
+                _set_offset(fault, offset)
+                append(fault)
+        self._skip_to(judged.resume[end - 1])
+        self._damage_end = max(self._damage_end, judged.resume[end - 1])
+        return True
 
     def _fault(self, kind: FaultKind, offset: int) -> FramingFault:
         self.statistics.faults[kind] += 1
@@ -600,25 +777,38 @@ class PacketReader:
         self.statistics.junk_bytes += offset - self._base - self._pos
         self._pos = offset - self._base
 
-    def _no_escape(self, first: int) -> Span | FramingFault | NeedData | None:
-        """Judge the NoEscape packet at ``first``; None if it was rejected without a report."""
+    def _announced(self, first: int) -> tuple[int, int]:
+        """Payload length that a plausible NoEscape header at ``first`` announces, else 0.
+
+        Second the number of bytes without which that cannot be judged.
+        """
         at = first - self._base
         have = len(self._buffer) - at
         if have < NO_ESCAPE_HEADER_BYTES:
-            return self._need(NO_ESCAPE_HEADER_BYTES - have)
+            return 0, NO_ESCAPE_HEADER_BYTES - have
         (length,) = _LENGTH.unpack_from(self._buffer, at + 4)
+        if not 1 <= length <= MAX_LENGTH:
+            return 0, 0
         begin = at + NO_ESCAPE_HEADER_BYTES
-        if 1 <= length <= MAX_LENGTH:
-            head = min(length, HEAD_BYTES)
-            if have < NO_ESCAPE_HEADER_BYTES + head:
-                return self._need(NO_ESCAPE_HEADER_BYTES + head - have)
-            if plausible(length, self._buffer[begin : begin + head], self._direction):
-                if have < NO_ESCAPE_HEADER_BYTES + length:
-                    return self._need(NO_ESCAPE_HEADER_BYTES + length - have)
-                self._pos = begin + length
-                self._damage_end = -1
-                self.statistics.packets += 1
-                return Framing.NO_ESCAPE, self._buffer, begin, begin + length, first
+        head = self._buffer[begin : begin + min(length, HEAD_BYTES)]
+        missing = min(length, HEAD_BYTES) - len(head)
+        return length if not missing and plausible(length, head, self._direction) else 0, missing
+
+    def _no_escape(self, first: int) -> Span | FramingFault | NeedData | None:
+        """Judge the NoEscape packet at ``first``; None if it was rejected without a report."""
+        length, missing = self._announced(first)
+        if missing:
+            return self._need(missing)
+        at = first - self._base
+        begin = at + NO_ESCAPE_HEADER_BYTES
+        if length:
+            missing = begin + length - len(self._buffer)
+            if missing > 0:
+                return self._need(missing)
+            self._pos = begin + length
+            self._damage_end = -1
+            self.statistics.packets += 1
+            return Framing.NO_ESCAPE, self._buffer, begin, begin + length, first
         fault = self._reject(FaultKind.HEADER, first, first + len(NO_ESCAPE_START))
         run = _RUN_OF_7C.match(self._buffer, at)
         if run:  # a start whose length would be 7C7C7C7C: all but the last 7 of the run
@@ -628,39 +818,88 @@ class PacketReader:
             self._damage_end = max(self._damage_end, last_rejected + len(NO_ESCAPE_START))
         return fault
 
+    def _swallowed_header(self, first: int, end: int) -> NeedData | int:
+        """Find a plausible NoEscape header between ``first`` and ``end``; NEVER: there is none."""
+        if first < self._swallowed < end:
+            return self._swallowed
+        at, stop = first + 1 - self._base, end - self._base
+        while inside := _HEADER_INSIDE.search(self._buffer, at, stop + NO_ESCAPE_HEADER_BYTES):
+            at = inside.start()
+            if at >= stop:
+                break
+            length, missing = 0, 8 - len(inside[0])
+            if not missing:
+                length, missing = self._announced(self._base + at)
+            if missing and not self._ended:
+                return self._need(missing)
+            if length:
+                self._swallowed = self._base + at
+                return self._swallowed
+            at += 1
+        return NEVER
+
     def _normal(  # noqa: PLR0911 - one return per row of the state table
         self, first: int
     ) -> Span | FramingFault | NeedData | None:
         """Judge the Normal packet at ``first``; None if it was rejected without a report."""
-        end = self._terminators.after(self._buffer, self._base, first, MAX_NORMAL_WIRE_BYTES)
-        if (end if end >= 0 else self._terminators.searched) - first > MAX_NORMAL_WIRE_BYTES:
-            return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
+        finder, damaged, reach = self._terminators, self._damage_end >= 0, MAX_NORMAL_WIRE_BYTES
+        end = finder.after(self._buffer, self._base, first, reach, damaged=damaged)
+        if damaged and end >= 0 and self._reject_run(first):
+            return self._faults.popleft() if self._faults else None
+        known = end if end >= 0 else finder.searched
+        if known - first > reach:
+            resume = min(first, known - 2 * reach) + reach
+            fault = self._reject(FaultKind.OVERSIZE, first, first + reach, resume)
+            last = self._base + self._buffer.rfind(b"\x7d", first - self._base, self._pos)
+            self._damage_end = max(self._damage_end, last + reach)
+            return fault
         if end < 0:
             return self._need(1, max(len(self._buffer) - self._pos, _JOIN_BYTES))
         at, stop = first - self._base, end - self._base
         if self._buffer[stop] == START:
-            if end == first + 1:  # doubled start: nothing is lost
-                self._skip_to(end)
+            run = _RUN_OF_7D.match(self._buffer, at)
+            if run and run.end() > at + 1:  # doubled start: nothing is lost
+                self._skip_to(self._base + run.end() - 1)
                 return None
-            return self._reject(FaultKind.TRUNCATED, first, end)
+            return self._reject(FaultKind.TRUNCATED, first, end, end)
         if end != self._judged:
             self._judged, self._good_starts = end, None
-            content = self._terminators.content(self._buffer, self._base, first)
+            content = finder.content(self._buffer, self._base, first)
             good = xor(content) == START
         else:
-            if self._good_starts is None:
-                self._good_starts = _good_starts(self._buffer[at:stop], first)
-            good = first in self._good_starts
+            good = first in self._starts_that_fit(first, end)
             content = unescape(self._buffer[at + 1 : stop]) if good else b""
+        if good and 1 < len(content) <= MAX_NORMAL_BYTES:
+            return self._accept_normal(first, end, content)
+        fitting = self._starts_that_fit(first, end)
+        behind = bisect_right(fitting, first)
+        resume = fitting[behind] if behind < len(fitting) else end + 1
         if good and len(content) > MAX_NORMAL_BYTES:
-            return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
-        if good and len(content) > 1:
-            self._pos = stop + 1
-            self._damage_end = -1
-            self.statistics.packets += 1
-            return Framing.NORMAL, content, 0, len(content) - 1, first
+            return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES, resume)
         kind = FaultKind.EMPTY if good or not content else FaultKind.CHECKSUM
-        return self._reject(kind, first, end + 1)
+        return self._reject(kind, first, end + 1, resume)
+
+    def _accept_normal(
+        self, first: int, end: int, content: bytes
+    ) -> Span | FramingFault | NeedData | None:
+        if content[0] not in self._known:
+            header = self._swallowed_header(first, end)
+            if isinstance(header, NeedData):
+                self._judged = -1  # come back as if for the first time
+                return header
+            if header < NEVER:
+                return self._reject(FaultKind.TRUNCATED, first, header)
+        self._pos = end + 1 - self._base
+        self._damage_end = -1
+        self.statistics.packets += 1
+        return Framing.NORMAL, content, 0, len(content) - 1, first
+
+    def _starts_that_fit(self, first: int, end: int) -> list[int]:
+        """Return the starts from ``first`` on that share the terminator and make a packet."""
+        if self._good_starts is None:
+            packet = self._buffer[first - self._base : end - self._base]
+            self._good_starts = _good_starts(packet, first)
+        return self._good_starts
 
     def _need(self, missing: int, wanted: int = 0) -> NeedData:
         self._missing = missing
@@ -700,12 +939,15 @@ class PacketReader:
         return True
 
 
-def _good_starts(packet: bytes, offset: int) -> frozenset[int]:
-    """Find the starts in a refuted Normal packet, itself included, whose checksum fits.
+def _good_starts(packet: bytes, offset: int) -> list[int]:
+    """Find the starts in a Normal packet, itself included, whose checksum fits; ascending.
 
     ``packet`` lies at ``offset`` in the stream, without its terminator. One pass from the back
     over its escaped bytes, since the content behind each is a suffix of the whole.
     """
+    if len(packet) >= _SHORT:
+        raw = np.frombuffer(packet + b"\x7e", np.uint8)
+        return _judge(raw, *_mark(raw), offset).good
     good = []
     checksum, count, end = 0, 0, len(packet)
     for escaped in reversed(list(_ESCAPED.finditer(packet, 1))):
@@ -720,4 +962,4 @@ def _good_starts(packet: bytes, offset: int) -> frozenset[int]:
     tail = packet[1:end]
     if checksum ^ xor(tail) == START and count + len(tail) > 1:
         good.append(offset)
-    return frozenset(good)
+    return good[::-1]

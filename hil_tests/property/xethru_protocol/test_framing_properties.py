@@ -13,7 +13,15 @@ from xethru_protocol.wire.framing import FramingFault, Packet, encode_no_escape,
 
 def marking_windows(size: int) -> AbstractContextManager[object]:
     """Let the receiver mark terminators in windows of ``size`` bytes, also in short streams."""
-    return mock.patch.multiple(framing, _NEAR=2, _WORTH_MARKING=3, _WINDOW=size)
+    return mock.patch.multiple(
+        framing,
+        _NEAR=2,
+        _WORTH_MARKING=3,
+        _WORTH_MARKING_DAMAGED=3,
+        _WINDOW=size,
+        _WINDOW_DAMAGED=size,
+        _SHORT=4,
+    )
 
 
 def packets_in(found: list[Packet | FramingFault]) -> list[tuple[int, bytes]]:

@@ -87,6 +87,27 @@ def test_each_damaged_place_is_one_fault(
     assert faults(read(stream)) == expected
 
 
+def test_noescape_frame_wins_over_an_unknown_packet_that_swallows_it() -> None:
+    """A stray 7D, an intact frame, and a 7E behind it where the checksum happens to fit."""
+    intact = frame(bins=1, counter=7)[:23] + b"\x10\x20\x30\x40"
+    assert not set(intact) & {0x7D, 0x7E, 0x7F}
+    tail = bytes([0x7D ^ xor(intact)]) + b"\x7e"
+    found = read(b"\x7d" + intact + tail + ACK)
+    assert payloads(found) == [intact[9:], b"\x10"]
+    assert faults(found)[0] == (FaultKind.TRUNCATED, 0)
+    # a known packet is data throughout, and so is an unknown one around an implausible header
+    known = b"\x10" + intact
+    assert payloads(read(encode_normal(known) + ACK)) == [known, b"\x10"]
+    unknown = b"\x77" + intact[:5] + b"\x01" + intact[6:]
+    assert payloads(read(encode_normal(unknown) + ACK)) == [unknown, b"\x10"]
+
+
+def test_a_header_cut_off_in_an_unknown_packet_is_waited_for_until_the_data_end() -> None:
+    packet = encode_normal(b"\x77" + frame()[:9])
+    assert payloads(read(packet + b"\xa0")) == []
+    assert payloads(read(packet, ended=True)) == [b"\x77" + frame()[:9]]
+
+
 def test_end_of_data_turns_waiting_into_a_fault_and_finds_what_is_inside() -> None:
     inner = frame(bins=3)[:23] + bytes(12)  # no 7D or 7E that could refute the stray start
     assert read(b"\x7d" + inner) == []
@@ -139,6 +160,10 @@ HOSTILE = {
     "noescape starts": b"\x7c\x7c\x7c\x7c\x00",
     "small packets behind escaped starts": b"\x7f\x7d" + encode_no_escape(b"\x10"),
     "bad packets of escaped starts": b"\x7d" + b"\x7f\x7d" * 2000 + b"\x01\x7e",
+    "empty packets": b"\x7d\x7e",
+    "bad packets": b"\x7d\x11\x7e",
+    "bad packets of escaped starts without end": b"\x7d" + b"\x7f\x7d" * 9000 + b"\x01",
+    "unknown packets around headers": encode_normal(b"\x77" + b"\x7c\x7c\x7c\x7c\x01\0\0\0\0" * 50),
     "half frames": frame()[:3000],
     "zeros behind starts": b"\x7d" + bytes(5000),
 }
@@ -191,6 +216,21 @@ def test_work_grows_with_the_bytes_only(name: str) -> None:
     assert large < 60
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "7D",
+        "escaped starts",
+        "starts and escaped starts",
+        "bad packets of escaped starts",
+        "bad packets of escaped starts without end",
+    ],
+)
+def test_rejected_starts_cost_little(name: str) -> None:
+    """Starts that share their fate are given up together: below three lines of Python per byte."""
+    assert _lines_run(140_000, HOSTILE[name], 1 << 16) / 140_000 < 3.0
+
+
 @pytest.mark.parametrize("name", HOSTILE)
 def test_bytes_are_searched_a_bounded_number_of_times(name: str) -> None:
     size = 200_000
@@ -231,8 +271,8 @@ def test_terminators_are_looked_for_once_in_every_byte(
     marked = []
 
     class CountingWindow(framing._Window):
-        def __init__(self, buffer: bytes, base: int, begin: int) -> None:
-            super().__init__(buffer, base, begin)
+        def __init__(self, buffer: bytes, base: int, begin: int, size: int) -> None:
+            super().__init__(buffer, base, begin, size)
             marked.append(self.end - base - begin)
 
     monkeypatch.setattr(framing, "_CONTENT", content)
