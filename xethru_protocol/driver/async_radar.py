@@ -50,7 +50,7 @@ from xethru_protocol.driver.profiles import (
     set_mode,
     wait_for_message,
 )
-from xethru_protocol.driver.radar import X4M300, RadarState, known_ports
+from xethru_protocol.driver.radar import RadarState, known_ports
 from xethru_protocol.transport import AsyncSerialTransport, AsyncTransport
 from xethru_protocol.wire.codes import PongCode, SensorMode
 from xethru_protocol.wire.errors import Disconnected, XeThruError
@@ -64,8 +64,6 @@ class AsyncX4M300(RadarState):
 
     A chip setting has coroutines: ``await radar.x4.iterations.get()``, ``.set(8)``.
     """
-
-    _fields = X4M300._fields
 
     _port_type = AsyncSerialTransport
     _transport: AsyncTransport

@@ -109,7 +109,8 @@ class X4Row(Setting[V]):
             raise LocalProtocolError(f"{self.name} follows from frame_area_m; set that")
         wanted = self._checked(value)
         if self.setting is X4Setting.FPS:
-            yield from (raw_mode.start(link, wanted) if wanted > 0 else raw_mode.stop(link))
+            moves = bool(x4.timer_rate(wanted))
+            yield from (raw_mode.start(link, wanted) if moves else raw_mode.stop(link))
             return
         plan = link.plan
         yield from link.request(m.X4DriverSet(setting=self.setting, value=wanted))
@@ -179,11 +180,6 @@ class X4Settings:
     """
 
     __slots__ = ()
-    _fields = (  # the order in which help() lists them
-        *("frame_area_m", "fps", "downconversion", "iterations", "pulses_per_step"),
-        *("dac_min", "dac_max", "dac_step", "tx_power", "tx_center_frequency", "prf_div"),
-        *("offset_m", "frame_bin_count"),
-    )
 
     fps = X4Row(
         X4Setting.FPS,

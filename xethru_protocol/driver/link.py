@@ -343,6 +343,7 @@ class Conversation:
             if message.code == SystemCode.XTS_SPRS_BOOTING:
                 self.reboots += 1
                 self._rebooted_since = True
+            self._take_data(message, arrival_ns)
         else:
             self._take_data(message, arrival_ns)
         if self._observer is not None:

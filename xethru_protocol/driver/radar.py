@@ -218,9 +218,9 @@ class RadarState:
 
 
 class X4M300(RadarState):
-    """One radar module on a port. Ranges are in metres as the module counts them.
+    """One radar module on a port: X4M300, X4M200, or any other with XeThru's X4 firmware.
 
-    Raw frames, one float32 per range bin::
+    Raw frames, a sample per range bin::
 
         with X4M300.open("/dev/ttyACM0") as radar:     # `xethru list` shows the ports
             radar.configure_raw(RawConfig(frame_area_m=(0.2, 9.4)))
@@ -228,7 +228,7 @@ class X4M300(RadarState):
             for frame in radar.frames(100):
                 print(frame.counter, frame.ranges_m, frame.samples)
 
-    What the module computes itself: presence, or respiration on an X4M200::
+    What the module computes itself, presence here, respiration on an X4M200::
 
         with X4M300.open("/dev/ttyACM0") as radar:
             radar.profile.load()
@@ -238,11 +238,40 @@ class X4M300(RadarState):
             for message in radar.messages():
                 print(message)
 
-    A chip setting is an attribute, ``radar.x4.iterations = 8``; ``help(radar.x4)`` lists them with
-    units and limits. All that is not a method here is in a part, see Attributes.
+    The methods, by task:
 
-    What goes wrong raises an `XeThruError`: `DeviceError` if the module refuses, `ResponseTimeout`
-    if it is silent, `Disconnected` if it is gone, `LocalProtocolError` if a value makes no sense.
+    begin and end
+        `open`, `ping`, `info`, `close`
+    raw frames
+        `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
+    all other messages
+        `messages`, `read_message`, `messages_waiting`; `listener` is called with every one
+    the module and its line
+        `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`
+    any command of the protocol
+        `request`
+
+    The parts, each with a help of its own, such as ``help(radar.x4)``:
+
+    x4
+        Settings of the radar chip, an attribute each: ``radar.x4.iterations = 8``.
+    profile
+        What the module computes itself: load, set up, run; its noise maps and parameter file.
+    pins
+        IO pins.
+    files
+        Files in the module's flash, and its crash dump.
+    registers
+        Registers of the radar chip.
+    postprocessing
+        What newer firmware does to frames before it sends them.
+    diagnostics
+        System tests, trace output, injected frames.
+
+    Ranges are metres as the module counts them, with 3.0e8 m/s. What goes wrong raises an
+    `XeThruError`: `DeviceError` if the module refuses, `ResponseTimeout` if it is silent,
+    `Disconnected` if it is gone, `LocalProtocolError` if a value makes no sense. What only may go
+    wrong is in `warnings`.
 
     Parameters
     ----------
@@ -263,30 +292,8 @@ class X4M300(RadarState):
         Ports at which a module that vanished may come back.
     sleep
         Waits [s] while there is no line.
-
-    Attributes
-    ----------
-    x4
-        `X4`: settings of the radar chip.
-    profile
-        `Profile`: load, set up and run what the module computes itself; noise maps, parameter file.
-    pins
-        `Pins`: IO pins.
-    files
-        `Files`: files in the module's flash, and its crash dump.
-    registers
-        `Registers`: of the radar chip.
-    postprocessing
-        `Postprocessing`: what newer firmware does to frames.
-    diagnostics
-        `Diagnostics`: system tests, trace output, injected frames.
     """
 
-    _fields = (  # the order in which help() lists them
-        *("configure_raw", "start", "read_frame", "frames", "frames_waiting", "stop"),
-        *("read_message", "messages", "messages_waiting", "close"),
-        *("ping", "info", "mode", "set_mode", "set_baud_rate", "reset", "reconnect", "request"),
-    )
     _port_type = SerialTransport
     _transport: Transport
 
@@ -509,7 +516,9 @@ class X4M300(RadarState):
     # --- other messages -------------------------------------------------------------------------
 
     def read_message(self, kind: type[MessageT], timeout_s: float = MESSAGE_TIMEOUT_S) -> MessageT:
-        """Next message of a class of `xethru_protocol.wire.messages`; others stay.
+        """Next message of a class of `xethru_protocol.wire.messages`, such as `DataString`.
+
+        Those of other classes stay.
 
         Raises
         ------

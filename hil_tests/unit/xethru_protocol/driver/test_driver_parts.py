@@ -4,6 +4,8 @@ The API of `xethru_protocol` itself: its names, lazily imported, and typed.
 """
 
 import inspect
+import pydoc
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -19,6 +21,7 @@ from hil_tests.unit.xethru_protocol.emulated import Emulated
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
 from xethru_protocol import X4M300, Frame, FrameGeometry, NoiseMapControl, RawConfig
 from xethru_protocol.driver import async_radar, board, chip, files, profiles, radar
+from xethru_protocol.driver.link import Part
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
     InjectMode,
@@ -249,15 +252,30 @@ def test_init_forgets_what_was_configured(raw: Scripted) -> None:
 
 def test_help_of_a_setting_has_units_and_limits() -> None:
     assert (chip.X4.iterations.__doc__ or "").endswith("1 ... 255.")
-    for name in chip.X4Settings._fields:
-        assert chip.X4.__dict__.get(name) is None
-        assert len(getattr(chip.X4, name).__doc__) > 20, name
-    known = {row.setting for row in vars(chip.X4Settings).values() if isinstance(row, chip.X4Row)}
+    rows = [row for row in vars(chip.X4Settings).values() if isinstance(row, chip.X4Row)]
+    shown = pydoc.plain(pydoc.render_doc(chip.X4))
+    for row in rows:
+        assert f" |  {row.name}\n |      {(row.__doc__ or '')[:20]}" in shown
+    known = {row.setting for row in rows}
     elsewhere = {  # a method, and `registers`
         *(X4Setting.ENABLE, X4Setting.SPIREGISTER),
         *(X4Setting.PIFREGISTER, X4Setting.XIFREGISTER),
     }
     assert known == set(X4Setting) - elsewhere
+
+
+@pytest.mark.parametrize("driver", [X4M300, async_radar.AsyncX4M300])
+def test_help_names_every_method_and_part(driver: type) -> None:
+    """The text of the class is the manual's first page; private names are not shown."""
+    shown = pydoc.plain(pydoc.render_doc(driver))
+    assert not re.search(r"^ \|  _[a-z]", shown, re.MULTILINE)
+    manual = inspect.getdoc(X4M300) or ""
+    for name, _ in inspect.getmembers(X4M300, callable):
+        assert name.startswith("_") or f"`{name}`" in manual, name
+    made = X4M300(ScriptedTransport(PlainModule()))
+    for name, part in vars(made).items():
+        if isinstance(part, Part):
+            assert f"\n{name}\n    " in manual, name
 
 
 # --- registers, pins, diagnostics, post-processing -----------------------------------------------
