@@ -10,8 +10,6 @@ from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.gate import Measure
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.errors import ResponseTimeout
 
 pytestmark = pytest.mark.requires("settings")
@@ -142,7 +140,7 @@ def test_questions_are_answered_between_frames(radar: X4M300, frame_rate_hz: flo
     radar.start(frame_rate_hz)
     first = radar.read_frame().counter
     for _ in range(20):
-        assert radar.request(m.X4DriverGet(setting=X4Setting.ITERATIONS)).values[0] == 16
+        assert radar.x4.iterations == 16
     later = [frame.counter for frame in radar.frames(5)]
     radar.stop()
     assert later == list(range(first + 1, first + 6))
@@ -164,8 +162,8 @@ def test_init_ends_the_stream(radar: X4M300) -> None:
     radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
     radar.start(17.0)
     radar.read_frame()
-    radar.request(m.X4DriverInit(), 10.0)
-    assert radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values == (0.0,)
+    radar.x4.init()
+    assert radar.x4.fps == 0.0
     late = 0
     with contextlib.suppress(ResponseTimeout):
         while late < 10:
@@ -188,4 +186,19 @@ def test_a_host_that_pauses_gets_whole_frames_afterwards(
     assert counters == sorted(set(counters))
     assert radar.frames_lost == counters[-1] - first - len(counters)
     assert radar.fault_count == 0
+    assert radar.statistics.off_lattice_samples == 0
+
+
+def test_settings_change_while_frames_come(radar: X4M300, frame_rate_hz: float) -> None:
+    """Protocol reference 4.9, 9.4: bins and values of the frames that follow are the new ones."""
+    radar.configure_raw(RawConfig(frame_area_m=(0.4, 2.0)))
+    radar.start(frame_rate_hz)
+    radar.read_frame()
+    radar.x4.frame_area_m = (0.4, 5.0)
+    radar.x4.iterations = 8
+    changed = next(frame for frame in radar.frames(20) if frame.ranges_m[-1] > 4.9)
+    radar.stop()
+    assert changed.samples.shape == changed.ranges_m.shape
+    assert radar.x4.frame_bin_count == changed.samples.size
+    assert radar.frames_discarded <= 1  # one may have been on its way
     assert radar.statistics.off_lattice_samples == 0

@@ -62,7 +62,7 @@ def test_unknown_commands_are_refused(radar: X4M300) -> None:
 @pytest.mark.requires("profiles")
 def test_it_starts_a_test_stopped(radar: X4M300) -> None:
     """The fixture promises it: no profile is loaded and nothing comes of its own accord."""
-    assert radar.request(m.GetMode()).values == bytes([SensorMode.XTID_SM_STOP])
+    assert radar.mode() is SensorMode.XTID_SM_STOP
     assert radar.profile.profile_id() == 0
     assert radar.statistics.packets == 2
     assert radar.statistics.clean

@@ -85,7 +85,7 @@ def test_settings_are_refused_while_it_runs(radar: X4M300) -> None:
     radar.profile.run()
     with pytest.raises(DeviceError):
         radar.profile.set_sensitivity(3)
-    assert radar.request(m.GetMode()).values[0] == SensorMode.XTID_SM_RUN
+    assert radar.mode() is SensorMode.XTID_SM_RUN
     radar.profile.stop()
 
 
@@ -185,7 +185,7 @@ def test_idle_pauses_and_run_goes_on(radar: X4M300) -> None:
     radar.profile.run()
     list(radar.messages(1))
     radar.profile.idle()
-    assert radar.request(m.GetMode()).values[0] == SensorMode.XTID_SM_IDLE
+    assert radar.mode() is SensorMode.XTID_SM_IDLE
     radar.profile.run()
     assert isinstance(next(iter(radar.messages(1))), m.PresenceSingle)
     radar.profile.stop()

@@ -7,7 +7,7 @@ from hil_tests.plugin.gate import Measure
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
 pytestmark = pytest.mark.requires("settings")
@@ -26,9 +26,9 @@ def test_it_is_ready_again_after_a_reset(
     ready_s = (radar_place.place.clock_ns() - begin_ns) * 1e-9
     assert radar.ping() is PongCode.XTS_SPRP_READY
     assert radar.info().serial_number == serial
-    assert radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values == (0.0,)
+    assert radar.x4.fps == 0.0
     radar.configure_raw()
-    assert radar.x4.settings()[X4Setting.ITERATIONS] == 16
+    assert radar.x4.iterations == 16
     measure("reset_to_ready", ready_s, unit="s", limit=(2.0, None))
 
 

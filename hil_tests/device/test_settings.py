@@ -26,7 +26,7 @@ def area(start_m: float, end_m: float, offset_m: float, downconversion: bool) ->
 def test_defaults_after_init(radar: X4M300) -> None:
     """Protocol reference 9.3."""
     radar.configure_raw()
-    radar.request(m.X4DriverInit(), 10.0)
+    radar.x4.init()
     settings = radar.x4.settings()
     assert settings[X4Setting.FPS] == 0
     assert settings[X4Setting.PULSESPERSTEP] == 10
@@ -73,7 +73,7 @@ def test_whole_numbers_read_back(
     radar: X4M300, setting: X4Setting, values: tuple[int, ...]
 ) -> None:
     """Protocol reference 4.9; bytes 7Dh, 7Eh, 7Fh travel escaped (1.1)."""
-    radar.request(m.X4DriverInit(), 10.0)
+    radar.x4.init()
     for value in values:
         radar.request(m.X4DriverSet(setting=setting, value=value))
         assert read(radar, setting) == value
@@ -82,7 +82,7 @@ def test_whole_numbers_read_back(
 
 def test_every_byte_reads_back(radar: X4M300) -> None:
     """All of 1 ... 255: among them, value or checksum is every special byte, in both directions."""
-    radar.request(m.X4DriverInit(), 10.0)
+    radar.x4.init()
     for value in range(1, 256):
         radar.request(m.X4DriverSet(setting=X4Setting.ITERATIONS, value=value))
         assert read(radar, X4Setting.ITERATIONS) == value
@@ -92,7 +92,7 @@ def test_every_byte_reads_back(radar: X4M300) -> None:
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.18, 0.2, 0.0312423706])  # the last is 3CFFF7F3h
 def test_offsets_read_back_as_float32(radar: X4M300, offset_m: float) -> None:
-    radar.request(m.X4DriverInit(), 10.0)
+    radar.x4.init()
     radar.request(m.X4DriverSet(setting=X4Setting.FRAMEAREAOFFSET, value=offset_m))
     assert read(radar, X4Setting.FRAMEAREAOFFSET) == np.float32(offset_m)
 
@@ -126,7 +126,7 @@ def test_frame_areas_are_quantised_as_the_vendor_does(
 def test_the_order_of_settings_does_not_matter(radar: X4M300) -> None:
     """Protocol reference 9.4: offset and downconversion apply the requested area anew."""
     for order in ((0, 1, 2), (2, 1, 0), (1, 2, 0)):
-        radar.request(m.X4DriverInit(), 10.0)
+        radar.x4.init()
         commands = (
             m.X4DriverSet(setting=X4Setting.FRAMEAREA, value=(0.2, 9.4)),
             m.X4DriverSet(setting=X4Setting.FRAMEAREAOFFSET, value=0.0),
@@ -170,14 +170,10 @@ def test_settings_without_getter_are_refused(radar: X4M300) -> None:
 
 def test_registers_of_the_chip(radar: X4M300) -> None:
     """Protocol reference 4.9: constants of SPI 0 ... 3, the PRF divider in PIF 44."""
-    radar.request(m.X4DriverInit(), 10.0)
-    got = [
-        radar.request(m.X4DriverGet(setting=X4Setting.SPIREGISTER, address=address)).values[0]
-        for address in range(4)
-    ]
-    assert got == [0x00, 0xFF, 0x01, 0x02]
-    divider = m.X4DriverGet(setting=X4Setting.PIFREGISTER, address=44)
-    assert radar.request(divider).values[0] == 16
+    radar.x4.init()
+    assert [radar.registers.read("spi", at) for at in range(4)] == [0x00, 0xFF, 0x01, 0x02]
+    assert radar.registers.read("pif", 44) == 16
+    assert len(radar.registers.read_burst(0x05, 12)) == 12
 
 
 def test_areas_without_bins_are_not_even_sent(radar: X4M300) -> None:

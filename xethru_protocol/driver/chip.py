@@ -21,7 +21,7 @@ from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncPart, Link, Part, S
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import FramePostprocessing, X4Setting
-from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError
+from xethru_protocol.wire.errors import DeviceError, LocalProtocolError, RemoteProtocolError
 
 V = TypeVar("V")
 RegisterSpace = Literal["spi", "pif", "xif"]
@@ -112,14 +112,26 @@ class X4Row(Setting[V]):
             moves = bool(x4.timer_rate(wanted))
             yield from (raw_mode.start(link, wanted) if moves else raw_mode.stop(link))
             return
-        plan = link.plan
+        fps = link.plan.fps if isinstance(link.plan, raw_mode.RawPlan) else None
+        if fps is None:
+            yield from self._change(link, wanted)
+            return
+        yield from raw_mode.stop(link)  # else nobody knows which settings the next frame has
+        try:
+            yield from self._change(link, wanted)
+        except DeviceError:
+            yield from raw_mode.run_at(link, fps)
+            raise
+        yield from raw_mode.run_at(link, fps)
+
+    def _change(self, link: Link, wanted: Any) -> Steps[None]:  # noqa: ANN401 - as the wire has it
         yield from link.request(m.X4DriverSet(setting=self.setting, value=wanted))
+        plan, geometry = link.plan, link.frames.geometry
         if isinstance(plan, raw_mode.RawPlan):
             changed: dict[str, Any] = {self.name: self.of_answer(wanted)}
             config = replace(plan.config, **changed)
             link.plan = replace(plan, config=config)
             link.frames.lattice = config.lattice
-        geometry = link.frames.geometry
         if self.setting in _MOVES_BINS and geometry is not None:
             baseband = geometry.downconversion
             if self.setting is X4Setting.DOWNCONVERSION:
@@ -175,8 +187,8 @@ class X4Settings:
     """Settings of the X4 chip. Protocol reference 4.9, 9.3 to 9.7.
 
     A value outside the limits raises `LocalProtocolError`, a refusal of the module `DeviceError`.
-    Most settings take effect at once, also while frames come: stop, set, start. After a reconnect
-    the driver sets them again if `configure_raw` or `start` was called before.
+    Frames that come are stopped for the change and started again. After a reconnect the driver
+    sets them again if `configure_raw` or `start` was called before.
     """
 
     __slots__ = ()

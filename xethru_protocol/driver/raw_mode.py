@@ -27,7 +27,7 @@ class RawPlan:
         """Configure and start again; frames that wait stay in the queue."""
         yield from _apply(link, self.config)
         if self.fps is not None:
-            yield from _run_at(link, self.fps)
+            yield from run_at(link, self.fps)
 
 
 def configure_raw(link: Link, config: RawConfig | None = None) -> Steps[FrameGeometry]:
@@ -124,7 +124,7 @@ def start(link: Link, fps: float) -> Steps[float]:
     _warn_of_rate(link, fps)
     yield from link.take_stale_input()
     link.frames.new_stream()  # a late frame of the last stream would make a false gap
-    return (yield from _run_at(link, fps))
+    return (yield from run_at(link, fps))
 
 
 def _take_over(link: Link) -> Steps[None]:
@@ -139,7 +139,8 @@ def _take_over(link: Link) -> Steps[None]:
     link.plan = RawPlan(config=config)
 
 
-def _run_at(link: Link, fps: float) -> Steps[float]:
+def run_at(link: Link, fps: float) -> Steps[float]:
+    """Let frames come as part of the stream that there is."""
     link.raw_mode = True
     yield from link.request(X4DriverSet(setting=X4Setting.FPS, value=fps))
     rate = yield from link.x4_get(X4Setting.FPS)

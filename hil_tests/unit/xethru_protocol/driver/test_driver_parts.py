@@ -10,17 +10,25 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import assert_type
 
 import numpy as np
 import pytest
 
 import xethru_protocol
 from hil_tests.golden.vectors import load
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
+from hil_tests.unit.xethru_protocol.both_drivers import AsyncScripted, DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.emulated import Emulated
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
-from xethru_protocol import X4M300, Frame, FrameGeometry, NoiseMapControl, RawConfig
-from xethru_protocol.driver import async_radar, board, chip, files, profiles, radar
+from xethru_protocol import (
+    X4M300,
+    AsyncX4M300,
+    Frame,
+    FrameGeometry,
+    NoiseMapControl,
+    RawConfig,
+)
+from xethru_protocol.driver import board, chip, files, profiles
 from xethru_protocol.driver.link import Part
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
@@ -222,6 +230,40 @@ def test_a_changed_setting_is_one_of_the_frames_that_come(emulated: Emulated) ->
     assert radar.warnings == []
 
 
+def test_a_setting_changed_while_frames_come_stops_them_for_it(emulated: Emulated) -> None:
+    """Protocol reference 4.9: frame length and values change with the next frame."""
+    radar, _, module = emulated
+    radar.configure_raw()
+    radar.start(17)
+    module.received.clear()
+    radar.x4.iterations = 8
+    asked = [c for c in module.received if isinstance(c, m.X4DriverSet)]
+    assert [(c.setting, c.value) for c in asked] == [
+        (X4Setting.FPS, 0.0),
+        (X4Setting.ITERATIONS, 8),
+        (X4Setting.FPS, 17.0),
+    ]
+    plan = radar._link.plan
+    assert getattr(plan, "fps", None) == 17.0
+
+
+def test_frames_go_on_after_a_setting_that_the_module_refuses(raw: Scripted) -> None:
+    radar, line = raw
+    plain = line._answer
+
+    def refusing(command: m.Message) -> Sequence[m.Message | bytes]:
+        if isinstance(command, m.X4DriverSet) and command.setting is X4Setting.DACMIN:
+            return [m.Error(code=1)]
+        return plain(command)
+
+    line._answer = refusing
+    radar.start(17)
+    with pytest.raises(DeviceError):
+        radar.x4.dac_min = 0
+    assert getattr(radar._link.plan, "fps", None) == 17.0
+    assert line.received[-2] == m.X4DriverSet(setting=X4Setting.FPS, value=17.0)
+
+
 def test_start_takes_the_settings_that_it_finds(emulated: Emulated) -> None:
     """Without `configure_raw`, as the vendor's examples set up a radar one value at a time."""
     radar, line, _ = emulated
@@ -264,7 +306,36 @@ def test_help_of_a_setting_has_units_and_limits() -> None:
     assert known == set(X4Setting) - elsewhere
 
 
-@pytest.mark.parametrize("driver", [X4M300, async_radar.AsyncX4M300])
+def test_type_checkers_know_every_setting() -> None:
+    """Mypy judges this test."""
+
+    async def asked(radar: AsyncX4M300) -> None:
+        assert_type(radar.x4.iterations, chip.AsyncSetting[int])
+        assert_type(await radar.x4.frame_area_m.get(), tuple[float, float])
+        assert_type(await radar.postprocessing.number_format.get(), int)
+        await radar.x4.fps.set(17)
+        radar.x4.iterations = 8  # type: ignore[arg-type] # it must be awaited
+
+    def ask(radar: X4M300) -> None:
+        assert_type(radar.x4.iterations, int)
+        assert_type(radar.x4.fps, float)
+        assert_type(radar.x4.downconversion, bool)
+        assert_type(radar.x4.frame_area_m, tuple[float, float])
+        assert_type(radar.read_message(m.DataString), m.DataString)
+        radar.x4.iterations = "8"  # type: ignore[assignment] # the mistake
+
+    assert asked.__name__ + ask.__name__  # neither is carried out
+
+
+def test_a_setting_of_the_asyncio_driver_is_not_assigned() -> None:
+    line = ScriptedTransport(PlainModule())
+    radar = AsyncX4M300(AsyncScripted(line))
+    with pytest.raises(AttributeError, match=r"iterations by: await .*iterations.set\(\)"):
+        radar.x4.iterations = 8  # type: ignore[arg-type] # the mistake
+    assert line.received == []
+
+
+@pytest.mark.parametrize("driver", [X4M300, AsyncX4M300])
 def test_help_names_every_method_and_part(driver: type) -> None:
     """The text of the class is the manual's first page; private names are not shown."""
     shown = pydoc.plain(pydoc.render_doc(driver))
@@ -506,7 +577,7 @@ def test_ranges_of_a_frame_are_those_of_its_bins(downconversion: bool) -> None:
 
 
 PARTS = [
-    (radar.X4M300, async_radar.AsyncX4M300),
+    (X4M300, AsyncX4M300),
     (chip.X4, chip.AsyncX4),
     (chip.Registers, chip.AsyncRegisters),
     (chip.Postprocessing, chip.AsyncPostprocessing),
