@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import re
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -48,11 +49,47 @@ frame_rate = _number(float, lambda value: 0 < value < 65536, "a number between 0
 seconds = _number(float, lambda value: 0 < value <= _LONGEST_S, "seconds, more than 0")
 # a hundred times what any radar sees
 metres = _number(float, lambda value: -1000 <= value <= 1000, "metres between -1000 and 1000")
+sensitivity = _number(int, lambda value: 0 <= value <= 9, "a whole number from 0 to 9")
 at_least_one = _number(int, lambda value: value >= 1, "a whole number from 1 on")
 # rates that a module could be set to (Protocol reference 4.10)
 baud_rate = _number(
     int, lambda value: 600 <= value <= 10_000_000, "a whole number from 600 to 10000000"
 )
+
+
+_LIMIT = re.compile(r"(\d+(?:\.\d*)?)(records|kB|MB|GB|B|s|min|h)|daily@(\d{1,2})")
+_UNITS = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "s": 1, "min": 60, "h": 3600}
+
+
+def split_limit(text: str) -> tuple[str, float]:
+    """Return a limit of a data file or directory: field of `Split`, and its value.
+
+    >>> split_limit("10MB"), split_limit("1.5h"), split_limit("500records"), split_limit("daily@14")
+    (('bytes', 10000000), ('seconds', 5400.0), ('records', 500), ('daily_hour', 14))
+    """
+    found = _LIMIT.fullmatch(text)
+    if found is None or (found[3] and int(found[3]) > 23) or (found[1] and not float(found[1])):
+        raise ArgumentTypeError(
+            f"{text!r} is no limit: write 500records, 10MB (B, kB, MB, GB), 600s (s, min, h) or"
+            " daily@14 (an hour, 0 ... 23)"
+        )
+    number, unit, hour = found.groups()
+    if hour:
+        return "daily_hour", int(hour)
+    if unit == "records":
+        return "records", math.ceil(float(number))
+    if unit in {"s", "min", "h"}:
+        return "seconds", float(number) * _UNITS[unit]
+    return "bytes", math.ceil(float(number) * _UNITS[unit])
+
+
+def base_name(text: str) -> tuple[str, str]:
+    kind, equals, name = text.partition("=")
+    if not (kind and equals and re.fullmatch(r"[\w.+-]+", name)):
+        raise ArgumentTypeError(
+            f"{text!r} must be KIND=NAME, such as datafloat=lab, the name of letters, digits and _"
+        )
+    return kind, name
 
 
 def _add_command(
@@ -109,6 +146,58 @@ def raw_config(arguments: argparse.Namespace) -> "RawConfig":
     if start_m >= end_m:
         arguments.refuse("argument --frame-area: START must be smaller than END")
     return RawConfig(frame_area_m=(start_m, end_m), downconversion=arguments.baseband)
+
+
+def _add_recording_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("vendor's format", "options of ModuleConnector's recorder")
+    group.add_argument(
+        "--session-id",
+        type=utf8_text,
+        default="",
+        metavar="TEXT",
+        help="name kept in the recording (default: a random UUID)",
+    )
+    group.add_argument(
+        "--new-directory",
+        action="store_true",
+        help="make a directory in DIR, xethru_recording_<local time>_<session id>",
+    )
+    for option, what in (("--split-files", "data file"), ("--split-directories", "directory")):
+        group.add_argument(
+            option,
+            type=split_limit,
+            action="append",
+            default=[],
+            metavar="LIMIT",
+            help=f"begin a new {what} at 500records, 10MB, 600s (min, h) or daily@14 o'clock; may "
+            "be given several times",
+        )
+    group.add_argument(
+        "--basename",
+        type=base_name,
+        action="append",
+        default=[],
+        metavar="KIND=NAME",
+        help="begin names of data files with NAME; KIND as in xethru_KIND_..., such as datafloat",
+    )
+    group.add_argument(
+        "--user-header",
+        type=utf8_text,
+        default="",
+        metavar="TEXT",
+        help="put TEXT before the records of each data file",
+    )
+    group.add_argument(
+        "--interval",
+        type=seconds,
+        metavar="S",
+        help="leave messages out that come sooner than S seconds after the last one of their kind",
+    )
+    group.add_argument(
+        "--flush-on-write",
+        action="store_true",
+        help="have each record on the disk before the next; slow",
+    )
 
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
@@ -200,22 +289,37 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     one.add_argument(
         "--profile",
-        choices=("raw", "presence", "none"),
+        choices=("raw", "presence", "respiration", "none"),
         default="raw",
-        help="raw: radar frames (default); presence: the X4M300's own profile; none: only listen "
-        "to what the module is sending, and send it nothing",
+        help="raw: radar frames (default); presence: the X4M300's own profile; respiration: that "
+        "of an X4M200 or X4M210, with sleep; none: only listen to what the module is sending, and "
+        "send it nothing",
     )
     _add_raw_settings(one)
+    group = one.add_argument_group("presence and respiration")
+    group.add_argument(
+        "--output",
+        type=not_empty,
+        metavar="NAMES",
+        help="what the profile sends, and nothing else (default: what it is set to), separated by "
+        "commas: iq or ap, pulsedoppler, pulsedoppler-byte, noisemap, noisemap-byte; of presence "
+        "single, movinglist; of respiration status, sleep, vitalsigns, movinglist, detectionlist, "
+        "normalizedmovementlist",
+    )
+    group.add_argument(
+        "--zone",
+        nargs=2,
+        type=metres,
+        metavar=("START", "END"),
+        help="detection zone in metres (default: what it is set to)",
+    )
+    group.add_argument(
+        "--sensitivity", type=sensitivity, metavar="N", help="0 ... 9 (default: what it is set to)"
+    )
+    _add_recording_options(one)
     one.add_argument("--count", type=at_least_one, help="stop after COUNT messages")
     one.add_argument(
         "--duration", type=seconds, metavar="S", help="stop after S seconds of recording"
-    )
-    one.add_argument(
-        "--session-id",
-        type=utf8_text,
-        default="",
-        metavar="TEXT",
-        help="name kept in the recording",
     )
     one.add_argument(
         "--force", action="store_true", help="replace a recording that is there already"

@@ -6,8 +6,10 @@ none comes while a record is half written; a second one insists.
 
 import time
 from argparse import Namespace
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -24,14 +26,26 @@ from xethru_protocol.cli.output import (
     print_warnings,
     warn,
 )
-from xethru_protocol.cli.recordings import files_to_replace, remove_unfinished
+from xethru_protocol.cli.recordings import (
+    files_to_replace,
+    remove_empty_directories,
+    remove_unfinished,
+)
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.recordings import RecordingError, RecordingWriter, WireCapture
+from xethru_protocol.recordings import (
+    RecordingError,
+    RecordingWriter,
+    Split,
+    WireCapture,
+    session_directory,
+)
+from xethru_protocol.recordings.vendor.layouts import KINDS
+from xethru_protocol.recordings.vendor.writer import new_session_id
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import ProfileId
-from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
+from xethru_protocol.wire.codes import MatrixControl, OutputFeature, ProfileId
+from xethru_protocol.wire.errors import DeviceError, ResponseTimeout, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.rows import Response
 
@@ -70,17 +84,111 @@ class RawFrames(Listen):
         return max(2.0, 3.0 / radar.start(self._fps))
 
 
-class Presence(Listen):
-    """Messages of the X4M300's own profile, about one a second."""
+_BOTH = MatrixControl.SLOW | MatrixControl.FAST
+_COMMON_OUTPUTS = {
+    "iq": (OutputFeature.BASEBAND_IQ, 1),
+    "ap": (OutputFeature.BASEBAND_AMPLITUDE_PHASE, 1),
+    "pulsedoppler": (OutputFeature.PULSEDOPPLER_FLOAT, _BOTH),
+    "pulsedoppler-byte": (OutputFeature.PULSEDOPPLER_BYTE, _BOTH),
+    "noisemap": (OutputFeature.NOISEMAP_FLOAT, _BOTH),
+    "noisemap-byte": (OutputFeature.NOISEMAP_BYTE, _BOTH),
+}
+_RIVALS = [
+    ("iq", "ap"),
+    ("pulsedoppler", "pulsedoppler-byte"),
+    ("noisemap", "noisemap-byte"),
+]
+"""Outputs of which the module sends one: the one that is switched on last (4.7)."""
 
-    profile_id = ProfileId.XTS_ID_APP_PRESENCE_2
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProfileKind:
+    """A profile: its id, which modules have it, its own outputs by name."""
+
+    profile_id: ProfileId
+    modules: str
+    own_outputs: Mapping[str, OutputFeature]
+
+    @property
+    def outputs(self) -> dict[str, tuple[OutputFeature, int]]:
+        """All outputs with the control that switches them on."""
+        return _COMMON_OUTPUTS | {name: (one, 1) for name, one in self.own_outputs.items()}
+
+
+PROFILES = {
+    "presence": ProfileKind(
+        profile_id=ProfileId.XTS_ID_APP_PRESENCE_2,
+        modules="an X4M300",
+        own_outputs={
+            "single": OutputFeature.PRESENCE_SINGLE,
+            "movinglist": OutputFeature.PRESENCE_MOVINGLIST,
+        },
+    ),
+    "respiration": ProfileKind(
+        profile_id=ProfileId.XTS_ID_APP_RESPIRATION_2,
+        modules="an X4M200 or X4M210",
+        own_outputs={
+            "status": OutputFeature.RESP_STATUS,
+            "sleep": OutputFeature.SLEEP_STATUS,
+            "vitalsigns": OutputFeature.VITAL_SIGNS,
+            "movinglist": OutputFeature.RESPIRATION_MOVINGLIST,
+            "detectionlist": OutputFeature.RESPIRATION_DETECTIONLIST,
+            "normalizedmovementlist": OutputFeature.RESPIRATION_NORMALIZEDMOVEMENTLIST,
+        },
+    ),
+}
+
+
+class Profile(Listen):
+    """Messages of a profile, about one a second, and what else its outputs bring."""
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        outputs: Sequence[str] | None,
+        zone_m: tuple[float, float] | None,
+        sensitivity: int | None,
+    ) -> None:
+        self._name = name
+        self._kind = PROFILES[name]
+        self._outputs = outputs
+        self._zone_m = zone_m
+        self._sensitivity = sensitivity
+        self.profile_id = self._kind.profile_id
 
     def prepare(self, radar: X4M300) -> None:
-        radar.profile.load()
+        try:
+            radar.profile.load(self._kind.profile_id)
+        except DeviceError as error:
+            raise CommandFailed(
+                f"this module does not load the profile {self._name}, which {self._kind.modules} "
+                f"has: {error}"
+            ) from error
+        if self._zone_m is not None:
+            zone_m = radar.profile.set_zone(*self._zone_m)
+            warn(f"xethru record: the detection zone is {zone_m[0]:.3f} ... {zone_m[1]:.3f} m")
+        if self._sensitivity is not None:
+            radar.profile.set_sensitivity(self._sensitivity)
+        if self._outputs is not None:
+            self._set_outputs(radar, self._outputs)
+
+    def _set_outputs(self, radar: X4M300, names: Sequence[str]) -> None:
+        """Switch others off first: switching one off switches its rival off, too (4.7)."""
+        for name, (feature, _) in self._kind.outputs.items():
+            with suppress(DeviceError):  # a module without this output does not send it
+                if name not in names and radar.profile.output(feature):
+                    radar.profile.set_output(feature, 0)
+        for name in names:
+            try:
+                radar.profile.set_output(*self._kind.outputs[name])
+            except DeviceError as error:
+                raise CommandFailed(f"this module does not take output {name}: {error}") from error
 
     def start(self, radar: X4M300) -> float:
         radar.profile.run()
-        return 10.0
+        # noise maps alone are sent only now and then
+        return 10.0 if self._outputs is None or {*self._outputs} - {*_COMMON_OUTPUTS} else 60.0
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
         """Take a message, and the frames that the profile sends if its outputs are on."""
@@ -107,10 +215,16 @@ class Recorder:
     receiving.
     """
 
-    def __init__(self, arguments: Namespace, profile_id: int | None) -> None:
+    def __init__(
+        self, arguments: Namespace, profile_id: int | None, options: Mapping[str, Any]
+    ) -> None:
         self.messages = 0  # taken
         self.failure: XeThruError | None = None  # why nothing more is written
+        self._session_id = arguments.session_id or new_session_id()
+        self._options = options
         self._directory = Path(arguments.out) if arguments.out else None
+        if self._directory is not None and arguments.new_directory:
+            self._directory = session_directory(self._directory, self._session_id, time.time_ns())
         self._wire_path = Path(arguments.wire) if arguments.wire else None
         paths = (self._directory, self._wire_path)
         self.paths = tuple(path for path in paths if path is not None)
@@ -156,11 +270,15 @@ class Recorder:
                 path.unlink()
             except OSError as error:
                 raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
+        for path in self.paths:
+            remove_empty_directories(path)
         self._were_there = {path: path.exists() for path in self.paths}
         if self._directory is not None:
-            session_id = self._arguments.session_id
             self._writer = RecordingWriter(
-                self._directory, session_id=session_id, profile_id=self._profile_id
+                self._directory,
+                session_id=self._session_id,
+                profile_id=self._profile_id,
+                **self._options,
             )
         if self._wire_path is not None:
             self._wire = WireCapture(self._wire_path, {"port": self._arguments.port})
@@ -238,6 +356,62 @@ class Recorder:
         }
 
 
+def _profile_of(arguments: Namespace) -> Profile | None:
+    """Return the profile to record, None for none; ends the program on wrong usage."""
+    name = arguments.profile
+    if name not in PROFILES:
+        for option in ("output", "zone", "sensitivity"):
+            if getattr(arguments, option) is not None:
+                arguments.refuse(f"--{option} needs --profile presence or respiration")
+        return None
+    names: list[str] | None = None
+    if arguments.output is not None:
+        known = PROFILES[name].outputs
+        names = [part.strip() for part in arguments.output.split(",")]
+        for part in names:
+            others = [other for other, kind in PROFILES.items() if part in kind.own_outputs]
+            if part not in known and others:
+                arguments.refuse(f"output {part} belongs to --profile {others[0]}, not {name}")
+            if part not in known:
+                arguments.refuse(
+                    f"profile {name} has no output {part!r}; known: {', '.join(known)}"
+                )
+        for rivals in _RIVALS:
+            both = [part for part in names if part in rivals]
+            if len(set(both)) > 1:
+                warn(
+                    f"xethru record: outputs {rivals[0]} and {rivals[1]} exclude each other; "
+                    f"the module sends {both[-1]}"
+                )
+    if arguments.zone is not None and arguments.zone[0] >= arguments.zone[1]:
+        arguments.refuse("argument --zone: START must be smaller than END")
+    return Profile(name, outputs=names, zone_m=arguments.zone, sensitivity=arguments.sensitivity)
+
+
+def _writer_options(arguments: Namespace) -> dict[str, Any]:
+    """Return the parameters of `RecordingWriter`; ends the program on wrong usage."""
+    limits = (
+        {name: min(value for key, value in given if key == name) for name, _ in given}
+        for given in (arguments.split_files, arguments.split_directories)
+    )
+    split, directories = (Split(**found) if found else None for found in limits)
+    kinds = {kind.name: kind.message for kind in KINDS}
+    for name, _ in arguments.basename:
+        if name not in kinds:
+            arguments.refuse(f"--basename: no data files are called {name!r}; {', '.join(kinds)}")
+    options = {
+        "user_header": arguments.user_header.encode(),
+        "split": split,
+        "split_directories": directories,
+        "basenames": {kinds[kind]: name for kind, name in arguments.basename},
+        "interval_s": arguments.interval,
+        "flush_on_write": arguments.flush_on_write,
+    }
+    if arguments.out is None and (any(options.values()) or arguments.new_directory):
+        arguments.refuse("options of the vendor's format need --out DIR")
+    return options
+
+
 _POLL_S = 0.2  # how late a signal, or the end, may be noticed
 
 
@@ -249,12 +423,14 @@ def record(arguments: Namespace) -> int:
     if arguments.out == arguments.wire:
         arguments.refuse("--out and --wire must not be the same")
     mode = Listen()
+    profile = _profile_of(arguments)
     if arguments.profile == "raw":
         mode = RawFrames(config=config, fps=arguments.fps)
-    elif arguments.profile == "presence":
-        mode = Presence()
+    elif profile is not None:
+        mode = profile
+    options = _writer_options(arguments)
     stop = StopFlag("previous")
-    with Recorder(arguments, mode.profile_id) as recorder:
+    with Recorder(arguments, mode.profile_id, options) as recorder:
         recorder.check()
         try:
             with module_at(arguments.port, arguments.baudrate) as radar:

@@ -30,6 +30,7 @@ from xethru_protocol.recordings import (
     recording_facts,
 )
 from xethru_protocol.recordings import convert as convert_recording
+from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
@@ -328,6 +329,7 @@ def set_aside(target: Path, *, replace: bool) -> Iterator[None]:
     for _, aside in kept:
         with suppress(OSError):
             aside.unlink()
+    remove_empty_directories(target)
 
 
 def _put_back(kept: Iterable[tuple[Path, Path]]) -> None:
@@ -342,11 +344,30 @@ def remove_unfinished(target: Path, *, was_there: bool) -> None:
         for path in _recording_files(target):
             if path.is_file():
                 path.unlink()
+        remove_empty_directories(target)
         if target.is_dir() and not was_there:
             target.rmdir()
 
 
 def _recording_files(target: Path) -> list[Path]:
-    if target.is_dir():
-        return sorted(path for path in target.glob("xethru_*") if not path.is_dir())
-    return [target] if target.exists() else []
+    """Return the files of a recording: those of the vendor's names, and others by its index."""
+    if not target.is_dir():
+        return [target] if target.exists() else []
+    found = {
+        path
+        for directory in (target, *_directories_in(target))
+        for path in (*directory.glob("xethru_*"), *data_files(directory))
+    }
+    return sorted(path for path in found if not path.is_dir())
+
+
+def _directories_in(target: Path) -> list[Path]:
+    """Return the directories that a recording in ``target`` was split into."""
+    return [path for path in target.glob("xethru_recording_*_[0-9]*") if path.is_dir()]
+
+
+def remove_empty_directories(target: Path) -> None:
+    """Remove what is left of a recording that was split into directories."""
+    for path in _directories_in(target):
+        with suppress(OSError):  # it holds something else
+            path.rmdir()

@@ -13,6 +13,7 @@ import pytest
 from hil_tests.device.serving import emulator
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.recordings.messages import dumped, xethru
+from xethru_protocol.cli import main
 
 pytestmark = pytest.mark.slow
 
@@ -78,6 +79,25 @@ def test_wire_capture_holds_the_same_messages(tmp_path: Path, capsys: Capture) -
         abs(one["t_ns"] - other["t_ns"]) < 10**9
         for one, other in zip(heard[:FRAMES], messages, strict=True)
     )
+
+
+def test_outputs_of_a_profile(tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "recording"
+    outputs = "iq,ap,single,movinglist,pulsedoppler,noisemap"
+    setup = ["--zone", "0.4", "5", "--sensitivity", "5", "--output", outputs]
+    with emulator("serve", "visitor", "--pace", "asap") as served:
+        command = ["record", "--port", served.paths[0], "--out", str(out), "--profile", "presence"]
+        assert main([*command, *setup, "--count", "600"]) == 0
+    errors = capsys.readouterr().err
+    assert "outputs iq and ap exclude each other; the module sends ap" in errors
+    kinds = {message["message"] for message in dumped(capsys, out)}
+    # a noise map is sent when it is made, two minutes after the start
+    assert kinds == {
+        "BASEBAND_AP",
+        "PRESENCE_SINGLE",
+        "PRESENCE_MOVINGLIST",
+        "PULSEDOPPLER_FLOAT",
+    }
 
 
 def test_unplugging_keeps_what_came(tmp_path: Path, capsys: Capture) -> None:

@@ -286,7 +286,7 @@ class RecordingWriter:
         self._closed = False
         with writing(self.directory):
             self.directory.mkdir(parents=True, exist_ok=True)
-            if any(path.name.startswith("xethru_") for path in self.directory.iterdir()):
+            if _holds_recording(self.directory):
                 raise RecordingError(
                     f"{self.directory} already holds a recording; name another directory"
                 )
@@ -371,6 +371,12 @@ class RecordingWriter:
         if self._options.parameter_file is not None:
             with GrowingFile(directory / PARAMETER_FILE_NAME) as file:
                 file.append(self._options.parameter_file)
+
+
+def _holds_recording(directory: Path) -> bool:
+    """Whether there are files of a recording, or directories of one that are not empty."""
+    found = (path for path in directory.iterdir() if path.name.startswith("xethru_"))
+    return any(not path.is_dir() or any(path.glob("xethru_*")) for path in found)
 
 
 def new_session_id() -> str:

@@ -1,23 +1,32 @@
 """``xethru record`` with scripted modules: what is written, when it ends, what it says."""
 
 import io
+import itertools
 import json
+import re
 import resource
 import subprocess
 import sys
+import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
 from xethru_protocol.cli.record import Recorder
-from xethru_protocol.recordings import describe_recording, read_note, read_recording
+from xethru_protocol.recordings import (
+    describe_recording,
+    read_note,
+    read_recording,
+    recording_facts,
+)
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import ProfileId, SensorMode, X4Setting
+from xethru_protocol.wire.codes import OutputFeature, ProfileId, SensorMode, X4Setting
 
 Capture = pytest.CaptureFixture[str]
 PRESENCE = m.PresenceSingle(counter=3, state=1, distance_m=1.5, direction=0, signal_quality=7)
@@ -162,6 +171,200 @@ def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) ->
     messages = [message for message, _ in read_recording(out)]
     assert messages == [PRESENCE, PRESENCE]
     assert describe_recording(out).profile_id == 0x014D4AB8
+
+
+def profile_module(received: EmulatedModule, *sent: m.Response) -> PtyModule:
+    """Return an emulated module behind a port, which sends these when it is set running."""
+
+    def answer(command: m.Message) -> Sequence[Said]:
+        is_run = command == m.SetMode(mode=SensorMode.XTID_SM_RUN)
+        return [*received(command), *(sent if is_run else ())]
+
+    return PtyModule(answer)
+
+
+def test_a_profile_is_set_up_as_asked(tmp_path: Path, capsys: Capture) -> None:
+    emulated = EmulatedModule()
+    emulated(m.LoadApp(profile_id=ProfileId.XTS_ID_APP_PRESENCE_2))
+    # a setting of before, which the module keeps
+    emulated(m.OutputSetControl(feature=OutputFeature.PULSEDOPPLER_BYTE, control=1))
+    out = tmp_path / "recording"
+    setup = ["--output", "iq,movinglist,pulsedoppler,noisemap", "--zone", "0.4", "5"]
+    with profile_module(emulated, PRESENCE) as module:
+        arguments = ["--profile", "presence", *setup, "--sensitivity", "7", "--count", "1"]
+        assert main(["record", "--port", module.path, "--out", str(out), *arguments]) == 0
+    errors = capsys.readouterr().err
+    assert re.fullmatch(
+        r"xethru record: the detection zone is 0\.\d{3} \.\.\. [45]\.\d{3} m\n", errors
+    )
+    settings = emulated.module.profile
+    assert {feature: control for feature, control in settings.outputs.items() if control} == {
+        OutputFeature.BASEBAND_IQ: 1,
+        OutputFeature.PRESENCE_MOVINGLIST: 1,
+        OutputFeature.PULSEDOPPLER_FLOAT: 3,
+        OutputFeature.NOISEMAP_FLOAT: 3,
+    }
+    assert settings.sensitivity == 7
+    # the module snaps outward to its grid of 5.14 cm (4.4)
+    assert settings.zone_m[0] <= 0.4
+    assert 5.0 <= settings.zone_m[1] < 5.06
+
+
+def test_outputs_that_exclude_each_other_are_warned_of(tmp_path: Path, capsys: Capture) -> None:
+    emulated = EmulatedModule()
+    with profile_module(emulated, PRESENCE) as module:
+        arguments = ["--profile", "presence", "--output", "iq,ap,single", "--count", "1"]
+        wire = ["--wire", str(tmp_path / "port.xtwire")]
+        assert main(["record", "--port", module.path, *wire, *arguments]) == 0
+    assert capsys.readouterr().err == (
+        "xethru record: outputs iq and ap exclude each other; the module sends ap\n"
+    )
+    outputs = emulated.module.profile.outputs
+    assert [feature for feature in OutputFeature if outputs.get(feature)] == [
+        OutputFeature.PRESENCE_SINGLE,
+        OutputFeature.BASEBAND_AMPLITUDE_PHASE,
+    ]
+
+
+def test_respiration_and_sleep_are_recorded_where_a_module_has_them(tmp_path: Path) -> None:
+    sleep = m.SleepStatus(
+        counter=1, state=0, rpm=14.5, distance_m=1.25, signal_quality=8, movement_slow=3.0,
+        movement_fast=4.0,
+    )  # fmt: skip
+    asked: list[m.Message] = []
+
+    def answer(command: m.Message) -> Sequence[Said]:
+        asked.append(command)
+        match command:
+            case m.Ping():
+                return [m.Pong(value=0xAAEEAEEA)]
+            case m.OutputGetControl(feature=feature):
+                return [m.ReplyInt(values=(int(feature == OutputFeature.RESP_STATUS),))]
+            case m.SetMode(mode=SensorMode.XTID_SM_RUN):
+                return [m.Ack(), sleep]
+        return [m.Ack()]
+
+    out = tmp_path / "recording"
+    with PtyModule(answer) as module:
+        arguments = ["--profile", "respiration", "--output", "sleep", "--count", "1"]
+        assert main(["record", "--port", module.path, "--out", str(out), *arguments]) == 0
+    assert m.LoadApp(profile_id=0x064E57AD) in asked
+    assert [command for command in asked if isinstance(command, m.OutputSetControl)] == [
+        m.OutputSetControl(feature=OutputFeature.RESP_STATUS, control=0),
+        m.OutputSetControl(feature=OutputFeature.SLEEP_STATUS, control=1),
+    ]
+    assert [message for message, _ in read_recording(out)] == [sleep]
+
+
+def test_a_module_without_the_profile_or_output_is_named(tmp_path: Path, capsys: Capture) -> None:
+    def answer(command: m.Message) -> Sequence[Said]:
+        match command:
+            case m.Ping():
+                return [m.Pong(value=0xAAEEAEEA)]
+            case m.LoadApp(profile_id=0x064E57AD):
+                return [m.Error(code=0x20)]
+            case m.OutputSetControl():
+                return [m.Error(code=0x21)]
+            case m.OutputGetControl():
+                return [m.ReplyInt(values=(0,))]
+        return [m.Ack()]
+
+    command = ["record", "--out", str(tmp_path / "recording"), "--count", "1", "--profile"]
+    with PtyModule(answer) as module:
+        assert main([*command, "respiration", "--port", module.path]) == 1
+        errors = capsys.readouterr().err
+        assert "does not load the profile respiration, which an X4M200 or X4M210 has: " in errors
+        assert "error 32 (APP_INVALID)" in errors
+        arguments = ["presence", "--output", "iq", "--port", module.path]
+        assert main([*command, *arguments]) == 1
+        assert "this module does not take output iq: " in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--profile", "presence", "--output", "sleep"], "belongs to --profile respiration"),
+        (["--profile", "respiration", "--output", "single"], "belongs to --profile presence"),
+        (["--profile", "presence", "--output", "iq,radio"], "has no output 'radio'; known: iq, ap"),
+        (["--output", "iq"], "--output needs --profile presence or respiration"),
+        (["--zone", "1", "2"], "--zone needs --profile"),
+        (["--profile", "none", "--sensitivity", "3"], "--sensitivity needs --profile"),
+        (["--profile", "presence", "--zone", "3", "2"], "START must be smaller than END"),
+        (["--profile", "presence", "--sensitivity", "10"], "a whole number from 0 to 9"),
+        (["--split-files", "10"], "'10' is no limit: write 500records, 10MB"),
+        (["--split-files", "0s"], "'0s' is no limit"),
+        (["--split-directories", "daily@24"], "'daily@24' is no limit"),
+        (["--basename", "datafloat"], "must be KIND=NAME"),
+        (["--basename", "datafloat=a/b"], "must be KIND=NAME"),
+        (["--basename", "float=a"], "no data files are called 'float'; baseband_ap, "),
+        (["--interval", "0"], "seconds, more than 0"),
+    ],
+)
+def test_options_that_make_no_sense_are_wrong_usage(
+    arguments: list[str], reason: str, tmp_path: Path, capsys: Capture
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["record", "--port", "p", "--out", str(tmp_path / "x"), *arguments])
+    assert ended.value.code == 2
+    assert reason in " ".join(capsys.readouterr().err.split())
+
+
+def test_options_of_the_format_need_a_directory(tmp_path: Path, capsys: Capture) -> None:
+    for option in (["--new-directory"], ["--split-files", "1MB"], ["--interval", "1"]):
+        with pytest.raises(SystemExit) as ended:
+            main(["record", "--port", "p", "--wire", str(tmp_path / "x"), *option])
+        assert ended.value.code == 2
+        assert "options of the vendor's format need --out DIR" in capsys.readouterr().err
+
+
+def test_files_are_split_named_and_headed(module: PtyModule, tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    options = ["--split-files", "2records", "--split-files", "1h", "--basename", "datafloat=lab"]
+    arguments = [*options, "--user-header", "hütte", "--flush-on-write", "--count", "5"]
+    assert main(["record", "--port", module.path, "--out", str(out), *arguments]) == 0
+    files = sorted(out.glob("lab_2*.dat"))
+    assert len(files) == 3
+    assert len(list(out.iterdir())) == 4
+    assert all(file.read_bytes().startswith("hütte".encode()) for file in files)
+    assert counters(out) == [0, 1, 2, 3, 4]
+    facts = recording_facts(out)
+    assert facts.user_header == "hütte".encode()
+    assert uuid.UUID(facts.session_id).version == 4
+    # --force finds them by the index
+    assert main(["record", "--port", module.path, "--out", str(out), "--count", "1"]) == 1
+    arguments = ["--count", "1", "--force"]
+    assert main(["record", "--port", module.path, "--out", str(out), *arguments]) == 0
+    assert len(list(out.iterdir())) == 2
+
+
+def test_directories_are_made_and_replaced(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    command = ["record", "--port", module.path, "--out", str(tmp_path), "--count", "3"]
+    session = ["--session-id", "one", "--new-directory"]
+    assert main([*command, *session, "--split-directories", "1records"]) == 0
+    (out,) = tmp_path.iterdir()
+    assert re.fullmatch(r"xethru_recording_\d{8}_\d{6}_one", out.name)
+    assert capsys.readouterr().out.startswith(f"{out}: 3 messages")
+    parts = sorted(path.name for path in out.iterdir())
+    pattern = r"xethru_recording_\d{8}_\d{6}_one_"
+    assert [re.sub(pattern, "", name) for name in parts] == ["0", "1", "2"]
+    assert counters(out) == counters(tmp_path) == [0, 1, 2]
+    command[4] = str(out)
+    assert main(command) == 1
+    assert main([*command, "--force"]) == 0
+    assert sorted(path.suffix for path in out.iterdir()) == [".dat", ".dat"]
+
+
+def test_an_interval_leaves_frames_out(module: PtyModule, tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    arguments = ["--interval", "0.02", "--count", "3"]
+    assert main(["record", "--port", module.path, "--out", str(out), *arguments]) == 0
+    times = [t_ns for _, t_ns in read_recording(out)]
+    steps = [b - a for a, b in itertools.pairwise(times) if a is not None and b is not None]
+    assert len(steps) == 2
+    assert min(steps) >= 20_000_000 - 1_000_000
 
 
 def test_nothing_to_record_leaves_nothing(tmp_path: Path, capsys: Capture) -> None:
