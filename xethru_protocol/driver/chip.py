@@ -116,7 +116,8 @@ class X4Row(Setting[V]):
         if fps is None:
             yield from self._change(link, wanted)
             return
-        yield from raw_mode.stop(link)  # else nobody knows which settings the next frame has
+        # else nobody knows which settings the next frame has; a reconnect is to start them again
+        yield from link.request(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
         try:
             yield from self._change(link, wanted)
         except DeviceError:

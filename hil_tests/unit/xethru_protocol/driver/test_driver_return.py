@@ -163,6 +163,30 @@ def test_stream_goes_on_after_an_unplug_under_another_name(
     assert any("looking for the module for 20 s" in text for text in radar.warnings)
 
 
+@pytest.mark.parametrize("setting", ["FPS", "ITERATIONS"])
+def test_a_setting_that_was_being_changed_is_changed_after_the_outage(
+    plugged: DriverOn, machine: Machine, setting: str
+) -> None:
+    """The module vanishes with the stop before the change, or with the change itself."""
+    plain = PlainModule()
+
+    def vanishing(command: m.Message) -> Said:
+        match command:
+            case m.X4DriverSet(setting=at, value=0.0 | 8) if at.name == setting:
+                line.gone = True
+                return []
+        return plain(command)
+
+    machine.plug(HOME, PlainModule(), from_s=2.0)
+    radar, line = plugged(vanishing, reconnect_s=10.0)
+    radar.configure_raw()
+    radar.start(17.0)
+    radar.x4.iterations = 8
+    sent = settings_sent(machine.lines[-1])
+    assert sent[-4:] == [("FPS", 17.0), ("FPS", 0.0), ("ITERATIONS", 8), ("FPS", 17.0)]
+    assert radar.reconnects == 1
+
+
 def test_counters_on_either_side_of_an_outage_make_no_gap(
     plugged: DriverOn, machine: Machine
 ) -> None:
