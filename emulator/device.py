@@ -54,6 +54,8 @@ NORMAL_BUFFER = 8000
 """Bytes of a Normal packet, escapes included, that a module can send (protocol reference 1.1)."""
 LARGEST_POOL_BLOCK = 7000
 """Payload bytes of the largest command that a module processes (protocol reference 1.1)."""
+COMMANDS_AT_ONCE = 16
+"""How many commands one visit carries out; the modules beside this one have their turn then."""
 _LONG_COMMANDS = (
     InjectFrame,
     SetFileData,
@@ -219,12 +221,13 @@ class Device:
         self._ready_ns: int | None = None
         # a reply that takes its time, and until when; further commands wait behind it
         self._held: tuple[int, Response] | None = None
+        self._backlog = False  # of received commands, for the next visit
         self.faults_seen = 0
 
     @property
     def wants_data(self) -> bool:
         """Whether more commands should be read now; a host that never reads is held back."""
-        return self._held is None and self._outbox.takes_replies
+        return self._held is None and not self._backlog and self._outbox.takes_replies
 
     @property
     def listens(self) -> bool:
@@ -252,7 +255,7 @@ class Device:
         return self._ready_ns is None or now_ns >= self._ready_ns
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
-        """Take bytes from the host and carry out the commands they complete."""
+        """Take bytes from the host and carry out commands they complete, the first few at once."""
         self.advance(now_ns)
         if not self.listens:
             return
@@ -265,15 +268,23 @@ class Device:
         self._carry_out_commands(now_ns)
 
     def _carry_out_commands(self, now_ns: int) -> None:
-        while self._held is None and not self.module.asleep:
+        left = COMMANDS_AT_ONCE
+        while self._takes_commands and left:
             event = self._connection.next_event()
             if isinstance(event, NeedData):
+                self._backlog = False
                 return
             if isinstance(event, Command):
+                left -= 1
                 if not _is_oversized(event):
                     self._carry_out(event, now_ns)
             else:
                 self.faults_seen += 1
+        self._backlog = self._connection.buffered > 0 and not self.module.asleep
+
+    @property
+    def _takes_commands(self) -> bool:
+        return self._held is None and not self.module.asleep and self._outbox.takes_replies
 
     def _carry_out(self, command: Command[Response], now_ns: int) -> None:
         reply = answer(self.module, command)
@@ -311,6 +322,7 @@ class Device:
         if self._held is not None and now_ns >= self._held[0]:
             (_, reply), self._held = self._held, None
             self._outbox.put(MessageKind.REPLY, reply, now_ns)
+        if self._backlog:
             self._carry_out_commands(now_ns)
         if self._sends:
             self._outbox.refill_on_time(self._stream, now_ns)
@@ -320,6 +332,7 @@ class Device:
         self._ready_ns = reset_ns + RESET_TO_READY_NS
         self._reset_ns = None
         self._held = None
+        self._backlog = False
         self._outbox.clear()
         self._connection = Connection(Role.MODULE)
         self.module.power_up(into_bootloader=restart is not None and restart.into_bootloader)
@@ -351,6 +364,8 @@ class Device:
         candidates.append(None if self._held is None else self._held[0])
         if self.module.restart is not None and self._reset_ns is None:
             candidates.append(now_ns)  # a fault from outside
+        if self._backlog and self._takes_commands:
+            candidates.append(now_ns)
         if self._sends:
             candidates.append(self._outbox.wake_ns(self._stream, now_ns))
         return min((time_ns for time_ns in candidates if time_ns is not None), default=None)

@@ -25,7 +25,7 @@ _IN_OPEN = 0x20
 _EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of a name (none for a device)
 
 
-LARGEST_READ = 4096  # what the line discipline hands out at once, and a bit
+LARGEST_READ = 1024  # at once: garbage takes time to look through, and other ports wait
 # Linux: the speed as a number, which tcgetattr() does not give for rates without a constant
 _TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19B2I")
 _SPEEDS = {

@@ -13,10 +13,9 @@ import selectors
 import socket
 from collections.abc import Callable
 
-from emulator.ports.pty import LinkError
+from emulator.ports.pty import LARGEST_READ, LinkError
 from emulator.ports.server import Service, wait_for
 
-LARGEST_READ = 4096  # as a pseudo-terminal hands out at once
 BACKLOG = 16
 LAST_PORT = 65535
 _NO_DESCRIPTOR = frozenset({errno.EMFILE, errno.ENFILE})
