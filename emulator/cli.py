@@ -418,7 +418,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     proxy = commands.add_parser(
         "proxy", help="put faults on the line of a real module", description=_PROXY_HELP
     )
-    proxy.add_argument("--port", type=Path, required=True, metavar="P", help="port of the module")
+    proxy.add_argument(
+        "--port",
+        required=True,
+        metavar="P",
+        help="port of the module: /dev/ttyACM0, tcp://HOST:PORT, rfc2217://HOST:PORT",
+    )
     proxy.add_argument(
         "--baud", type=int, default=115_200, metavar="B", help="of a UART (default 115200)"
     )

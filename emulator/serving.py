@@ -29,7 +29,7 @@ from emulator.ports.folders import (
     socket_path,
 )
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
-from emulator.ports.proxy import ModuleLine, open_module
+from emulator.ports.proxy import ModuleLine
 from emulator.ports.pty import LinkError, PortWatch
 from emulator.ports.server import Server, Service
 from emulator.ports.sockets import OdometryFeed
@@ -39,6 +39,8 @@ from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.system import StopFlag, flush_streams
+from xethru_protocol.transport import open_line
+from xethru_protocol.wire.errors import PortUnavailable
 
 NS_PER_MS = 1_000_000
 SOCKET_NAME = "odometry.sock"
@@ -258,12 +260,10 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         try:
             capture = None
             if options.wire is not None:
-                capture = cleanup.enter_context(
-                    WireCapture(options.wire, {"port": os.fspath(options.port)})
-                )
+                capture = cleanup.enter_context(WireCapture(options.wire, {"port": options.port}))
             zero_ns = time.monotonic_ns()
             session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
-            module = ModuleLine(open_module(options.port, options.baud), capture, stop.request)
+            module = ModuleLine(open_line(options.port, options.baud), capture, stop.request)
             cleanup.callback(module.close)
             faulty = session.wrap(module, PROXY_NAME)
             session.check_names()
@@ -273,7 +273,7 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                 name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present
             )
             ports = DevicePorts([named], folder, LinkOptions(), cleanup)
-        except (RecordingError, LinkError, FaultPlanError) as error:
+        except (PortUnavailable, RecordingError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
         services: list[Service] = [module, control]
         try:

@@ -1,7 +1,10 @@
 """Bytes to and from a port, blocking or with asyncio, and where ports are found.
 
->>> from xethru_protocol.transport import SerialTransport
->>> SerialTransport("/dev/no-such-port")
+A port is a serial port of this machine, or a network port: ``tcp://HOST:PORT`` (or ``socket://``)
+for bytes as they are, ``rfc2217://HOST:PORT`` for a server that also sets the baud rate.
+
+>>> from xethru_protocol.transport import open_line
+>>> open_line("/dev/no-such-port")
 Traceback (most recent call last):
 xethru_protocol.wire.errors.PortUnavailable: there is no port /dev/no-such-port; 'xethru list'...
 
@@ -14,7 +17,9 @@ import errno
 import json
 import math
 import os
+import re
 import select
+import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -36,6 +41,9 @@ _BAUD = 115200  # what a UART module starts with; without meaning on USB and pty
 _BITS_PER_BYTE = 10  # start and stop bit
 # Names of ports without a rate of their own: USB CDC and pseudo-terminals.
 _UNLIMITED = ("/dev/ttyACM", "/dev/pts/", "/dev/cu.usbmodem", "/dev/tty.usbmodem", "/dev/ttys")
+_NETWORK_TIMEOUT_S = 5.0  # to connect; pyserial's, too
+_RFC2217_TIMEOUT_S = 3.0  # for an answer about the line; pyserial's, too
+_KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # seconds, and tries
 
 
 class Transport(Protocol):
@@ -58,24 +66,14 @@ class Transport(Protocol):
         """Release the line. May be called twice."""
 
 
-class SerialTransport:
-    """A serial port: a real module's or an emulated one's pty.
+class LineTransport:
+    """A `Transport` over a descriptor: what serial ports and network connections have in common."""
 
-    Takes an exclusive lock, so that two programs do not each get half of the bytes.
+    _gone = "was disconnected; plug the module in again"
 
-    ``path`` is, for example, ``/dev/ttyACM0`` or a link made by ``xethru-emulator``; ``baudrate``
-    matters on a UART only. Raises PortUnavailable if the port does not exist, is no serial port,
-    is in use, or may not be opened.
-    """
-
-    def __init__(self, path: str, baudrate: int = _BAUD) -> None:
-        self.name = path
-        try:
-            self._port = serial.Serial(path, baudrate, timeout=0, exclusive=True)
-        # SerialException is an OSError; no rate can have more than 32 bits
-        except (OSError, ValueError, OverflowError) as error:
-            raise PortUnavailable(_why(path, error)) from None
-        self._fd: int = self._port.fileno()
+    def __init__(self, name: str, descriptor: int) -> None:
+        self.name = name
+        self._fd = descriptor
         # select(), which pyserial's write uses, cannot wait on descriptors above 1023
         self._readable, self._writable = select.poll(), select.poll()
         self._readable.register(self._fd, select.POLLIN)
@@ -106,7 +104,7 @@ class SerialTransport:
     def write(self, data: bytes) -> None:
         deadline = time.monotonic() + _WRITE_TIMEOUT_S
         rest = memoryview(data)
-        while rest:
+        while rest or self.unsent:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
                 raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
@@ -125,11 +123,49 @@ class SerialTransport:
         except (OSError, ValueError) as error:
             raise Disconnected(self._lost()) from error
 
+    @property
+    def unsent(self) -> bool:
+        """Whether bytes that `write_some` took still wait for room."""
+        return False
+
     def fileno(self) -> int:
         """Descriptor to wait for with other means; raises `Disconnected` after `close`."""
         if self._fd < 0:
             raise Disconnected(self._lost())
         return self._fd
+
+    @property
+    def bytes_per_s(self) -> float:
+        """What the line carries at most; infinite if it has no known limit."""
+        return math.inf
+
+    def set_baudrate(self, baudrate: int) -> None:
+        """Change this side's rate, keeping the port open; no effect on lines that have none."""
+
+    def close(self) -> None:
+        self._fd = -1
+
+    def _lost(self) -> str:
+        return f"{self.name} was closed" if self._fd < 0 else f"{self.name} {self._gone}"
+
+
+class SerialTransport(LineTransport):
+    """A serial port: a real module's or an emulated one's pty.
+
+    Takes an exclusive lock, so that two programs do not each get half of the bytes.
+
+    ``path`` is, for example, ``/dev/ttyACM0`` or a link made by ``xethru-emulator``; ``baudrate``
+    matters on a UART only. Raises PortUnavailable if the port does not exist, is no serial port,
+    is in use, or may not be opened.
+    """
+
+    def __init__(self, path: str, baudrate: int = _BAUD) -> None:
+        try:
+            self._port = serial.Serial(path, baudrate, timeout=0, exclusive=True)
+        # SerialException is an OSError; no rate can have more than 32 bits
+        except (OSError, ValueError, OverflowError) as error:
+            raise PortUnavailable(_why(path, error)) from None
+        super().__init__(path, self._port.fileno())
 
     @property
     def bytes_per_s(self) -> float:
@@ -146,14 +182,260 @@ class SerialTransport:
             raise Disconnected(f"{self.name} cannot be set to {baudrate} baud: {error}") from error
 
     def close(self) -> None:
-        self._fd = -1
+        super().close()
         with suppress(OSError):  # the device vanished: there is nothing left to release
             self._port.close()
 
-    def _lost(self) -> str:
-        if self._fd < 0:
-            return f"{self.name} was closed"
-        return f"{self.name} was disconnected; plug the module in again"
+
+class SocketTransport(LineTransport):
+    """A module behind ``tcp://HOST:PORT`` or ``socket://HOST:PORT``, such as ser2net's raw ports.
+
+    There is no lock: who else may connect is the server's affair, and most take one client at a
+    time. Raises PortUnavailable if the server cannot be reached.
+    """
+
+    _gone = (
+        "hung up; is the module gone, or has another program taken it? "
+        "(an adapter has one client at a time)"
+    )
+
+    def __init__(self, url: str) -> None:
+        host, port = _address(url)
+        try:
+            self._socket = socket.create_connection((host, port), _NETWORK_TIMEOUT_S)
+        except (OSError, UnicodeError) as error:  # UnicodeError: not a host name
+            raise PortUnavailable(_why_unreachable(url, host, error)) from None
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # a server that lost its power says nothing: without this the line would seem quiet
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in _KEEP_ALIVE.items():
+            if hasattr(socket, option):  # Linux
+                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+        super().__init__(url, self._socket.fileno())
+
+    def close(self) -> None:
+        super().close()
+        self._socket.close()
+
+
+# Telnet (RFC 854, 856, 858) and its option for serial ports (RFC 2217)
+_IAC, _SB, _SE = b"\xff", b"\xfa", b"\xf0"
+_WILL, _WONT, _DO, _DONT = 251, 252, 253, 254
+_BINARY, _NO_GO_AHEAD, _COM_PORT = 0, 3, 44
+_OPTIONS = frozenset({_BINARY, _NO_GO_AHEAD, _COM_PORT})
+_SET_BAUDRATE, _PURGE_DATA = 1, 12
+# 8 data bits, no parity, 1 stop bit, no flow control, DTR and RTS on: as pyserial opens a port
+_FORMAT = ((2, 8), (3, 1), (4, 1), (5, 1), (5, 8), (5, 11))
+_PURGE_BOTH = 3
+_FROM_SERVER = 100  # added to a command in its answer
+_TELNET = re.compile(
+    rb"\xff(?:(\xff)|([\xfb-\xfe])(.)|\xfa((?:[^\xff]|\xff\xff)*)\xff\xf0|[^\xfa-\xff])", re.DOTALL
+)
+_LONGEST_COMMAND = 4096
+_MOST_UNSENT = 65536
+
+
+class Rfc2217Transport(SocketTransport):
+    """A serial port of another machine at ``rfc2217://HOST:PORT``, whose baud rate can be set.
+
+    pyserial's own client needs a thread that takes every byte by itself, and carries 0.4 MB/s on
+    one core; this one leaves the descriptor to the caller. Raises PortUnavailable if the server
+    cannot be reached, does not speak RFC 2217, or does not set the rate.
+    """
+
+    def __init__(self, url: str, baudrate: int = _BAUD) -> None:
+        super().__init__(url)
+        self._held = b""  # an incomplete telnet command
+        self._came = b""  # read while an answer about the line was waited for
+        self._outgoing = bytearray()
+        self._offered = {(verb, option) for verb in (_WILL, _DO) for option in _OPTIONS}
+        self._answers: dict[int, bytes] = {}
+        self._speaks = False  # the server knows RFC 2217
+        self._purged = False  # what came before is older than this connection
+        self._baudrate = baudrate
+        try:
+            for verb, option in sorted(self._offered):
+                self._outgoing += bytes((_IAC[0], verb, option))
+            if not self._wait(lambda: self._speaks):
+                raise PortUnavailable(
+                    f"{url}: what answers there does not speak RFC 2217; "
+                    f"is it a plain TCP port? Then name it tcp://{url.partition('://')[2]}"
+                )
+            self.set_baudrate(baudrate)
+            for command, value in _FORMAT:
+                self._command(command, bytes((value,)))
+            self._command(_PURGE_DATA, bytes((_PURGE_BOTH,)))
+            self._wait(lambda: _PURGE_DATA in self._answers)
+        except Disconnected as error:
+            self.close()
+            raise PortUnavailable(str(error)) from None
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def bytes_per_s(self) -> float:
+        """10 bits per byte at the rate that was set."""
+        return self._baudrate / _BITS_PER_BYTE
+
+    def set_baudrate(self, baudrate: int) -> None:
+        """Change the rate of the server's port; `Disconnected` if it does not do that."""
+        self._answers.pop(_SET_BAUDRATE, None)
+        try:
+            self._command(_SET_BAUDRATE, baudrate.to_bytes(4, "big"))
+        except OverflowError:
+            raise Disconnected(f"{self.name}: {baudrate} is no baud rate") from None
+        if not self._wait(lambda: _SET_BAUDRATE in self._answers):
+            raise Disconnected(f"{self.name} does not answer to a change of the baud rate")
+        found = int.from_bytes(self._answers[_SET_BAUDRATE], "big")
+        if found != baudrate:
+            raise Disconnected(
+                f"{self.name} cannot be set to {baudrate} baud: the server reports {found}"
+            )
+        self._baudrate = baudrate
+
+    def write_some(self, data: bytes | memoryview) -> int:
+        if len(self._outgoing) > _MOST_UNSENT:
+            data = b""
+        self._outgoing += bytes(data).replace(_IAC, _IAC + _IAC)
+        self._flush()
+        return len(data)
+
+    @property
+    def unsent(self) -> bool:
+        return bool(self._outgoing)
+
+    def _take(self) -> bytes | None:
+        if self._came:
+            came, self._came = self._came, b""
+            return came
+        data = super()._take()
+        if data:
+            data = self._without_commands(data) or None  # b"" would mean that the server hung up
+            self._flush()
+        return data
+
+    def _flush(self) -> None:
+        if self._outgoing:
+            del self._outgoing[: super().write_some(bytes(self._outgoing))]
+
+    def _wait(self, done: Callable[[], bool]) -> bool:
+        """Receive until ``done()``; False if that did not happen in time."""
+        deadline = time.monotonic() + _RFC2217_TIMEOUT_S
+        self._purged = False
+        self._flush()
+        while not done():
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                return False
+            try:
+                data = super()._take() if self._readable.poll(_whole_ms(left_s)) else None
+            except OSError as error:
+                raise Disconnected(self._lost()) from error
+            if data == b"":
+                raise Disconnected(self._lost())
+            if data:
+                came = self._without_commands(data)
+                self._came = came if self._purged else self._came + came
+                self._purged = False
+            self._flush()
+        return True
+
+    def _command(self, command: int, value: bytes) -> None:
+        about = bytes((_COM_PORT, command)) + value
+        self._outgoing += _IAC + _SB + about.replace(_IAC, _IAC + _IAC) + _IAC + _SE
+
+    def _without_commands(self, data: bytes) -> bytes:
+        """Return the module's bytes; telnet commands between them are carried out."""
+        if self._held:
+            data, self._held = self._held + data, b""
+        if _IAC not in data:
+            return data
+        parts, start = [], 0
+        while (at := data.find(_IAC, start)) >= 0:
+            parts.append(data[start:at])
+            found = _TELNET.match(data, at)
+            if found is None:
+                self._held, start = data[at:], len(data)
+                if len(self._held) > _LONGEST_COMMAND:
+                    raise Disconnected(f"{self.name} sends what is no telnet; is it another port?")
+                break
+            start = found.end()
+            escaped, verb, option, about = found.groups()
+            if escaped:
+                parts.append(_IAC)
+            elif verb:
+                self._negotiate(verb[0], option[0])
+            elif about and about[0] == _COM_PORT and len(about) > 1:
+                about = about.replace(_IAC + _IAC, _IAC)
+                self._answers[about[1] - _FROM_SERVER] = about[2:]
+                if about[1] == _PURGE_DATA + _FROM_SERVER:
+                    parts.clear()
+                    self._purged = True
+        parts.append(data[start:])
+        return b"".join(parts)
+
+    def _negotiate(self, verb: int, option: int) -> None:
+        """Agree to what is needed and refuse the rest, each once (RFC 854)."""
+        if verb in (_WONT, _DONT):
+            return
+        self._speaks |= option == _COM_PORT
+        agree, refuse = (_DO, _DONT) if verb == _WILL else (_WILL, _WONT)
+        answer = agree if option in _OPTIONS else refuse
+        if (answer, option) not in self._offered:
+            self._offered.add((answer, option))
+            self._outgoing += bytes((_IAC[0], answer, option))
+
+
+_SCHEMES = ("tcp", "socket", "rfc2217")
+
+
+def is_network_port(port: str) -> bool:
+    """Whether a port is named by a scheme, such as ``tcp://``; also if there is no such scheme."""
+    return re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", port) is not None
+
+
+def open_line(port: str, baudrate: int = _BAUD) -> LineTransport:
+    """Open a port by its name: a serial port, ``tcp://``, ``socket://`` or ``rfc2217://``.
+
+    ``baudrate`` matters on UARTs, and at ``rfc2217://``. Raises PortUnavailable with what is wrong
+    with the name, or why it cannot be opened.
+    """
+    if not is_network_port(port):
+        return SerialTransport(port, baudrate)
+    if port.lower().startswith("rfc2217:"):
+        return Rfc2217Transport(port, baudrate)
+    return SocketTransport(port)
+
+
+def _address(url: str) -> tuple[str, int]:
+    scheme, _, rest = url.partition("://")
+    if scheme.lower() not in _SCHEMES:
+        raise PortUnavailable(
+            f"{url}: {scheme}:// is no kind of port; there are tcp://HOST:PORT, "
+            "rfc2217://HOST:PORT, and serial ports such as /dev/ttyACM0"
+        )
+    found = re.fullmatch(r"(\[[^\]]+\]|[^:/?#\[\]]+):([0-9]{1,5})/?", rest, re.ASCII)
+    if found is None or not 0 < int(found[2]) < 65536:
+        raise PortUnavailable(
+            f"{url}: must be {scheme}://HOST:PORT with a port of 1...65535, and nothing behind it"
+        )
+    return found[1].strip("[]"), int(found[2])
+
+
+def _why_unreachable(url: str, host: str, error: Exception) -> str:
+    if isinstance(error, socket.gaierror | UnicodeError):
+        reason = getattr(error, "strerror", None) or "no such name can exist"
+        return f"{url} cannot be reached: there is no host {host} ({reason})"
+    if isinstance(error, ConnectionRefusedError):
+        return (
+            f"{url} cannot be reached: nothing listens there; does ser2net, an adapter, or "
+            "'xethru-emulator serve --tcp' run on that machine?"
+        )
+    if isinstance(error, TimeoutError):
+        return f"{url} cannot be reached: no answer within {_NETWORK_TIMEOUT_S:g} s; is it on?"
+    return f"{url} cannot be reached: {getattr(error, 'strerror', None) or error}"
 
 
 def capacity_bytes_per_s(line: object) -> float:
@@ -210,11 +492,11 @@ class AsyncTransport(Protocol):
 
 
 class AsyncSerialTransport:
-    """A serial port whose descriptor the running event loop watches; see `SerialTransport`."""
+    """A port whose descriptor the running event loop watches; ports as of `open_line`."""
 
     def __init__(self, path: str, baudrate: int = _BAUD) -> None:
         self.name = path
-        self._port = SerialTransport(path, baudrate)
+        self._port = open_line(path, baudrate)
         # Tasks that wait for the descriptor, which must not be watched once it is closed.
         self._waiting: dict[asyncio.Future[bool], Callable[[int], object]] = {}
         self._turn_ends_s = 0.0
@@ -242,7 +524,7 @@ class AsyncSerialTransport:
         loop = asyncio.get_running_loop()
         rest = memoryview(data)
         deadline_s = loop.time() + _WRITE_TIMEOUT_S
-        while rest := rest[self._port.write_some(rest) :]:
+        while (rest := rest[self._port.write_some(rest) :]) or self._port.unsent:
             left_s = deadline_s - loop.time()
             if not await self._wait(loop.add_writer, loop.remove_writer, left_s):
                 raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
@@ -300,6 +582,7 @@ class PortInfo:
     kind: str  # "usb" or "emulated"
     description: str
     serial: str | None
+    tcp: int | None = None  # TCP port of this machine at which an emulated module is, too
 
 
 def find_ports() -> tuple[PortInfo, ...]:
@@ -333,14 +616,27 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
             if not is_running(int(entry["pid"])):
                 continue
             devices = [
-                (str(one["path"]), str(one["name"]), one["serial"]) for one in entry["devices"]
+                (str(one["path"]), str(one["name"]), one["serial"], one.get("tcp"))
+                for one in entry["devices"]
             ]
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+        ):
             continue  # not an emulator's entry, or one that is being written
-        for path, name, serial_number in devices:
+        for path, name, serial_number, tcp in devices:
             if os.path.exists(path):  # False, too, for what can be no path
                 yield PortInfo(
-                    path=path, kind="emulated", description=f"emulated {name}", serial=serial_number
+                    path=path,
+                    kind="emulated",
+                    description=f"emulated {name}",
+                    serial=serial_number,
+                    tcp=tcp,
                 )
 
 

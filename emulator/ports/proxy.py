@@ -6,25 +6,21 @@ incomplete for 50 ms goes on as it is. Nothing is added, removed or reordered by
 
 from __future__ import annotations
 
-import os
 import selectors
-import termios
 import time
-import tty
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 
-from emulator.ports.pty import LinkError
 from emulator.ports.server import Service, wait_for
 from xethru_protocol.recordings.wire_capture import WireCapture
+from xethru_protocol.transport import LineTransport
+from xethru_protocol.wire.errors import Disconnected
 from xethru_protocol.wire.framing import Direction, NeedData, PacketReader
 
 HOLD_NS = 50_000_000
 """How long an incomplete packet waits for the rest of it."""
 MOST_UNSENT = 65_536
 MOST_WAITING = 1 << 20
-_READ = 65_536
 
 
 class ModuleLine(Service):
@@ -32,8 +28,8 @@ class ModuleLine(Service):
 
     Parameters
     ----------
-    descriptor
-        Non-blocking, of the open port; closed by `close`.
+    line
+        The open port; closed by `close`.
     capture
         Gets all bytes as they pass the port.
     gone
@@ -41,9 +37,9 @@ class ModuleLine(Service):
     """
 
     def __init__(
-        self, descriptor: int, capture: WireCapture | None, gone: Callable[[], None]
+        self, line: LineTransport, capture: WireCapture | None, gone: Callable[[], None]
     ) -> None:
-        self._descriptor = descriptor
+        self._line = line
         self._capture = capture
         self._gone = gone
         self._selector: selectors.BaseSelector | None = None
@@ -98,9 +94,7 @@ class ModuleLine(Service):
 
     def close(self) -> None:
         self._selector = None
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+        self._line.close()
 
     def _ready(self, events: int, now_ns: int) -> None:
         if events & selectors.EVENT_WRITE:
@@ -110,13 +104,11 @@ class ModuleLine(Service):
 
     def _read(self, now_ns: int) -> None:
         try:
-            data = os.read(self._descriptor, _READ)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
+            data = self._line.read(0.0)
+        except Disconnected:
             self._lost()
+            return
+        if not data:
             return
         if self._capture is not None:
             self._capture.write("rx", data, time.time_ns())
@@ -137,10 +129,8 @@ class ModuleLine(Service):
 
     def _write(self) -> None:
         try:
-            self._unsent = self._unsent[os.write(self._descriptor, self._unsent) :]
-        except BlockingIOError:
-            pass
-        except OSError:
+            self._unsent = self._unsent[self._line.write_some(self._unsent) :]
+        except Disconnected:
             self._lost()
             return
         self._watch()
@@ -148,40 +138,13 @@ class ModuleLine(Service):
     def _watch(self) -> None:
         if self._selector is None or not self._alive:
             return
-        wanted = selectors.EVENT_WRITE if self._unsent else 0
+        wanted = selectors.EVENT_WRITE if self._unsent or self._line.unsent else 0
         wanted |= selectors.EVENT_READ if self._waiting < MOST_WAITING else 0
-        wait_for(self._selector, self._descriptor, wanted, self._ready)
+        wait_for(self._selector, self._line.fileno(), wanted, self._ready)
 
     def _lost(self) -> None:
         if self._selector is not None:
-            wait_for(self._selector, self._descriptor, 0)
+            wait_for(self._selector, self._line.fileno(), 0)
         self._alive = False
         self._unsent = b""
         self._gone()
-
-
-def open_module(path: Path, baud: int) -> int:
-    """Open a serial port, raw, and return its descriptor.
-
-    Raises
-    ------
-    LinkError
-        When it cannot be opened or set up.
-    """
-    speed = getattr(termios, f"B{baud}", None)
-    if speed is None:
-        raise LinkError(f"{path}: {baud} baud is no rate of this system's serial ports")
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-    except OSError as error:
-        raise LinkError(f"{path}: cannot open the port: {error.strerror}") from error
-    try:
-        tty.setraw(descriptor)
-        settings = termios.tcgetattr(descriptor)
-        settings[4] = settings[5] = speed
-        termios.tcsetattr(descriptor, termios.TCSANOW, settings)
-        termios.tcflush(descriptor, termios.TCIOFLUSH)
-    except termios.error as error:
-        os.close(descriptor)
-        raise LinkError(f"{path}: is no serial port: {error.args[-1]}") from error
-    return descriptor

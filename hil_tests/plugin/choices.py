@@ -42,7 +42,7 @@ def add_options(parser: pytest.Parser) -> None:
         action="append",
         metavar="SPEC",
         help="radar to test, repeatable: emu[:SCENE][?seed=S&fps=F&line=pty], /dev/ttyACM0, "
-        "serial=NUMBER, auto, tcp://HOST:PORT, replay:RECORDING "
+        "serial=NUMBER, auto, tcp://HOST:PORT, rfc2217://HOST:PORT, replay:RECORDING "
         f"(environment {ENVIRONMENT}, ini {INI}; default emu)",
     )
     group.addoption(

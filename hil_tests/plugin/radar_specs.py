@@ -10,6 +10,7 @@
 | `serial=202611210001` | a module by its serial number, at any port |
 | `auto` | every module that answers; at least one must |
 | `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
+| `rfc2217://HOST:PORT` | a UART behind an adapter that sets the baud rate, such as ser2net |
 | `replay:RECORDING?radar=NAME` | a recording at the port of an emulated module |
 
 Each takes ``?has=NAME,NAME``: further capabilities, such as a reflector on a stage, for tests
@@ -37,7 +38,7 @@ class Kind(Enum):
     EMULATED = "emu"
     PORT = "port"
     SERIAL_NUMBER = "serial"
-    TCP = "tcp"
+    NETWORK = "network"
     REPLAY = "replay"
     AUTO = "auto"
 
@@ -48,19 +49,20 @@ _OPTIONS: dict[Kind, tuple[str, ...]] = {
     Kind.EMULATED: ("firmware", "fps", "has", "line", "radar", "seed"),
     Kind.PORT: ("fps", "has", "line"),
     Kind.SERIAL_NUMBER: ("fps", "has"),
-    Kind.TCP: ("fps", "has"),
+    Kind.NETWORK: ("fps", "has"),
     Kind.REPLAY: ("has", "radar"),
     Kind.AUTO: ("fps", "has"),
 }
 DEFAULT_FPS = 17.0
+_NETWORK_SCHEMES = ("tcp", "socket", "rfc2217")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarSpec:
     """One radar to test.
 
-    ``text`` is what the user wrote, ``target`` its scene, port, serial number, ``host:port`` or
-    recording, perhaps empty, ``options`` what followed the question mark. Tests, reports and
+    ``text`` is what the user wrote, ``target`` its scene, port, serial number or recording,
+    perhaps empty, ``options`` what followed the question mark. Tests, reports and
     folders use ``name``, which is unique within a run.
     """
 
@@ -130,11 +132,13 @@ def _kind(body: str) -> tuple[Kind, str]:
         if not re.fullmatch(r"[0-9]{12}", number):
             raise SpecError(f"--radar {body}: a serial number has 12 digits, as on the label")
         return Kind.SERIAL_NUMBER, number
-    if body.startswith("tcp://"):
-        host, _, port = body.removeprefix("tcp://").rpartition(":")
+    if scheme in _NETWORK_SCHEMES and rest.startswith("//"):
+        host, _, port = rest.removeprefix("//").rpartition(":")
         if not host or not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
-            raise SpecError(f"--radar {body}: must be tcp://HOST:PORT with a port of 1...65535")
-        return Kind.TCP, body.removeprefix("tcp://")
+            raise SpecError(
+                f"--radar {body}: must be {scheme}://HOST:PORT with a port of 1...65535"
+            )
+        return Kind.NETWORK, body
     if scheme == "replay" and colon:
         if not rest or not os.path.exists(rest):
             raise SpecError(f"--radar {body}: there is no recording {rest}")
@@ -143,7 +147,7 @@ def _kind(body: str) -> tuple[Kind, str]:
         return Kind.PORT, str(Path(os.path.expanduser(body)))
     raise SpecError(
         f"--radar {body}: names no radar; allowed are emu[:SCENE], a port such as /dev/ttyACM0, "
-        "serial=NUMBER, auto, tcp://HOST:PORT, replay:RECORDING"
+        "serial=NUMBER, auto, tcp://HOST:PORT, rfc2217://HOST:PORT, replay:RECORDING"
     )
 
 
@@ -194,7 +198,7 @@ def _name(kind: Kind, target: str, options: Mapping[str, str]) -> str:
         return target
     if kind is Kind.AUTO:
         return "auto"
-    if kind is Kind.TCP:
-        return "tcp-" + re.sub(r"[^0-9A-Za-z.]+", "-", target)
+    if kind is Kind.NETWORK:
+        return re.sub(r"[^0-9A-Za-z.]+", "-", target)
     last = Path(target).name or target
     return f"replay-{Path(last).stem}" if kind is Kind.REPLAY else last

@@ -9,8 +9,6 @@ import contextlib
 import json
 import math
 import os
-import select
-import socket
 import time
 from abc import ABC, abstractmethod
 from collections import deque
@@ -23,63 +21,11 @@ from hil_tests.device.serving import Served, emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.plugin.radar_specs import Kind, RadarSpec
 from xethru_protocol.driver.radar import X4M300, known_ports
-from xethru_protocol.transport import SerialTransport, Transport, find_ports
-from xethru_protocol.wire.errors import Disconnected, PortUnavailable, XeThruError
+from xethru_protocol.transport import Transport, capacity_bytes_per_s, find_ports, open_line
+from xethru_protocol.wire.errors import XeThruError
 
 if TYPE_CHECKING:
     from emulator.scene.scene import Scene
-
-_TIMEOUT_S = 5.0
-"""To connect, and to write."""
-_CHUNK_BYTES = 65536
-
-
-class TcpTransport:
-    """A `Transport` to ``host:port`` or ``tcp://host:port``; may raise `PortUnavailable`."""
-
-    def __init__(self, address: str) -> None:
-        self.name = address if address.startswith("tcp://") else f"tcp://{address}"
-        host, _, port = self.name.removeprefix("tcp://").rpartition(":")
-        try:
-            self._socket = socket.create_connection((host.strip("[]"), int(port)), _TIMEOUT_S)
-        except (OSError, UnicodeError) as error:  # UnicodeError: not a host name
-            reason = getattr(error, "strerror", None) or error
-            raise PortUnavailable(
-                f"{self.name} cannot be reached: {reason}; does the adapter, or "
-                "'xethru-emulator serve --tcp', run there?"
-            ) from None
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    def read(self, timeout_s: float) -> bytes:
-        try:
-            ready, _, _ = select.select([self._socket], [], [], max(timeout_s, 0.0))
-            if not ready:
-                return b""
-            data = self._socket.recv(_CHUNK_BYTES)
-        except (OSError, ValueError) as error:  # ValueError: closed
-            raise Disconnected(self._lost()) from error
-        if not data:
-            raise Disconnected(self._lost())
-        return data
-
-    def write(self, data: bytes) -> None:
-        try:
-            self._socket.sendall(data)
-        except TimeoutError:
-            text = f"{self.name} takes no data any more; is the module hanging?"
-            raise Disconnected(text) from None
-        except OSError as error:
-            raise Disconnected(self._lost()) from error
-
-    def close(self) -> None:
-        self._socket.close()
-
-    def _lost(self) -> str:
-        return (
-            f"{self.name} hung up; is the module gone, or has another program taken it? "
-            "(an adapter has one client at a time)"
-        )
-
 
 MOST_BYTES = 32 << 20  # of one test, some five minutes of frames; then the oldest go
 
@@ -161,7 +107,7 @@ CAPABILITIES: Mapping[str, str] = {
     "profiles": "bare XEP firmware has none",
     "files": "a file system that answers",
     "unplug": "only emulated ones can be unplugged by a program",
-    "uart": "USB, TCP and pseudo-terminals have no baud rate",
+    "uart": "USB, tcp:// and pseudo-terminals have no baud rate",
     "virtual_time": "waiting must cost nothing",
 }
 """What a test may require of a radar, and why one may lack it; ``?has=`` adds others."""
@@ -308,8 +254,8 @@ class ProcessTarget(RadarTarget):
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
         if self.spec.line == "tcp":
-            return TcpTransport(f"127.0.0.1:{self._served.tcp_ports[self._index]}")
-        return SerialTransport(path or self._served.paths[self._index], baudrate)
+            return open_line(f"tcp://127.0.0.1:{self._served.tcp_ports[self._index]}")
+        return open_line(path or self._served.paths[self._index], baudrate)
 
     def unplug(self, seconds: float) -> None:
         from emulator.cli import ask
@@ -327,40 +273,31 @@ class ProcessTarget(RadarTarget):
 
 
 class PortTarget(RadarTarget):
-    """A module at a port of this machine, named or found by its serial number."""
+    """A module at a port, named or found by its serial number; perhaps a port of the network."""
 
     def __init__(self, spec: RadarSpec) -> None:
         path = _port_of(spec.target) if spec.kind is Kind.SERIAL_NUMBER else spec.target
         super().__init__(spec, frozenset({"settings", "profiles", "files"}), f"module at {path}")
-        self._path, self.lock_target = path, os.path.realpath(path)
+        self._path = path
+        self._is_here = spec.kind is not Kind.NETWORK
+        # this keeps sessions of this machine apart; an adapter is one by every scheme
+        self.lock_target = os.path.realpath(path) if self._is_here else path.partition("://")[2]
 
     def explore(self) -> None:
         """Find out whether the port is a UART."""
-        line = SerialTransport(self._path)
-        self.bytes_per_s = _UART_BYTES_PER_S if self.spec.line == "uart" else line.bytes_per_s
+        line = self.open_line()
+        self.bytes_per_s = (
+            _UART_BYTES_PER_S if self.spec.line == "uart" else capacity_bytes_per_s(line)
+        )
         line.close()
         if not math.isinf(self.bytes_per_s):
             self.capabilities |= {"uart"}
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
-        return SerialTransport(path or self._path, baudrate)
+        return open_line(path or self._path, baudrate)
 
     def candidates(self) -> Sequence[str]:
-        return known_ports()
-
-
-class TcpTarget(RadarTarget):
-    """A module behind a TCP port, perhaps of another machine."""
-
-    def __init__(self, spec: RadarSpec) -> None:
-        super().__init__(
-            spec, frozenset({"settings", "profiles", "files"}), f"module at tcp://{spec.target}"
-        )
-        self.lock_target = spec.target
-
-    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
-        del path, baudrate
-        return TcpTransport(self.spec.target)
+        return known_ports() if self._is_here else ()
 
 
 def target_of(spec: RadarSpec) -> RadarTarget:
@@ -370,8 +307,6 @@ def target_of(spec: RadarSpec) -> RadarTarget:
             return InProcessTarget(spec)
         case Kind.EMULATED | Kind.REPLAY:
             return ProcessTarget(spec)
-        case Kind.TCP:
-            return TcpTarget(spec)
         case _:
             return PortTarget(spec)
 

@@ -174,7 +174,11 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         "unix, monotonic, or the monotonic nanoseconds at stamp 0",
     )
     run.add_argument(
-        "--ports", nargs="+", metavar="PORT", help="the modules' ports (default: look for them)"
+        "--ports",
+        nargs="+",
+        metavar="PORT",
+        help="the modules' ports, such as /dev/ttyACM0 or tcp://HOST:PORT "
+        "(default: those of the rig file, or look for them)",
     )
     run.add_argument("--out", type=folder, default=Path("out/run"), help="folder for the results")
     run.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")

@@ -109,14 +109,18 @@ def _add_command(
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--port", type=not_empty, required=True, help="serial port, for example /dev/ttyACM0"
+        "--port",
+        type=not_empty,
+        required=True,
+        help="serial port, for example /dev/ttyACM0, or tcp://HOST:PORT, rfc2217://HOST:PORT",
     )
     parser.add_argument(
         "--baudrate",
         type=baud_rate,
         default=115200,
         metavar="RATE",
-        help="of a module on a UART (default 115200); without meaning on USB and for emulators",
+        help="of a module on a UART (default 115200); without meaning on USB, at tcp:// and for "
+        "emulators",
     )
 
 

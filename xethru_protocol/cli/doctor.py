@@ -123,6 +123,7 @@ def _damaged_entries(machine: Machine) -> str | None:
     looks_at="what the path links to",
     remedy="start the emulator again, or remove the link: rm {path}",
     ends=True,
+    network=False,
 )
 def _stale_link(probe: PortProbe) -> str | None:
     if os.path.islink(probe.path) and not os.path.exists(probe.path):
@@ -136,6 +137,7 @@ def _stale_link(probe: PortProbe) -> str | None:
     looks_at="the path",
     remedy="plug the module in; 'xethru list' shows the ports there are",
     ends=True,
+    network=False,
 )
 def _missing(probe: PortProbe) -> str | None:
     return None if os.path.exists(probe.path) else "there is no such port"
@@ -147,6 +149,7 @@ def _missing(probe: PortProbe) -> str | None:
     looks_at="what kind of file the path is, and its driver",
     remedy="name the module's port, such as /dev/ttyACM0; 'xethru list' shows them",
     ends=True,
+    network=False,
 )
 def _no_port(probe: PortProbe) -> str | None:
     return None if probe.is_serial_port else "it is no serial port"
@@ -158,6 +161,7 @@ def _no_port(probe: PortProbe) -> str | None:
     looks_at="permissions of the device",
     remedy="its group may not open it either: add a udev rule, or run sudo chmod 660 {target}",
     ends=True,
+    network=False,
 )
 def _no_rights_for_the_group(probe: PortProbe) -> str | None:
     joining_helps = os.stat(probe.path).st_mode & 0o060 == 0o060
@@ -170,6 +174,7 @@ def _no_rights_for_the_group(probe: PortProbe) -> str | None:
     looks_at="permissions of the device",
     remedy="join the group with sudo usermod -aG {group} {user}, then log in again",
     ends=True,
+    network=False,
 )
 def _no_rights(probe: PortProbe) -> str | None:
     if os.access(probe.path, os.R_OK | os.W_OK):
@@ -183,6 +188,7 @@ def _no_rights(probe: PortProbe) -> str | None:
     looks_at="open files of all programs (/proc)",
     remedy="end all of them but one",
     ends=True,
+    network=False,
 )
 def _shared(probe: PortProbe) -> str | None:
     if len(probe.users) < 2:
@@ -199,6 +205,7 @@ def _shared(probe: PortProbe) -> str | None:
     looks_at="open files of all programs (/proc)",
     remedy="end that program; the port was left alone, so nothing else is known",
     ends=True,
+    network=False,
 )
 def _in_use(probe: PortProbe) -> str | None:
     return f"{probe.users[0]} has it open" if probe.users else None
@@ -210,9 +217,34 @@ def _in_use(probe: PortProbe) -> str | None:
     looks_at="the answer of the system",
     remedy="if a program of another user has it, sudo xethru doctor --port {path} names it",
     ends=True,
+    network=False,
 )
 def _cannot_open(probe: PortProbe) -> str | None:
     return probe.refusal
+
+
+@Check(
+    PORT_CHECKS,
+    "can be reached",
+    looks_at="the answer of the network",
+    remedy="check host and port number; tcp:// passes bytes as they are, rfc2217:// sets the rate",
+    ends=True,
+    network=True,
+)
+def _cannot_reach(probe: PortProbe) -> str | None:
+    return probe.refusal
+
+
+@Check(
+    PORT_CHECKS,
+    "stays reachable",
+    looks_at="the line while PING is sent",
+    remedy="end what else is connected: an adapter has one client at a time; else check its cable",
+    ends=True,
+    network=True,
+)
+def _hung_up(probe: PortProbe) -> str | None:
+    return "the other side hung up while the module was checked" if probe.contact.gone else None
 
 
 @Check(
@@ -221,6 +253,7 @@ def _cannot_open(probe: PortProbe) -> str | None:
     looks_at="the line while PING is sent",
     remedy="check plug and cable; a module that has just restarted needs ten seconds",
     ends=True,
+    network=False,
 )
 def _gone(probe: PortProbe) -> str | None:
     return "it went away while the module was checked" if probe.contact.gone else None
@@ -482,7 +515,8 @@ def _reports(paths: Sequence[str]) -> Iterator[Report]:
 
 def _check_port(path: str, description: str) -> Report:
     with closing(PortProbe(path)) as probe:
-        findings = tuple(run_checks(probe, PORT_CHECKS))
+        checks = [row for row in PORT_CHECKS if row.network in (None, probe.is_network)]
+        findings = tuple(run_checks(probe, checks))
         about = description
         if findings[-1].check == PORT_CHECKS[-1].name:  # it was asked about itself
             about = ", ".join(filter(None, (description, _introduction(probe))))

@@ -21,7 +21,7 @@ from typing import Generic, TypeVar
 
 from xethru_protocol.driver.link import ModuleInfo
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.transport import SerialTransport
+from xethru_protocol.transport import LineTransport, is_network_port, open_line
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
@@ -54,6 +54,7 @@ class Check(Generic[SubjectT]):
     remedy: str  # ``{...}`` names an attribute of the subject, which is quoted for a shell
     level: Level = Level.FAULT  # NOTE for what is a fault only to some users
     ends: bool = False
+    network: bool | None = None  # only of network ports, or (False) only of this machine's own
     find: Callable[[SubjectT], str | None] = field(init=False)
 
     def __call__(self, find: Callable[[SubjectT], str | None]) -> Callable[[SubjectT], str | None]:
@@ -229,7 +230,8 @@ class PortProbe:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self._transport: SerialTransport | None = None
+        self.is_network = is_network_port(path)
+        self._transport: LineTransport | None = None
 
     def close(self) -> None:
         if self._transport is not None:
@@ -275,7 +277,7 @@ class PortProbe:
     def refusal(self) -> str | None:
         """Open the port; if that fails, return the reason."""
         try:
-            self._transport = SerialTransport(self.path)
+            self._transport = open_line(self.path)
         except PortUnavailable as error:
             return str(error)
         return None
@@ -340,7 +342,7 @@ class PortProbe:
         assert self._transport is not None
         self._transport.close()
         try:
-            self._transport = SerialTransport(self.path, baudrate=baudrate)
+            self._transport = open_line(self.path, baudrate)
         except PortUnavailable:
             return False
         return True

@@ -31,6 +31,7 @@ from xethru_protocol.driver.link import (
     Link,
     ModuleInfo,
     Observer,
+    OpenLine,
     P,
     Procedure,
     RawConfig,
@@ -51,7 +52,12 @@ from xethru_protocol.driver.profiles import (
     wait_for_message,
 )
 from xethru_protocol.driver.radar import RadarState, known_ports
-from xethru_protocol.transport import AsyncSerialTransport, AsyncTransport
+from xethru_protocol.transport import (
+    AsyncSerialTransport,
+    AsyncTransport,
+    Transport,
+    is_network_port,
+)
 from xethru_protocol.wire.codes import PongCode, SensorMode
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 from xethru_protocol.wire.messages import Command, Response
@@ -65,7 +71,7 @@ class AsyncX4M300(RadarState):
     A chip setting has coroutines: ``await radar.x4.iterations.get()``, ``.set(8)``.
     """
 
-    _port_type = AsyncSerialTransport
+    _port_type = staticmethod(AsyncSerialTransport)
     _transport: AsyncTransport
 
     def __init__(
@@ -258,9 +264,21 @@ class AsyncX4M300(RadarState):
                 await self._transport.write(data)
             case Sleep(seconds):
                 await self._sleep(seconds)
+            case OpenLine(path, baudrate) if is_network_port(path):
+                self._transport.close()
+                self._use(await self._opened(path, baudrate))
             case _:
                 self._change_line(step)
         return False
+
+    async def _opened(self, path: str, baudrate: int) -> Transport | AsyncTransport:
+        """Open a network port in a thread: connecting may take seconds, and others go on."""
+        opening = asyncio.ensure_future(asyncio.to_thread(self._open_port, path, baudrate))
+        try:
+            return await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(_close)
+            raise
 
     async def _pump(self, timeout_s: float) -> bool:
         """Read once and sort what came, or wait for the task that does; False if nothing came."""
@@ -280,3 +298,9 @@ class AsyncX4M300(RadarState):
             self.raw_listener("rx", data, arrival_ns)
         self._link.conversation.receive(data, arrival_ns)
         return True
+
+
+def _close(opening: asyncio.Future[Transport | AsyncTransport]) -> None:
+    """Close a line that nobody waits for any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()

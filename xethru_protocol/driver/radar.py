@@ -44,12 +44,11 @@ from xethru_protocol.driver.profiles import (
     wait_for_message,
 )
 from xethru_protocol.transport import (
-    AsyncSerialTransport,
     AsyncTransport,
-    SerialTransport,
     Transport,
     capacity_bytes_per_s,
     find_ports,
+    open_line,
     set_rate,
 )
 from xethru_protocol.wire.codes import PongCode, SensorMode
@@ -73,7 +72,7 @@ class RadarState:
         time [ns]; may be None.
     """
 
-    _port_type: ClassVar[type[SerialTransport] | type[AsyncSerialTransport]]
+    _port_type: "ClassVar[staticmethod[[str, int], Transport | AsyncTransport]]"
     _open_port: Callable[[str, int], Transport | AsyncTransport]
 
     def __init__(
@@ -109,9 +108,10 @@ class RadarState:
         queue_frames: int = DEFAULT_FRAMES,
         reconnect_s: float = 0.0,
     ) -> Self:
-        """Driver on a serial port; `PortUnavailable` if it cannot be opened.
+        """Driver on a port; `PortUnavailable` if it cannot be opened.
 
-        ``baudrate`` is the rate at which a UART module talks now; USB and ptys have none.
+        ``path`` is a serial port, ``tcp://HOST:PORT`` or ``rfc2217://HOST:PORT``. ``baudrate`` is
+        the rate at which a UART module talks now; USB, ptys and ``tcp://`` have none.
         """
         transport = cls._port_type(path, baudrate)
         try:
@@ -204,14 +204,17 @@ class RadarState:
         """Times the module vanished and was found again."""
         return self._link.reconnects
 
+    def _use(self, transport: Transport | AsyncTransport) -> None:
+        self._transport = transport
+        self._link.bytes_per_s = capacity_bytes_per_s(transport)
+
     def _change_line(self, step: Step) -> None:
         match step:
             case CloseLine():
                 self._transport.close()
             case OpenLine(path, baudrate):
                 self._transport.close()
-                self._transport = self._open_port(path, baudrate)
-                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
+                self._use(self._open_port(path, baudrate))
             case SetLineRate(baudrate):
                 set_rate(self._transport, baudrate)
                 self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
@@ -294,7 +297,7 @@ class X4M300(RadarState):
         Waits [s] while there is no line.
     """
 
-    _port_type = SerialTransport
+    _port_type = staticmethod(open_line)
     _transport: Transport
 
     def __init__(
@@ -305,7 +308,7 @@ class X4M300(RadarState):
         observer: Observer | None = None,
         queue_frames: int = DEFAULT_FRAMES,
         reconnect_s: float = 0.0,
-        open_port: Callable[[str, int], Transport] = SerialTransport,
+        open_port: Callable[[str, int], Transport] = open_line,
         candidates: Callable[[], Sequence[str]] = known_ports,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:

@@ -12,7 +12,6 @@ import pytest
 
 from hil_tests.device.serving import emulator, open_radar
 from hil_tests.patience import catches, seconds, wait_until
-from hil_tests.plugin.radar_targets import TcpTransport
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.codes import PongCode
@@ -178,6 +177,6 @@ def test_tcp_ports_are_told_and_reach_the_same_modules(announcements: Path) -> N
     with emulator(*arguments) as served:
         (word,) = announcements.glob("*.json")
         for told in json.loads(word.read_text())["devices"]:
-            with X4M300(TcpTransport(f"127.0.0.1:{told['tcp']}")) as driver:
+            with X4M300.open(f"tcp://127.0.0.1:{told['tcp']}") as driver:
                 assert driver.info().serial_number == told["serial"]
         assert served.end() == 0

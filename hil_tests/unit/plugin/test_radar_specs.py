@@ -24,7 +24,8 @@ def one(text: str) -> RadarSpec:
         ("/dev/ttyACM0", Kind.PORT, "/dev/ttyACM0", "ttyACM0"),
         ("./ports/radar_1?line=uart", Kind.PORT, "ports/radar_1", "radar_1"),
         ("serial=202611210001", Kind.SERIAL_NUMBER, "202611210001", "202611210001"),
-        ("tcp://192.0.2.7:3000", Kind.TCP, "192.0.2.7:3000", "tcp-192.0.2.7-3000"),
+        ("tcp://192.0.2.7:3000", Kind.NETWORK, "tcp://192.0.2.7:3000", "tcp-192.0.2.7-3000"),
+        ("rfc2217://pi:7000", Kind.NETWORK, "rfc2217://pi:7000", "rfc2217-pi-7000"),
         ("auto", Kind.AUTO, "", "auto"),
     ],
 )

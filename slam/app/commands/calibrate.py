@@ -37,6 +37,7 @@ from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import Rig
 from xethru_protocol.system import StopFlag, read_bounded
+from xethru_protocol.transport import is_network_port
 
 Array = NDArray[np.float64]
 
@@ -189,6 +190,7 @@ def _rig_file(info: SessionInfo, report: _Report) -> RigFile:
                 else radar.range_offset_m,
                 phase_offset_deg=math.degrees(radar.phase_offset_rad),
                 gain_db=float(report.gains.gains_db[index]) if has_gain else 0.0,
+                port=radar.port if is_network_port(radar.port) else None,
             )
         )
     return RigFile(radars=tuple(radars))

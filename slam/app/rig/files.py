@@ -8,6 +8,7 @@ echoes are than the mean of the rig.
 
 Which cable ends where does not matter: a module's mount, offset and gain follow its serial number.
 A module that is missing, foreign or there twice is refused by name before anything is set.
+`port` is for a module that is not found by itself, such as one at `tcp://HOST:PORT`.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ class RigRadar(Table):
     range_offset_m: _Number = 0.0
     phase_offset_deg: _Number = 0.0
     gain_db: _Number = 0.0
+    port: Annotated[str, Field(min_length=1, max_length=300)] | None = None
 
 
 class RigWheels(Table):
@@ -118,7 +120,8 @@ def write_rig(path: Path, rig: RigFile) -> None:
     tables = []
     for radar in rig.radars:
         # a JSON string of these names is a TOML string
-        lines = [f"{key} = {json.dumps(value)}" for key, value in radar.model_dump().items()]
+        known = radar.model_dump(exclude_none=True)
+        lines = [f"{key} = {json.dumps(value)}" for key, value in known.items()]
         tables.append("\n".join(["[[radars]]", *lines]))
     if rig.wheels != RigWheels():
         lines = [f"{key} = {json.dumps(value)}" for key, value in rig.wheels.model_dump().items()]
@@ -134,14 +137,16 @@ class _Module:
         self.port = port
         self._observer, self._name = observer, ""
         self._early: list[ProtocolRecord] = []
-        try:
-            self.driver = X4M300.open(port, observer=self._take)
-            held.callback(self.driver.close)
-            self.driver.ping()
-            request = SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)
-            self.serial = self.driver.request(request).text
-        except XeThruError as error:
-            raise AppError(f"{port}: {error}") from None
+        with ExitStack() as unless_it_answers:
+            try:
+                self.driver = X4M300.open(port, observer=self._take)
+                unless_it_answers.callback(self.driver.close)
+                self.driver.ping()
+                request = SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)
+                self.serial = self.driver.request(request).text
+            except XeThruError as error:
+                raise AppError(f"{port}: {error}") from None
+            held.push(unless_it_answers.pop_all())
 
     def name(self, name: str) -> None:
         self._name = name
@@ -167,11 +172,12 @@ def open_rig(
     Parameters
     ----------
     ports
-        Where the modules are; None: wherever this machine has modules or running emulators.
+        Where the modules are; None: at the ports that the rig file names, and, if it does not name
+        one for each radar, wherever this machine has modules or running emulators.
     observer
         Gets everything that happens on their links, later on from other threads.
     note
-        Gets a line about where each radar was found, and about each port that is skipped.
+        Gets a line about where each radar was found, and one about the ports that are skipped.
 
     Raises
     ------
@@ -179,21 +185,32 @@ def open_rig(
         A module is missing, not in the rig, or found twice, or a named port has no module.
     """
     with ExitStack() as unless_it_works:
-        candidates = known_ports() if ports is None else ports
+        named = (
+            tuple(filter(None, (radar.port for radar in rig.radars))) if ports is None else ports
+        )
+        is_complete = ports is not None or len(named) == len(rig.radars)
+        candidates = named if is_complete else (*named, *known_ports())
         if not candidates:
             raise AppError(
                 "there are no modules and no running emulators on this machine; "
                 "plug the modules in, or name their ports with --ports"
             )
         modules = []
+        passed_over = []
         for port in dict.fromkeys(candidates):
             try:
-                modules.append(_Module(port, observer, unless_it_works))
-            except AppError as error:
-                if ports is not None:
+                module = _Module(port, observer, unless_it_works)
+            except AppError:
+                if port in named:
                     raise
-                note(f"passed over: {error}")
-        links = _match(rig, rig_path, modules, is_named=ports is not None, note=note)
+                passed_over.append(f"{port} (no module answers)")
+                continue
+            modules.append(module)
+            if port not in named and module.serial not in {radar.serial for radar in rig.radars}:
+                passed_over.append(f"{port} (module {module.serial})")
+        if passed_over:
+            note(f"passed over, not of this rig: {', '.join(passed_over)}")
+        links = _match(rig, rig_path, modules, named=named, note=note)
         kept = {link.driver for link in links}
         for module in modules:
             if module.driver not in kept:
@@ -204,8 +221,13 @@ def open_rig(
 
 def are_emulated(links: Sequence[RadarLink]) -> bool:
     """Return whether any of these modules is that of a running emulator."""
-    emulated = {os.path.realpath(port.path) for port in find_ports() if port.kind == "emulated"}
-    return any(os.path.realpath(link.port) in emulated for link in links)
+    found = [port for port in find_ports() if port.kind == "emulated"]
+    emulated = {os.path.realpath(port.path) for port in found}
+    here = {f"{host}:{port.tcp}" for port in found for host in ("127.0.0.1", "localhost", "[::1]")}
+    return any(
+        os.path.realpath(link.port) in emulated or link.port.partition("://")[2] in here
+        for link in links
+    )
 
 
 def _match(
@@ -213,7 +235,7 @@ def _match(
     rig_path: Path,
     modules: Sequence[_Module],
     *,
-    is_named: bool,
+    named: Sequence[str],
     note: Callable[[str], None],
 ) -> tuple[RadarLink, ...]:
     by_serial: dict[str, _Module] = {}
@@ -230,12 +252,11 @@ def _match(
     if missing:
         raise AppError(_missing_text(rig_path, missing, foreign, modules))
     for module in foreign:
-        text = f"the module at {module.port} has serial number {module.serial}"
-        if is_named:
+        if module.port in named:
             raise AppError(
-                f"{text}, which {rig_path} does not name; leave the port out or add the radar"
+                f"the module at {module.port} has serial number {module.serial}, which {rig_path} "
+                "does not name; leave the port out or add the radar"
             )
-        note(f"passed over: {text}, which {rig_path} does not name")
     links = []
     for radar, mount in zip(rig.radars, rig.rig.mounts, strict=True):
         module = by_serial[radar.serial]

@@ -11,6 +11,7 @@ from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import empty_room
+from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from slam.app.errors import AppError
 from slam.app.rig import files as rig_match
 from slam.app.rig.files import RigFile, RigRadar, RigWheels, load_rig, open_rig, write_rig
@@ -171,9 +172,54 @@ def test_a_foreign_module_is_refused_where_it_was_named_and_passed_over_elsewher
     links = bench.find()
     assert [link.port for link in links] == ["a", "b"]
     assert not bench.is_open("c")
-    assert any(note.startswith("passed over: the module at c") for note in bench.notes)
+    (skipped,) = [note for note in bench.notes if note.startswith("passed over")]
+    assert skipped == f"passed over, not of this rig: c (module {OTHER})"
     for link in links:
         link.driver.close()
+
+
+def test_ports_in_the_way_cost_one_line_and_are_closed(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.serials = {"a": LEFT, "b": RIGHT, "c": OTHER, "d": "000000000008"}
+    mute = ScriptedTransport(lambda command: [])  # never answers
+    monkeypatch.setattr(rig_match, "known_ports", lambda: ("mute", "a", "c", "no", "d", "b"))
+
+    def open_port(port: str, *, observer: Observer) -> X4M300:
+        if port != "mute":
+            return bench.open(port, observer=observer)
+        return X4M300(mute, clock=mute.clock, observer=observer)
+
+    monkeypatch.setattr(X4M300, "open", open_port)
+    for link in bench.find():
+        link.driver.close()
+    skipped = [note for note in bench.notes if "passed over" in note]
+    assert len(skipped) == 1
+    assert skipped[0].count("no module answers") == 2
+    assert all(port in skipped[0] for port in ("mute", "c (module", "no (", "d (module"))
+    assert not any(bench.is_open(port) for port in bench.serials)
+    assert mute.closed
+
+
+def test_a_rig_file_names_ports_itself(bench: Bench, tmp_path: Path) -> None:
+    bench.serials = {"tcp://pi:5000": RIGHT, "b": LEFT, "c": OTHER}
+    left, right = robot().radars
+    networked = right.model_copy(update={"port": "tcp://pi:5000"})
+    path = tmp_path / "rig.toml"
+    write_rig(path, RigFile(radars=(left, networked)))
+    rig = load_rig(path)
+    assert [radar.port for radar in rig.radars] == [None, "tcp://pi:5000"]
+    links = bench.find(rig=rig)
+    assert [link.port for link in links] == ["b", "tcp://pi:5000"]
+    for link in links:
+        link.driver.close()
+    local = left.model_copy(update={"port": "b"})
+    for link in bench.find(rig=RigFile(radars=(local, networked))):  # c is not even opened
+        link.driver.close()
+    assert bench.notes.count(f"passed over, not of this rig: c (module {OTHER})") == 1
+    elsewhere = right.model_copy(update={"port": "tcp://nowhere:1"})
+    with pytest.raises(AppError, match="tcp://nowhere:1: there is no port"):
+        bench.find(rig=RigFile(radars=(left, elsewhere)))
 
 
 @pytest.mark.parametrize(
