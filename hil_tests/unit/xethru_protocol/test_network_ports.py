@@ -31,7 +31,7 @@ from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 SHORT = RawConfig(frame_area_m=(0.4, 1.0))
 
 
-class _PtyPort(serial.Serial):  # type: ignore[misc]  # pyserial has no types
+class _PtyPort(serial.Serial):
     """A pty for pyserial's server, which asks for modem lines; a pty has none."""
 
     dtr = rts = True
@@ -72,7 +72,8 @@ class Redirector:
             except OSError:
                 return
             with self._client, _PtyPort(self._path, 9600, timeout=0.01) as port:
-                manager = rfc2217.PortManager(port, self)
+                # the stubs of pyserial ask for two ports; a port and a writer are used
+                manager = rfc2217.PortManager(port, self)  # type: ignore[arg-type]
                 gone = threading.Event()
 
                 def pass_on(

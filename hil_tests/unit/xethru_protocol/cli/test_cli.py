@@ -101,7 +101,7 @@ def test_list_shows_running_emulators_only(
 ) -> None:
     port = folder / "left"
     port.touch()
-    here = {"path": str(port), "name": "left", "serial": "42", "tcp": None}
+    here = {"path": str(port), "name": "left", "serial": "42", "tcp": 5000}
     gone = {"path": str(folder / "gone"), "name": "gone", "serial": "43", "tcp": None}
     running = {"ready": True, "pid": 1, "devices": [here, gone]}
     (folder / "1.json").write_text(json.dumps(running))
@@ -110,9 +110,8 @@ def test_list_shows_running_emulators_only(
     for number, pid in enumerate(["1e999", str(1 << 70), "-1", "0"], start=4):
         word = json.dumps(running | {"pid": "PID"}).replace('"PID"', pid)
         (folder / f"{number}.json").write_text(word)
-    assert emulated_ports(capsys) == [
-        {"path": str(port), "kind": "emulated", "description": "emulated left", "serial": "42"}
-    ]
+    about = {"kind": "emulated", "description": "emulated left", "serial": "42", "tcp": 5000}
+    assert emulated_ports(capsys) == [{"path": str(port), **about}]
 
 
 @pytest.mark.parametrize(
