@@ -163,7 +163,7 @@ class _Live:
         rate = f"{(self._frames - 1) / span_s:.1f}" if self._frames > 1 else "-"
         line = (
             f"{counted(self._frames, 'frame')}, {rate}/s, {geometry.n_bins} bins, "
-            f"strongest at {geometry.range_start_m + strongest * geometry.bin_length_m:.3f} m, "
+            f"strongest at {frame.ranges_m[strongest]:.3f} m, "
             f"{self._radar.frames_lost} lost"
         )
         print_text(rewriting(line, sys.stdout))
