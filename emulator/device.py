@@ -19,6 +19,7 @@ from emulator.module.commands import answer
 from emulator.module.memory import Identity, Memory
 from emulator.module.modes import STREAMING, Group, State, group_of
 from emulator.module.module import (
+    ACK_WAIT_NS,
     FirmwareOutbox,
     LosslessOutbox,
     MessageKind,
@@ -45,8 +46,8 @@ from xethru_protocol.wire.messages import (
     X4DriverWriteI2c,
 )
 
-ACK_TO_RESET_NS = 500_000_000
-"""From the ACK of MOD_RESET to the restart. Protocol reference 8.1."""
+MOST_WAITING_BYTES = 2 * 7000 + 10 * 100
+"""Of commands while one takes its time: as many as the firmware's message pool has (1.1)."""
 RESET_TO_READY_NS = 2_000_000_000
 """Until the transmitter starts and the queued BOOTING and READY leave. Protocol reference 8.1."""
 NORMAL_START = 0x7D
@@ -219,15 +220,17 @@ class Device:
         self._connection = Connection(Role.MODULE)
         self._reset_ns: int | None = None
         self._ready_ns: int | None = None
-        # a reply that takes its time, and until when; further commands wait behind it
-        self._held: tuple[int, Response] | None = None
+        # until when the command task sleeps, and the reply it sends then; commands wait behind it
+        self._held: tuple[int, Response | None] | None = None
         self._backlog = False  # of received commands, for the next visit
+        self._waiting_bytes = 0
         self.faults_seen = 0
 
     @property
     def wants_data(self) -> bool:
         """Whether more commands should be read now; a host that never reads is held back."""
-        return self._held is None and not self._backlog and self._outbox.takes_replies
+        room = self._waiting_bytes < MOST_WAITING_BYTES
+        return room and not self._backlog and self._outbox.takes_replies
 
     @property
     def listens(self) -> bool:
@@ -265,6 +268,8 @@ class Device:
             self._plan_restart(now_ns)
             return
         self._connection.receive_data(data)
+        if self._held is not None:
+            self._waiting_bytes += len(data)
         self._carry_out_commands(now_ns)
 
     def _carry_out_commands(self, now_ns: int) -> None:
@@ -280,7 +285,8 @@ class Device:
                     self._carry_out(event, now_ns)
             else:
                 self.faults_seen += 1
-        self._backlog = self._connection.buffered > 0 and not self.module.asleep
+        waits = self._held is not None or self.module.asleep
+        self._backlog = self._connection.buffered > 0 and not waits
 
     @property
     def _takes_commands(self) -> bool:
@@ -291,11 +297,12 @@ class Device:
         for notice in self.module.notices:
             self._outbox.put(MessageKind.DEBUG, notice, now_ns)
         self.module.notices.clear()
-        delay_ns, self.module.reply_delay_ns = self.module.reply_delay_ns, 0
-        if reply is not None and delay_ns:
-            self._held = now_ns + delay_ns, reply
-        elif reply is not None:
+        wait, self.module.wait = self.module.wait, None
+        replies_now = wait is None or not wait.before_reply
+        if reply is not None and replies_now:
             self._outbox.put(MessageKind.REPLY, reply, now_ns)
+        if wait is not None:
+            self._held = now_ns + wait.duration_ns, None if replies_now else reply
         self._plan_restart(now_ns)
         self._stream.command_done(command, now_ns)
 
@@ -306,7 +313,7 @@ class Device:
         if restart.at_ns is not None:
             self._reset_ns = restart.at_ns
         elif self._reset_ns is None:
-            self._reset_ns = now_ns + ACK_TO_RESET_NS
+            self._reset_ns = now_ns + ACK_WAIT_NS
 
     def advance(self, now_ns: int) -> None:
         """Let time pass: restart when due, and queue the frames that fell due."""
@@ -321,7 +328,10 @@ class Device:
                     self._outbox.put(MessageKind.REPLY, System(code=code), now_ns)
         if self._held is not None and now_ns >= self._held[0]:
             (_, reply), self._held = self._held, None
-            self._outbox.put(MessageKind.REPLY, reply, now_ns)
+            self._waiting_bytes = 0
+            self._backlog = True
+            if reply is not None:
+                self._outbox.put(MessageKind.REPLY, reply, now_ns)
         if self._backlog:
             self._carry_out_commands(now_ns)
         if self._sends:
@@ -333,6 +343,7 @@ class Device:
         self._reset_ns = None
         self._held = None
         self._backlog = False
+        self._waiting_bytes = 0
         self._outbox.clear()
         self._connection = Connection(Role.MODULE)
         self.module.power_up(into_bootloader=restart is not None and restart.into_bootloader)

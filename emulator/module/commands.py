@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from emulator.chip.chip import Refusal, Silence
 from emulator.module.modes import State, check_permission
-from emulator.module.module import CRASH_DUMP, NOISE_MAPS, Module
+from emulator.module.module import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
 from emulator.module.settings import ZONE_LIMITS_M
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
@@ -24,7 +24,6 @@ from xethru_protocol.wire.codes import (
     BootloaderKey,
     DirCode,
     ErrorCode,
-    FileType,
     FramePostprocessing,
     IoPinCode,
     NoiseMapCode,
@@ -40,7 +39,6 @@ from xethru_protocol.wire.codes import (
 HIGHEST_TRACE_LEVEL = 9
 SLOWEST_BAUDRATE, FASTEST_BAUDRATE = 600, 10_000_000
 """The firmware acknowledges and ignores any other rate."""
-PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
 TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
 LONGEST_READ = 4096
@@ -197,7 +195,7 @@ def _read(module: Module, command: m.GetFileData) -> m.Response:
 @answers(m.DeleteFile)
 def _delete(module: Module, command: m.DeleteFile) -> None:
     module.files.delete((command.file_type, command.identifier))
-    module.reply_delay_ns = module.options.file_delete_ns
+    module.wait = Wait(duration_ns=module.options.file_delete_ns, before_reply=True)
     module.save()
 
 
@@ -215,11 +213,13 @@ def _crash_dump_length(module: Module, command: m.GetCrashDumpLength) -> m.Respo
 
 @answers(m.ClearCrashDump)
 def _clear_crash_dump(module: Module, command: m.ClearCrashDump) -> None:
-    if module.files.is_open(CRASH_DUMP):
-        raise Refusal(ErrorCode.XTS_SPRE_BUSY)
-    if module.files.get(CRASH_DUMP) is not None:
+    if module.files.get(CRASH_DUMP) is None:
+        return
+    try:
         module.files.delete(CRASH_DUMP)
-        module.save()
+    except Refusal:  # it is open, or too many are
+        raise Refusal(ErrorCode.XTS_SPRE_BUSY) from None
+    module.save()
 
 
 @answers(m.GetCrashDump)
@@ -441,7 +441,7 @@ def _system_test(module: Module, command: m.SystemTest) -> m.Response:
     passed, data = True, b""
     match command.code:
         case TestCode.TX_ONLY | TestCode.TX_ONLY_TX_OFF:
-            module.asleep = True
+            module.sleep()
             return m.Ack()
         case TestCode.STREAM_TX_OFF:
             module.chip.set(X4Setting.TXPOWER, 0)
@@ -474,7 +474,8 @@ def _system_test(module: Module, command: m.SystemTest) -> m.Response:
 @answers(m.X4DriverInit)
 def _x4_init(module: Module, command: m.X4DriverInit) -> None:
     module.chip.init()
-    module.reply_delay_ns = module.options.x4_init_ns
+    if module.options.x4_init_ns:
+        module.wait = Wait(duration_ns=module.options.x4_init_ns, before_reply=True)
 
 
 @answers(m.X4DriverSet)

@@ -1,15 +1,17 @@
 """What a module keeps: its identity, files in flash, what survives resets.
 
-Files are as long as they were created; erased bytes are FF. Assumed: sizes add up to the storage
-without overhead, and a write may change erased and written bytes alike.
+Files are as long as they were created and take whole blocks of the flash; erased bytes are FF.
+Assumed: a write may change erased and written bytes alike.
 
 Source: protocol reference 4.7, 4.10, 4.11, 5.1, 8.2, 8.5 and 11, row 18.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Protocol
 
 from emulator.chip.chip import Refusal
@@ -19,6 +21,9 @@ from xethru_protocol.wire.codes import FORMAT_KEY, FileError, InfoItem
 
 MAX_FILES = 20
 MAX_OPEN = 10
+BLOCK_BYTES = 8192
+"""What the flash erases at once; the first block holds the table of files."""
+_WORD = 0xFFFFFFFF
 ERASED = b"\xff"
 
 FileKey = tuple[int, int]
@@ -88,38 +93,84 @@ class Identity:
         return texts.get(item)
 
 
-class FileSystem:
-    """Files of one module; what the firmware answers with an ERROR raises `Refusal`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredFile:
+    """A file in the flash.
 
-    def __init__(self, storage_bytes: int, files: Mapping[FileKey, bytes] | None = None) -> None:
-        self._storage_bytes = storage_bytes
-        self._files = {key: bytearray(data) for key, data in (files or {}).items()}
-        self._open: set[FileKey] = set()
+    Attributes
+    ----------
+    offset
+        Where it begins behind the table, in bytes; None: wherever there is room.
+    data
+        Its content; bytes to which the flash does not reach are left out.
+    length
+        Bytes it was created with; None: as many as it has.
+    """
+
+    data: bytes
+    offset: int | None = None
+    length: int | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class _File:
+    key: FileKey
+    offset: int
+    length: int
+    data: bytearray
 
     @property
-    def contents(self) -> dict[FileKey, bytes]:
-        """All files, oldest first."""
-        return {key: bytes(data) for key, data in self._files.items()}
+    def end(self) -> int:
+        """Where the next file may begin."""
+        return (self.offset + _blocks(self.length)) & _WORD
+
+
+def _blocks(length: int) -> int:
+    """Return the size of the blocks that a file takes; the firmware counts in 32 bits."""
+    return -(-length // BLOCK_BYTES) * BLOCK_BYTES & _WORD
+
+
+class FileSystem:
+    """Files of one module; what the firmware answers with an ERROR raises `Refusal`.
+
+    A file takes whole blocks in the first gap that is large enough and never moves. The first file
+    of an empty table is not checked against the storage, and the room behind one that is too large
+    is counted as a large positive number: both as in the firmware.
+    """
+
+    def __init__(
+        self, storage_bytes: int, files: Mapping[FileKey, StoredFile] | None = None
+    ) -> None:
+        self._data_bytes = storage_bytes // BLOCK_BYTES * BLOCK_BYTES - BLOCK_BYTES
+        self._files: list[_File] = []  # in the order of their places
+        self._open: set[FileKey] = set()
+        for key, file in (files or {}).items():
+            length = len(file.data) if file.length is None else file.length
+            offset = self._gap(_blocks(length)) if file.offset is None else file.offset
+            if offset is not None and len(self._files) < MAX_FILES:
+                self._add(key, offset, length).data[: len(file.data)] = file.data
+
+    @property
+    def contents(self) -> dict[FileKey, StoredFile]:
+        """All files, in the order of their places."""
+        return {
+            file.key: StoredFile(data=bytes(file.data), offset=file.offset, length=file.length)
+            for file in self._files
+        }
 
     def names(self) -> list[FileKey]:
-        return list(self._files)
+        return [file.key for file in self._files]
 
     def create(self, key: FileKey, length: int) -> None:
-        if key in self._open:
-            raise Refusal(FileError.ALREADY_OPEN)
-        if key in self._files:
-            raise Refusal(FileError.ALREADY_EXISTS)
-        if len(self._files) >= MAX_FILES or length > self.free_bytes:
-            raise Refusal(FileError.FULL)
-        self._check_room_to_open()
-        self._files[key] = bytearray(ERASED * length)
+        """Make a file of erased bytes, and leave it open."""
+        self._check_handle(key)
+        self._create(key, length)
         self._open.add(key)
 
     def open(self, key: FileKey) -> None:
-        if key in self._open:
-            raise Refusal(FileError.ALREADY_OPEN)
-        self._check_exists(key)
-        self._check_room_to_open()
+        if key not in self._open:
+            self._find(key)
+        self._check_handle(key)
         self._open.add(key)
 
     def close(self, key: FileKey) -> None:
@@ -130,24 +181,25 @@ class FileSystem:
         self._open.clear()
 
     def length(self, key: FileKey) -> int:
-        self._check_exists(key)
-        return len(self._files[key])
+        return self._find(key).length
 
     def read(self, key: FileKey, offset: int, length: int) -> bytes:
-        self._check_open(key)
-        self._check_range(key, offset, length)
-        return bytes(self._files[key][offset : offset + length])
+        file = self._opened(key, offset, length)
+        # of a file that is larger than the storage, no more than that is worth making
+        return bytes(file.data[offset : offset + length]).ljust(
+            min(length, self._data_bytes), ERASED
+        )
 
     def write(self, key: FileKey, offset: int, data: bytes) -> None:
-        self._check_open(key)
-        self._check_range(key, offset, len(data))
-        self._files[key][offset : offset + len(data)] = data
+        file = self._opened(key, offset, len(data))
+        kept = data[: max(len(file.data) - offset, 0)]
+        file.data[offset : offset + len(kept)] = kept
 
     def delete(self, key: FileKey) -> None:
-        if key in self._open:
-            raise Refusal(FileError.ALREADY_OPEN)
-        self._check_exists(key)
-        del self._files[key]
+        if key not in self._open:
+            self._find(key)
+        self._check_handle(key)  # the firmware takes one for it
+        self._files.remove(self._find(key))
 
     def format(self, key: int) -> None:
         if key != FORMAT_KEY:
@@ -159,39 +211,69 @@ class FileSystem:
         """Give a file a new content, as the firmware does with files of its own."""
         if key in self._open:
             raise Refusal(FileError.ALREADY_OPEN)
-        freed = len(self._files.get(key, b""))
-        full = key not in self._files and len(self._files) >= MAX_FILES
-        if full or len(data) > self.free_bytes + freed:
-            raise Refusal(FileError.FULL)
-        self._files[key] = bytearray(data)
+        before = list(self._files)
+        self._files = [file for file in self._files if file.key != key]
+        try:
+            self._create(key, len(data))
+        except Refusal:
+            self._files = before
+            raise
+        file = self._find(key)
+        file.data[:] = data[: len(file.data)]
 
     def get(self, key: FileKey) -> bytes | None:
         """Return a file's content, open or not; None if there is no such file."""
-        data = self._files.get(key)
-        return None if data is None else bytes(data)
+        return next((bytes(file.data) for file in self._files if file.key == key), None)
 
-    def is_open(self, key: FileKey) -> bool:
-        return key in self._open
+    def _create(self, key: FileKey, length: int) -> None:
+        if length == 0:
+            raise Refusal(FileError.UNKNOWN_FAILURE)
+        if key in self.names():
+            raise Refusal(FileError.ALREADY_EXISTS)
+        offset = self._gap(_blocks(length))
+        if len(self._files) >= MAX_FILES or offset is None:
+            raise Refusal(FileError.FULL)
+        self._add(key, offset, length)
 
-    @property
-    def free_bytes(self) -> int:
-        return self._storage_bytes - sum(len(data) for data in self._files.values())
+    def _gap(self, size: int) -> int | None:
+        """Return the first place for so many bytes; None if there is none."""
+        if not self._files or self._files[0].offset >= size:
+            return 0
+        for before, after in pairwise(self._files):
+            if (after.offset - before.end) & _WORD >= size:
+                return before.end
+        last = self._files[-1]
+        return last.end if (self._data_bytes - last.end) & _WORD >= size else None
 
-    def _check_room_to_open(self) -> None:
+    def _add(self, key: FileKey, offset: int, length: int) -> _File:
+        reachable = max(min(length, self._data_bytes - offset), 0)
+        file = _File(key=key, offset=offset, length=length, data=bytearray(ERASED * reachable))
+        self._files.insert(bisect_right(self._files, offset, key=lambda other: other.offset), file)
+        return file
+
+    def _find(self, key: FileKey) -> _File:
+        for file in self._files:
+            if file.key == key:
+                return file
+        raise Refusal(FileError.NOT_FOUND)
+
+    def _opened(self, key: FileKey, offset: int, length: int) -> _File:
+        self._check_open(key)
+        file = self._find(key)
+        if offset + length > file.length:
+            raise Refusal(FileError.OUT_OF_RANGE)
+        return file
+
+    def _check_handle(self, key: FileKey) -> None:
+        """Refuse what needs a handle of its own for a file."""
+        if key in self._open:
+            raise Refusal(FileError.ALREADY_OPEN)
         if len(self._open) >= MAX_OPEN:
             raise Refusal(FileError.TOO_MANY_FILES_OPEN)
-
-    def _check_exists(self, key: FileKey) -> None:
-        if key not in self._files:
-            raise Refusal(FileError.NOT_FOUND)
 
     def _check_open(self, key: FileKey) -> None:
         if key not in self._open:
             raise Refusal(FileError.NOT_OPEN)
-
-    def _check_range(self, key: FileKey, offset: int, length: int) -> None:
-        if offset + length > len(self._files[key]):
-            raise Refusal(FileError.OUT_OF_RANGE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,7 +292,7 @@ class SavedState:
 
     start: Start = field(default_factory=Start)
     profiles: Mapping[int, ProfileSettings] = field(default_factory=dict)
-    files: Mapping[FileKey, bytes] = field(default_factory=dict)
+    files: Mapping[FileKey, StoredFile] = field(default_factory=dict)
     parameter_file_name: str = ""
     certification: bool = False
     unfinished_update: bool = False

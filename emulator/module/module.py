@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from emulator.chip.chip import Chip, Refusal
 from emulator.module.bootloader import PAGE_COUNT, SMALL_PAGE_COUNT, Bootloader
-from emulator.module.memory import FileSystem, Identity, Memory, SavedState
+from emulator.module.memory import ERASED, FileSystem, Identity, Memory, SavedState, StoredFile
 from emulator.module.modes import ModeMachine, State
 from emulator.module.pins import IoPins
 from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
@@ -32,6 +32,9 @@ from xethru_protocol.wire.codes import (
 )
 
 CRASH_DUMP = (int(FileType.CRASH_DUMP), 0)
+PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
+SHIPPED_PARAMETERS = b"; an emulated module computes its profile without stored parameters\n"
+"""Content of the parameter file, which a host finds and copies; assumed."""
 NOISE_MAPS = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
 NS_PER_S = 1_000_000_000
 NS_PER_MIN = 60 * NS_PER_S
@@ -43,8 +46,8 @@ APP_START_NS = NS_PER_S // 10
 """From the answer to START_APP to the start of the application."""
 LARGE_STORAGE = 0x48000
 """File storage of a microcontroller with 2 MB of flash."""
-BAUDRATE_DELAY_NS = NS_PER_S // 2
-"""From the ACK of SETBAUDRATE to the switch."""
+ACK_WAIT_NS = NS_PER_S // 2
+"""From the ACK of some commands to what they do. Protocol reference 3."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,8 +58,23 @@ class Restart:
     at_ns: int | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wait:
+    """A wait inside a command, in which no other is carried out. Protocol reference 3."""
+
+    duration_ns: int
+    before_reply: bool = False
+
+
 def _placeholder_noise_maps() -> tuple[bytes, bytes]:
     return b"\x00" * 64, b"\x00" * 64
+
+
+def _as_shipped(options: DeviceOptions) -> SavedState:
+    """Return the flash of a new module: the profile layer has put a parameter file there."""
+    if options.firmware == "xep":
+        return SavedState()
+    return SavedState(files={PARAMETER_FILE: StoredFile(data=SHIPPED_PARAMETERS)})
 
 
 class Module:
@@ -89,8 +107,8 @@ class Module:
         A restart asked for; the owner of the clock carries it out.
     notices
         Messages to send before the reply.
-    reply_delay_ns
-        How long the current command's reply takes.
+    wait
+        How long the current command keeps others waiting, before or after its reply; None: not.
     asleep
         Whether nothing but a power cycle brings it back.
     """
@@ -106,7 +124,7 @@ class Module:
         self.chip = chip
         self.options = options or DeviceOptions()
         self._memory = memory
-        saved = (None if memory is None else memory.load()) or SavedState()
+        saved = (None if memory is None else memory.load()) or _as_shipped(self.options)
         self._saved_profiles = {key: value.copy() for key, value in saved.profiles.items()}
         self.modes = ModeMachine(self.options, saved.start)
         self.files = FileSystem(self.options.storage_bytes, saved.files)
@@ -125,6 +143,8 @@ class Module:
         self.now_ns = 0
         self.restart: Restart | None
         self._baudrate_change: tuple[int, int] | None
+        self._sleep_ns: int | None
+        self.wait: Wait | None
         self._noise_map_busy_until_ns: int
         self._noise_map_stored_ns: int
         self._power_up_parts(into_bootloader=False)
@@ -153,6 +173,8 @@ class Module:
         if self._baudrate_change is not None and now_ns >= self._baudrate_change[0]:
             self.uart_baudrate = self._baudrate_change[1]
             self._baudrate_change = None
+        if self._sleep_ns is not None and now_ns >= self._sleep_ns:
+            self.asleep = True
         interval_ns = self.profile.noise_map_interval_min * NS_PER_MIN
         running = self.state is State.RUN
         if running and interval_ns and now_ns - self._noise_map_stored_ns >= interval_ns:
@@ -165,17 +187,24 @@ class Module:
         if self.now_ns < self._noise_map_busy_until_ns:
             raise Refusal(ErrorCode.XTS_SPRE_BUSY)
         for key, data in zip(NOISE_MAPS, self.noise_maps(), strict=True):
-            self.files.replace(key, data)
+            self.files.replace(key, data or ERASED)  # no file is empty
         self._noise_map_busy_until_ns = self.now_ns + self.options.noise_map_store_ns
         self.save()
 
     def change_baudrate(self, baudrate: int) -> None:
-        """Change the UART's rate once the ACK has left."""
-        self._baudrate_change = (self.now_ns + BAUDRATE_DELAY_NS, baudrate)
+        """Change the UART's rate once the ACK has left; none if it stays as it is."""
+        self.wait = Wait(duration_ns=ACK_WAIT_NS)
+        self._baudrate_change = (self.now_ns + ACK_WAIT_NS, baudrate)
+
+    def sleep(self) -> None:
+        """Stop for good once the ACK has left."""
+        self.wait = Wait(duration_ns=ACK_WAIT_NS)
+        self._sleep_ns = self.now_ns + ACK_WAIT_NS
 
     def request_restart(self, *, into_bootloader: bool = False) -> None:
         """Restart as the host commands, which ends a series of faults."""
         self._faults = 0
+        self.wait = Wait(duration_ns=ACK_WAIT_NS)
         self.restart = Restart(into_bootloader=into_bootloader)
 
     def crash(self, reason: str, now_ns: int) -> None:
@@ -248,8 +277,9 @@ class Module:
     def _power_up_parts(self, *, into_bootloader: bool) -> None:
         self.restart = None
         self.notices: list[m.Response] = []
-        self.reply_delay_ns = 0
+        self.wait = None
         self.asleep = False
+        self._sleep_ns = None
         self.uart_baudrate = DEFAULT_BAUDRATE
         self._baudrate_change = None
         self.trace_level: int = TraceLevel.NONE

@@ -26,7 +26,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from emulator.module.memory import MAX_FILES, SavedState
+from emulator.module.memory import MAX_FILES, SavedState, StoredFile
 from emulator.module.modes import Start, State
 from emulator.module.settings import ProfileSettings
 from emulator.ports.pty import LinkError
@@ -181,6 +181,8 @@ class _File(_Document):
     type: U32
     identifier: U32
     base64: str
+    offset: U32 | None = None  # not in states written before files had places
+    length: U32 | None = None
 
 
 class _State(_Document):
@@ -275,8 +277,14 @@ def _document(state: SavedState, serial: str) -> _State:
             for profile_id, settings in state.profiles.items()
         ],
         files=[
-            _File(type=kind, identifier=identifier, base64=b64encode(data).decode("ascii"))
-            for (kind, identifier), data in state.files.items()
+            _File(
+                type=kind,
+                identifier=identifier,
+                base64=b64encode(file.data).decode("ascii"),
+                offset=file.offset,
+                length=file.length,
+            )
+            for (kind, identifier), file in state.files.items()
         ],
         parameter_file_name=state.parameter_file_name,
         certification=state.certification,
@@ -299,7 +307,9 @@ def _saved(state: _State) -> SavedState:
             for profile in state.profiles
         },
         files={
-            (file.type, file.identifier): b64decode(file.base64, validate=True)
+            (file.type, file.identifier): StoredFile(
+                data=b64decode(file.base64, validate=True), offset=file.offset, length=file.length
+            )
             for file in state.files
         },
         parameter_file_name=state.parameter_file_name,

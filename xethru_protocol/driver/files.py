@@ -15,7 +15,12 @@ from xethru_protocol.driver.link import (
 )
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FileError
-from xethru_protocol.wire.errors import DeviceError, RemoteProtocolError, XeThruError
+from xethru_protocol.wire.errors import (
+    DeviceError,
+    LocalProtocolError,
+    RemoteProtocolError,
+    XeThruError,
+)
 
 CHUNK_BYTES = 256  # as the vendor's host reads and writes
 
@@ -84,6 +89,9 @@ def write(
     data: bytes,
     on_progress: OnProgress | None = None,
 ) -> Steps[None]:
+    if not data:
+        name = FileName(file_type=file_type, identifier=identifier)
+        raise LocalProtocolError(f"file {name} must have at least one byte")
     yield from link.request(
         m.CreateFile(file_type=file_type, identifier=identifier, length=len(data)),
         SLOW_TIMEOUT_S,
@@ -236,8 +244,9 @@ class Files(Part):
         """Create a file and write it; if that fails midway it is deleted again.
 
         User-defined types begin at 80000000h. ``on_progress`` is called with the bytes written so
-        far and their total: at the start and after each chunk. Raises `DeviceError` if the file
-        exists already, there is no room, or the module cannot write.
+        far and their total: at the start and after each chunk. Raises `LocalProtocolError` if
+        there is nothing to write, `DeviceError` if the file exists already, there is no room, or
+        the module cannot write.
         """
         self._call_once(write, file_type, identifier, data, on_progress)
 

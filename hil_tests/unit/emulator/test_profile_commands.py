@@ -213,13 +213,13 @@ def test_a_running_profile_takes_baseband_output_only() -> None:
 def test_noise_maps_are_files() -> None:
     """4.6, 4.11: stored as slow and fast; a store takes its time; 15 and 16 delete."""
     host = loaded()
-    found = m.ReplyInt(values=(0x05F09BCA, 0x05F09BCB, 0, 0))
+    found = m.ReplyInt(values=(0x037DD98C, 0x05F09BCA, 0x05F09BCB, 0, 0, 0))
     for sub_code in (0x15, 0x16):
         assert host.ask(m.StoreNoiseMap()) == m.Ack()
         assert host.ask(m.StoreNoiseMap()) == m.Error(code=3), "one is under way"
         assert host.ask(m.FindAllFiles()) == found
         host.command(m.LoadNoiseMap(), m.DeleteNoiseMap(sub_code=sub_code))
-        assert host.ask(m.FindAllFiles()) == m.ReplyInt(values=())
+        assert host.ask(m.FindAllFiles()) == m.ReplyInt(values=(0x037DD98C, 0))
         host.now_ns += SECOND
     assert host.ask(m.DeleteNoiseMap()) == m.Ack(), "also if there is none"
 

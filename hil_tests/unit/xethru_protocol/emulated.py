@@ -11,7 +11,7 @@ from hil_tests.unit.emulator.doubles import RampSource
 from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import FileType, SensorMode
+from xethru_protocol.wire.codes import FORMAT_KEY, FileType, SensorMode
 
 STORAGE = 0x18000
 
@@ -24,13 +24,14 @@ class EmulatedModule:
         self.module = Module(Identity(serial="123456789012"), Chip(RampSource()), options)
         if stopped:
             answer(self.module, m.SetMode(mode=SensorMode.XTID_SM_STOP))
+        self.module.files.format(FORMAT_KEY)
         self.received: list[m.Message] = []
         self.fail_at: int | None = None  # offset at which a file fails with code 12
         self.run_errors: list[int] = []  # with which it refuses the next RUN commands
 
     @property
     def files(self) -> dict[FileKey, bytes]:
-        return self.module.files.contents
+        return {key: file.data for key, file in self.module.files.contents.items()}
 
     @property
     def open(self) -> set[FileKey]:

@@ -136,6 +136,6 @@ def test_noise_maps_are_stored_periodically_while_the_profile_runs(host: BareHos
     )
     files = host.device.module.files
     host.device.module.advance(2 * minute - 1)
-    assert files.names() == []
+    assert files.names() == [(0x037DD98C, 0)]
     host.device.module.advance(2 * minute)
-    assert files.names() == [(0x05F09BCA, 0), (0x05F09BCB, 0)]
+    assert files.names() == [(0x037DD98C, 0), (0x05F09BCA, 0), (0x05F09BCB, 0)]

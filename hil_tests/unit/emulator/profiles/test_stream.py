@@ -9,6 +9,7 @@ from emulator.chip import Pace
 from emulator.chip.chip import ModuleClock
 from emulator.device import ChipStream, CombinedStream
 from emulator.module.modes import State
+from emulator.module.module import NOISE_MAPS
 from emulator.module.settings import ProfileSettings
 from hil_tests.unit.emulator.profiles.doubles import (
     BIN_M,
@@ -163,7 +164,7 @@ def test_a_created_map_is_stored_and_used_again(monkeypatch: pytest.MonkeyPatch)
     saved: list[int] = []
     monkeypatch.setattr(module, "save", lambda: saved.append(len(module.files.names())))
     presence_until(stream, 125)
-    assert saved == [2]
+    assert saved == [3]
     stream.restarted(200 * SECOND)
     states = [one.state for time_s, one in presence_until(stream, 225) if time_s > 220.5]
     assert set(states) == {PresenceState.NO_PRESENCE}
@@ -174,11 +175,11 @@ def test_a_created_map_is_stored_and_used_again(monkeypatch: pytest.MonkeyPatch)
     assert set(states) == {PresenceState.INITIALIZING}
 
 
-@pytest.mark.parametrize("damage", [b"", b"x" * 64, b"\x00" * 100])
+@pytest.mark.parametrize("damage", [b"\xff", b"x" * 64, b"\x00" * 100])
 def test_a_damaged_map_is_created_anew(damage: bytes) -> None:
     stream, module = profile(room(), noise_map_control=3)
     presence_until(stream, 125)
-    module.files.replace(module.files.names()[0], damage)
+    module.files.replace(NOISE_MAPS[0], damage)
     stream.restarted(200 * SECOND)
     assert {one.state for _, one in presence_until(stream, 225)} == {PresenceState.INITIALIZING}
 

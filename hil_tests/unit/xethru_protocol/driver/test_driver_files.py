@@ -9,7 +9,12 @@ from hil_tests.unit.xethru_protocol.emulated import Emulated, EmulatedModule
 from xethru_protocol.driver.files import FileName
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FORMAT_KEY, FileType
-from xethru_protocol.wire.errors import DeviceError, Disconnected, RemoteProtocolError
+from xethru_protocol.wire.errors import (
+    DeviceError,
+    Disconnected,
+    LocalProtocolError,
+    RemoteProtocolError,
+)
 
 USER = 0x80000001
 CONTENT = bytes(range(256)) * 2 + b"the end"
@@ -44,11 +49,13 @@ def test_progress_is_reported_at_the_start_and_after_each_chunk(driver_on: Drive
     assert told == [(0, 519), (256, 519), (512, 519), (519, 519)] * 2
 
 
-def test_empty_files_are_files(driver_on: DriverOn) -> None:
-    radar, _ = driver_on(EmulatedModule())
-    radar.files.write(USER, 1, b"")
-    assert radar.files.length(USER, 1) == 0
-    assert radar.files.read(USER, 1) == b""
+def test_an_empty_file_is_refused_before_the_module_does(driver_on: DriverOn) -> None:
+    """4.11: CREATE with length 0 is error 12, an unknown failure."""
+    module = EmulatedModule()
+    radar, _ = driver_on(module)
+    with pytest.raises(LocalProtocolError, match="80000001/1 must have at least one byte"):
+        radar.files.write(USER, 1, b"")
+    assert not any(isinstance(command, m.CreateFile) for command in module.received)
 
 
 def test_files_are_listed_found_and_deleted(driver_on: DriverOn) -> None:
