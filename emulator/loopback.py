@@ -1,8 +1,9 @@
 """A host's transport that ends in an emulated device of the same process: no port, no waiting.
 
 Time is virtual: it stands still while messages flow and jumps to the device's next deadline
-when a host waits for one, so a reset of 2.5 s takes none. Give the driver the transport's own
-clock, ``X4M300(transport, clock=transport.clock_ns)``, and its time limits are virtual too.
+when a host waits for one, so a reset of 2.5 s takes none. Only a device that sends as fast as its
+host reads takes the time of a line. Give the driver the transport's own clock,
+``X4M300(transport, clock=transport.clock_ns)``, and its time limits are virtual too.
 """
 
 from __future__ import annotations
@@ -11,6 +12,10 @@ from emulator.device import Device
 from xethru_protocol.wire.errors import Disconnected
 
 NS_PER_S = 1_000_000_000
+# More packets than a module's queue holds are made while the host reads them. Without time for them
+# no limit of time would ever pass for that host.
+_AT_ONCE = 64
+_NS_PER_BYTE = 25  # USB 2.0 high speed, about 40 MB/s
 
 
 class LoopbackTransport:
@@ -24,6 +29,7 @@ class LoopbackTransport:
         self._device = device
         self._name = name
         self._now_ns = 0
+        self._at_once = 0  # packets since the device last had none
         self._open = True
         device.port_opened(self._now_ns)
 
@@ -43,7 +49,11 @@ class LoopbackTransport:
             self._device.advance(self._now_ns)
             packet = self._device.next_packet(self._now_ns)
             if packet is not None:
+                self._at_once += 1
+                if self._at_once > _AT_ONCE:
+                    self._now_ns += len(packet) * _NS_PER_BYTE
                 return packet
+            self._at_once = 0
             wake_ns = self._device.wake_ns(self._now_ns)
             if wake_ns is None or wake_ns > deadline_ns:
                 self._now_ns = deadline_ns

@@ -10,7 +10,7 @@ def test_what_my_program_does(faulty_line):
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import pytest
 
@@ -81,6 +81,7 @@ class FaultyLine:
 
     def __init__(self, inner: InnerDevice | None = None) -> None:
         self.truth: list[Injected] = []
+        self._radars: list[X4M300] = []
         self._now_ns = 0
         if inner is None:
             echoes = echo_source(empty_room(), 0, 0)
@@ -124,7 +125,7 @@ class FaultyLine:
         return [PATH] if self.device.port_present(self._now_ns) else []
 
     def radar(self, reconnect_s: float = 0.0) -> X4M300:
-        return X4M300(
+        radar = X4M300(
             self.open(PATH, 115200),
             clock=self.clock_ns,
             reconnect_s=reconnect_s,
@@ -132,6 +133,13 @@ class FaultyLine:
             candidates=self.ports,
             sleep=self.sleep,
         )
+        self._radars.append(radar)
+        return radar
+
+    def forget(self) -> None:
+        """Let the drivers go as if they were closed, whatever became of the module."""
+        for radar in self._radars:
+            radar._link.closed = True
 
     def streaming(self, fps: float = 20.0, reconnect_s: float = 0.0) -> X4M300:
         """Return a driver whose module sends short frames."""
@@ -142,6 +150,8 @@ class FaultyLine:
 
 
 @pytest.fixture
-def faulty_line() -> FaultyLine:
-    """Return a stock module in this process, on a line in virtual time."""
-    return FaultyLine()
+def faulty_line() -> Iterator[FaultyLine]:
+    """Give a stock module in this process, on a line in virtual time."""
+    line = FaultyLine()
+    yield line
+    line.forget()

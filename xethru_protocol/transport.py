@@ -14,6 +14,7 @@ pseudo-terminals appear in no list of ports.
 
 import asyncio
 import errno
+import fcntl
 import json
 import math
 import os
@@ -21,6 +22,7 @@ import re
 import select
 import socket
 import tempfile
+import termios
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -63,7 +65,10 @@ class Transport(Protocol):
         """Send all of ``data``; raises `Disconnected` if the line is gone."""
 
     def close(self) -> None:
-        """Release the line. May be called twice."""
+        """Release the line: a thread that reads from it gets `Disconnected`.
+
+        May be called twice.
+        """
 
 
 class LineTransport:
@@ -74,9 +79,11 @@ class LineTransport:
     def __init__(self, name: str, descriptor: int) -> None:
         self.name = name
         self._fd = descriptor
+        self._wake, self._waker = os.pipe()  # ends the wait of another thread
         # select(), which pyserial's write uses, cannot wait on descriptors above 1023
         self._readable, self._writable = select.poll(), select.poll()
         self._readable.register(self._fd, select.POLLIN)
+        self._readable.register(self._wake, select.POLLIN)
         self._writable.register(self._fd, select.POLLOUT)
 
     def read(self, timeout_s: float) -> bytes:
@@ -143,7 +150,11 @@ class LineTransport:
         """Change this side's rate, keeping the port open; no effect on lines that have none."""
 
     def close(self) -> None:
-        self._fd = -1
+        if self._fd >= 0:
+            self._fd = -1
+            os.write(self._waker, b"!")
+            os.close(self._waker)
+            os.close(self._wake)
 
     def _lost(self) -> str:
         return f"{self.name} was closed" if self._fd < 0 else f"{self.name} {self._gone}"
@@ -152,7 +163,8 @@ class LineTransport:
 class SerialTransport(LineTransport):
     """A serial port: a real module's or an emulated one's pty.
 
-    Takes an exclusive lock, so that two programs do not each get half of the bytes.
+    Takes an exclusive lock, so that two programs do not each get half of the bytes, and has the
+    system refuse further opens (``TIOCEXCL``), since not every program asks for the lock.
 
     ``path`` is, for example, ``/dev/ttyACM0`` or a link made by ``xethru-emulator``; ``baudrate``
     matters on a UART only. Raises PortUnavailable if the port does not exist, is no serial port,
@@ -166,6 +178,7 @@ class SerialTransport(LineTransport):
         except (OSError, ValueError, OverflowError) as error:
             raise PortUnavailable(_why(path, error)) from None
         super().__init__(path, self._port.fileno())
+        self._set_exclusive(termios.TIOCEXCL)
 
     @property
     def bytes_per_s(self) -> float:
@@ -182,9 +195,15 @@ class SerialTransport(LineTransport):
             raise Disconnected(f"{self.name} cannot be set to {baudrate} baud: {error}") from error
 
     def close(self) -> None:
+        if self._fd >= 0:
+            self._set_exclusive(termios.TIOCNXCL)  # it would outlive this descriptor on a pty
         super().close()
         with suppress(OSError):  # the device vanished: there is nothing left to release
             self._port.close()
+
+    def _set_exclusive(self, request: int) -> None:
+        with suppress(OSError):  # no terminal of this system knows it, or it vanished
+            fcntl.ioctl(self._fd, request)
 
 
 class SocketTransport(LineTransport):

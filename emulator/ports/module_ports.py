@@ -227,18 +227,19 @@ class DevicePorts:
         cleanup.callback(link.close)
         if isinstance(line, UartLine) and options.host_baud is None:
             line.host_baud = link.host_baud
-        tcp, watch = None, None
+        watch = PortWatch(link.terminal, closed=lambda now_ns: link.admit())
+        cleanup.callback(watch.close)
+        self.services.append(watch)
+        tcp = None
         device: ByteDevice = named.device
         if tcp_port is not None:
-            watch = PortWatch(link.terminal)
-            cleanup.callback(watch.close)
             tcp = TcpLink(options.tcp_host, tcp_port, admits=partial(_is_free, link, watch))
             cleanup.callback(tcp.close)
             has_client = partial(_is_open, tcp)
             device = DeviceSide(named.device, lambda: not has_client())
             guest = DeviceSide(named.device, has_client)
             self.ports.append(Port(tcp, guest, _line(named, options)))
-            self.services += [watch, tcp]
+            self.services.append(tcp)
         self.ports.append(Port(link, device, line))
         plug = Plug(
             link,

@@ -209,6 +209,16 @@ class PtyLink:
         except termios.error:
             return None
 
+    def admit(self) -> None:
+        """Let hosts open the terminal again after one of them was killed.
+
+        A host may have asked for exclusive use (``TIOCEXCL``), which a terminal keeps until all
+        its descriptors are closed, also ours.
+        """
+        if self._slave_fd >= 0:
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(self._slave_fd, termios.TIOCNXCL)
+
     def close(self) -> None:
         """Remove the link, if it is still ours, and give the terminal back.
 

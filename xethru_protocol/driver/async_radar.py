@@ -19,7 +19,7 @@ import asyncio
 import itertools
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from typing import Self
+from typing import Any, Literal, Self
 
 from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.board import AsyncDiagnostics, AsyncPins
@@ -51,7 +51,7 @@ from xethru_protocol.driver.profiles import (
     set_mode,
     wait_for_message,
 )
-from xethru_protocol.driver.radar import RadarState, known_ports
+from xethru_protocol.driver.radar import RadarState, known_ports, reentry
 from xethru_protocol.transport import (
     AsyncSerialTransport,
     AsyncTransport,
@@ -98,6 +98,7 @@ class AsyncX4M300(RadarState):
         self._sleep = sleep
         self._one_at_a_time = asyncio.Lock()
         self._reading: asyncio.Future[None] | None = None
+        self._at_work = False  # never while a task waits
         self.x4 = AsyncX4(self._call)
         self.profile = AsyncProfile(self._call, self._listen)
         self.pins = AsyncPins(self._call)
@@ -114,6 +115,7 @@ class AsyncX4M300(RadarState):
 
     async def close(self) -> None:
         """Stop the radar if this driver configured it, and release the line."""
+        self._refuse_reentry()
         self._link.closed = True
         try:
             await self._call_once(raw_mode.leave)
@@ -174,10 +176,7 @@ class AsyncX4M300(RadarState):
 
     async def read_frame(self, timeout_s: float = TIMEOUT_S) -> Frame:
         """Next frame, in order of arrival; see `X4M300.read_frame`."""
-        frames = self._link.frames
-        while not frames:  # another task may have been faster
-            await self._listen(Link.wait_for_frame, timeout_s)
-        return frames.pop()
+        return await self._listen(Link.next_frame, timeout_s)
 
     async def frames(
         self, count: int | None = None, timeout_s: float = TIMEOUT_S
@@ -237,30 +236,43 @@ class AsyncX4M300(RadarState):
 
     async def _run(self, procedure: Steps[T]) -> T:
         """Carry out a procedure that sends commands: no other may send before it is done."""
+        self._refuse_reentry()
         async with self._one_at_a_time:
             return await self._carry(procedure)
 
+    def _refuse_reentry(self) -> None:
+        """Refuse to go on inside a callback, as event loops that can be nested make possible."""
+        if self._at_work:
+            raise reentry(self._link.name)
+
     async def _carry(self, procedure: Steps[T]) -> T:
+        self._refuse_reentry()
         try:
-            step = next(procedure)
+            step = self._advance(procedure.send, None)
             while True:
                 try:
                     came = await self._carry_out(step)
                 except BaseException as error:  # the procedure decides
-                    step = procedure.throw(error)
+                    step = self._advance(procedure.throw, error)
                 else:
-                    step = procedure.send(came)
+                    step = self._advance(procedure.send, came)
         except StopIteration as end:
             result: T = end.value
             return result
+
+    def _advance(self, advance: Callable[[Any], Step], what: object) -> Step:
+        self._at_work = True
+        try:
+            return advance(what)
+        finally:
+            self._at_work = False
 
     async def _carry_out(self, step: Step) -> bool:
         if isinstance(step, Read):  # the most frequent one, so without a match
             return await self._pump(step.timeout_s)
         match step:
             case Write(data):
-                if self.raw_listener is not None:
-                    self.raw_listener("tx", data, self._link.clock())
+                self._hear("tx", data, self._link.clock())
                 await self._transport.write(data)
             case Sleep(seconds):
                 await self._sleep(seconds)
@@ -294,10 +306,21 @@ class AsyncX4M300(RadarState):
         if not data:
             return False
         arrival_ns = self._link.clock()
-        if self.raw_listener is not None:
-            self.raw_listener("rx", data, arrival_ns)
-        self._link.conversation.receive(data, arrival_ns)
+        self._hear("rx", data, arrival_ns)
+        self._at_work = True
+        try:
+            self._link.conversation.receive(data, arrival_ns)
+        finally:
+            self._at_work = False
         return True
+
+    def _hear(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
+        if self.raw_listener is not None:
+            self._at_work = True
+            try:
+                self.raw_listener(direction, data, t_ns)
+            finally:
+                self._at_work = False
 
 
 def _close(opening: asyncio.Future[Transport | AsyncTransport]) -> None:

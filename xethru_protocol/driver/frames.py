@@ -248,13 +248,16 @@ class Frame:
 
     ``samples``, shape (geometry.n_bins,): float32 RF amplitudes (read-only, the only copy of
     the received bytes) or complex64 baseband. ``arrival_ns`` is the driver's clock when the
-    frame's last byte was read; the frame itself carries only ``counter``.
+    frame's last byte was read; the frame itself carries only ``counter``. Counters follow on
+    each other within a ``stream`` only: streams count from 0, and a new one begins wherever the
+    counter may have begun anew (INIT, a restart, a reconnect). Protocol reference 6.1.
     """
 
     counter: int
     samples: Samples
     geometry: FrameGeometry
     arrival_ns: int
+    stream: int = 0
 
     @property
     def ranges_m(self) -> NDArray[np.float64]:
@@ -293,12 +296,18 @@ class FrameQueue:
         Where the bins of radar frames lie; None: not known yet, radar frames are discarded.
     lattice
         Which samples radar frames can have; None: not known, nothing is checked.
+    rate_hz
+        Frames per second that the radar was set to, 0 while it is stopped; None: a profile's.
     dropped
         Frames that came, but left a full queue unread.
     discarded
         Data messages that are no frame of this geometry.
+    misfit
+        Why the last data message was discarded.
     last_counter
-        Counter of the newest frame of this stream; None before the first.
+        Counter of the newest frame; None before the first, and where the next follows on nothing.
+    stream
+        Number of the newest frame's stream.
     """
 
     def __init__(self, limit: int, statistics: LinkStatistics, warn: Callable[[str], None]) -> None:
@@ -306,15 +315,23 @@ class FrameQueue:
             raise LocalProtocolError(f"a frame queue needs room for a frame, not for {limit}")
         self.geometry: FrameGeometry | None = None
         self.lattice: Lattice | None = None
+        self.rate_hz: float | None = None
         self.dropped = 0
         self.discarded = 0
+        self.misfit = ""
         self.last_counter: int | None = None
+        self.stream = 0
         self._limit = limit
         self._statistics = statistics
         self._warn = warn
         self._frames: deque[Frame] = deque()
         self._in_burst = False
         self._gap = (0, 0)  # the last one: counter before it, frames missing in it
+        self._restarted = False
+        self._outage_hz = 0.0  # rate of the stream that a broken line cut; 0: none was
+        # counter and arrival [ns] of the first and the newest frame of this stream
+        self._first: tuple[int, int] | None = None
+        self._last: tuple[int, int] = (0, 0)
         self._baseband_geometry: FrameGeometry | None = None
 
     def __len__(self) -> int:
@@ -326,16 +343,31 @@ class FrameQueue:
             self._in_burst = False
         return frame
 
-    def new_stream(self) -> None:
-        """Forget the frames that wait and their counters: what comes now follows on nothing."""
+    def clear(self) -> None:
+        """Forget the frames that wait: what comes now follows on nothing."""
         self._frames.clear()
         self._in_burst = False
+        self._outage_hz = 0.0
         self.break_off()
 
     def break_off(self) -> None:
         """Keep the frames that wait, but what comes now does not follow on them."""
         self.last_counter = None
         self._gap = (0, 0)
+
+    def restart(self) -> None:
+        """Begin a new stream with the next frame: the chip's counter may begin anew."""
+        self._restarted = True
+        self.break_off()
+
+    def interrupt(self, rate_hz: float | None = None) -> None:
+        """Begin a new stream, as `restart`, and count the frames that are missing before it.
+
+        No counter shows them: their number is the time from the last frame to the next, times
+        the frame rate, by default that of the stream that was broken.
+        """
+        self._outage_hz = rate_hz or self._newest_rate_hz() or self._outage_hz
+        self.restart()
 
     def take(self, message: DataFloat | BasebandIq, arrival_ns: int) -> None:
         """Queue a message's frame, or count the message as discarded."""
@@ -348,13 +380,30 @@ class FrameQueue:
         geometry, values = self.geometry, message.values
         # radar frames have content id 0 (Protocol reference 6.1)
         if geometry is None or message.content_id != 0 or values.size != geometry.n_values:
-            self.discarded += 1
+            self._discard(message)
             return
         if self.lattice is not None:
             self._statistics.off_lattice_samples += self.lattice.off_lattice(values)
         n = geometry.n_bins
         samples = _complex(values[:n], values[n:]) if geometry.downconversion else values
         self._queue(message.info, samples, geometry, arrival_ns)
+
+    def _discard(self, message: DataFloat) -> None:
+        if message.content_id != 0:
+            why = f"data with content id {message.content_id} came, which radar frames do not have"
+        elif self.geometry is None:
+            why = (
+                f"radar frames of {message.values.size} values come, but configure_raw() was not "
+                "called, so where their bins lie is not known and they are discarded; call it, "
+                "or set the driver's geometry"
+            )
+        else:
+            why = (
+                f"frames of {message.values.size} values come, not of the {self.geometry.n_values} "
+                "of configure_raw(); call it again"
+            )
+        self.discarded += 1
+        self.misfit = why
 
     def _take_baseband(self, message: BasebandIq, arrival_ns: int) -> None:
         geometry = FrameGeometry(
@@ -372,16 +421,47 @@ class FrameQueue:
     def _queue(
         self, counter: int, samples: Samples, geometry: FrameGeometry, arrival_ns: int
     ) -> None:
-        if self.last_counter is not None:
-            self._count_missing(self.last_counter, counter)
+        if self._restarted:
+            self._begin_stream(arrival_ns)
+        elif self.last_counter is not None:
+            self._count_missing(self.last_counter, counter, arrival_ns)
         self.last_counter = counter
+        self._last = counter, arrival_ns
+        if self._first is None:
+            self._first = self._last
         if len(self._frames) >= self._limit:
             self._drop_oldest()
         self._frames.append(
-            Frame(counter=counter, samples=samples, geometry=geometry, arrival_ns=arrival_ns)
+            Frame(
+                counter=counter,
+                samples=samples,
+                geometry=geometry,
+                arrival_ns=arrival_ns,
+                stream=self.stream,
+            )
         )
 
-    def _count_missing(self, last: int, counter: int) -> None:
+    def _begin_stream(self, arrival_ns: int) -> None:
+        if self._first is not None:  # streams without a frame are not counted
+            away_s = (arrival_ns - self._last[1]) * 1e-9
+            self._statistics.frames_lost += max(round(away_s * self._outage_hz) - 1, 0)
+            self.stream += 1
+        self._first = None
+        self._restarted = False
+        self._outage_hz = 0.0
+        self._gap = (0, 0)
+
+    def _newest_rate_hz(self) -> float:
+        """Return the rate of the newest stream: as set, or by its counters; 0 if not known."""
+        if self.rate_hz is not None:
+            return self.rate_hz
+        if self._first is None:
+            return 0.0
+        (first, first_ns), (last, last_ns) = self._first, self._last
+        counted = (last - first) % _COUNTER_WRAP
+        return counted * 1e9 / (last_ns - first_ns) if last_ns > first_ns else 0.0
+
+    def _count_missing(self, last: int, counter: int, arrival_ns: int) -> None:
         missing = (counter - last - 1) % _COUNTER_WRAP
         if missing < _COUNTER_WRAP // 2:
             self._statistics.frames_lost += missing
@@ -393,7 +473,9 @@ class FrameQueue:
         inside = (counter - before - 1) % _COUNTER_WRAP
         if 1 <= inside <= gap:
             self._statistics.frames_lost += inside - 1 - gap
-        self._gap = (0, 0)
+            self._gap = (0, 0)
+        elif counter != last:  # old firmware sends a frame twice at times
+            self._begin_stream(arrival_ns)
 
     def _drop_oldest(self) -> None:
         self._frames.popleft()

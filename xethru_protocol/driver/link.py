@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Generator, Sequence
 from dataclasses import dataclass, fields
 from typing import Concatenate, Literal, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar
 
-from xethru_protocol.driver.frames import FrameQueue, Lattice
+from xethru_protocol.driver.frames import Frame, FrameQueue, Lattice
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codec import describe
@@ -33,6 +33,7 @@ from xethru_protocol.wire.errors import (
     LocalProtocolError,
     RemoteProtocolError,
     ResponseTimeout,
+    XeThruError,
 )
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault, LinkStatistics
 from xethru_protocol.wire.rows import ROWS, Command, Response, Row
@@ -93,7 +94,11 @@ BAUD_RATES = (
 )
 
 _STALE_READS = 64  # more than any port buffers; a bound, since a fast module never pauses
-_BAUD_SETTLE_S = (0.1, 0.4)  # before and after the change, as the vendor's host waits
+# The module changes its rate 500 ms after its ACK and hears nothing until then (Protocol
+# reference 3); the vendor's host waits 100 ms before its own change and 400 ms behind it.
+_BAUD_SETTLE_S = (0.1, 0.45)
+_BAUD_PROBE_S = 0.3  # one PING at a rate that may not be the module's
+_BAUD_PROBES_NEW, _BAUD_PROBES_OLD = 7, 3
 POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
 _WARNINGS = 1000  # kept; a radar may run for months
 _MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
@@ -222,8 +227,13 @@ FRAMES = (m.DataFloat, m.BasebandIq)  # a tuple is the faster argument of isinst
 _ENDLESS_S = 1e9
 _ANSWERS = (m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString)
 # The module answers PINGs that waited for it one right after the other; a PONG that stays out
-# this long after the last one was never sent.
+# this long after the last one was probably never sent.
 _SETTLED_NS = 250_000_000
+# Part of the timeout for which the right answer is waited for after a wrong one.
+_AFTER_A_WRONG_ONE = 0.25
+_SHOWN = 160  # characters of an answer in an error
+# Information that every firmware has; two items, so that no late answer is taken for another.
+_TOKENS = (InfoItem.XTID_SSIC_VERSION, InfoItem.XTID_SSIC_BUILD)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,9 +266,15 @@ class Conversation:
     answer_owed
         Whether the answer of a request that was given up may still come. The module answers in
         order, so a PING brings both sides into step again: all before its PONG belongs to nothing
-        any more (Protocol reference 13).
+        any more (Protocol reference 13). That holds only if no other PONG may come.
+    pings
+        PINGs that were sent.
     pongs_owed
-        PONGs that are due.
+        PONGs that are due, but for those that are taken for never sent.
+    pongs_possible
+        PONGs that may still come, at most.
+    unexpected
+        First answer since the last question that does not fit it.
     """
 
     def __init__(
@@ -282,8 +298,10 @@ class Conversation:
         self.answers: deque[Response] = deque()
         self.expected: tuple[type[Response], ...] = ()
         self.answer_owed = False
-        self.pongs_owed = 0
+        self.pings = self.pongs_owed = self.pongs_possible = 0
+        self.unexpected: Response | None = None
         self._winding_down = False
+        self._frames_since = False  # the last question
         self._damaged_since = False  # since the last frame or answer
         self._rebooted_since = False
 
@@ -296,9 +314,13 @@ class Conversation:
         data = self._connection.send(command)
         self.stray_count += len(self.answers)
         self.answers.clear()
+        self.unexpected = None
+        self._frames_since = False
         self.expected = ROWS[type(command)].replies
         if isinstance(command, m.Ping):
+            self.pings += 1
             self.pongs_owed += 1
+            self.pongs_possible += 1
         else:
             self.answer_owed = True  # also if this is left by an interrupt
         if self._observer is not None:
@@ -327,6 +349,7 @@ class Conversation:
             self.listener(message, arrival_ns)
         if isinstance(message, FRAMES):
             self._damaged_since = self._rebooted_since = False
+            self._frames_since = True
             self._take_data(message, arrival_ns)
             return
         # some firmware answers with a message that other firmware sends unasked
@@ -338,7 +361,9 @@ class Conversation:
                 self.answers.append(message)
             if isinstance(message, m.Pong):
                 self.pongs_owed = max(self.pongs_owed - 1, 0)
+                self.pongs_possible = max(self.pongs_possible - 1, 0)
         elif isinstance(message, m.System):
+            self._take_data(message, arrival_ns)
             self.readies += message.code == SystemCode.XTS_SPRS_READY
             if message.code == SystemCode.XTS_SPRS_BOOTING:
                 self.reboots += 1
@@ -359,7 +384,8 @@ class Conversation:
         self.answers.clear()
         self.expected = ()
         self.answer_owed = False
-        self.pongs_owed = 0
+        self.pongs_owed = self.pongs_possible = 0
+        self.unexpected = None
         self._damaged_since = self._rebooted_since = False
 
     def wind_down(self) -> None:
@@ -399,6 +425,30 @@ class Conversation:
             )
         return ResponseTimeout(f"{missing}; {likely}")
 
+    def unanswered(self, command: Command[Response], timeout_s: float) -> XeThruError:
+        """Error for a command that got no answer, or only one that does not fit."""
+        if self.unexpected is None:
+            what = f"answer to {summary(command)}"
+            if self._frames_since:
+                likely = "it sends frames meanwhile; does it know this command in its mode?"
+                return self.silence(what, timeout_s, likely)
+            return self.silence(what, timeout_s)
+        row = ROWS[type(command)]
+        wanted = " or ".join(ROWS[reply].name for reply in row.replies)
+        if row.content_id is not None:
+            wanted += f" with content id 0x{row.content_id(command):X}"
+        if isinstance(command, m.SystemGetInfo):
+            wanted += f" and info {command.item}"
+        came = summary(self.unexpected)
+        if len(came) > _SHOWN:
+            came = f"{came[:_SHOWN]}..."
+        text = (
+            f"{self.name} answered {summary(command)} with {came}, where {wanted} was expected; "
+            "is its firmware another one, or does another program use the port, too?"
+        )
+        # no PONG is silence all the same: who pings a module that starts asks again
+        return ResponseTimeout(text) if isinstance(command, m.Ping) else RemoteProtocolError(text)
+
     def report(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
         if self._observer is not None:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
@@ -435,7 +485,10 @@ class Link:
     Attributes
     ----------
     messages
-        Messages of the running profile that were not taken yet; None: nobody reads them.
+        Messages that were not taken yet: those of the running profile, if somebody reads them,
+        and texts (DATA STRING), whoever reads.
+    keeps_messages
+        Whether somebody reads a profile's messages.
     home
         The path the user named; ``path`` is where the module is now.
     plan
@@ -468,7 +521,8 @@ class Link:
         self.conversation = Conversation(path, clock, observer, self._take)
         self.statistics = self.conversation.statistics
         self.frames = FrameQueue(queue_frames, self.statistics, self.warn)
-        self.messages: deque[Response] | None = None
+        self.messages: deque[Response] = deque()
+        self.keeps_messages = False
         self.messages_dropped = 0
         self.plan: Plan | None = None
         self.identified = False
@@ -478,11 +532,18 @@ class Link:
         self.reconnects = 0
         self.raw_mode = False
         self.closed = False
+        self._tokens = deque(_TOKENS)
+        self._tokens_out = 0  # asked for and not answered, or answered too late
+        self._token_at: int | None = None  # PINGs before the first token that is out
+        self._warned = False  # of frames whose geometry is not known
 
     def _take(self, message: Response, arrival_ns: int) -> None:
         if isinstance(message, FRAMES):
             self.frames.take(message, arrival_ns)
-        elif self.messages is not None:
+        elif isinstance(message, m.System):
+            if message.code == SystemCode.XTS_SPRS_BOOTING:
+                self.frames.restart()
+        elif self.keeps_messages or isinstance(message, m.DataString):
             if len(self.messages) >= _MESSAGES:
                 self.messages.popleft()
                 if not self.messages_dropped:
@@ -509,13 +570,36 @@ class Link:
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
         if self.conversation.answer_owed and not isinstance(command, m.Ping):
-            # the answer to an abandoned request may still come: all before this PONG is dropped
-            yield from self._exchange(m.Ping(), timeout_s)
+            yield from self._catch_up(timeout_s)
         reply = yield from self._exchange(command, timeout_s)
         # the conversation checked it: the row's replies are what ReplyT stands for
         return reply  # type: ignore[return-value]
 
-    def _exchange(self, command: Command[Response], timeout_s: float) -> Steps[Response]:
+    def _catch_up(self, timeout_s: float) -> Steps[None]:
+        """Receive until no answer to an abandoned request can come any more."""
+        conversation = self.conversation
+        if not conversation.pongs_possible:
+            yield from self._exchange(m.Ping(), timeout_s)
+            return
+        # PONGs do not say which PING they answer, so with one due they prove nothing. This answer
+        # names what was asked: all that was asked before is answered, or never will be.
+        token = m.SystemGetInfo(item=self._tokens[0])
+        if self._token_at is None:
+            self._token_at = conversation.pings
+        self._tokens_out += 1
+        yield from self._exchange(token, timeout_s, catching_up=True)
+        self._tokens_out -= 1
+        # it may be the answer to an earlier one: PINGs behind that one are not answered yet
+        behind = conversation.pings - self._token_at
+        conversation.pongs_possible = min(conversation.pongs_possible, behind)
+        conversation.pongs_owed = min(conversation.pongs_owed, behind)
+        self._token_at = None
+        self._tokens.rotate()
+
+    def _exchange(
+        self, command: Command[Response], timeout_s: float, *, catching_up: bool = False
+    ) -> Steps[Response]:
+        """Ask and return the answer; while ``catching_up``, others are of earlier commands."""
         yield from self.take_stale_input()
         conversation = self.conversation
         row = ROWS[type(command)]
@@ -526,31 +610,60 @@ class Link:
             if isinstance(command, m.Ping):
                 answer = yield from self._pong(deadline_ns)
             else:
-                content_id = row.content_id(command) if row.content_id else None
-                answer = yield from self._answer(row, content_id, deadline_ns)
+                answer = yield from self._answer(command, row, timeout_s, catching_up)
         finally:  # also after a cancellation or an interrupt
             conversation.expected = ()
         if answer is None:
-            raise conversation.silence(f"answer to {summary(command)}", timeout_s)
-        conversation.answer_owed = False
+            raise conversation.unanswered(command, timeout_s)
+        if not isinstance(command, m.Ping) or not conversation.pongs_possible:
+            conversation.answer_owed = False
         if isinstance(answer, m.Error):
             meaning = error_name(answer.code, row.errors)
             raise DeviceError(answer.code, summary(command), meaning)
+        self._follow(command)
         return answer
 
-    def _answer(self, row: Row, content_id: int | None, deadline_ns: int) -> Steps[Response | None]:
+    def _follow(self, command: Command[Response]) -> None:
+        """Note what a command that was carried out does to the frames. Protocol reference 6.1."""
+        match command:
+            case m.X4DriverInit() | m.ModReset() | m.X4DriverSet(setting=X4Setting.ENABLE):
+                self.frames.rate_hz = 0.0
+                self.frames.restart()
+            case m.LoadApp():
+                self.frames.rate_hz = None
+                self.frames.restart()
+            case m.X4DriverSet(setting=X4Setting.FPS, value=float(rate)):
+                self.frames.rate_hz = x4.real_frame_rate(rate) if rate > 0 else 0.0
+
+    def _answer(
+        self, command: Command[Response], row: Row, timeout_s: float, catching_up: bool
+    ) -> Steps[Response | None]:
         conversation = self.conversation
+        content_id = row.content_id(command) if row.content_id else None
+        item = command.item if isinstance(command, m.SystemGetInfo) else None
+        until_ns = conversation.deadline_ns(timeout_s)
+        late_pongs = conversation.pongs_possible
         while True:
             while conversation.answers:
                 answer = conversation.answers.popleft()
-                if isinstance(answer, m.Error):
+                if isinstance(answer, m.Error) and not catching_up:
                     return answer
-                if isinstance(answer, row.replies) and (
-                    content_id is None or getattr(answer, "content_id", None) == content_id
+                if (
+                    isinstance(answer, row.replies)
+                    and (content_id is None or getattr(answer, "content_id", None) == content_id)
+                    and (item is None or getattr(answer, "info", None) == item)
                 ):
                     return answer
                 conversation.stray_count += 1
-            left_s = self.left_s(deadline_ns)
+                if isinstance(answer, m.Pong) and late_pongs:
+                    late_pongs -= 1
+                elif isinstance(answer, m.ReplyString) and self._tokens_out:
+                    self._tokens_out -= 1
+                elif conversation.unexpected is None and not catching_up:
+                    conversation.unexpected = answer
+                    grace_ns = conversation.deadline_ns(timeout_s * _AFTER_A_WRONG_ONE)
+                    until_ns = min(until_ns, grace_ns)
+            left_s = self.left_s(until_ns)
             if left_s <= 0:
                 return None
             yield Read(left_s)
@@ -573,6 +686,8 @@ class Link:
                     until_ns = min(deadline_ns, self.clock() + _SETTLED_NS)
                 else:  # PING has no errors: those are of another command, too
                     conversation.stray_count += 1
+                    if not conversation.answer_owed:
+                        conversation.unexpected = conversation.unexpected or answer
             left_s = self.left_s(until_ns)
             if left_s <= 0 or (pong is not None and conversation.pongs_owed == 0):
                 break
@@ -690,32 +805,56 @@ class Link:
             raise LocalProtocolError(
                 f"{baudrate} baud is no rate of a module; it has {', '.join(map(str, BAUD_RATES))}"
             )
+        old = self.baudrate
         yield from self.request(m.SetBaudRate(baudrate=baudrate))
         before_s, after_s = _BAUD_SETTLE_S
         yield from self.listen(lambda: False, before_s)
         yield SetLineRate(baudrate)
-        yield from self.listen(lambda: False, after_s)
-        try:
-            yield from self.ping()
-        except ResponseTimeout:
-            yield SetLineRate(self.baudrate)
-            raise ResponseTimeout(
-                f"{self.name} does not answer at {baudrate} baud; "
-                f"this side is back at {self.baudrate}"
-            ) from None
         self.baudrate = baudrate
+        yield from self.listen(lambda: False, after_s)
+        if (yield from self._probe(_BAUD_PROBES_NEW)):
+            return
+        yield SetLineRate(old)
+        if (yield from self._probe(_BAUD_PROBES_OLD)):
+            self.baudrate = old
+            raise ResponseTimeout(
+                f"{self.name} acknowledged {baudrate} baud and still answers at {old}; "
+                f"this side is back at {old}"
+            )
+        yield SetLineRate(baudrate)
+        raise ResponseTimeout(
+            f"{self.name} answers neither at {baudrate} nor at {old} baud; this side stays at "
+            f"{baudrate}. Can line and adapter carry that? A module that is switched off and on "
+            f"answers at {POWER_UP_BAUD}"
+        )
+
+    def _probe(self, times: int) -> Steps[bool]:
+        """Whether the module answers one of some PINGs, of which it may not hear the first."""
+        for _ in range(times):
+            try:
+                yield from self.ping(_BAUD_PROBE_S)
+            except ResponseTimeout:
+                continue
+            return True
+        return False
 
     # --- frames -----------------------------------------------------------------------------------
 
-    def wait_for_frame(self, timeout_s: float) -> Steps[None]:
+    def next_frame(self, timeout_s: float) -> Steps[Frame]:
         frames = self.frames
         conversation = self.conversation
+        discarded = frames.discarded
         deadline_ns = conversation.deadline_ns(timeout_s)
         left_s = timeout_s
         while not frames:
             yield Read(left_s)
+            if frames.discarded > discarded and frames.geometry is None and not self._warned:
+                self._warned = True
+                self.warn(frames.misfit)
             left_s = self.left_s(deadline_ns)
             if left_s <= 0 and not frames:
+                if frames.discarded > discarded:
+                    raise conversation.silence("frame", timeout_s, frames.misfit)
                 if frames.last_counter is None:
                     raise conversation.silence("frame", timeout_s)
                 raise conversation.silence(
@@ -723,6 +862,7 @@ class Link:
                     timeout_s,
                     "did the module stop, or its recording end?",
                 )
+        return frames.pop()
 
 
 Procedure: TypeAlias = Callable[Concatenate[Link, P], Steps[T]]

@@ -13,11 +13,19 @@
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncCall, AsyncPart, Link, Part, Steps
+from xethru_protocol.driver.link import (
+    SLOW_TIMEOUT_S,
+    AsyncCall,
+    AsyncPart,
+    Call,
+    Link,
+    Part,
+    Steps,
+)
 from xethru_protocol.driver.reconnect import await_restart
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
@@ -83,7 +91,10 @@ def load(link: Link, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> Steps
     yield from link.wait_until_ready()
     yield from _load(link, profile_id)
     link.plan = ProfilePlan(profile_id=profile_id, loaded=True)
-    keep_messages(link).clear()  # those that wait are of what ran before
+    waiting = keep_messages(link)
+    texts = _texts(waiting)
+    waiting.clear()  # those that wait are of what ran before
+    waiting.extend(texts)
 
 
 def _load(link: Link, profile_id: int) -> Steps[None]:
@@ -160,7 +171,7 @@ def factory_preset(link: Link) -> Steps[None]:
 
 def output(link: Link, question: m.OutputGetControl | m.DebugOutputGetControl) -> Steps[int]:
     what = f"control of output {question.feature:08X}h"
-    return (yield from _value(link, question, what)) & 0xFFFFFFFF
+    return (yield from _setting(link, question, what)) & 0xFFFFFFFF
 
 
 def parameter_file(link: Link, name: str) -> Steps[str]:
@@ -238,17 +249,23 @@ def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[
     limit_s = _starting_time_s(link) if timeout_s is None else timeout_s
     deadline_ns = link.conversation.deadline_ns(limit_s)
     waiting = keep_messages(link)
-    while (left_s := link.left_s(deadline_ns)) > 0:
-        wait_s = min(left_s, MESSAGE_TIMEOUT_S)
-        if not waiting and not (yield from link.listen(lambda: bool(waiting), wait_s)):
-            if wait_s == MESSAGE_TIMEOUT_S:
-                raise _no_message(link, wait_s)
-            break
-        message = waiting.popleft()
-        if isinstance(message, m.PresenceSingle | m.PresenceMovingList) and (
-            message.state != PresenceState.INITIALIZING
-        ):
-            return message
+    texts: list[m.Response] = []
+    try:
+        while (left_s := link.left_s(deadline_ns)) > 0:
+            wait_s = min(left_s, MESSAGE_TIMEOUT_S)
+            if not waiting and not (yield from link.listen(lambda: bool(waiting), wait_s)):
+                if wait_s == MESSAGE_TIMEOUT_S:
+                    raise _no_message(link, wait_s)
+                break
+            message = waiting.popleft()
+            if isinstance(message, m.PresenceSingle | m.PresenceMovingList) and (
+                message.state != PresenceState.INITIALIZING
+            ):
+                return message
+            if isinstance(message, m.DataString):
+                texts.append(message)
+    finally:
+        waiting.extendleft(reversed(texts))
     raise link.conversation.silence(
         "end of the profile's start", limit_s, "does the room keep it from settling?"
     )
@@ -256,12 +273,15 @@ def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[
 
 def keep_messages(link: Link) -> deque[m.Response]:
     """From now on keep what the profile sends, and return where."""
-    if link.messages is None:
-        link.messages = deque()
+    link.keeps_messages = True
     return link.messages
 
 
 # --- inside -------------------------------------------------------------------------------------
+
+
+def _texts(messages: Iterable[m.Response]) -> list[m.DataString]:
+    return [message for message in messages if isinstance(message, m.DataString)]
 
 
 def _starting_time_s(link: Link) -> float:
@@ -331,7 +351,11 @@ class Profile(Part):
     `X4M300.messages`, its BASEBAND_IQ by `X4M300.frames`.
     """
 
-    __slots__ = ()
+    __slots__ = ("_listen",)
+
+    def __init__(self, call: Call, listen: Call) -> None:
+        super().__init__(call)
+        self._listen = listen
 
     def load(self, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> None:
         """Stop whatever runs and load a profile, not running yet, with its own last settings.
@@ -491,7 +515,7 @@ class Profile(Part):
         ResponseTimeout
             If it is still starting then, or sends nothing for seconds.
         """
-        return self._call(wait_until_initialized, timeout_s)
+        return self._listen(wait_until_initialized, timeout_s)
 
 
 class AsyncProfile(AsyncPart):

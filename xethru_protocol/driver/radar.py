@@ -1,10 +1,14 @@
-"""Driver of one X4M300: raw radar mode, profiles, everything else. Pull-driven, no threads.
+"""Driver of one X4M300: raw radar mode, profiles, everything else. Pull-driven, starts no threads.
 
-`AsyncX4M300` has the same methods as coroutines.
+Several threads may use one driver, for example one that reads frames and one that sends commands:
+commands wait for each other, one thread at a time reads the line, and what it reads reaches the
+others. `AsyncX4M300` has the same methods as coroutines.
 """
 
 import itertools
+import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar, Self
 
@@ -52,9 +56,11 @@ from xethru_protocol.transport import (
     set_rate,
 )
 from xethru_protocol.wire.codes import PongCode, SensorMode
-from xethru_protocol.wire.errors import XeThruError
+from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.messages import Command, Response
+
+_LEAVE_S = 1.0  # for a thread to leave a line that was closed
 
 
 def known_ports() -> Sequence[str]:
@@ -62,8 +68,20 @@ def known_ports() -> Sequence[str]:
     return [port.path for port in find_ports()]
 
 
+def reentry(name: str) -> LocalProtocolError:
+    """Error for a driver that is called by what it calls itself."""
+    return LocalProtocolError(
+        f"the driver of {name} was called from its own listener, observer or other callback (or "
+        "from a signal handler) while it is at work; let the callback only store what it gets, "
+        "for example in a queue.Queue, and call the driver when it has returned, or from another "
+        "thread that the callback does not wait for"
+    )
+
+
 class RadarState:
     """Counters and settings of a driver, blocking or not.
+
+    A listener, observer or other callback must not call the driver: `LocalProtocolError`.
 
     Attributes
     ----------
@@ -96,6 +114,17 @@ class RadarState:
             candidates=candidates,
         )
         self._link.bytes_per_s = capacity_bytes_per_s(transport)
+
+    def __del__(self) -> None:
+        link = getattr(self, "_link", None)  # missing if the driver could not be made
+        if link is not None and link.frames.rate_hz and not link.closed:
+            warnings.warn(
+                f"a driver of {link.path} was dropped while its radar transmits, which it still "
+                f"does; write 'with {type(self).__name__}.open(...) as radar', or call close()",
+                ResourceWarning,
+                stacklevel=2,
+                source=self,
+            )
 
     @classmethod
     def open(
@@ -166,7 +195,10 @@ class RadarState:
 
     @property
     def frames_lost(self) -> int:
-        """Frames missing by the counters of those that came."""
+        """Frames missing by the counters of those that came.
+
+        Over a reconnect, by the frame rate and the time without frames.
+        """
         return self._link.statistics.frames_lost
 
     @property
@@ -322,8 +354,14 @@ class X4M300(RadarState):
         )
         self._open_port = open_port
         self._sleep = sleep
+        self._one_at_a_time = threading.Lock()
+        # Held while the driver's state is used, not while a thread waits for the line.
+        self._turn = threading.Condition(threading.Lock())
+        self._reading = False
+        self._waiting = 0  # threads that wait for the one that reads
+        self._inside: set[int] = set()  # threads in a call of the driver
         self.x4 = X4(self._call)
-        self.profile = Profile(self._call)
+        self.profile = Profile(self._call, self._listen)
         self.pins = Pins(self._call)
         self.files = Files(self._call, self._call_once)
         self.registers = Registers(self._call)
@@ -341,6 +379,7 @@ class X4M300(RadarState):
 
         A profile is left running, as the module itself would after power-up.
         """
+        self._refuse_reentry()
         self._link.closed = True
         try:
             self._call_once(raw_mode.leave)
@@ -420,8 +459,9 @@ class X4M300(RadarState):
     def reconnect(self, timeout_s: float = reconnect.RESTART_S) -> str:
         """Find the module again at the same port or another, and restore what was configured.
 
-        Frames that were read before it vanished stay in the queue; none is counted lost for the
-        time it was away. Returns the port it was found at.
+        Frames that were read before it vanished stay in the queue. Those that come begin a new
+        `Frame.stream`, and `frames_lost` includes those of the time between. Returns the port it
+        was found at.
 
         Raises
         ------
@@ -449,7 +489,8 @@ class X4M300(RadarState):
         LocalProtocolError
             If the module does not list the rate.
         ResponseTimeout
-            If the module is silent at the new rate; this side is back at the old one then.
+            If the module does not answer at the new rate. This side is back at the old rate then
+            if the module answers there, and at the new one if it answers at neither.
         """
         self._call_once(Link.set_baud_rate, baudrate, force=force)
 
@@ -498,10 +539,7 @@ class X4M300(RadarState):
         Disconnected
             If the line is gone.
         """
-        frames = self._link.frames
-        if not frames:
-            self._call(Link.wait_for_frame, timeout_s)
-        return frames.pop()
+        return self._listen(Link.next_frame, timeout_s)
 
     def frames(self, count: int | None = None, timeout_s: float = TIMEOUT_S) -> Iterator[Frame]:
         """Iterate over frames; ``count`` of them, or without end.
@@ -513,7 +551,7 @@ class X4M300(RadarState):
 
     def frames_waiting(self) -> int:
         """Receive what the line has, without waiting, and count the frames not taken yet."""
-        self._call(Link.take_stale_input)
+        self._listen(Link.take_stale_input)
         return len(self._link.frames)
 
     # --- other messages -------------------------------------------------------------------------
@@ -528,7 +566,7 @@ class X4M300(RadarState):
         ResponseTimeout
             If none comes in time.
         """
-        return self._call(wait_for_message, kind, timeout_s)
+        return self._listen(wait_for_message, kind, timeout_s)
 
     def messages(
         self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
@@ -542,34 +580,66 @@ class X4M300(RadarState):
 
     def messages_waiting(self, kind: type[Response] = Response) -> int:
         """Receive what the line has, without waiting, and count the messages not taken yet."""
-        return self._call(messages_waiting, kind)
+        return self._listen(messages_waiting, kind)
 
     # --- carrying out steps ---------------------------------------------------------------------
 
     def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Carry a procedure out; again after a reconnect, if that is on."""
+        """Carry out a procedure that sends commands; again after a reconnect, if that is on."""
         link = self._link
         if link.reconnect_s > 0:
             return self._run(reconnect.resilient(link, lambda: procedure(link, *args, **kwargs)))
         return self._run(procedure(link, *args, **kwargs))
 
     def _call_once(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Carry a procedure out; a broken line raises `Disconnected`."""
+        """Carry out a procedure that sends commands; a broken line raises `Disconnected`."""
         return self._run(procedure(self._link, *args, **kwargs))
 
+    def _listen(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
+        """Carry out a procedure that only receives, beside one that sends; also repeated."""
+        link = self._link
+        if link.reconnect_s <= 0:
+            return self._carry(procedure(link, *args, **kwargs))
+        if not link.identified:
+            self._run(reconnect.identify(link))
+        for _ in range(reconnect.RECONNECTS_PER_CALL):
+            reconnects = link.reconnects
+            try:
+                return self._carry(procedure(link, *args, **kwargs))
+            except Disconnected as error:
+                self._run(reconnect.recover(link, reconnects, error))
+        return self._carry(procedure(link, *args, **kwargs))
+
     def _run(self, procedure: Steps[T]) -> T:
+        """Carry out a procedure that sends commands: no other may send before it is done."""
+        self._refuse_reentry()
+        with self._one_at_a_time:
+            return self._carry(procedure)
+
+    def _refuse_reentry(self) -> None:
+        if threading.get_ident() in self._inside:
+            raise reentry(self._link.name)
+
+    def _carry(self, procedure: Steps[T]) -> T:
+        thread = threading.get_ident()
+        if thread in self._inside:
+            raise reentry(self._link.name)
+        self._inside.add(thread)
         try:
-            step = next(procedure)
-            while True:
-                try:
-                    came = self._carry_out(step)
-                except BaseException as error:  # the procedure decides
-                    step = procedure.throw(error)
-                else:
-                    step = procedure.send(came)
+            with self._turn:
+                step = next(procedure)
+                while True:
+                    try:
+                        came = self._carry_out(step)
+                    except BaseException as error:  # the procedure decides
+                        step = procedure.throw(error)
+                    else:
+                        step = procedure.send(came)
         except StopIteration as end:
             result: T = end.value
             return result
+        finally:
+            self._inside.discard(thread)
 
     def _carry_out(self, step: Step) -> bool:
         if isinstance(step, Read):  # the most frequent one, so without a match
@@ -578,16 +648,45 @@ class X4M300(RadarState):
             case Write(data):
                 if self.raw_listener is not None:
                     self.raw_listener("tx", data, self._link.clock())
-                self._transport.write(data)
+                self._without_turn(self._transport.write, data)
             case Sleep(seconds):
-                self._sleep(seconds)
+                self._without_turn(self._sleep, seconds)
             case _:
+                if self._reading and not isinstance(step, SetLineRate):
+                    self._transport.close()  # the thread that reads leaves it
+                    self._await_reader(_LEAVE_S)
                 self._change_line(step)
         return False
 
+    def _await_reader(self, timeout_s: float) -> bool:
+        """Wait until the thread that reads has done so; False if it has not in time."""
+        self._waiting += 1
+        try:
+            return self._turn.wait(min(max(timeout_s, 0.0), threading.TIMEOUT_MAX))
+        finally:
+            self._waiting -= 1
+
+    def _without_turn(self, wait: Callable[[T], None], argument: T) -> None:
+        try:
+            self._turn.release()
+            wait(argument)
+        finally:
+            self._turn.acquire()
+
     def _pump(self, timeout_s: float) -> bool:
-        """Read once and sort what came; False if nothing did in time."""
-        data = self._transport.read(timeout_s)
+        """Read once and sort what came, or wait for the thread that does; False if nothing came."""
+        if self._reading:
+            return self._await_reader(timeout_s)
+        data = b""
+        self._reading = True
+        try:
+            self._turn.release()
+            data = self._transport.read(timeout_s)
+        finally:
+            self._turn.acquire()
+            self._reading = False
+            if self._waiting:  # they go on when this thread waits again, or returns
+                self._turn.notify_all()
         if not data:
             return False
         arrival_ns = self._link.clock()

@@ -26,6 +26,8 @@ class RawPlan:
     def restore(self, link: Link) -> Steps[None]:
         """Configure and start again; frames that wait stay in the queue."""
         yield from _apply(link, self.config)
+        # setting up took its time, too
+        link.frames.interrupt(x4.real_frame_rate(self.fps or 0.0))
         if self.fps is not None:
             yield from run_at(link, self.fps)
 
@@ -37,7 +39,7 @@ def configure_raw(link: Link, config: RawConfig | None = None) -> Steps[FrameGeo
     else:
         config.area(config.offset_m)
     geometry = yield from _apply(link, config)
-    link.frames.new_stream()  # those that wait are of older settings
+    link.frames.clear()  # those that wait are of older settings
     return geometry
 
 
@@ -59,7 +61,6 @@ def _apply(link: Link, config: RawConfig) -> Steps[FrameGeometry]:
     geometry = yield from read_geometry(link, config.downconversion)
     _check_geometry(link, geometry, config, predicted)
     link.plan = RawPlan(config=config)
-    link.frames.break_off()
     link.frames.geometry = geometry
     link.frames.lattice = config.lattice
     return geometry
@@ -123,7 +124,7 @@ def start(link: Link, fps: float) -> Steps[float]:
         yield from _take_over(link)
     _warn_of_rate(link, fps)
     yield from link.take_stale_input()
-    link.frames.new_stream()  # a late frame of the last stream would make a false gap
+    link.frames.clear()  # a late frame of before would make a false gap
     return (yield from run_at(link, fps))
 
 

@@ -63,7 +63,7 @@ def reset(link: Link, *, wait: bool = False, timeout_s: float = RESTART_S) -> St
     yield from link.request(ModReset())
     link.raw_mode = False
     link.plan = None
-    link.frames.new_stream()
+    link.frames.clear()
     if wait:
         yield from await_restart(link, readies, timeout_s)
 
@@ -94,7 +94,7 @@ def await_restart(link: Link, readies: int, timeout_s: float = RESTART_S) -> Ste
 
 
 def reconnect(link: Link, timeout_s: float = RESTART_S) -> Steps[str]:
-    link.frames.break_off()
+    link.frames.interrupt()
     deadline_ns = link.conversation.deadline_ns(timeout_s)
     yield from _find_again(link, deadline_ns, timeout_s, restore=True)
     return link.path

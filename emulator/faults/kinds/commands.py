@@ -104,7 +104,7 @@ def late_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) ->
     return [Piece(packet, behind=1)]
 
 
-@of_reply("1 ResponseTimeout and 1 stray")
+@of_reply("1 RemoteProtocolError and 1 stray")
 def wrong_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A REPLY carries the content id of another question."""
     payload = normal_payload(packet)

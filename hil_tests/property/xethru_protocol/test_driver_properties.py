@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -62,6 +62,8 @@ class StallingModule:
         if isinstance(command, m.X4DriverSet):
             assert isinstance(command.value, int)
             answer = m.Error(code=command.value)
+        elif isinstance(command, m.SystemGetInfo):
+            answer = m.ReplyString(content_id=0x58, info=command.item, text="1.6.8")
         self.line.say_later((end_ns - now_ns) * 1e-9, answer)
         return []
 
@@ -77,6 +79,8 @@ def stalls(draw: st.DrawFn) -> list[tuple[int, int]]:
 
 
 @settings(deadline=None, max_examples=150)
+# the module stalls a second time with PONGs still due
+@example([(0, 4 * SECOND), (3 * SECOND, 12 * SECOND)], set(), ["ping"] * 6 + ["set"] * 2)
 @given(
     stalls(),
     st.sets(st.integers(1, 30), max_size=8),

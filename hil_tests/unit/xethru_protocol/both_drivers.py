@@ -1,6 +1,7 @@
 """The same tests on both drivers: `AsyncX4M300` with an event loop around each call."""
 
 import asyncio
+import contextlib
 import inspect
 from collections.abc import Callable, Iterator
 from typing import Any, Self, cast
@@ -9,7 +10,7 @@ from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, Scripte
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.chip import AsyncSetting, Setting
 from xethru_protocol.driver.link import AsyncPart
-from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.driver.radar import X4M300, RadarState
 
 
 class AsyncScripted:
@@ -82,7 +83,17 @@ DriverOn = Callable[..., Scripted]
 """Returns a driver and its line: the function below."""
 
 
-def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
+@contextlib.contextmanager
+def driver_factory(kind: str) -> Iterator[DriverOn]:
+    """Give a maker of drivers; at the end they count as closed, whatever their modules do."""
+    made: list[RadarState] = []
+    with asyncio.Runner() as runner:
+        yield _maker(kind, runner, made)
+    for radar in made:
+        radar._link.closed = True
+
+
+def _maker(kind: str, runner: asyncio.Runner, made: list[RadarState]) -> DriverOn:
     def driver_on(
         answer: Answer | None = None,
         *,
@@ -105,13 +116,15 @@ def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
 
         shared = {"clock": line.clock, "candidates": lambda: list(known), **options}
         if kind == "sync":
-            return X4M300(line, open_port=open_line, sleep=pass_time, **shared), line
+            made.append(X4M300(line, open_port=open_line, sleep=pass_time, **shared))
+            return cast(X4M300, made[-1]), line
         awaited = AsyncX4M300(
             AsyncScripted(line),
             open_port=lambda path, baudrate: AsyncScripted(open_line(path, baudrate)),
             sleep=let_time_pass,
             **shared,
         )
+        made.append(awaited)
         return cast(X4M300, Blocking(awaited, runner)), line
 
     return driver_on

@@ -1,6 +1,5 @@
 """Drivers on scripted lines, in both kinds, and a module at a port."""
 
-import asyncio
 from collections.abc import Iterator
 
 import pytest
@@ -12,8 +11,8 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 
 @pytest.fixture(params=["sync", "async"])
 def driver_on(request: pytest.FixtureRequest) -> Iterator[DriverOn]:
-    with asyncio.Runner() as runner:
-        yield driver_factory(request.param, runner)
+    with driver_factory(request.param) as driver_on:
+        yield driver_on
 
 
 @pytest.fixture

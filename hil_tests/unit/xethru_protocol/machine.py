@@ -43,14 +43,24 @@ class Machine:
 
 
 class UartModule(PlainModule):
-    """A module that hears and is heard only at its own baud rate."""
+    """A module that hears and is heard only at its own baud rate.
 
-    def __init__(self) -> None:
+    ``takes_ns`` after its ACK it changes the rate, unless it is ``stubborn``, and hears nothing
+    until then. Protocol reference 3.
+    """
+
+    def __init__(self, *, takes_ns: int = 500_000_000, stubborn: bool = False) -> None:
         super().__init__()
         self.baudrate = 115200
+        self.deaf = False
+        self._takes_ns = takes_ns
+        self._stubborn = stubborn
         self._line_rate = 115200
+        self._asleep_until_ns = 0
+        self._now_ns: Callable[[], int] = lambda: 0
 
     def connect(self, line: ScriptedTransport, baudrate: int) -> None:
+        self._now_ns = line.clock
         self._line_rate = baudrate
         line.bytes_per_s = 11520.0
         line.set_baudrate = self._set_line_rate
@@ -59,11 +69,14 @@ class UartModule(PlainModule):
         self._line_rate = baudrate
 
     def __call__(self, command: m.Message) -> Sequence[m.Message | bytes]:
-        if self._line_rate != self.baudrate:
+        if self._now_ns() < self._asleep_until_ns or self._line_rate != self.baudrate or self.deaf:
             return []
         answer = super().__call__(command)
         if isinstance(command, m.SetBaudRate):
-            self.baudrate = command.baudrate  # behind the answer, which goes out at the old rate
+            # behind the answer, which goes out at the old rate
+            self._asleep_until_ns = self._now_ns() + self._takes_ns
+            if not self._stubborn:
+                self.baudrate = command.baudrate
         if isinstance(command, m.ModReset):
             self.baudrate = 115200
         return answer

@@ -162,7 +162,33 @@ def test_messages_are_kept_only_if_they_are_asked_for(raw: Scripted) -> None:
     radar, line = raw
     line.say(*(presence(k, PRESENCE) for k in range(9)), frame(1))
     radar.read_frame()
-    assert radar._link.messages is None
+    assert not radar._link.messages
+
+
+def test_texts_are_kept_for_whoever_reads_messages_later(loaded: Emulated) -> None:
+    radar, line, _ = loaded
+    early, late = m.DataString(text="early"), m.DataString(text="late")
+    line.say(early, presence(1, PRESENCE))
+    radar.profile.load()  # what ran before has nothing more to say, but for its texts
+    radar.profile.run()
+    line.say(presence(2, INITIALIZING), late, presence(3, PRESENCE), presence(4, PRESENCE))
+    assert radar.profile.wait_until_initialized() == presence(3, PRESENCE)
+    assert list(radar.messages(3)) == [early, late, presence(4, PRESENCE)]
+
+
+def test_text_that_came_before_anything_was_asked_is_kept(driver_on: DriverOn) -> None:
+    radar, line = driver_on(EmulatedModule(stopped=False))
+    line.say(presence(1, PRESENCE), m.DataString(text="boot"), presence(2, PRESENCE))
+    radar.ping()
+    assert next(radar.messages(timeout_s=0.0)) == m.DataString(text="boot")
+
+
+def test_output_is_not_asked_for_while_no_profile_is_loaded(emulated: Emulated) -> None:
+    """In that state stock firmware leaves the question unanswered. Protocol reference 4.4, 8.3."""
+    radar, line, _ = emulated
+    with pytest.raises(LocalProtocolError, match="no profile is loaded"):
+        radar.profile.output(OutputFeature.BASEBAND_IQ)
+    assert line.now_ns < 1e9
 
 
 def test_messages_that_pile_up_are_dropped_and_told_of(loaded: Emulated) -> None:

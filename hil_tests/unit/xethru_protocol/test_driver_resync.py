@@ -31,8 +31,9 @@ def test_answer_behind_a_late_pong_is_not_taken_for_the_next_commands(driver_on:
         radar.request(FIRST)  # and so is this ACK
 
     def slow(command: m.Message) -> Said:
-        if isinstance(command, m.Ping):
-            line.say_later(0.1, m.Ack(), READY)  # FIRST's and this PING's
+        if isinstance(command, m.SystemGetInfo):
+            version = m.ReplyString(content_id=0x58, info=command.item, text="1.6.8")
+            line.say_later(0.1, m.Ack(), version)  # FIRST's and this one's
             return [READY]  # the one that was owed
         line.say_later(0.2, m.Error(code=21))  # in order: behind the others
         return []
@@ -41,7 +42,8 @@ def test_answer_behind_a_late_pong_is_not_taken_for_the_next_commands(driver_on:
     with pytest.raises(DeviceError) as caught:
         radar.request(SECOND)
     assert caught.value.code == 21  # not the ACK of FIRST
-    assert line.received[2:] == [m.Ping(), SECOND]
+    # a PONG would not say which PING it answers; this answer names its question (5.3)
+    assert line.received[2:] == [m.SystemGetInfo(item=3), SECOND]
 
 
 def test_ping_tells_the_state_of_now_not_of_a_late_pong(driver_on: DriverOn) -> None:

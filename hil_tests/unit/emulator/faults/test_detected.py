@@ -1,5 +1,6 @@
 """For each kind of fault: a driver counts exactly what was injected, or it cannot, and why."""
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,7 @@ from hil_tests.unit.emulator.faults.witnesses import FPS, WITNESSES
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
-from xethru_protocol.wire.errors import DeviceError, ResponseTimeout
+from xethru_protocol.wire.errors import DeviceError, RemoteProtocolError, ResponseTimeout
 from xethru_protocol.wire.framing import FaultKind
 
 __all__ = ["faulty_line"]  # a fixture
@@ -38,6 +39,7 @@ class Expected:
     reboots: int = 0
     timeouts: int = 0
     refusals: int = 0
+    unexpected: int = 0
 
 
 def damaged(kind: FaultKind) -> Expected:
@@ -81,7 +83,7 @@ REPLIES: dict[str, Expected] = {
     "duplicate_ack": Expected(keys=READ, stray=1),
     "stale_ack": Expected(keys=READ, stray=1),
     "late_reply": Expected(keys=READ, timeouts=1, stray=1),
-    "wrong_reply": Expected(keys=READ, timeouts=1, stray=1),
+    "wrong_reply": Expected(keys=READ, unexpected=1, stray=1),
     "system_message": Expected(keys={"packet": "reply", **READ}, reboots=1),
     "command_lost": Expected(keys=READ, timeouts=1),
     "command_damaged": Expected(keys=READ, timeouts=1),
@@ -202,7 +204,7 @@ def test_faults_of_answers_are_counted(kind: str, faulty_line: FaultyLine) -> No
     radar = faulty_line.radar()
     radar.request(m.X4DriverInit(), 10.0)
     radar.request(m.X4DriverSet(setting=X4Setting.PULSESPERSTEP, value=pulses))
-    timeouts = refusals = 0
+    timeouts = refusals = unexpected = 0
     with fault(faulty_line.device, kind, count=3, **wanted.keys) as injection:
         for _ in range(3):
             try:
@@ -211,6 +213,9 @@ def test_faults_of_answers_are_counted(kind: str, faulty_line: FaultyLine) -> No
                 timeouts += 1
             except DeviceError as error:
                 refusals += error.code == 7
+            except RemoteProtocolError:
+                unexpected += 1
+    assert unexpected == 3 * wanted.unexpected
     assert injection.injected == faulty_line.device.injected[kind] == 3
     faulty_line.sleep(10.0)
     radar.ping()
@@ -231,7 +236,9 @@ def test_faults_of_a_stream_are_counted(kind: str, faulty_line: FaultyLine) -> N
     hidden = not (wanted.faults or wanted.lost or wanted.off_lattice or wanted.unknown)
     assert bool(KINDS[kind].hidden) == (hidden and not wanted.discarded)
     if kind in WITNESSES:
-        WITNESSES[kind](frames, list(FaultyLine().streaming(FPS).frames(100))[1:], faulty_line)
+        sound = FaultyLine()
+        WITNESSES[kind](frames, list(sound.streaming(FPS).frames(100))[1:], faulty_line)
+        sound.forget()
 
 
 def test_flips_that_cancel_pass_the_checksum(faulty_line: FaultyLine) -> None:
@@ -284,15 +291,23 @@ def test_a_damaged_command_is_counted_by_the_module(faulty_line: FaultyLine) -> 
 @pytest.mark.parametrize("kind", ["unplug", "disconnect_mid_frame"])
 def test_a_module_that_vanishes_is_found_again(kind: str, faulty_line: FaultyLine) -> None:
     radar = faulty_line.streaming(FPS, reconnect_s=15.0)
-    before = list(radar.frames(5))
+    (rate_hz,) = radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values
+    frames = list(radar.frames(5))
     for _ in range(2):
         with fault(faulty_line.device, kind, away_s=0.5):
             began_ns = faulty_line.clock_ns()
-            list(radar.frames(10))
+            frames += radar.frames(10)
             assert faulty_line.clock_ns() - began_ns < 5e9
     assert radar.reconnects == faulty_line.device.injected[kind] == 2
-    assert len(before) == 5
-    assert radar.frames_lost == 0
+    assert [frame.stream for frame in frames] == sorted(frame.stream for frame in frames)
+    assert {frame.stream for frame in frames} == {0, 1, 2}
+    away_s = [
+        (after.arrival_ns - before.arrival_ns) * 1e-9
+        for before, after in itertools.pairwise(frames)
+        if after.stream != before.stream
+    ]
+    assert radar.frames_lost == sum(round(gap_s * rate_hz) - 1 for gap_s in away_s)
+    assert radar.frames_lost > 2 * 0.5 * rate_hz
 
 
 def test_a_watchdog_reboot_is_counted(faulty_line: FaultyLine) -> None:

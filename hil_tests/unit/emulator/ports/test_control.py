@@ -3,6 +3,7 @@
 import json
 import selectors
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ from xethru_protocol.wire.errors import Disconnected
 
 
 @pytest.fixture
-def line() -> FaultyLine:
-    return FaultyLine()
+def line() -> Iterator[FaultyLine]:
+    line = FaultyLine()
+    yield line
+    line.forget()
 
 
 def ask(line: FaultyLine, **asked: Any) -> dict[str, Any]:  # noqa: ANN401 - JSON

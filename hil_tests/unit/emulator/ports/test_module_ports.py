@@ -309,7 +309,7 @@ def test_an_open_port_hangs_up_and_its_name_is_gone_until_the_module_is_back(
 def test_the_loop_wakes_by_itself_when_the_port_is_due(vanishing: Unplugged) -> None:
     host = vanishing.open("radar")
     vanishing.reset(host)
-    (plug,) = vanishing.opened.services
+    *_, plug = vanishing.opened.services
     assert plug.wake_ns(0) is None
     vanishing.at_ms(RESTART_MS)
     wake_ns = plug.wake_ns(vanishing.now_ns)

@@ -8,7 +8,7 @@ import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame
-from xethru_protocol.driver.link import ProtocolRecord, RawConfig
+from xethru_protocol.driver.link import Link, ProtocolRecord, RawConfig
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import (
@@ -257,6 +257,61 @@ def test_replies_to_nothing_and_to_something_else_are_not_taken(driver_on: Drive
     assert radar.stray_count == 3
 
 
+@pytest.mark.parametrize(
+    ("command", "came", "text"),
+    [
+        (
+            m.GetSensitivity(),
+            m.ReplyByte(content_id=0x10A5112B, values=b"\x05"),
+            r"answered APP_GET SENSITIVITY with REPLY BYTE .*where REPLY INT was expected",
+        ),
+        (
+            m.X4DriverGet(setting=X4Setting.DACMAX),
+            m.ReplyInt(content_id=X4Setting.DACMIN, values=(949,)),
+            r"answered X4DRIVER_GET id=DACMAX with REPLY INT .*=.949., where .* content id 0x17 ",
+        ),
+        (
+            m.SystemGetInfo(item=6),
+            m.ReplyString(content_id=0x58, info=3, text="1.6.8"),
+            r"with REPLY STRING .*1\.6\.8.* content id 0x58 and info 6 was expected",
+        ),
+        (m.ModReset(), m.Pong(value=0xAAEEAEEA), r"answered MOD_RESET with PONG .*where ACK was"),
+    ],
+    ids=["type", "content id", "info", "pong"],
+)
+def test_answer_that_does_not_fit_is_named(
+    driver_on: DriverOn, command: m.Command[m.Response], came: m.Message, text: str
+) -> None:
+    radar, line = driver_on(lambda command: [came])
+    with pytest.raises(RemoteProtocolError, match=text):
+        radar.request(command)
+    assert line.now_ns < 0.6e9  # not the whole timeout: what was to come has come
+
+
+def test_anything_but_a_pong_is_no_pong(driver_on: DriverOn) -> None:
+    radar, _ = driver_on(lambda command: [m.Ack()])
+    with pytest.raises(ResponseTimeout, match=r"answered PING .* with ACK, where PONG was "):
+        radar.ping()
+
+
+def test_right_answer_behind_a_wrong_one_is_taken(driver_on: DriverOn) -> None:
+    def confused(command: m.Message) -> Said:
+        line.say_later(0.4, m.Ack())
+        return [m.ReplyInt(values=(1,))]
+
+    radar, line = driver_on(confused)
+    assert radar.request(m.X4DriverInit()) == m.Ack()
+
+
+def test_silence_of_a_module_that_sends_frames_is_none_of_its_power(raw: Scripted) -> None:
+    radar, line = raw
+    line._answer = lambda command: []
+    for k in range(60):
+        line.say_later(0.05 * k, frame(k))
+    with pytest.raises(ResponseTimeout, match="it sends frames meanwhile"):
+        radar.request(m.GetMode())
+
+
 @pytest.mark.parametrize("late", [m.Ack(), m.Error(code=1)], ids=["ack", "error"])
 def test_late_answer_is_not_taken_for_the_next_commands(
     driver_on: DriverOn, late: m.Message
@@ -382,7 +437,7 @@ def test_closing_stops_the_radar_also_in_the_middle_of_a_packet(driver_on: Drive
         radar.configure_raw()
         radar.start(17.0)
         line.say(b"\x7c\x7c\x7c\x7c\x6a\x16\x00\x00\x00\xa0")
-        radar._pump(0.0)
+        radar._call_once(Link.take_stale_input)
         line.say(bytes(5736))  # the rest of it
         line.received.clear()
     assert [type(c) for c in line.received] == [m.X4DriverSet, m.SetMode]
@@ -405,9 +460,7 @@ def test_observer_hears_everything_but_frames(driver_on: DriverOn) -> None:
     radar, line = driver_on(observer=heard.append)
     radar.ping()
     line.say(m.System(code=0x11), b"\x00", frame(1))
-    radar._pump(0.0)
-    radar._pump(0.0)
-    radar._pump(0.0)
+    radar._call_once(Link.take_stale_input)
     assert [(record.direction, record.summary) for record in heard] == [
         ("tx", "PING seed=0xEEAAEAAE"),
         ("rx", "PONG value=0xAAEEAEEA"),

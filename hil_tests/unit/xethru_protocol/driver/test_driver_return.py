@@ -8,7 +8,7 @@ import pytest
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.machine import Machine, UartModule
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport, frame
-from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.link import Link, RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, PongCode, SensorMode, X4Setting
@@ -154,11 +154,17 @@ def test_stream_goes_on_after_an_unplug_under_another_name(
     radar.configure_raw(RawConfig(iterations=8, dac_step=1))
     radar.start(17.0)
     line.say(frame(40), frame(41))
-    assert radar.read_frame().counter == 40
+    assert (radar.read_frame().counter, radar.read_frame().stream) == (40, 0)
     unplug(line)
-    assert [got.counter for got in radar.frames(2)] == [0, 1]
+    before_ns = line.now_ns
+    first, second = radar.frames(2)
+    assert [first.counter, second.counter] == [0, 1]
     assert radar.port == ELSEWHERE
-    assert (radar.reconnects, radar.frames_lost) == (1, 0)
+    # the time without frames, at the timer's real rate for 17 (Protocol reference 9.6)
+    missing = round((first.arrival_ns - before_ns) * 1e-9 * 17.04938) - 1
+    assert missing > 80
+    assert (radar.reconnects, radar.frames_lost) == (1, missing)
+    assert (first.stream, second.stream) == (1, 1)
     assert settings_sent(machine.lines[-1]) == settings_sent(line)  # with iterations and rate
     assert any("looking for the module for 20 s" in text for text in radar.warnings)
 
@@ -190,7 +196,7 @@ def test_a_setting_that_was_being_changed_is_changed_after_the_outage(
 def test_counters_on_either_side_of_an_outage_make_no_gap(
     plugged: DriverOn, machine: Machine
 ) -> None:
-    """Whether the counter restarts is an open question of the reference (15, 5)."""
+    """A module that kept its power counts on until INIT. Protocol reference 6.1."""
     back = PlainModule()
     back.stream = (frame(900),)
     machine.plug(HOME, lambda c: [frame(500), *back(c)] if isinstance(c, m.Ping) else back(c))
@@ -200,10 +206,12 @@ def test_counters_on_either_side_of_an_outage_make_no_gap(
     line.say(frame(40))
     radar.read_frame()
     unplug(line)
-    counters: list[int] = []
-    while 900 not in counters:
-        counters.append(radar.read_frame().counter)
-    assert radar.frames_lost == 0
+    streams: dict[int, int] = {}
+    while 900 not in streams:
+        got = radar.read_frame()
+        streams[got.counter] = got.stream
+    assert streams == {500: 1, 900: 2}
+    assert radar.frames_lost == 0  # all of it took less than a frame period
 
 
 def test_packet_cut_by_an_outage_is_counted_as_junk(plugged: DriverOn, machine: Machine) -> None:
@@ -211,7 +219,7 @@ def test_packet_cut_by_an_outage_is_counted_as_junk(plugged: DriverOn, machine: 
     radar, line = plugged(reconnect_s=10.0)
     radar.configure_raw()
     line.say(line._bytes(frame(7))[:100])
-    radar._pump(0.0)
+    radar._call_once(Link.take_stale_input)
     unplug(line)
     radar.ping()
     assert (radar.reconnects, radar.statistics.junk_bytes) == (1, 100)

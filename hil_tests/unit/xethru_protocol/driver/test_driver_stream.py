@@ -1,16 +1,24 @@
 """What bounds and checks a stream: queue, statistics, lattice, read-backs, rates, listeners."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
-from hil_tests.unit.xethru_protocol.scripted import BYTE_SETTINGS, READY, PlainModule, frame
+from hil_tests.unit.xethru_protocol.machine import UartModule
+from hil_tests.unit.xethru_protocol.scripted import (
+    BYTE_SETTINGS,
+    READY,
+    PlainModule,
+    ScriptedTransport,
+    frame,
+)
 from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.codes import PongCode, X4Setting
 from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError, ResponseTimeout
 from xethru_protocol.wire.framing import FaultKind
 
@@ -77,6 +85,64 @@ def test_statistics_count_what_came_and_what_was_wrong(driver_on: DriverOn) -> N
     assert statistics.frames_lost == radar.frames_lost == 2
     assert statistics.packets > 20
     assert statistics.bytes > 4 * 5747
+
+
+@pytest.mark.parametrize(
+    "restarts",
+    [
+        lambda radar, line: radar.configure_raw(),
+        lambda radar, line: radar.request(m.X4DriverInit()),
+        lambda radar, line: radar.reset(),
+        lambda radar, line: radar.request(m.X4DriverSet(setting=X4Setting.ENABLE, value=0)),
+        lambda radar, line: radar.request(m.LoadApp(profile_id=0x014D4AB8)),
+        lambda radar, line: line.say(m.System(code=0x10)),  # BOOTING: it restarted by itself
+    ],
+    ids=["configure_raw", "INIT", "reset", "ENABLE", "LOADAPP", "BOOTING"],
+)
+def test_stream_begins_wherever_the_counter_may_begin_anew(
+    raw: Scripted, restarts: Callable[[X4M300, ScriptedTransport], object]
+) -> None:
+    """Protocol reference 6.1: the counter is cleared by the chip's start-up code."""
+    radar, line = raw
+    line.say(frame(1), frame(2))
+    assert [got.stream for got in radar.frames(2)] == [0, 0]
+    for stream in (1, 2):
+        restarts(radar, line)
+        # more than before, and yet another count
+        line.say(frame(10 * stream), frame(10 * stream + 3))
+        assert [got.stream for got in radar.frames(2)] == [stream, stream]
+    assert radar.frames_lost == 4  # two in each of the new streams
+
+
+def test_counter_that_goes_back_begins_a_stream_and_rates_do_not(raw: Scripted) -> None:
+    radar, line = raw
+    radar.start(17.0)
+    line.say(frame(7), frame(8))
+    assert [got.stream for got in radar.frames(2)] == [0, 0]
+    radar.stop()
+    radar.start(10.0)
+    line.say(frame(9), frame(1), frame(2))
+    assert [(got.counter, got.stream) for got in radar.frames(3)] == [(9, 0), (1, 1), (2, 1)]
+    # neither a damaged counter nor a frame that came twice is a restart (17: XEP 2.1.3)
+    line.say(frame(900), frame(4), frame(4))
+    assert [got.stream for got in radar.frames(3)] == [1, 1, 1]
+    assert radar.frames_lost == 0  # it was 3
+
+
+def test_frames_before_configure_raw_are_reported(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    for k in range(50):
+        line.say_later(0.05 * k, frame(k))
+    with pytest.raises(ResponseTimeout, match=r"1431 values come, but configure_raw\(\) was not"):
+        radar.read_frame()
+    assert len(radar.warnings) == 1
+    assert "configure_raw() was not called" in radar.warnings[0]
+    assert radar.frames_discarded > 30
+    line.timed.clear()
+    radar.configure_raw()
+    line.say(frame(99, bins=50))
+    with pytest.raises(ResponseTimeout, match="frames of 50 values come, not of the 1431"):
+        radar.read_frame(timeout_s=0.5)
 
 
 def on_lattice(counter: int, counts: np.ndarray[tuple[int], np.dtype[np.uint32]]) -> m.DataFloat:
@@ -176,35 +242,63 @@ def test_rate_beyond_a_uart_is_a_warning(driver_on: DriverOn) -> None:
     )  # tried all the same
 
 
-def test_baud_rate_changes_on_both_sides_with_the_vendors_pauses(driver_on: DriverOn) -> None:
-    plain = PlainModule()
-    changes: list[tuple[int, int]] = []
-    asked: list[tuple[str, int]] = []
-
-    def module(command: m.Message) -> Said:
-        asked.append((type(command).__name__, line.now_ns))
-        return plain(command)
-
+def uart(
+    driver_on: DriverOn, module: UartModule
+) -> tuple[X4M300, ScriptedTransport, list[tuple[int, int]]]:
+    """Return driver, line, and the rates this side changes to, with their times."""
     radar, line = driver_on(module)
-    line.set_baudrate = lambda rate: changes.append((rate, line.now_ns))
+    module.connect(line, 115200)
+    changes: list[tuple[int, int]] = []
+
+    def change(rate: int) -> None:
+        changes.append((rate, line.now_ns))
+        module._set_line_rate(rate)
+
+    line.set_baudrate = change
+    return radar, line, changes
+
+
+def test_baud_rate_changes_on_both_sides(driver_on: DriverOn) -> None:
+    """The module sleeps for 500 ms behind its ACK; a PING of that time would be lost (3)."""
+    module = UartModule()
+    radar, line, changes = uart(driver_on, module)
     radar.set_baud_rate(921600)
-    assert line.received[0] == m.SetBaudRate(baudrate=921600)
-    (rate, changed_ns), (last, pinged_ns) = changes[0], asked[-1]
+    assert [type(command).__name__ for command in line.received] == ["SetBaudRate", "Ping"]
+    ((rate, changed_ns),) = changes
     assert rate == 921600
-    assert changed_ns - asked[0][1] == pytest.approx(100e6, abs=1e6)
-    assert last == "Ping"
-    assert pinged_ns - changed_ns == pytest.approx(400e6, abs=1e6)
+    assert changed_ns == pytest.approx(100e6, abs=1e6)
+    assert (module.baudrate, radar.warnings) == (921600, [])
+    assert 500e6 <= line.now_ns < 700e6
 
 
-def test_module_that_is_silent_at_the_new_rate_is_talked_to_at_the_old_one(
+def test_module_that_takes_its_time_to_change_its_rate_is_asked_again(driver_on: DriverOn) -> None:
+    radar, line, changes = uart(driver_on, UartModule(takes_ns=1_700_000_000))
+    radar.set_baud_rate(921600)
+    assert [rate for rate, _ in changes] == [921600]
+    assert 1.7e9 <= line.now_ns < 2.5e9
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+
+
+def test_module_that_keeps_its_rate_is_talked_to_at_it(driver_on: DriverOn) -> None:
+    radar, line, changes = uart(driver_on, UartModule(stubborn=True))
+    with pytest.raises(ResponseTimeout, match="38400 baud and still answers at 115200; this side"):
+        radar.set_baud_rate(38400)
+    assert [rate for rate, _ in changes] == [38400, 115200]
+    assert 2e9 < line.now_ns < 4e9
+    assert (radar._link.baudrate, radar.ping()) == (115200, PongCode.XTS_SPRP_READY)
+
+
+def test_module_that_answers_at_neither_rate_is_expected_at_the_new_one(
     driver_on: DriverOn,
 ) -> None:
-    changes: list[int] = []
-    radar, line = driver_on(lambda c: [m.Ack()] if isinstance(c, m.SetBaudRate) else [])
-    line.set_baudrate = changes.append
-    with pytest.raises(ResponseTimeout, match="not answer at 38400 baud; this side is back at 115"):
+    """It said it would change; going back would cut off one that only needs longer."""
+    module = UartModule()
+    radar, line, changes = uart(driver_on, module)
+    line._answer = lambda command: [m.Ack()] if isinstance(command, m.SetBaudRate) else []
+    with pytest.raises(ResponseTimeout, match="neither at 38400 nor at 115200 baud; this side st"):
         radar.set_baud_rate(38400)
-    assert changes == [38400, 115200]
+    assert [rate for rate, _ in changes] == [38400, 115200, 38400]
+    assert radar._link.baudrate == 38400
 
 
 def test_rates_no_module_lists_are_sent_only_when_forced(driver_on: DriverOn) -> None:

@@ -1,0 +1,277 @@
+"""Who calls a driver: its own callbacks, several threads, programs that drop it."""
+
+import gc
+import queue
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from hil_tests.patience import seconds
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.emulated import Emulated
+from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.errors import Disconnected, LocalProtocolError
+from xethru_protocol.wire.framing import NEED_DATA
+
+SET_POWER = m.X4DriverSet(setting=X4Setting.TXPOWER, value=1)
+
+# --- callbacks ----------------------------------------------------------------------------------
+
+
+def called(radar: Any, name: str) -> None:  # noqa: ANN401 - a driver or its stand-in
+    """Call a method of a driver, also where it is a coroutine and its event loop runs already."""
+    target = getattr(radar, "target", radar)
+    result = getattr(target, name)()
+    if hasattr(result, "send"):
+        result.send(None)
+
+
+@pytest.mark.parametrize("name", ["ping", "read_frame", "stop", "close"])
+@pytest.mark.parametrize("place", ["listener", "raw_listener", "observer"])
+def test_callback_that_calls_the_driver_is_refused_at_once(
+    driver_on: DriverOn, place: str, name: str
+) -> None:
+    raised: list[str] = []
+
+    def call_back(*what: object) -> None:
+        try:
+            called(radar, name)
+        except LocalProtocolError as error:
+            raised.append(str(error))
+
+    radar, line = driver_on(**({"observer": call_back} if place == "observer" else {}))
+    if place != "observer":
+        setattr(radar, place, call_back)
+    line.say(frame(1))
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert raised
+    assert all("callback" in text and "queue.Queue" in text for text in raised)
+    assert line.received == [m.Ping()]  # nothing was sent from inside
+    assert not line.closed
+    assert line.now_ns < 1e6
+
+
+def test_error_of_a_callback_reaches_the_caller_and_the_driver_goes_on(driver_on: DriverOn) -> None:
+    radar, _ = driver_on()
+    radar.listener = lambda message, t_ns: called(radar, "ping")
+    with pytest.raises(LocalProtocolError, match="called from its own listener"):
+        radar.request(SET_POWER)
+    radar.listener = None
+    assert radar.request(SET_POWER) == m.Ack()
+
+
+def test_report_of_progress_must_not_call_the_driver_either(emulated: Emulated) -> None:
+    radar, _, _ = emulated
+    with pytest.raises(LocalProtocolError, match="callback"):
+        radar.files.write(0x80000000, 1, bytes(600), lambda done, total: called(radar, "ping"))
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+
+
+# --- threads ------------------------------------------------------------------------------------
+
+
+class Wire:
+    """A line on which reads wait in real time; two readers at once are an error, as on a port."""
+
+    def __init__(self) -> None:
+        self.name = "the wire"
+        self.reading = threading.Event()
+        self.module = PlainModule()
+        self._to_host: queue.Queue[bytes] = queue.Queue()
+        self._connection = Connection(Role.MODULE)
+        self._busy = threading.Lock()
+        self._closed = False
+
+    def read(self, timeout_s: float) -> bytes:
+        if self._closed:
+            raise Disconnected("the wire was closed")
+        if not self._busy.acquire(blocking=False):
+            raise RuntimeError("concurrent poll() invocation")
+        try:
+            self.reading.set()
+            return self._to_host.get(timeout_s > 0, min(timeout_s, seconds(60)))
+        except queue.Empty:
+            return b""
+        finally:
+            self._busy.release()
+
+    def write(self, data: bytes) -> None:
+        self._connection.receive_data(data)
+        while (event := self._connection.next_event()) is not NEED_DATA:
+            assert isinstance(event, m.Message)
+            self.say(*self.module(event))
+
+    def say(self, *said: m.Message | bytes) -> None:
+        for one in said:
+            self._to_host.put(one if isinstance(one, bytes) else self._connection.send(one))
+
+    def close(self) -> None:
+        self._closed = True
+        self._to_host.put(b"")
+
+
+@contextmanager
+def thread(work: Callable[[], object]) -> Iterator[list[object]]:
+    """Run a function in a thread; at the end its result is in the list, or its error is raised."""
+    results: list[object] = []
+
+    def run() -> None:
+        try:
+            results.append(work())
+        except BaseException as error:
+            results.append(error)
+
+    worker = threading.Thread(target=run, daemon=True)
+    worker.start()
+    yield results
+    worker.join(seconds(60))
+    assert not worker.is_alive()
+    if isinstance(results[0], BaseException):
+        raise results[0]
+
+
+def wait_for_reader(wire: Wire) -> None:
+    assert wire.reading.wait(seconds(60))
+
+
+def test_thread_asks_while_another_waits_for_a_frame() -> None:
+    wire = Wire()
+    radar = X4M300(wire)
+    radar.configure_raw()
+    wire.reading.clear()
+    with thread(lambda: radar.read_frame(seconds(60)).counter) as read:
+        wait_for_reader(wire)
+        for _ in range(20):  # all these answers are heard by the other thread
+            assert radar.request(SET_POWER) == m.Ack()
+            assert not read
+        wire.say(frame(7))
+    assert read == [7]
+    assert radar.stray_count == 0
+
+
+def test_threads_that_ask_at_once_each_get_their_own_answer() -> None:
+    wire = Wire()
+    radar = X4M300(wire)
+    radar.configure_raw()
+    values = {X4Setting.DACMIN: 949, X4Setting.DACMAX: 1100, X4Setting.ITERATIONS: 16}
+
+    def ask(setting: X4Setting) -> set[object]:
+        replies = [radar.request(m.X4DriverGet(setting=setting)) for _ in range(100)]
+        return {reply.values for reply in replies}
+
+    def read() -> list[int]:
+        return [got.counter for got in radar.frames(200, seconds(60))]
+
+    with (
+        thread(read) as frames,
+        thread(lambda: ask(X4Setting.DACMIN)) as first,
+        thread(lambda: ask(X4Setting.DACMAX)) as second,
+    ):
+        third = ask(X4Setting.ITERATIONS)
+        wire.say(*(frame(k) for k in range(200)))
+    assert [first, second, third] == [
+        [{(values[X4Setting.DACMIN],)}],
+        [{(values[X4Setting.DACMAX],)}],
+        {(values[X4Setting.ITERATIONS],)},
+    ]
+    assert frames == [list(range(200))]
+    assert (radar.stray_count, radar.frames_lost) == (0, 0)
+
+
+def test_thread_that_stops_waiting_leaves_the_line_to_the_other() -> None:
+    """The one that read returns with its frame, and the answer is still to come."""
+    wire = Wire()
+    radar = X4M300(wire)
+    radar.configure_raw()
+    asked = threading.Event()
+
+    def slow(command: m.Message) -> Sequence[m.Message | bytes]:
+        asked.set()
+        return []
+
+    wire.module = slow  # type: ignore[assignment] # both are called with a command
+    wire.reading.clear()
+    with thread(lambda: radar.read_frame(seconds(60)).counter) as read:
+        wait_for_reader(wire)
+        with thread(lambda: radar.request(SET_POWER, seconds(60))) as answer:
+            assert asked.wait(seconds(60))
+            wire.say(frame(1))
+            while not read:
+                time.sleep(0.001)
+            wire.say(m.Ack())
+    assert (read, answer) == ([1], [m.Ack()])
+
+
+def test_closing_wakes_the_thread_that_reads() -> None:
+    wire = Wire()
+    radar = X4M300(wire)
+
+    def read() -> object:
+        with pytest.raises(Disconnected):
+            radar.read_frame(seconds(60))
+        return "woken"
+
+    with thread(read) as result:
+        wait_for_reader(wire)
+        radar.close()
+    assert result == ["woken"]
+
+
+# --- dropped ------------------------------------------------------------------------------------
+
+
+def drop(prepare: Callable[[X4M300], object]) -> list[str]:
+    """Return the texts of the warnings that dropping a driver gives."""
+    line = ScriptedTransport(PlainModule())
+    radar = X4M300(line, clock=line.clock)
+    prepare(radar)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        del radar
+        gc.collect()
+    return [str(one.message) for one in caught if issubclass(one.category, ResourceWarning)]
+
+
+def begin(radar: X4M300) -> None:
+    radar.configure_raw()
+    radar.start(17.0)
+
+
+def begin_and(end: Callable[[X4M300], object]) -> Callable[[X4M300], object]:
+    def prepare(radar: X4M300) -> None:
+        begin(radar)
+        end(radar)
+
+    return prepare
+
+
+def test_driver_dropped_while_its_radar_transmits_is_warned_of() -> None:
+    (text,) = drop(begin)
+    assert "the port" in text
+    assert "with X4M300.open(...)" in text
+
+
+@pytest.mark.parametrize(
+    "prepare",
+    [
+        X4M300.ping,
+        X4M300.configure_raw,
+        begin_and(X4M300.stop),
+        begin_and(X4M300.close),
+        begin_and(X4M300.reset),
+    ],
+    ids=["ping", "configured", "stopped", "closed", "reset"],
+)
+def test_driver_of_a_radar_that_is_silent_may_be_dropped(
+    prepare: Callable[[X4M300], object],
+) -> None:
+    assert drop(prepare) == []
