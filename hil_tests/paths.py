@@ -10,9 +10,19 @@ FIXTURES = REPOSITORY / "fixtures"
 SHARED_DATA = Path(os.environ.get("XETHRU_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
 
 
-def real_recording() -> Path:
-    """Return a recording of a standing X4, baseband of 2017; skip the test without it."""
-    path = SHARED_DATA / "x4_baseband_iq_2017"
-    if not path.is_dir():
-        pytest.skip(f"no recording {path}: set XETHRU_SHARED_DATA to the folder that holds it")
+def shared_data(name: str) -> Path:
+    """Return a file or folder of the data that is not in the tree; skip the test without it."""
+    path = SHARED_DATA / name
+    if not path.exists():
+        pytest.skip(f"no {path}: set XETHRU_SHARED_DATA to the folder that holds it")
     return path
+
+
+def real_recording() -> Path:
+    """Return a recording of a standing X4, BASEBAND_IQ of 2017; skip the test without it."""
+    return shared_data("x4_baseband_iq_2017")
+
+
+def real_raw_recording() -> Path:
+    """Return a recording of an X4M03, DATA FLOAT of 2025; skip the test without it."""
+    return shared_data("x4m03_rf_2025")

@@ -342,6 +342,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "file", type=not_empty, metavar="FILE", help="file or directory of a recording"
     )
     one.add_argument("--samples", action="store_true", help="print arrays whole")
+    one.add_argument(
+        "--frames",
+        choices=("auto", "rf", "baseband"),
+        default="auto",
+        help="what radar frames hold, which most recordings do not say (default: from the "
+        "module's answers if they are there, else by how smooth the values are over range)",
+    )
     _add_radar(one)
     _add_json(one)
 

@@ -3,11 +3,13 @@
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import numpy as np
 
 from xethru_protocol.cli.output import (
     CommandFailed,
@@ -22,6 +24,7 @@ from xethru_protocol.cli.output import (
     warn_of,
 )
 from xethru_protocol.recordings import (
+    FrameLayout,
     RecordingError,
     RecordingFault,
     RecordingSummary,
@@ -44,7 +47,7 @@ from xethru_protocol.wire.framing import (
     Packet,
     PacketReader,
 )
-from xethru_protocol.wire.messages import Ack, Message, Pong, Response, UnknownMessage
+from xethru_protocol.wire.messages import Ack, DataFloat, Message, Pong, Response, UnknownMessage
 from xethru_protocol.wire.rows import ROWS
 
 _CHUNK_BYTES = 65536
@@ -160,18 +163,24 @@ def dump(arguments: Namespace) -> int:
             payload = encode(message, bulk=bulk)
             print_json(_as_json(framing, payload, message) | {"t_ns": t_ns})
     else:
-        summary = describe_recording(file, radar=radar)
+        downconversion = {"baseband": True, "rf": False}.get(arguments.frames)
+        summary = describe_recording(file, radar=radar, downconversion=downconversion)
         for line in _head(summary):
             print_line(line)
         for message, t_ns in read_recording(file, faults.append, radar=radar):
             time = _since(t_ns, summary.start_ns)
-            print_line(f"{time}  {message_line(message, with_samples=arguments.samples)}")
+            line = message_line(message, with_samples=arguments.samples, frames=summary.frames)
+            print_line(f"{time}  {line}")
     warn_of("dump", faults)
     return 1 if faults else 0
 
 
-def message_line(message: Response, *, with_samples: bool) -> str:
+def message_line(
+    message: Response, *, with_samples: bool, frames: Mapping[int, FrameLayout] | None = None
+) -> str:
     """One line about a message: its name and fields, long ones cut unless asked for.
+
+    Frames that are complex baseband by ``frames`` are shown as bins of I and Q.
 
     >>> from xethru_protocol.wire.messages import DataFloat
     >>> import numpy as np
@@ -180,6 +189,12 @@ def message_line(message: Response, *, with_samples: bool) -> str:
     'DATA FLOAT content_id=0 info=7 length=5 data=[0, 0.333333, 0.666667, ... 5 in all]'
     """
     name, shown = describe(message)
+    if isinstance(message, DataFloat) and message.content_id == 0:
+        layout = (frames or {}).get(len(message.values))
+        if layout is not None and layout.downconversion:
+            del shown["length"], shown["data"]
+            i, q = np.split(message.values, 2)
+            shown |= {"bins": layout.bins, "i": i.tolist(), "q": q.tolist()}
     parts = (f"{key}={_text(value, with_samples)}" for key, value in shown.items())
     return " ".join([name, *parts])
 
@@ -194,6 +209,9 @@ def _as_json(framing: Framing, payload: bytes, message: Message) -> dict[str, An
     }
 
 
+_HINT = ", by how smooth they are (--frames rf or baseband if not)"
+
+
 def _head(summary: RecordingSummary) -> Iterator[str]:
     total = sum(summary.messages.values())
     yield (
@@ -202,6 +220,9 @@ def _head(summary: RecordingSummary) -> Iterator[str]:
     )
     for name, count in sorted(summary.messages.items()):
         yield f"  {count} {name}"
+    for layout in summary.frames.values():
+        if layout.downconversion is not None:
+            yield f"  frames of {layout}{_HINT if layout.inferred else ''}"
     if summary.start_ns is not None and summary.duration_ns is not None:
         start = datetime.fromtimestamp(summary.start_ns // 10**9, UTC)
         ms = summary.start_ns % 10**9 // 10**6

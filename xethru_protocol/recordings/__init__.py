@@ -17,6 +17,7 @@ from xethru_protocol.recordings.formats import (
     recording_format,
     recording_radars,
 )
+from xethru_protocol.recordings.frame_layout import FrameLayout
 from xethru_protocol.recordings.recorder import Recorder
 from xethru_protocol.recordings.records import (
     RadarFacts,
@@ -31,6 +32,7 @@ from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chu
 __all__ = [
     "Chunk",
     "Conversion",
+    "FrameLayout",
     "RadarFacts",
     "Record",
     "Recorder",

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from xethru_protocol.recordings import npz, wire_capture
+from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.records import (
     FaultHandler,
     RadarFacts,
@@ -45,7 +46,8 @@ class RecordingSummary:
 
     ``start_ns`` is the time of the first message [ns since 1970], ``duration_ns`` lasts from there
     to the last; both are None without times. ``messages`` counts each kind by name, ``size_bytes``
-    is of all files, ``parameter_file`` the name of the stored one.
+    is of all files, ``parameter_file`` the name of the stored one, ``frames`` what the DATA FLOAT
+    messages of radar frames hold, by their number of values.
     """
 
     path: Path
@@ -57,6 +59,7 @@ class RecordingSummary:
     session_id: str
     profile_id: int | None
     parameter_file: str | None
+    frames: dict[int, FrameLayout]
     faults: tuple[RecordingFault, ...]
 
 
@@ -150,14 +153,21 @@ def recording_facts(path: Path | str) -> RecordingFacts:
             return vendor_facts(path)
 
 
-def describe_recording(path: Path | str, *, radar: str | None = None) -> RecordingSummary:
-    """Read a whole recording, or the named radar's part, and summarise it."""
+def describe_recording(
+    path: Path | str, *, radar: str | None = None, downconversion: bool | None = None
+) -> RecordingSummary:
+    """Read a whole recording, or the named radar's part, and summarise it.
+
+    ``downconversion`` says whether its frames are baseband; None: as far as it can be told.
+    """
     path = Path(path)
+    layouts = FrameLayouts(downconversion)
     faults: list[RecordingFault] = []
     counts: Counter[str] = Counter()
     first_ns = last_ns = None
     for message, t_ns in read_recording(path, faults.append, radar=radar):
         counts[message_name(message)] += 1
+        layouts.take(message)
         if t_ns is not None:
             first_ns = t_ns if first_ns is None else min(first_ns, t_ns)
             last_ns = t_ns if last_ns is None else max(last_ns, t_ns)
@@ -177,6 +187,7 @@ def describe_recording(path: Path | str, *, radar: str | None = None) -> Recordi
         session_id=facts.session_id,
         profile_id=facts.profile_id,
         parameter_file=None if facts.parameter_file is None else PARAMETER_FILE_NAME,
+        frames=layouts.layouts(),
         faults=tuple(faults),
     )
 

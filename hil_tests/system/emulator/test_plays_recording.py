@@ -8,11 +8,13 @@ import pytest
 from emulator.loopback import LoopbackTransport
 from emulator.playback import played_radars
 from hil_tests.device.serving import Served, emulator, open_radar
-from hil_tests.paths import real_recording
+from hil_tests.paths import real_raw_recording, real_recording
+from xethru_protocol.cli import main
+from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import read_recording
 from xethru_protocol.wire.codes import PongCode
-from xethru_protocol.wire.messages import BasebandIq
+from xethru_protocol.wire.messages import BasebandIq, DataFloat
 
 pytestmark = pytest.mark.slow
 
@@ -47,6 +49,29 @@ def test_every_counter_and_every_sample_arrives(player: Served, recorded: list[B
         assert frame.geometry.n_bins == 54
     # module metres, from the recording's own description
     assert frames[0].geometry.range_start_m == pytest.approx(0.3343, abs=1e-4)
+
+
+def test_raw_frames_of_an_x4m03_arrive(tmp_path: Path) -> None:
+    """By the driver as complex bins, and by whoever only listens to the wire."""
+    recording = real_raw_recording()
+    recorded = [message for message, _ in read_recording(recording)]
+    n_frames = ("--count", str(len(recorded)))
+    with emulator("play", recording, "--rate", "0") as served:
+        with X4M300.open(served.paths[0]) as driver:
+            driver.configure_raw(RawConfig(downconversion=True))
+            driver.start(17)
+            frames = list(driver.frames(len(recorded), timeout_s=5.0))
+            assert (driver.frames_lost, driver.fault_count) == (0, 0)
+        listen = ["record", "--port", served.paths[0], "--profile", "none", *n_frames]
+        assert main([*listen, "--wire", str(tmp_path / "port.xtwire")]) == 0
+    assert len(frames) == 1518
+    for frame, message in zip(frames, recorded, strict=True):
+        assert isinstance(message, DataFloat)
+        assert frame.counter == message.info
+        assert frame.samples.real.tobytes() == message.values[:91].tobytes()
+        assert frame.samples.imag.tobytes() == message.values[91:].tobytes()
+    heard = [message for message, _ in read_recording(tmp_path / "port.xtwire")]
+    assert heard[: len(recorded)] == recorded
 
 
 def test_a_host_that_asks_first_hears_it_all_too(

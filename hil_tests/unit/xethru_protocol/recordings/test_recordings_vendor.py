@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.paths import FIXTURES, SHARED_DATA
+from hil_tests.paths import FIXTURES, real_recording, shared_data
 from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence
 from xethru_protocol.recordings import (
     RecordingError,
@@ -21,8 +21,6 @@ from xethru_protocol.recordings import (
 from xethru_protocol.wire import messages as m
 
 RECORDINGS = FIXTURES / "recordings"
-REAL = SHARED_DATA / "x4_baseband_iq_2017"
-MANIFEST = SHARED_DATA / "recordings" / "manifest.json"
 META = "xethru_recording_meta.dat"
 MS = 1_000_000
 
@@ -69,14 +67,13 @@ def test_what_the_vendor_wrote_is_written_again_byte_for_byte(name: str, tmp_pat
 
 
 def test_the_real_meta_file_of_2017_is_written_again_byte_for_byte(tmp_path: Path) -> None:
-    if not REAL.is_dir():
-        pytest.skip(f"no recording {REAL}: set XETHRU_SHARED_DATA to the folder that holds it")
-    facts = recording_facts(REAL)
+    real = real_recording()
+    facts = recording_facts(real)
     assert facts.session_id == "baseband_recording"
     # its file name has the local time of Oslo in summer, 15:04 where UTC had 13:04
-    write_again(REAL, tmp_path / "again")
+    write_again(real, tmp_path / "again")
     ours = contents(tmp_path / "again")
-    theirs = contents(REAL)
+    theirs = contents(real)
     name = "xethru_baseband_iq_20170913_"
     assert ours[META].replace(name.encode() + b"130437", name.encode() + b"150437") == theirs[META]
     assert ours[name + "130437.dat"] == theirs[name + "150437.dat"]
@@ -113,9 +110,8 @@ def test_the_facts_are_those_the_vendors_reader_gives(
 
 
 def test_every_record_is_what_the_vendors_reader_gives() -> None:
-    if not MANIFEST.is_file():
-        pytest.skip(f"no {MANIFEST}: set XETHRU_SHARED_DATA to the folder that holds recordings/")
-    for recording in json.loads(MANIFEST.read_text())["recordings"]:
+    manifest = shared_data("recordings") / "manifest.json"
+    for recording in json.loads(manifest.read_text())["recordings"]:
         told = [record for record in recording["records"] if "values" in record]
         found = list(read_recording(RECORDINGS / recording["directory"]))
         assert [t_ns for _, t_ns in found] == [record["epoch_ms"] * MS for record in told]
@@ -273,16 +269,3 @@ def test_records_have_the_values_and_times_that_were_written() -> None:
         np.testing.assert_allclose(message.q, np.arange(1, 11) * counter * -2e-3, rtol=1e-6)
         assert message.range_offset_m == np.float32(0.4)
         assert message.carrier_frequency_hz == np.float32(7.29e9)
-
-
-@pytest.mark.skipif(
-    not REAL.is_dir(), reason="real recording not found; name its folder in XETHRU_SHARED_DATA"
-)
-def test_the_real_recording_is_read_whole() -> None:
-    records = [message for message, _ in read_recording(REAL) if isinstance(message, m.BasebandIq)]
-    assert len(records) == 514
-    assert {message.num_bins for message in records} == {54}
-    assert {message.range_offset_m for message in records} == {np.float32(0.3343209922)}
-    strength = np.mean([np.abs(message.i + 1j * message.q) for message in records], axis=0)
-    assert int(np.argmax(strength)) == 0
-    assert strength[0] == pytest.approx(0.0294, abs=1e-4)

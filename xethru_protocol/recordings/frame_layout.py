@@ -1,0 +1,114 @@
+"""What the values of radar frames are: RF, or complex baseband.
+
+A frame does not say it (Protocol reference 6.1), and recordings of the vendor's format hold no
+settings. What can be known: a module that was asked for its bin count gave it; more values than two
+for each of 188 baseband bins, or an odd number of them, are RF (9.4). Else it is inferred from the
+frames themselves. The chip samples RF at 3.2 values per period of its carrier, so that neighbours
+differ about as much as they are large; white noise does so, too. Baseband bins are filtered to the
+pulse's bandwidth and neighbours are alike, in the first half of the values (I) and in the second
+(Q).
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.messages import DataFloat, ReplyInt
+from xethru_protocol.wire.rows import Response
+
+_MOST_BASEBAND_BINS = 188  # Protocol reference 9.4
+_ENOUGH_FRAMES = 64
+_FEWEST_BINS = 8  # to tell smooth from rough
+# 0 for equal neighbours, 1 for independent ones. Emulated RF frames have 0.95 to 1.4, emulated and
+# real baseband 0.09 to 0.45.
+_SMOOTH, _ROUGH = 0.55, 0.85
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameLayout:
+    """What frames with a number of ``values`` are.
+
+    ``downconversion`` is None where that cannot be told; ``inferred``: it is a conclusion from the
+    frames' content and may be wrong.
+    """
+
+    values: int
+    downconversion: bool | None
+    inferred: bool = False
+
+    @property
+    def bins(self) -> int | None:
+        if self.downconversion is None:
+            return None
+        return self.values // 2 if self.downconversion else self.values
+
+    def __str__(self) -> str:
+        """Describe it.
+
+        >>> str(FrameLayout(values=182, downconversion=True, inferred=True))
+        'probably 91 complex baseband bins'
+        """
+        if self.downconversion is None:
+            return f"{self.values} values, RF or complex baseband"
+        kind = "complex baseband" if self.downconversion else "RF"
+        return f"{'probably ' if self.inferred else ''}{self.bins} {kind} bins"
+
+
+@dataclass(slots=True)
+class FrameLayouts:
+    """Gathers what shows the layout of the frames of a recording, message by message.
+
+    ``downconversion`` is what the caller knows about all of them; None: nothing.
+    """
+
+    downconversion: bool | None = None
+    _frames: dict[int, list[npt.NDArray[np.float32]]] = field(default_factory=dict)
+    _answered: dict[int, bool] = field(default_factory=dict)  # by number of values
+    _bin_count: int | None = None
+    _counts: Counter[int] = field(default_factory=Counter)
+
+    def take(self, message: Response) -> None:
+        match message:
+            case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(count,)):
+                self._bin_count = count
+            case DataFloat(content_id=0, values=values):
+                length = len(values)
+                self._counts[length] += 1
+                if self._bin_count is not None and length in (self._bin_count, 2 * self._bin_count):
+                    self._answered[length] = length != self._bin_count
+                kept = self._frames.setdefault(length, [])
+                if len(kept) < _ENOUGH_FRAMES:
+                    kept.append(values)
+
+    def layouts(self) -> dict[int, FrameLayout]:
+        """Return the layouts by number of values, the most frequent first."""
+        return {length: self._layout(length) for length, _ in self._counts.most_common()}
+
+    def _layout(self, length: int) -> FrameLayout:
+        if length % 2 or length > 2 * _MOST_BASEBAND_BINS:
+            return FrameLayout(values=length, downconversion=False)
+        if self.downconversion is not None:
+            return FrameLayout(values=length, downconversion=self.downconversion)
+        if length in self._answered:
+            return FrameLayout(values=length, downconversion=self._answered[length])
+        frames = np.array(self._frames[length], np.float64)
+        roughness = _roughness(frames.reshape(len(frames), 2, length // 2))
+        if roughness is None or _SMOOTH <= roughness <= _ROUGH:
+            return FrameLayout(values=length, downconversion=None)
+        return FrameLayout(values=length, downconversion=roughness < _SMOOTH, inferred=True)
+
+
+def _roughness(halves: npt.NDArray[np.float64]) -> float | None:
+    """Mean square step between neighbours in range, per twice the variance over range.
+
+    ``halves`` has shape (n, 2, bins). None for frames that are too short, constant or not finite.
+    """
+    halves = halves[np.isfinite(halves).all(axis=(1, 2))]
+    if halves.shape[2] < _FEWEST_BINS or not len(halves):
+        return None
+    halves = halves - halves.mean(axis=2, keepdims=True)
+    power = 2 * float(np.square(halves[..., 1:]).sum())
+    return float(np.square(np.diff(halves, axis=2)).sum()) / power if power > 0 else None
