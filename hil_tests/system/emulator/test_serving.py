@@ -71,16 +71,16 @@ def test_a_file_survives_the_emulator(tmp_path: Path) -> None:
         assert served.end() == 0
     assert [path.name for path in tmp_path.iterdir()] == [f"{served.serials[0]}.json"]
     with emulator(*serve) as served, open_radar(served.paths[0]) as radar:
-        assert radar.files.find_all() == (FILE,)
+        assert radar.files.find(FILE.file_type) == (FILE,)
         assert radar.files.read(FILE.file_type, FILE.identifier) == content
         radar.files.delete(FILE.file_type, FILE.identifier)
-        assert not radar.files.find_all()
+        assert not radar.files.find(FILE.file_type)
 
 
 def test_without_a_state_dir_nothing_is_kept() -> None:
     for _ in range(2):
         with emulator("serve", "--bare") as served, open_radar(served.paths[0]) as radar:
-            assert not radar.files.find_all()
+            assert not radar.files.find(FILE.file_type)
             radar.files.write(FILE.file_type, FILE.identifier, b"x")
 
 
