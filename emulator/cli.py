@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.chip import Pace
-from xethru_protocol.system import StopFlag, flush_streams
+from xethru_protocol.system import StopFlag, each_line, flush_streams, json_text, one_line
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -165,7 +165,7 @@ def _control(arguments: argparse.Namespace) -> int:
         return _failed(f"{path}: what answers there is no emulator")
     if refused is not None:
         return _failed(refused)
-    _print(answer.decode().rstrip("\n"))
+    _print(json_text(reply))
     return 0
 
 
@@ -230,12 +230,13 @@ def _number(text: str) -> float:
 
 def _socket_of(path: Path) -> Path:
     """Return the control socket of the emulator that has a port; a socket is itself."""
-    from xethru_protocol.transport import run_directory
+    from xethru_protocol.transport import is_private, run_directory
 
     with contextlib.suppress(OSError):  # too long, for example: connecting reports it
         if path.is_socket():
             return path
-    for entry in sorted(run_directory().glob("*.json")):
+    folder = run_directory()
+    for entry in sorted(folder.glob("*.json")) if is_private(folder) else ():
         try:
             announced = json.loads(entry.read_text())
             ports = [Path(device["path"]) for device in announced["devices"]]
@@ -264,14 +265,13 @@ def ask(path: Path, request: dict[str, Any]) -> bytes:
 
 def _print(text: str) -> None:
     if sys.stdout is not None:
-        sys.stdout.write(f"{text}\n")
+        sys.stdout.write(f"{each_line(text)}\n")
         sys.stdout.flush()  # what fails shall fail here, not when the interpreter ends
 
 
 def _failed(text: str, *, exit_code: int = 1) -> int:
     if sys.stderr is not None:  # started with stderr closed
-        line = " ".join(text.split())
-        sys.stderr.write(f"xethru-emulator: {line}\n")
+        sys.stderr.write(f"xethru-emulator: {one_line(' '.join(text.split()))}\n")
     return exit_code
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import sys
 import time
@@ -38,7 +37,7 @@ from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
-from xethru_protocol.system import StopFlag, flush_streams
+from xethru_protocol.system import StopFlag, flush_streams, json_text
 from xethru_protocol.transport import open_line
 from xethru_protocol.wire.errors import PortUnavailable
 
@@ -327,7 +326,7 @@ def _run(
     ports.moved = lambda: announcement.update({**ready, "devices": ports.entries()})
     if sys.stdout is not None:  # else it was started with stdout closed
         try:
-            sys.stdout.write(json.dumps(ready, separators=(",", ":")) + "\n")
+            sys.stdout.write(json_text(ready, separators=(",", ":")) + "\n")
             sys.stdout.flush()
         except OSError as error:  # ports that were not announced are of no use
             flush_streams()

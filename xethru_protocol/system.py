@@ -1,4 +1,4 @@
-"""The operating system for command lines: signals, closed streams, bounded files, locks.
+"""The operating system for command lines: signals, streams, text for terminals, files, locks.
 
 Imports nothing heavy: a command line uses it while it imports the rest.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import json
 import os
 import signal
 import sys
@@ -172,6 +173,30 @@ def flush_streams() -> bool:
             _null_at(descriptor)
             taken &= descriptor != 1
     return taken
+
+
+def one_line(text: str) -> str:
+    r"""Write out what is not printable: text of modules, files and other programs is shown so.
+
+    Control characters would move the cursor, set the title or recolour the terminal that shows
+    them, and line ends would pass for lines of ours.
+
+    >>> print(one_line("radar \x1b[2J\n"))
+    radar \x1b[2J\n
+    """
+    if text.isprintable():
+        return text
+    return "".join(part if part.isprintable() else ascii(part)[1:-1] for part in text)
+
+
+def each_line(text: str) -> str:
+    """Do as `one_line` in text whose line ends are ours."""
+    return "\n".join(map(one_line, text.split("\n")))
+
+
+def json_text(value: object, **options: Any) -> str:  # noqa: ANN401 - those of json.dumps
+    """JSON in ASCII without control characters; DEL is the one that `json.dumps` leaves."""
+    return json.dumps(value, **options).replace("\x7f", "\\u007f")
 
 
 def _null_at(descriptor: int) -> None:

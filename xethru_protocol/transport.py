@@ -21,6 +21,7 @@ import os
 import re
 import select
 import socket
+import stat
 import tempfile
 import termios
 import time
@@ -617,6 +618,20 @@ def run_directory() -> Path:
     return Path(tempfile.gettempdir()) / f"xethru-{os.getuid()}"
 
 
+def is_private(folder: Path) -> bool:
+    """Whether a folder is this user's, and no other user may write there.
+
+    Only then is the run directory believed: in the folder for temporary files anybody can make one
+    of that name.
+    """
+    try:
+        status = folder.lstat()
+    except OSError:
+        return False
+    mine = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
+    return mine and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
 def _usb_ports() -> Iterator[PortInfo]:
     for port in sorted(list_ports.comports(), key=lambda found: found.device):
         description = _USB_IDS.get((port.vid, port.pid))
@@ -627,7 +642,7 @@ def _usb_ports() -> Iterator[PortInfo]:
 
 
 def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
-    if not folder.is_dir():
+    if not is_private(folder):
         return
     for file in sorted(folder.glob("*.json")):
         try:

@@ -16,7 +16,6 @@ import errno
 import json
 import os
 import shutil
-import stat
 import tempfile
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator
@@ -31,7 +30,7 @@ from emulator.module.modes import Start, State
 from emulator.module.settings import ProfileSettings
 from emulator.ports.pty import LinkError
 from xethru_protocol.system import PathInUseError, locked
-from xethru_protocol.transport import is_running, run_directory
+from xethru_protocol.transport import is_private, is_running, run_directory
 
 _PORTS = "ports-"
 
@@ -41,14 +40,13 @@ def fresh_port_folder() -> Path:
 
 
 def _private_run_directory() -> Path | None:
-    """Create the folder; None when it cannot be made or belongs to another user."""
+    """Create the folder; None when it cannot be made or is not this user's alone."""
     folder = run_directory()
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.lstat()
     except OSError:
         return None
-    return folder if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() else None
+    return folder if is_private(folder) else None
 
 
 class Announcement:

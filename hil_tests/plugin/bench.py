@@ -24,6 +24,7 @@ from hil_tests.plugin.radar_targets import (
 )
 from xethru_protocol.driver.link import BAUD_RATES, POWER_UP_BAUD
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.system import one_line
 from xethru_protocol.transport import Transport, set_rate
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
@@ -56,7 +57,11 @@ class PortLock:
         folder = Path(tempfile.gettempdir()) / "xethru-hil-locks"
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
-            folder.chmod(0o777)  # other users lock here, too
+        if folder.is_symlink() or not folder.is_dir():
+            raise PortBusyError(f"{folder}: must be a folder, for locks; remove it")
+        with contextlib.suppress(PermissionError):  # another user's
+            # other users lock here, too, and remove no lock of others (the sticky bit)
+            folder.chmod(0o1777)
         name = re.sub(r"[^0-9A-Za-z.]+", "_", device).strip("_")
         if len(name) > _LONGEST_NAME:
             name = hashlib.blake2b(device.encode(errors="surrogateescape")).hexdigest()
@@ -65,7 +70,8 @@ class PortLock:
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            owner = os.read(self._descriptor, 20).decode().strip() or "unknown"
+            written = os.read(self._descriptor, 20).strip()
+            owner = written.decode() if written.isdigit() else "unknown"
             self.release()
             if owner == str(os.getpid()):
                 raise PortBusyError(
@@ -93,8 +99,11 @@ def _open(path: Path) -> int:
     flags = os.O_CLOEXEC | os.O_NOFOLLOW
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, _ALL_USERS)
-    except PermissionError:
-        return os.open(path, os.O_RDONLY | flags)  # enough for flock
+    except PermissionError:  # Linux may create nothing over another user's file in such a folder
+        try:
+            return os.open(path, os.O_RDWR | flags)
+        except PermissionError:
+            return os.open(path, os.O_RDONLY | flags)  # enough for flock
     with contextlib.suppress(OSError):
         os.fchmod(descriptor, _ALL_USERS)  # whatever the umask
     return descriptor
@@ -237,7 +246,7 @@ class RadarUnderTest:
         if info.order_code is None:  # base firmware, without profiles
             self.place.capabilities -= {"profiles"}
         known = (info.order_code or "bare", info.serial_number, info.firmware_id, info.version)
-        self.identity = " ".join(part for part in known if part)
+        self.identity = one_line(" ".join(part for part in known if part))
 
     def _wait_until_ready(self, radar: X4M300, line: Transport, deadline_ns: int) -> None:
         while True:

@@ -18,7 +18,13 @@ from slam.app.commands.options import add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep import STRESSES
-from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
+from xethru_protocol.system import (
+    StopFlag,
+    StopRequestedError,
+    flush_streams,
+    one_line,
+    open_closed_streams,
+)
 
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
@@ -85,7 +91,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _end(message: str, exit_code: int) -> int:
-    line = " ".join(message.split())
+    line = one_line(" ".join(message.split()))
     with contextlib.suppress(OSError):  # the terminal may be gone, and be the reason of the end
         print(f"uwb-slam: {line}", file=sys.stderr)  # noqa: T201 - a command line prints
     return exit_code

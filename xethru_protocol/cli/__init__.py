@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     from xethru_protocol.cli.arguments import parse
-    from xethru_protocol.cli.output import one_line, warn
+    from xethru_protocol.cli.output import warn
     from xethru_protocol.wire.errors import XeThruError
 
     try:
@@ -36,7 +36,7 @@ def _run(argv: Sequence[str] | None) -> int:
             run = getattr(import_module(f"xethru_protocol.cli.{file}"), function)
             code: int = run(arguments)
         except XeThruError as error:
-            warn(f"xethru {arguments.command}: {one_line(str(error))}")
+            warn(f"xethru {arguments.command}: {error}")
             return 1
     except SystemExit:  # after --help or wrong usage
         if flush_streams():

@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from xethru_protocol.cli.output import counted, one_line, print_json, print_line, profile_name
+from xethru_protocol.cli.output import counted, print_json, print_line, profile_name
 from xethru_protocol.cli.port_probe import (
     USUAL_BAUDRATE,
     Check,
@@ -23,7 +23,8 @@ from xethru_protocol.cli.port_probe import (
     PortProbe,
     run_checks,
 )
-from xethru_protocol.transport import find_ports, is_running, run_directory
+from xethru_protocol.system import one_line
+from xethru_protocol.transport import find_ports, is_private, is_running, run_directory
 from xethru_protocol.wire.codes import PongCode, ProfileId, SensorMode
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.messages import Ping
@@ -41,7 +42,7 @@ class Machine:
         """Entries of emulators that do not run any more."""
         return tuple(
             entry
-            for entry in sorted(self.run_directory.glob("*"))
+            for entry in self._entries("*")
             if (pid := _process_id(entry)) is not None and not is_running(pid)
         )
 
@@ -50,9 +51,13 @@ class Machine:
         """Entries of running emulators that cannot be read."""
         return tuple(
             entry
-            for entry in sorted(self.run_directory.glob("*.json"))
+            for entry in self._entries("*.json")
             if entry not in self.stale and not _is_readable(entry)
         )
+
+    def _entries(self, pattern: str) -> list[Path]:
+        folder = self.run_directory
+        return sorted(folder.glob(pattern)) if is_private(folder) else []
 
 
 def _process_id(entry: Path) -> int | None:
@@ -91,6 +96,20 @@ def _no_module(machine: Machine) -> str | None:
     if machine.ports:
         return None
     return "no module was found: none on USB, no emulator is running"
+
+
+@Check(
+    MACHINE_CHECKS,
+    "run directory private",
+    looks_at="owner and permissions of the run directory",
+    remedy="if it is yours: chmod go-w {run_directory}; else set XDG_RUNTIME_DIR to a folder of "
+    "your own, for emulators and for xethru",
+)
+def _not_private(machine: Machine) -> str | None:
+    folder = machine.run_directory
+    if is_private(folder) or not os.path.lexists(folder):
+        return None
+    return f"{folder} is not this user's alone: what it says about emulators is not believed"
 
 
 @Check(
@@ -540,7 +559,7 @@ def _introduction(probe: PortProbe) -> str:
 
 
 def _lines(report: Report) -> Iterator[str]:
-    yield f"{one_line(report.subject)}{': ' if report.about else ''}{report.about}"
+    yield f"{report.subject}{': ' if report.about else ''}{report.about}"
     well = sum(finding.level is Level.OK for finding in report.checks)
     if well:
         yield f"  ok     {counted(well, 'check')}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import sys
@@ -11,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
-from xethru_protocol.system import flush_streams
+from xethru_protocol.system import flush_streams, json_text, one_line
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 
@@ -39,22 +38,23 @@ class CommandFailed(XeThruError):  # noqa: N818 - reads as the event it is
 def print_json(value: dict[str, Any]) -> None:
     """Write one JSON object on a line of its own, at once; NaN and infinities become null."""
     try:
-        text = json.dumps(value, allow_nan=False)
+        text = json_text(value, allow_nan=False)
     except ValueError:
-        text = json.dumps(_without_nan(value))
-    print_line(text)
+        text = json_text(_without_nan(value))
+    print_text(text + "\n")
 
 
 def print_line(text: str) -> None:
     """Write a result line at once, so that the reader of a pipe gets it immediately.
 
-    CommandFailed if it cannot be written, BrokenPipeError if its reader has ended.
+    What is not printable is written out. CommandFailed if it cannot be written, BrokenPipeError if
+    its reader has ended.
     """
-    print_text(text + "\n")
+    print_text(one_line(text) + "\n")
 
 
 def print_text(text: str) -> None:
-    """Write a part of a result, at once; raises like `print_line`."""
+    """Write a part of a result as it is, at once; raises like `print_line`."""
     if sys.stdout is None:  # started with it closed
         raise CommandFailed("standard output is closed; nothing can be printed")
     try:
@@ -71,11 +71,12 @@ def print_text(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    show(text + "\n")
+    """Write a line to standard error; what is not printable is written out."""
+    show(one_line(text) + "\n")
 
 
 def show(text: str) -> None:
-    """Write a text to standard error; a closed one is no failure."""
+    """Write a text as it is to standard error; a closed one is no failure."""
     if sys.stderr is None:
         return
     try:
@@ -88,11 +89,6 @@ def show(text: str) -> None:
 def is_terminal(stream: TextIO | None) -> bool:
     """Whether a stream is a terminal; a closed one is not."""
     return stream is not None and stream.isatty()
-
-
-def one_line(text: str) -> str:
-    """Write control characters out: a file name may hold line ends."""
-    return "".join(part if part.isprintable() else ascii(part)[1:-1] for part in text)
 
 
 def _without_nan(value: Any) -> Any:  # noqa: ANN401 - any JSON value
@@ -175,10 +171,7 @@ _MOST = 10  # lines; a damaged text file has as many faults as lines
 def warn_of(command: str, faults: Sequence[RecordingFault]) -> None:
     """Print the first faults one by one, and the number of the others."""
     for fault in faults[:_MOST]:
-        warn(
-            f"xethru {command}: {one_line(fault.file)}: {one_line(fault.reason)} "
-            f"(at byte {fault.offset})"
-        )
+        warn(f"xethru {command}: {fault.file}: {fault.reason} (at byte {fault.offset})")
     if len(faults) > _MOST:
         warn(f"xethru {command}: and {len(faults) - _MOST} faults more")
 
@@ -219,7 +212,7 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
 
 def print_warnings(radar: X4M300) -> None:
     for text in radar.warnings:
-        warn(f"xethru: {one_line(text)}")
+        warn(f"xethru: {text}")
     radar.warnings.clear()
 
 

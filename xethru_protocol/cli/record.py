@@ -20,7 +20,6 @@ from xethru_protocol.cli.output import (
     bytes_text,
     counted,
     module_at,
-    one_line,
     print_json,
     print_line,
     print_warnings,
@@ -442,7 +441,7 @@ def record(arguments: Namespace) -> int:
                     _record_from(radar, recorder, mode, arguments.duration, stop)
         except XeThruError as error:
             recorder.fail(error)
-    targets = " and ".join(one_line(str(path)) for path in recorder.paths)
+    targets = " and ".join(str(path) for path in recorder.paths)
     if arguments.json:
         print_json(recorder.summary() | {"ended_by": _end(recorder, stop)})
     elif recorder.failure is None and recorder.messages:
@@ -455,7 +454,7 @@ def record(arguments: Namespace) -> int:
             text += f"; kept {counted(recorder.messages, 'message')} in {targets}"
         if stop.received is None:
             raise CommandFailed(text)
-        warn(f"xethru record: {one_line(text)}")
+        warn(f"xethru record: {text}")
     return 0 if stop.received is None else 128 + stop.received
 
 

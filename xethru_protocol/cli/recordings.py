@@ -16,7 +16,6 @@ from xethru_protocol.cli.output import (
     Progress,
     bytes_text,
     counted,
-    one_line,
     print_json,
     print_line,
     profile_name,
@@ -35,6 +34,7 @@ from xethru_protocol.recordings import (
 from xethru_protocol.recordings import convert as convert_recording
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
+from xethru_protocol.system import one_line
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import LocalProtocolError
@@ -215,7 +215,7 @@ _HINT = ", by how smooth they are (--frames rf or baseband if not)"
 def _head(summary: RecordingSummary) -> Iterator[str]:
     total = sum(summary.messages.values())
     yield (
-        f"{one_line(str(summary.path))}: {summary.format} recording, {counted(total, 'message')}, "
+        f"{summary.path}: {summary.format} recording, {counted(total, 'message')}, "
         f"{bytes_text(summary.size_bytes)}"
     )
     for name, count in sorted(summary.messages.items()):
@@ -230,11 +230,11 @@ def _head(summary: RecordingSummary) -> Iterator[str]:
     else:
         yield "  times are not known"
     if summary.session_id:
-        yield f"  session {one_line(summary.session_id)}"
+        yield f"  session {summary.session_id}"
     if summary.profile_id:
         yield f"  profile {profile_name(summary.profile_id)}"
     if summary.parameter_file is not None:
-        yield f"  parameter file {one_line(summary.parameter_file)}"
+        yield f"  parameter file {summary.parameter_file}"
     yield ""
 
 
@@ -291,7 +291,7 @@ def convert(arguments: Namespace) -> int:
             }
         )
     else:
-        print_line(f"{one_line(target)}: {counted(done.messages, 'message')}")
+        print_line(f"{target}: {counted(done.messages, 'message')}")
     for name, number in sorted(done.skipped.items()):
         warn(f"xethru convert: {number} {name} left out: the format has no place for them")
     warn_of("convert", done.faults)

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -35,6 +36,42 @@ def test_a_scenario_for_another_radar_is_refused_in_one_line(
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "no radar is called 'nose'; there are radar_1" in error
+
+
+def test_no_control_character_reaches_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names of files, and what answers at a control socket."""
+    hostile = "\x1b]0;owned\x07\x7f\x9b2J"
+    for command in (
+        ["serve", hostile],
+        ["serve", "--bare", "--faults", hostile],
+        ["play", str(tmp_path / hostile)],
+        ["ctl", str(tmp_path / hostile), "state"],
+        ["proxy", "--port", hostile],
+    ):
+        assert main(command) in (1, 2)
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.isprintable()
+    path = tmp_path / "control"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def answer() -> None:
+            client, _ = listener.accept()
+            with client:
+                client.recv(4096)
+                text = json.dumps({"ok": True, "name": "\x1b\x7f\x9b"}, ensure_ascii=False)
+                client.sendall(text.encode() + b"\n")
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        assert main(["ctl", str(path), "state"]) == 0
+        thread.join()
+    printed = capsys.readouterr().out
+    assert printed.rstrip("\n").isprintable()
+    assert json.loads(printed)["name"] == "\x1b\x7f\x9b"
 
 
 def test_the_list_of_faults_is_json(capsys: pytest.CaptureFixture[str]) -> None:

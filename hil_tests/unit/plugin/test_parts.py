@@ -2,6 +2,7 @@
 
 import math
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -51,6 +52,28 @@ def test_a_lock_follows_no_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(OSError, match="symbolic links"):
         PortLock("radar")
     assert ours.read_text() == "not to be lost"
+
+
+def test_locks_of_others_are_not_removed_and_not_shown_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    lock = PortLock("radar")
+    folder = tmp_path / "xethru-hil-locks"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o1777  # sticky, as the one above it
+    (path := folder / "radar.lock").write_bytes(b"\xff\xfe\x1b[2J")
+    with pytest.raises(PortBusyError, match=r"another session \(process unknown\)"):
+        PortLock("radar")
+    lock.release()
+    path.unlink()
+    folder.chmod(0o777)  # as older versions left it
+    PortLock("radar").release()
+    assert folder.stat().st_mode & stat.S_ISVTX
+    path.unlink()
+    folder.rmdir()
+    folder.symlink_to(tmp_path)
+    with pytest.raises(PortBusyError, match="must be a folder"):
+        PortLock("radar")
 
 
 def test_a_tap_forgets_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:

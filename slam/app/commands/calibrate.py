@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import tomllib
@@ -36,7 +35,7 @@ from slam.config import FrontEnd, SlamConfig, override
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import Rig
-from xethru_protocol.system import StopFlag, read_bounded
+from xethru_protocol.system import StopFlag, json_text, one_line, read_bounded
 from xethru_protocol.transport import is_network_port
 
 Array = NDArray[np.float64]
@@ -82,12 +81,13 @@ def run_calibrate(
         _check_rig_place(rig, session)
     report = _report_of(_drive_of(recorded, stop), known)
     if recorded.cut_at_byte is not None:
-        sys.stderr.write(f"{session}: cut at byte {recorded.cut_at_byte}; read up to there\n")
+        cut = f"{session}: cut at byte {recorded.cut_at_byte}; read up to there"
+        sys.stderr.write(f"{one_line(cut)}\n")
     planted = _planted(report.drive.rig, scene)
     if as_json:
-        sys.stdout.write(json.dumps(_facts(report, planted), indent=2, allow_nan=False) + "\n")
+        sys.stdout.write(json_text(_facts(report, planted), indent=2, allow_nan=False) + "\n")
     else:
-        sys.stdout.write("".join(f"{line}\n" for line in _lines(report, planted)))
+        sys.stdout.write("".join(f"{one_line(line)}\n" for line in _lines(report, planted)))
     if rig is not None:
         write_rig(rig, _rig_file(recorded.info, report))
 

@@ -48,7 +48,7 @@ from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord, Ru
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, one_line
 
 _KEPT_WARNINGS = 200
 
@@ -319,7 +319,7 @@ def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
     text = _report_text(recorded, stop)
     with naming(page):
         page.write_text(text, encoding="utf-8")
-    sys.stdout.write(f"{page}\n")
+    sys.stdout.write(f"{one_line(str(page))}\n")
 
 
 def _report_text(session: RecordedSession, stop: StopFlag) -> str:

@@ -26,7 +26,7 @@ from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
 from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
 from xethru_protocol.recordings.mcap import MAGIC
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, one_line
 
 _MAGIC = b"RRF"
 _END = b"FOOT"
@@ -99,7 +99,7 @@ def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -
         few = shown.quantize(_PALETTE, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     with naming(out):
         few.save(out, format="png", optimize=True)
-    sys.stdout.write(f"{out}\n")
+    sys.stdout.write(f"{one_line(str(out))}\n")
 
 
 def _settled(process: ViewerProcess, rrd: Path, at_s: float | None, stop: StopFlag) -> bytes:
@@ -162,7 +162,7 @@ def run_view(
     recorded = open_session(path)
     if out is not None:
         _write_view(recorded, out, stop)
-        sys.stdout.write(f"{out}\n")
+        sys.stdout.write(f"{one_line(str(out))}\n")
     elif screenshot is not None:
         with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
             made = Path(folder) / _VIEW_NAME

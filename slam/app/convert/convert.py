@@ -16,7 +16,7 @@ from slam.app.run.replay import recorded_config
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, each_line
 
 
 def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
@@ -107,7 +107,7 @@ def run_convert(
                 )
     for line in warnings:
         note(f"{source}: {line}")
-    print(result)  # noqa: T201 - the result
+    print(each_line(str(result)))  # noqa: T201 - the result
 
 
 def _is_session(path: Path) -> bool:

@@ -19,6 +19,7 @@ from slam.app.run.evaluation import Summary, ratio
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import LandmarkScore
 from slam.geometry import transform
+from xethru_protocol.system import one_line
 
 _LIVE_PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 10.0
@@ -73,7 +74,7 @@ class Progress(SessionObserver):
     def on_log(self, line: LogLine) -> None:
         if line.warning:
             who = line.radar if line.radar in _NO_RADARS else f"radar {line.radar}"
-            self._write(f"warning: {who}: {line.text}\n")
+            self._write(one_line(f"warning: {who}: {line.text}") + "\n")
 
     def close(self) -> None:
         """Show the last line and leave it standing."""
@@ -112,7 +113,7 @@ class Progress(SessionObserver):
 
 def note(text: str) -> None:
     """Print a line about the program itself."""
-    sys.stderr.write(f"uwb-slam: {text}\n")
+    sys.stderr.write(f"uwb-slam: {one_line(text)}\n")
     sys.stderr.flush()
 
 
@@ -138,7 +139,8 @@ def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence
     Without a header, rows are a `Row` each, whose note is to the left, too.
     """
     left = {0, 2} if header is None else {0}
-    table = [*([] if header is None else [header]), *rows]
+    title = one_line(title)
+    table = [[*map(one_line, row)] for row in (*([] if header is None else [header]), *rows)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [
         "  ".join(

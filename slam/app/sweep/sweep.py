@@ -34,7 +34,7 @@ from slam.app.sweep.statistics import (
     summarise_groups,
 )
 from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
-from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
+from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked, one_line
 
 _TAIL = b"\n]}\n"
 
@@ -215,7 +215,8 @@ def _digest(*texts: str) -> str:
 def _run(cases: Sequence[Case], part: PartFile, results: Iterator[SweepRun], out: Path) -> None:
     n_done = len(part.runs)
     if n_done:
-        sys.stderr.write(f"{part.path}: {n_done} of {len(cases)} runs are done, going on\n")
+        at = one_line(str(part.path))
+        sys.stderr.write(f"{at}: {n_done} of {len(cases)} runs are done, going on\n")
 
     def left() -> str:
         return f"; {len(part.runs)} of {len(cases)} runs are in {part.path}" if part.runs else ""
@@ -228,8 +229,8 @@ def _run(cases: Sequence[Case], part: PartFile, results: Iterator[SweepRun], out
             to_do = len(cases) - len(part.runs)
             remaining_s = elapsed_s / (len(part.runs) - n_done) * to_do
             sys.stderr.write(
-                f"{len(part.runs)} of {len(cases)}: {_run_line(run)}; {_clock(elapsed_s)} "
-                f"elapsed, {_clock(remaining_s)} remaining\n"
+                f"{len(part.runs)} of {len(cases)}: {one_line(_run_line(run))}; "
+                f"{_clock(elapsed_s)} elapsed, {_clock(remaining_s)} remaining\n"
             )
     except StopRequestedError as stopped:
         raise StopRequestedError(stopped.received, left()) from None
@@ -249,7 +250,7 @@ def _run(cases: Sequence[Case], part: PartFile, results: Iterator[SweepRun], out
         part.path.write_text(text, encoding="ascii")
         part.path.replace(out)
     for group in groups:
-        sys.stdout.write(f"{group_line(group)}\n")
+        sys.stdout.write(f"{one_line(group_line(group))}\n")
     for clean, rows in stress_tables(groups):
         print_table(*stress_table(clean, rows))
 

@@ -4,11 +4,15 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from hil_tests.unit.slam.app.sessions import session_info, write_session
 from slam.app.cli import main
+from slam.app.records import LogLine
+from slam.app.run.output import Progress, note, print_table
 from xethru_protocol.system import locked
 
 
@@ -31,6 +35,37 @@ def test_a_name_that_is_no_utf_8_is_wrong_usage() -> None:
     with pytest.raises(SystemExit) as end:
         main(["demo", "--out", os.fsdecode(b"\xff")])
     assert end.value.code == 2
+
+
+HOSTILE = "\x1b]0;owned\x07\x7f\x9b2J\n"
+
+
+def test_no_control_character_reaches_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names of scenes and radars in a session, warnings of a drive, names of files."""
+    info = session_info()
+    radars = (replace(info.radars[0], name=f"nose{HOSTILE}", serial=HOSTILE), info.radars[1])
+    info = replace(info, scene=HOSTILE, radars=radars)
+    progress = Progress(info, None, lambda: 0)
+    progress.on_log(LogLine(t_ns=0, radar=HOSTILE, text=HOSTILE, warning=True))
+    note(HOSTILE)
+    print_table(HOSTILE, None, [(HOSTILE, HOSTILE, HOSTILE)])
+    session = write_session(tmp_path / "session.mcap", 20, info=info)
+    for command in (
+        ["replay", session, "--out", tmp_path / "replay"],
+        ["repair", session, "--out", tmp_path / HOSTILE],
+        ["report", session, "--out", tmp_path / f"{HOSTILE}.html"],
+        ["evaluate", HOSTILE, HOSTILE],
+        ["demo", "--scene", HOSTILE, "--out", tmp_path / "demo"],
+        ["run", "--rig", tmp_path / HOSTILE, "--odometry", HOSTILE, "--out", tmp_path / "run"],
+    ):
+        main([str(part) for part in command])
+    printed = capsys.readouterr()
+    assert "owned" in printed.out
+    assert "owned" in printed.err
+    for line in (printed.out + printed.err).split("\n"):
+        assert line.isprintable(), line
 
 
 def trajectory(folder: Path) -> str:

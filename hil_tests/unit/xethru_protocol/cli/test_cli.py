@@ -4,13 +4,15 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hil_tests.unit.xethru_protocol.pty_module import PtyModule
+from hil_tests.unit.xethru_protocol.pty_module import PtyModule, stock
 from xethru_protocol.cli import main
+from xethru_protocol.recordings import RecordingWriter
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 
@@ -112,6 +114,75 @@ def test_list_shows_running_emulators_only(
         (folder / f"{number}.json").write_text(word)
     about = {"kind": "emulated", "description": "emulated left", "serial": "42", "tcp": 5000}
     assert emulated_ports(capsys) == [{"path": str(port), **about}]
+
+
+def announce(folder: Path, name: str = "left") -> None:
+    (folder / "left").touch()
+    device = {"path": str(folder / "left"), "name": name, "serial": name, "tcp": None}
+    (folder / "1.json").write_text(json.dumps({"pid": 1, "devices": [device]}))
+
+
+@pytest.mark.parametrize(
+    "whose", ["group may write", "others may write", "of another user", "link"]
+)
+def test_a_run_directory_that_is_not_ours_alone_is_not_believed(
+    whose: str, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    announce(folder)
+    assert len(emulated_ports(capsys)) == 1
+    match whose:
+        case "group may write":
+            folder.chmod(0o770)
+        case "others may write":
+            folder.chmod(0o1777)
+        case "link":
+            folder.rename(folder.with_name("elsewhere"))
+            folder.symlink_to(folder.with_name("elsewhere"))
+        case _:
+            other = folder.stat().st_uid + 1
+            monkeypatch.setattr("xethru_protocol.transport.os.getuid", lambda: other)
+    assert emulated_ports(capsys) == []
+    assert main(["doctor"]) == 1
+    assert "is not this user's alone" in " ".join(capsys.readouterr().out.split())
+
+
+HOSTILE = "\x1b]0;owned\x07\x1b[2J\r\n\x7f\x9b31m"
+
+
+def test_no_control_character_of_others_reaches_the_terminal(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names in the run directory, strings of a module, names in a recording."""
+    announce(folder, HOSTILE)
+    recording = tmp_path / "recording"
+    with RecordingWriter(recording, session_id=HOSTILE) as writer:
+        writer.write(m.DataString(content_id=1, info=2, text=HOSTILE), 1_700_000_000 * 10**9)
+    with PtyModule(stock(firmware_id=HOSTILE, version=HOSTILE)) as module:
+        for command in (
+            ["list"],
+            ["doctor"],
+            ["doctor", "--port", module.path],
+            ["info", "--port", module.path],
+            ["dump", str(recording)],
+        ):
+            main(command)
+            printed = capsys.readouterr()
+            for line in (printed.out + printed.err).split("\n"):
+                assert line.isprintable(), command
+            assert main([*command, "--json"]) in (0, 1)
+            shown = capsys.readouterr().out
+            assert shown.isascii()
+            assert "\x7f" not in shown
+            objects = [json.loads(line) for line in shown.splitlines()]
+            assert any(HOSTILE in text for text in _strings(objects)), command
+
+
+def _strings(value: Any) -> Iterator[str]:  # noqa: ANN401 - any JSON value
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _strings(item)
 
 
 @pytest.mark.parametrize(

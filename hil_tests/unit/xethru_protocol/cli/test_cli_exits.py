@@ -15,6 +15,7 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main, output
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import describe_recording
+from xethru_protocol.system import one_line
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
 XETHRU = f"{sys.executable} -m xethru_protocol.cli"
@@ -133,7 +134,7 @@ def test_odd_names_are_one_readable_line(
         printed, errors = capsys.readouterr()
         (line,) = errors.splitlines()
         assert (printed, line.isprintable()) == ("", True)
-        assert output.one_line(name) in line
+        assert one_line(name) in line
 
 
 def test_results_that_the_terminal_has_no_letters_for(monkeypatch: pytest.MonkeyPatch) -> None:
