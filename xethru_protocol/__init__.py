@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from xethru_protocol.driver.frames import Frame, FrameGeometry
     from xethru_protocol.driver.link import RawConfig
     from xethru_protocol.driver.radar import X4M300
+    from xethru_protocol.recordings import Recorder, RecordingReader, read_recording
     from xethru_protocol.transport import find_ports
     from xethru_protocol.wire.codes import NoiseMapControl, OutputFeature, ProfileId
     from xethru_protocol.wire.errors import (
@@ -46,10 +47,13 @@ __all__ = [
     "PortUnavailable",
     "ProfileId",
     "RawConfig",
+    "Recorder",
+    "RecordingReader",
     "RemoteProtocolError",
     "ResponseTimeout",
     "XeThruError",
     "find_ports",
+    "read_recording",
 ]
 
 _HOMES = {
@@ -57,6 +61,7 @@ _HOMES = {
     "driver.async_radar": ("AsyncX4M300",),
     "driver.frames": ("Frame", "FrameGeometry"),
     "driver.link": ("RawConfig",),
+    "recordings": ("Recorder", "RecordingReader", "read_recording"),
     "transport": ("find_ports",),
     "wire.codes": ("NoiseMapControl", "OutputFeature", "ProfileId"),
     "wire.errors": (

@@ -47,6 +47,18 @@ HEADERS = {
     "DataReader": "DataReader, DataRecord",
     "DataPlayer": "DataPlayer",
 }
+# Methods that the headers of ModuleConnector 1 declare, by section.
+DECLARED = {
+    "ModuleConnector, auto": 17,
+    "X4M300, X4M200, X4M210": 69,
+    "XEP": 80,
+    "Transport": 8,
+    "Bootloader": 3,
+    "Data": 38,
+    "DataRecorder, RecordingOptions, PreferredSplitSize": 33,
+    "DataReader, DataRecord": 23,
+    "DataPlayer": 15,
+}
 EXAMPLES = "Its examples"
 COMMANDS = ("xethru ", "xethru-emulator ")
 
@@ -229,6 +241,12 @@ def test_nothing_is_left_to_request_alone() -> None:
         *("get_x2", "get_x2m200", "get_not_supported", "get_fb_data_recorder"),
         *("get_radar_engine", "get_laptop_presence_app"),
     }
+
+
+def test_no_row_got_lost() -> None:
+    for section, count in DECLARED.items():
+        names = {name for row in rows() if row.section == section for name in row.theirs}
+        assert len(names) >= count, section
 
 
 def test_every_method_of_the_headers_has_a_row() -> None:
