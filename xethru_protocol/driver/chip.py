@@ -253,10 +253,9 @@ class X4Settings:
 
 
 def _forget_raw_mode(link: Link) -> None:
-    """Take note that the chip lost its settings and that its frame counter restarts."""
+    """Take note that the chip lost its settings."""
     if isinstance(link.plan, raw_mode.RawPlan):
         link.plan = None
-    link.frames.break_off()
     link.frames.geometry = None
     link.frames.lattice = None
 

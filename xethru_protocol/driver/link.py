@@ -368,7 +368,6 @@ class Conversation:
             if message.code == SystemCode.XTS_SPRS_BOOTING:
                 self.reboots += 1
                 self._rebooted_since = True
-            self._take_data(message, arrival_ns)
         else:
             self._take_data(message, arrival_ns)
         if self._observer is not None:
@@ -540,10 +539,10 @@ class Link:
     def _take(self, message: Response, arrival_ns: int) -> None:
         if isinstance(message, FRAMES):
             self.frames.take(message, arrival_ns)
-        elif isinstance(message, m.System):
-            if message.code == SystemCode.XTS_SPRS_BOOTING:
-                self.frames.restart()
-        elif self.keeps_messages or isinstance(message, m.DataString):
+            return
+        if isinstance(message, m.System) and message.code == SystemCode.XTS_SPRS_BOOTING:
+            self.frames.restart()
+        if self.keeps_messages or isinstance(message, m.DataString):
             if len(self.messages) >= _MESSAGES:
                 self.messages.popleft()
                 if not self.messages_dropped:

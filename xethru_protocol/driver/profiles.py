@@ -35,6 +35,7 @@ from xethru_protocol.wire.codes import (
     OutputFeature,
     PresenceState,
     ProfileId,
+    RespirationState,
     SensorMode,
 )
 from xethru_protocol.wire.errors import (
@@ -53,6 +54,11 @@ _RESERVE_S = 5.0
 _SMALLEST_ZONE_M = 0.20
 _MAX_SENSITIVITY = 9
 _SLACK_M = 1e-4  # limits come as float32
+_WITH_STATE = (m.PresenceSingle, m.PresenceMovingList, m.RespStatus, m.SleepStatus, m.VitalSigns)
+_INITIALIZING: Mapping[type[m.Response], int] = {
+    kind: PresenceState.INITIALIZING if kind in _WITH_STATE[:2] else RespirationState.INITIALIZING
+    for kind in _WITH_STATE
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,9 +264,7 @@ def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[
                     raise _no_message(link, wait_s)
                 break
             message = waiting.popleft()
-            if isinstance(message, m.PresenceSingle | m.PresenceMovingList) and (
-                message.state != PresenceState.INITIALIZING
-            ):
+            if isinstance(message, _WITH_STATE) and message.state != _INITIALIZING[type(message)]:
                 return message
             if isinstance(message, m.DataString):
                 texts.append(message)
@@ -503,7 +507,8 @@ class Profile(Part):
     def wait_until_initialized(self, timeout_s: float | None = None) -> m.Response:
         """Wait until the profile reports more than that it is starting; returns that message.
 
-        Messages of other kinds that come meanwhile are dropped.
+        That is one of presence, respiration, sleep or vital signs; an output of one must be on.
+        Other messages that come meanwhile are dropped, but for debug text.
 
         Parameters
         ----------

@@ -1,5 +1,7 @@
 """The presence profile, by both drivers. Protocol reference 4.4-4.7, 7.3, 8.2, 8.3, 13."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -223,6 +225,46 @@ def test_end_of_the_start_is_the_first_message_of_another_state(running: Emulate
     line.say_later(19, presence(19, NO_PRESENCE), presence(20, PRESENCE))
     assert radar.profile.wait_until_initialized() == presence(19, NO_PRESENCE)
     assert list(radar.messages(1)) == [presence(20, PRESENCE)]
+
+
+RESPIRING = m.RespStatus(
+    counter=2, state=0, rpm=15, distance_m=1.0, movement_mm=0.5, signal_quality=9
+)
+SLEEPING = m.SleepStatus(
+    counter=2,
+    state=3,
+    rpm=12.0,
+    distance_m=1.0,
+    signal_quality=9,
+    movement_slow=0.0,
+    movement_fast=0.0,
+)
+VITAL = m.VitalSigns(
+    counter=2,
+    state=7,
+    respiration_rate=15.0,
+    respiration_distance_m=1.0,
+    respiration_confidence=1.0,
+    heart_rate=60.0,
+    heart_distance_m=1.0,
+    heart_confidence=1.0,
+    normalized_movement_slow=0.0,
+    normalized_movement_fast=0.0,
+    normalized_movement_start_m=0.5,
+    normalized_movement_end_m=5.0,
+)
+
+
+@pytest.mark.parametrize("first", [RESPIRING, SLEEPING, VITAL])
+def test_start_of_a_respiration_profile_ends_as_its_states_say(
+    running: Emulated, first: m.RespStatus | m.SleepStatus | m.VitalSigns
+) -> None:
+    """Protocol reference 7.4: state 4 is initialising there, 2 is not."""
+    radar, line, _ = running
+    line.say(replace(first, state=4), replace(first, counter=1, state=4), first)
+    assert radar.profile.wait_until_initialized() == first
+    line.say(replace(first, state=2))
+    assert radar.profile.wait_until_initialized() == replace(first, state=2)
 
 
 def test_module_that_falls_silent_while_it_starts_is_not_waited_for_all_the_time(

@@ -509,6 +509,15 @@ def test_messages_of_one_kind_are_taken_and_the_others_stay(running: Emulated) -
     assert radar.messages_waiting(m.DataString) == 1
 
 
+def test_restarts_are_among_the_messages(running: Emulated) -> None:
+    radar, line, _ = running
+    booting, ready = m.System(code=0x10), m.System(code=0x11)
+    line.say(booting, state(1), ready)
+    assert radar.messages_waiting(m.System) == 2
+    assert [radar.read_message(m.System) for _ in range(2)] == [booting, ready]
+    assert list(radar.messages(1)) == [state(1)]
+
+
 def test_frames_that_wait_are_counted_without_waiting(raw: Scripted) -> None:
     radar, line = raw
     assert radar.frames_waiting() == 0
