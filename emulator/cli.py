@@ -275,14 +275,38 @@ def _failed(text: str, *, exit_code: int = 1) -> int:
     return exit_code
 
 
+# --- options
+
+
+def _options(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from emulator.module.settings import option_texts
+
+    texts = option_texts()
+    if arguments.json:
+        _print(json.dumps([asdict(one) for one in texts], indent=2))
+        return 0
+    for one in texts:
+        _print(f"{one.name}={one.default}\n    {one.meaning}\n    Values: {one.allowed}.")
+    return 0
+
+
+_AT_ONCE: dict[str, Callable[[argparse.Namespace], int]] = {
+    "faults": _list,
+    "options": _options,
+    "ctl": _control,
+}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     with StopFlag("same") as stop:  # the imports take most of a second: a signal may come in them
         arguments = _parse(argv)
-        if arguments.command not in ("faults", "ctl"):
+        if arguments.command not in _AT_ONCE:
             return _run(arguments, stop)
     # a signal ends these at once: there is nothing to clean up
     try:
-        return _list(arguments) if arguments.command == "faults" else _control(arguments)
+        return _AT_ONCE[arguments.command](arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:  # the reader of our output has closed it
@@ -347,6 +371,21 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         default=Pace.REALTIME,
         metavar="{realtime,asap}",
         help="which clock drives the modules (default realtime)",
+    )
+    serve.add_argument(
+        "--model",
+        choices=["x4m300", "x4m200"],
+        default="x4m300",
+        help="product: with the presence profile, or with the respiration profile (default x4m300)",
+    )
+    serve.add_argument(
+        "--option",
+        action="append",
+        type=_option,
+        default=[],
+        metavar="NAME=VALUE",
+        help="how the modules behave where the reference allows more than one answer; may be "
+        "repeated; `xethru-emulator options` lists them",
     )
     _add_link_dir(serve)
     _add_faults(serve)
@@ -445,6 +484,14 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     faults.add_argument("kind", nargs="?", metavar="KIND", help="only this one")
     faults.add_argument("--json", action="store_true", help="as JSON")
 
+    options = commands.add_parser(
+        "options",
+        help="list the options of `serve --option`",
+        description="Lists the options that `serve --option NAME=VALUE` takes, with their "
+        "defaults; numbers in parentheses are sections of the protocol reference.",
+    )
+    options.add_argument("--json", action="store_true", help="as JSON")
+
     ctl = commands.add_parser(
         "ctl",
         help="control a running emulator",
@@ -500,6 +547,15 @@ def _whole(least: int, most: int, shown: str | None = None) -> Callable[[str], i
         return value
 
     return value_of
+
+
+def _option(text: str) -> tuple[str, object]:
+    from emulator.module.settings import option_of
+
+    try:
+        return option_of(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _host(text: str) -> str:

@@ -17,7 +17,7 @@ from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, InnerDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
 from emulator.module.memory import Identity
-from emulator.module.settings import DeviceOptions
+from emulator.module.settings import MODELS, DeviceOptions
 from emulator.playback import PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket
 from emulator.ports.folders import (
@@ -156,11 +156,17 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             zero_ns = time.monotonic_ns()
             session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
             stays = links.port_on_reset == "stay"
-            device_options = DeviceOptions(port_on_reset="stay" if stays else "vanish")
+            changes = {"port_on_reset": "stay" if stays else "vanish"} | dict(options.option)
+            device_options = DeviceOptions.of_model(options.model, **changes)
+            if device_options.shipped_profile not in device_options.profiles:
+                raise CannotServeError(
+                    "--option: shipped_profile must be one of profiles", exit_code=2
+                )
+            order_code = MODELS[options.model].order_code
             devices = []
             for index, radar in enumerate(scene.radars):
                 device = radar_device(
-                    Identity(serial=radar.serial),
+                    Identity(serial=radar.serial, order_code=order_code),
                     echo_source(scene, index, options.seed),
                     options.pace,
                     scene_time_zero_ns=zero_ns,

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from emulator.chip.chip import Chip, Refusal
 from emulator.module.bootloader import PAGE_COUNT, SMALL_PAGE_COUNT, Bootloader
 from emulator.module.memory import ERASED, FileSystem, Identity, Memory, SavedState, StoredFile
-from emulator.module.modes import ModeMachine, State
+from emulator.module.modes import ModeMachine, Start, State
 from emulator.module.pins import IoPins
 from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
 from xethru_protocol.wire import messages as m
@@ -126,7 +126,10 @@ class Module:
         self._memory = memory
         saved = (None if memory is None else memory.load()) or _as_shipped(self.options)
         self._saved_profiles = {key: value.copy() for key, value in saved.profiles.items()}
-        self.modes = ModeMachine(self.options, saved.start)
+        start = saved.start
+        if start.profile_id not in self.options.profiles:  # as shipped, or of another model
+            start = Start(profile_id=int(self.options.shipped_profile))
+        self.modes = ModeMachine(self.options, start)
         self.files = FileSystem(self.options.storage_bytes, saved.files)
         self.certification = saved.certification
         small = self.options.storage_bytes < LARGE_STORAGE

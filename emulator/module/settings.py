@@ -6,11 +6,15 @@ and 11, row 5.
 
 from __future__ import annotations
 
+import inspect
 import math
+import os.path
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
 from operator import itemgetter
-from typing import Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from emulator.chip.chip import Refusal
 from xethru_protocol.wire import x4
@@ -25,7 +29,29 @@ from xethru_protocol.wire.codes import (
     TxCenterFrequency,
 )
 
-X4M300_PROFILES = frozenset({ProfileId.XTS_ID_APP_PRESENCE_2})
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """A product: its order code, and the profile and message that are on as shipped."""
+
+    order_code: str
+    profile: ProfileId
+    output: OutputFeature
+
+
+MODELS = {
+    "x4m300": Model(
+        order_code="X4M300",
+        profile=ProfileId.XTS_ID_APP_PRESENCE_2,
+        output=OutputFeature.PRESENCE_SINGLE,
+    ),
+    "x4m200": Model(
+        order_code="X4M200",
+        profile=ProfileId.XTS_ID_APP_RESPIRATION_2,
+        output=OutputFeature.RESP_STATUS,
+    ),
+}
+X4M300_PROFILES = frozenset({MODELS["x4m300"].profile})
 DEFAULT_BAUDRATE = 115_200
 """After every power-up; a rate is never saved."""
 BITS_PER_BYTE = 10
@@ -71,8 +97,10 @@ class DeviceOptions:
         modes.
     profiles
         What LOADAPP accepts (4.3).
+    shipped_profile
+        The profile that runs in a module as shipped (8.2).
     default_output
-        The presence message that is on in a module as shipped (15, question 3).
+        The message that is on in a module as shipped (15, question 3).
     port_on_reset
         Whether a reset keeps the port ("stay") or takes it away until the USB is back ("vanish").
     bad_value
@@ -121,14 +149,15 @@ class DeviceOptions:
     """
 
     firmware: Literal["sensor", "xep"] = "sensor"
-    profiles: frozenset[int] = X4M300_PROFILES
+    profiles: frozenset[ProfileId] = X4M300_PROFILES
+    shipped_profile: ProfileId = ProfileId.XTS_ID_APP_PRESENCE_2
     default_output: OutputFeature = OutputFeature.PRESENCE_SINGLE
     port_on_reset: Literal["stay", "vanish"] = "stay"
     bad_value: Literal["refuse", "clamp"] = "refuse"
-    bad_value_error: int = ErrorCode.XTS_SPRE_COMMAND_FAILED
-    busy_profile_error: int = ErrorCode.XTS_SPRE_COMMAND_FAILED
-    no_profile_error: int = ErrorCode.XTS_SPRE_NOT_RECOGNIZED
-    run_without_profile_error: int = ErrorCode.XTS_SPRE_APP_INVALID
+    bad_value_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
+    busy_profile_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
+    no_profile_error: ErrorCode = ErrorCode.XTS_SPRE_NOT_RECOGNIZED
+    run_without_profile_error: ErrorCode = ErrorCode.XTS_SPRE_APP_INVALID
     get_without_profile: Literal["silence", "error"] = "silence"
     presence_output_while_running: bool = False
     run_to_manual: Literal["accept", "refuse"] = "accept"
@@ -142,6 +171,118 @@ class DeviceOptions:
     x4_init_ns: int = 0
     file_delete_ns: int = 100_000_000
     watchdog_memory_ns: int = 300_000_000_000
+
+    @classmethod
+    def of_model(cls, model: str, **changes: Any) -> DeviceOptions:  # noqa: ANN401 - of any field
+        """Return the options of a product of `MODELS`, with changes."""
+        shipped = MODELS[model]
+        of_product: dict[str, Any] = {
+            "profiles": frozenset({shipped.profile}),
+            "shipped_profile": shipped.profile,
+            "default_output": shipped.output,
+        }
+        return cls(**of_product | changes)
+
+
+# --- options as text
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptionText:
+    """A field of `DeviceOptions` in words; ``allowed`` are its values."""
+
+    name: str
+    default: str
+    allowed: str
+    meaning: str
+
+
+def option_texts() -> list[OptionText]:
+    return [
+        OptionText(
+            name=one.name,
+            default=_text_of(one.default),
+            allowed=_allowed(_OPTION_TYPES[one.name]),
+            meaning=_MEANINGS.get(one.name, ""),
+        )
+        for one in fields(DeviceOptions)
+    ]
+
+
+def option_of(text: str) -> tuple[str, object]:
+    """Return name and value of an option ``name=value``; ValueError, one line, if there is none.
+
+    Examples
+    --------
+    >>> option_of("bad_value=clamp")
+    ('bad_value', 'clamp')
+    >>> option_of("storage_bytes=0x18000")
+    ('storage_bytes', 98304)
+    >>> option_of("bad_value=ignore")
+    Traceback (most recent call last):
+    ValueError: bad_value='ignore': must be refuse or clamp
+    """
+    name, equals, value = text.partition("=")
+    kind = _OPTION_TYPES.get(name)
+    if kind is None:
+        raise ValueError(f"no option is called {name!r}; there are {', '.join(_OPTION_TYPES)}")
+    try:
+        if not equals:
+            raise ValueError
+        return name, _value_of(kind, value)
+    except ValueError:
+        shown = f"{name}={value!r}" if equals else f"{name}: no value"
+        raise ValueError(f"{shown}: must be {_allowed(kind)}") from None
+
+
+def _value_of(kind: Any, text: str) -> object:  # noqa: ANN401 - a type, or a form of typing
+    if get_origin(kind) is Literal or kind is bool:
+        values = get_args(kind) or (False, True)
+        return values[[_text_of(value) for value in values].index(text)]
+    if get_origin(kind) is frozenset:
+        (member,) = get_args(kind)
+        return frozenset(_value_of(member, part) for part in text.split(","))
+    if issubclass(kind, IntEnum):
+        names = {name: member for member, name in _member_names(kind).items()}
+        member = names.get(text.upper()) or kind.__members__.get(text.upper())
+        return member or kind(int(text, 0))
+    number = int(text, 0) if kind is int else float(text)
+    if not (math.isfinite(number) and (number >= 0 or kind is float)) or abs(number) > 2**63:
+        raise ValueError
+    return number
+
+
+def _allowed(kind: Any) -> str:  # noqa: ANN401 - a type, or a form of typing
+    if get_origin(kind) is Literal or kind is bool:
+        return " or ".join(_text_of(value) for value in get_args(kind) or (True, False))
+    if get_origin(kind) is frozenset:
+        return f"one or more, with commas between, of {_allowed(get_args(kind)[0])}"
+    if issubclass(kind, IntEnum):
+        return ", ".join(_member_names(kind).values())
+    return "a whole number >= 0" if kind is int else "a number"
+
+
+def _text_of(value: Any) -> str:  # noqa: ANN401 - a default of any field
+    if isinstance(value, frozenset):
+        return ",".join(sorted(_text_of(member) for member in value))
+    if isinstance(value, IntEnum):
+        return _member_names(type(value))[value]
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _member_names(kind: type[IntEnum]) -> dict[IntEnum, str]:
+    """Return the vendor's names without what they have in common."""
+    prefix = os.path.commonprefix([member.name for member in kind])  # noqa: RUF071 - no paths
+    return {member: member.name.removeprefix(prefix[: prefix.rfind("_") + 1]) for member in kind}
+
+
+_OPTION_TYPES = get_type_hints(DeviceOptions)
+_MEANINGS = {
+    name: " ".join(meaning.split())
+    for name, meaning in re.findall(
+        r"^(\w+)\n((?:    .*\n?)+)", inspect.cleandoc(DeviceOptions.__doc__ or ""), re.MULTILINE
+    )
+}
 
 
 # --- bits on the serial line

@@ -46,6 +46,8 @@ from emulator.profiles.doppler import (
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import MatrixInstance, PresenceDirection, PresenceState
 
+BEST_QUALITY = 10
+_DB_PER_QUALITY = 3.0
 _TINY = float(np.finfo(np.float64).tiny)
 _BRIDGED_BINS = 8
 _NEWEST_FRAMES = 3
@@ -54,8 +56,8 @@ _NEWEST_MARGIN_DB = 4.0
 _STILL_MPS = 0.1
 _QUIETEST_THRESHOLD_DB = 14.0
 _INTERVAL_BINS = 10
-_FULL_MOVEMENT_DB = 40.0
-_NO_MOVEMENT_DB = 3.0
+FULL_MOVEMENT_DB = 40.0
+NO_MOVEMENT_DB = 3.0
 _ABSORBABLE = 2.0
 """Excess up to which the noise map adapts; every threshold lies above."""
 
@@ -97,6 +99,12 @@ def excess_over(noise_map: NoiseMap, power: Powers, matrix: Matrix) -> NDArray[n
 def threshold_db(sensitivity: int) -> float:
     """Return the excess from which a bin is occupied."""
     return _QUIETEST_THRESHOLD_DB - sensitivity
+
+
+def signal_quality(found: Detection, sensitivity: int) -> int:
+    """Return a step per 3 dB above the threshold, 1...10."""
+    margin_db = found.excess_db - threshold_db(sensitivity)
+    return min(max(round(margin_db / _DB_PER_QUALITY), 1), BEST_QUALITY)
 
 
 def detections(
@@ -154,7 +162,7 @@ def movement_list(sweep: ProfileSweep, excess: NDArray[np.float64]) -> tuple[flo
     inside = excess[sweep.in_zone]
     starts = np.arange(0, len(inside), _INTERVAL_BINS)
     peak_db = 10 * np.log10(np.maximum(np.maximum.reduceat(inside, starts), 1e-30))
-    share = (peak_db - _NO_MOVEMENT_DB) / (_FULL_MOVEMENT_DB - _NO_MOVEMENT_DB)
+    share = (peak_db - NO_MOVEMENT_DB) / (FULL_MOVEMENT_DB - NO_MOVEMENT_DB)
     values = 100 * np.clip(share, 0, 1)
     return (float(values.mean()), *values.tolist())
 
@@ -245,8 +253,9 @@ class PresenceProcessing:
     ----------
     noise_map
         As it is now; an incomplete one is created from the first matrices.
-    power
-        The matrices of the last tick, as far as they were full.
+    power, excess
+        The matrices of the last tick, as far as they were full, and movement over the noise map
+        per bin, once there is one; by instance.
     """
 
     def __init__(self, sweep: ProfileSweep, noise_map: NoiseMap) -> None:
@@ -254,6 +263,11 @@ class PresenceProcessing:
         self._slow_time = {matrix.instance: SlowTime(matrix) for matrix in MATRICES}
         self.noise_map = noise_map
         self.power: Powers = {}
+        self.excess: dict[MatrixInstance, NDArray[np.float64]] = {}
+
+    def pulses(self, instance: MatrixInstance) -> NDArray[np.complex128]:
+        """Return the newest pulses of a matrix, oldest first, shape (n_pulses, n_bins)."""
+        return self._slow_time[instance].pulses()
 
     def add(self, iq: NDArray[np.complex128]) -> None:
         for slow_time in self._slow_time.values():
@@ -284,6 +298,7 @@ class PresenceProcessing:
                 movement_fast=nothing,
             )
         slow, fast = (excess_over(self.noise_map, self.power, matrix) for matrix in (SLOW, FAST))
+        self.excess = {SLOW.instance: slow, FAST.instance: fast}
         either = np.maximum(slow, fast)
         frames = self._slow_time[FAST.instance].pulses()
         found = detections(self._sweep, either, self.noise_map, frames, sensitivity)

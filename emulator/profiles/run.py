@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 from emulator.chip import Pace
 from emulator.chip.chip import NS_PER_S, EchoSource, ModuleClock, Refusal
 from emulator.module.module import NOISE_MAPS, MessageStream, Module
+from emulator.profiles import respiration
 from emulator.profiles.doppler import (
     FRAME_RATE_HZ,
     FRAMES_PER_TICK,
@@ -52,7 +53,7 @@ from emulator.profiles.doppler import (
     StoredMap,
     default_noise_map,
 )
-from emulator.profiles.presence import Presence, PresenceProcessing, threshold_db
+from emulator.profiles.presence import Presence, PresenceProcessing, signal_quality
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
@@ -60,14 +61,13 @@ from xethru_protocol.wire.codes import (
     NoiseMapControl,
     OutputFeature,
     PresenceDirection,
+    ProfileId,
     SensorMode,
 )
 from xethru_protocol.wire.messages import Command, Response
 
 BYTE_START_DB = -130.0
 BYTE_STEP_DB = 0.5
-_DB_PER_QUALITY = 3.0
-BEST_QUALITY = 10
 
 MATRIX_REPORTS: dict[int, Callable[..., m.Response]] = {
     OutputFeature.PULSEDOPPLER_FLOAT: m.PulseDopplerFloat,
@@ -78,6 +78,12 @@ MATRIX_REPORTS: dict[int, Callable[..., m.Response]] = {
 _BYTES = frozenset({OutputFeature.PULSEDOPPLER_BYTE, OutputFeature.NOISEMAP_BYTE})
 _BASEBAND = (OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE)
 _PRESENCE = (OutputFeature.PRESENCE_SINGLE, OutputFeature.PRESENCE_MOVINGLIST)
+_RESPIRATION = (
+    OutputFeature.RESP_STATUS,
+    OutputFeature.RESPIRATION_MOVINGLIST,
+    OutputFeature.RESPIRATION_DETECTIONLIST,
+    OutputFeature.RESPIRATION_NORMALIZEDMOVEMENTLIST,
+)
 _NOISE_MAPS = (OutputFeature.NOISEMAP_FLOAT, OutputFeature.NOISEMAP_BYTE)
 # Ticks and the matrices' periods repeat after it, so leaving out multiples shifts nothing.
 _CYCLE = SLOW.frames
@@ -111,15 +117,9 @@ def baseband(
 
 
 def presence_single(counter: int, presence: Presence, sensitivity: int) -> m.PresenceSingle:
-    """Return the nearest thing to one person: the first detection.
-
-    Signal quality is a step per 3 dB above the threshold, 1...10, and 0 without presence.
-    """
+    """Return the nearest thing to one person: the first detection; quality 0 without presence."""
     strongest = presence.detections[0] if presence.detections else None
-    quality = 0
-    if strongest is not None:
-        margin_db = strongest.excess_db - threshold_db(sensitivity)
-        quality = min(max(round(margin_db / _DB_PER_QUALITY), 1), BEST_QUALITY)
+    quality = 0 if strongest is None else signal_quality(strongest, sensitivity)
     return m.PresenceSingle(
         counter=counter & 0xFFFFFFFF,
         state=presence.state,
@@ -231,7 +231,13 @@ class ProfileRun:
     def silent(self) -> bool:
         """Whether all outputs are off."""
         matrices = any(map(self._instances, MATRIX_REPORTS))
-        return not (matrices or any(map(self._on, (*_BASEBAND, *_PRESENCE))))
+        return not (matrices or any(map(self._on, (*_BASEBAND, *self._reports))))
+
+    @property
+    def _reports(self) -> tuple[OutputFeature, ...]:
+        """What the loaded profile says once a tick, if it is on."""
+        breathing = self._module.modes.profile_id == ProfileId.XTS_ID_APP_RESPIRATION_2
+        return _RESPIRATION if breathing else _PRESENCE
 
     def take(self) -> Response | None:
         """Take one step: return a message that is ready, or go through one frame first."""
@@ -277,10 +283,8 @@ class ProfileRun:
     def _tick(self, counter: int) -> None:
         sensitivity = self._module.profile.sensitivity
         presence = self.processing.tick(sensitivity)
-        if self._on(OutputFeature.PRESENCE_SINGLE):
-            self._ready.append(presence_single(counter, presence, sensitivity))
-        if self._on(OutputFeature.PRESENCE_MOVINGLIST):
-            self._ready.append(moving_list(counter, presence))
+        for report in filter(self._on, self._reports):
+            self._ready.append(self._report(report, counter & 0xFFFFFFFF, presence, sensitivity))
         for feature in MATRIX_REPORTS:
             for matrix in self._instances(feature):
                 power = self._powers(feature).get(matrix.instance)
@@ -295,6 +299,23 @@ class ProfileRun:
                             matrix_counter=self._taken // matrix.period,
                         )
                     )
+
+    def _report(
+        self, feature: OutputFeature, counter: int, presence: Presence, sensitivity: int
+    ) -> Response:
+        match feature:
+            case OutputFeature.PRESENCE_SINGLE:
+                return presence_single(counter, presence, sensitivity)
+            case OutputFeature.PRESENCE_MOVINGLIST:
+                return moving_list(counter, presence)
+            case OutputFeature.RESPIRATION_MOVINGLIST:
+                return respiration.moving_list(counter, presence)
+            case OutputFeature.RESPIRATION_DETECTIONLIST:
+                return respiration.detection_list(counter, presence)
+            case OutputFeature.RESPIRATION_NORMALIZEDMOVEMENTLIST:
+                return respiration.normalized_movement_list(counter, self.processing, self._sweep)
+        now = respiration.respiration(presence, self.processing, self._sweep)
+        return respiration.status(counter, now, sensitivity)
 
     def _powers(self, feature: int) -> Powers:
         if feature not in _NOISE_MAPS:

@@ -18,7 +18,8 @@ from xethru_protocol.driver.files import FileName
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings.wire_capture import read_chunks
-from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, RespirationState
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
 pytestmark = pytest.mark.slow
@@ -39,6 +40,16 @@ def scenario(tmp_path: Path) -> str:
         '[[fault]]\nkind = "missing_frames"\nevery = 10\ncount = 2\nparameters = { frames = 3 }\n'
     )
     return str(path)
+
+
+def test_an_x4m200_is_served() -> None:
+    with (
+        emulator("serve", "visitor", "--model", "x4m200", "--option", "bad_value=clamp") as served,
+        open_radar(served.paths[0]) as radar,
+    ):
+        assert radar.info().order_code == "X4M200"
+        message = radar.read_message(m.RespStatus, seconds(5))
+        assert message.state == RespirationState.INITIALIZING
 
 
 def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:

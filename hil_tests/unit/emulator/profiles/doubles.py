@@ -7,7 +7,7 @@ from emulator.chip import Pace
 from emulator.chip.chip import Chip, ModuleClock
 from emulator.echo.echo import SceneEcho
 from emulator.module.module import Module
-from emulator.module.settings import ProfileSettings
+from emulator.module.settings import DeviceOptions, ProfileSettings
 from emulator.profiles.run import ProfileStream
 from emulator.scene.motion import PersonSpec
 from emulator.scene.scene import LeakageSpec, NoiseSpec, Scene, empty_room
@@ -46,10 +46,12 @@ def profile(
     outputs: dict[int, int] | None = None,
     pace: Pace = Pace.REALTIME,
     zero_ns: int = 0,
+    model: str = "x4m300",
     **settings: Any,  # noqa: ANN401 - whatever ProfileSettings takes
 ) -> tuple[ProfileStream, Module]:
-    module = Module(IDENTITY, Chip(RampSource()))
-    module.profile = ProfileSettings(**({"noise_map_control": DEFAULT_MAP} | settings))
+    module = Module(IDENTITY, Chip(RampSource()), DeviceOptions.of_model(model))
+    shipped: dict[str, Any] = {"outputs": module.profile.outputs, "noise_map_control": DEFAULT_MAP}
+    module.profile = ProfileSettings(**(shipped | settings))
     if outputs is not None:
         module.profile.outputs = outputs
     source = SceneEcho(scene, scene.radars[0], seed=1)

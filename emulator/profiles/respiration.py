@@ -1,0 +1,176 @@
+"""The respiration profile's processing: who breathes, how often, and how far the chest is out.
+
+It stands on the presence profile's: detections, excess and movement are those of
+`emulator.profiles.presence`. The nearest detection is the person whose breathing is reported.
+
+Chest
+    The 85 pulses of the slow matrix, 19.94 s, at the person's bin lie on an arc around what stands
+    still there. A circle through them gives the arc's centre, their angle about it the phase, and
+    that the displacement, lambda / 4 pi per radian.
+Rate
+    The highest peak between 6 and 40 breaths a minute of the displacement's spectrum (Hann window,
+    zero-padded); the window resolves 3 a minute. It is clear if the peak holds at least half of
+    the power above 3 a minute, and only then a rate is reported.
+State
+    Initialising until the matrices are full and the noise map is there; no movement without a
+    detection; movement tracking while the person walks; breathing with a clear rate; else movement.
+
+The reference gives the fields of messages only (7.4); everything here is ours. It is a test signal
+with a known answer and says nothing about what a real module measures.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.echo.echo import SPEED_OF_LIGHT_MPS
+from emulator.profiles.doppler import FAST, SLOW, ProfileSweep
+from emulator.profiles.presence import (
+    FULL_MOVEMENT_DB,
+    NO_MOVEMENT_DB,
+    Detection,
+    Presence,
+    PresenceProcessing,
+    signal_quality,
+)
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.codes import PresenceDirection, PresenceState, RespirationState
+
+SLOWEST_HZ, FASTEST_HZ = 6 / 60, 40 / 60
+_LEAST_HZ = 3 / 60
+"""Below it lies what is left of a person's sway."""
+_SPECTRUM = 2048
+_CLEAR = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Respiration:
+    """What the profile knows after a tick.
+
+    Attributes
+    ----------
+    rate_hz, chest_mm
+        Breaths per second, and displacement of the chest towards the radar from its mean over
+        20 s [mm]; 0 unless the state is BREATHING.
+    """
+
+    state: RespirationState
+    person: Detection | None = None
+    rate_hz: float = 0.0
+    chest_mm: float = 0.0
+
+
+def respiration(
+    presence: Presence, processing: PresenceProcessing, sweep: ProfileSweep
+) -> Respiration:
+    """Return who breathes how, from the presence profile's tick and its slow pulses."""
+    if presence.state is PresenceState.INITIALIZING:
+        return Respiration(state=RespirationState.INITIALIZING)
+    if not presence.detections:
+        return Respiration(state=RespirationState.NO_MOVEMENT)
+    person = min(presence.detections, key=lambda found: found.distance_m)
+    if person.direction is not PresenceDirection.STILL:
+        return Respiration(state=RespirationState.MOVEMENT_TRACKING, person=person)
+    index = int(np.argmin(np.abs(sweep.range_m - person.distance_m)))
+    pulses = processing.pulses(SLOW.instance)[:, index]
+    chest_m = displacement_m(pulses, SPEED_OF_LIGHT_MPS / sweep.carrier_hz)
+    rate_hz = breathing_rate_hz(chest_m, SLOW.rate_hz)
+    if rate_hz is None:
+        return Respiration(state=RespirationState.MOVEMENT, person=person)
+    return Respiration(
+        state=RespirationState.BREATHING,
+        person=person,
+        rate_hz=rate_hz,
+        chest_mm=1e3 * float(chest_m[-1]),
+    )
+
+
+def displacement_m(pulses: NDArray[np.complex128], wavelength_m: float) -> NDArray[np.float64]:
+    """Return the displacement towards the radar of what moves on an arc, mean 0, shape (n,).
+
+    The circle is the algebraic least-squares fit: ``|z|^2 = 2 Re(conj(centre) z) + rest``.
+    """
+    columns = np.stack([2 * pulses.real, 2 * pulses.imag, np.ones(len(pulses))], axis=1)
+    scale = float(np.abs(pulses).max()) or 1.0
+    columns[:, :2] /= scale
+    fit, *_ = np.linalg.lstsq(columns, np.abs(pulses / scale) ** 2, rcond=None)
+    centre = scale * complex(fit[0], fit[1])
+    phase = np.unwrap(np.angle(pulses - centre))
+    return np.asarray((phase - phase.mean()) * wavelength_m / (4 * math.pi), dtype=np.float64)
+
+
+def breathing_rate_hz(chest_m: NDArray[np.float64], sampling_hz: float) -> float | None:
+    """Return the rate of a periodic displacement, shape (n,); None if it is not clear."""
+    window = 0.5 - 0.5 * np.cos(math.tau * np.arange(len(chest_m)) / len(chest_m))
+    power = np.abs(np.fft.rfft((chest_m - chest_m.mean()) * window, _SPECTRUM)) ** 2
+    frequency_hz = np.fft.rfftfreq(_SPECTRUM, 1 / sampling_hz)
+    breaths = np.flatnonzero((frequency_hz >= SLOWEST_HZ) & (frequency_hz <= FASTEST_HZ))
+    peak = int(breaths[np.argmax(power[breaths])])
+    lobe_hz = 2 * sampling_hz / len(chest_m)  # half the width of the window's main lobe
+    near = np.abs(frequency_hz - frequency_hz[peak]) <= lobe_hz
+    total = float(power[(frequency_hz >= _LEAST_HZ) | near].sum())
+    clear = total > 0 and float(power[near].sum()) >= _CLEAR * total
+    return float(frequency_hz[peak]) if clear else None
+
+
+# --- messages
+
+
+def status(counter: int, now: Respiration, sensitivity: int) -> m.RespStatus:
+    person = now.person
+    return m.RespStatus(
+        counter=counter,
+        state=now.state,
+        rpm=round(60 * now.rate_hz),
+        distance_m=0.0 if person is None else person.distance_m,
+        movement_mm=now.chest_mm,
+        signal_quality=0 if person is None else signal_quality(person, sensitivity),
+    )
+
+
+def moving_list(counter: int, presence: Presence) -> m.RespirationMovingList:
+    return m.RespirationMovingList(
+        counter=counter,
+        movement_slow=presence.movement_slow,
+        movement_fast=presence.movement_fast,
+    )
+
+
+def detection_list(counter: int, presence: Presence) -> m.RespirationDetectionList:
+    """Return all detections; radar cross sections are 0, as released firmware has them."""
+    found = presence.detections
+    return m.RespirationDetectionList(
+        counter=counter,
+        detection_distance_m=tuple(one.distance_m for one in found),
+        detection_rcs=(0.0,) * len(found),
+        detection_velocity=tuple(one.velocity_mps for one in found),
+    )
+
+
+def normalized_movement_list(
+    counter: int, processing: PresenceProcessing, sweep: ProfileSweep
+) -> m.RespirationNormalizedMovementList:
+    """Return movement 0...1 per bin of the zone; 0 is an excess of 3 dB, 1 one of 40 dB."""
+    slow, fast = (
+        _normalized(processing.excess.get(matrix.instance), sweep) for matrix in (SLOW, FAST)
+    )
+    return m.RespirationNormalizedMovementList(
+        counter=counter,
+        start_m=float(sweep.range_m[sweep.in_zone][0]),
+        bin_length_m=x4.BASEBAND_BIN_M,
+        movement_slow=slow,
+        movement_fast=fast,
+    )
+
+
+def _normalized(excess: NDArray[np.float64] | None, sweep: ProfileSweep) -> tuple[float, ...]:
+    if excess is None:
+        return (0.0,) * int(sweep.in_zone.sum())
+    excess_db = 10 * np.log10(np.maximum(excess[sweep.in_zone], 1e-30))
+    share = (excess_db - NO_MOVEMENT_DB) / (FULL_MOVEMENT_DB - NO_MOVEMENT_DB)
+    return tuple(np.clip(share, 0, 1).tolist())
