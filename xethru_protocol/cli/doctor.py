@@ -282,7 +282,8 @@ def _gone(probe: PortProbe) -> str | None:
     PORT_CHECKS,
     "not in the bootloader",
     looks_at="the answer to a command only the bootloader knows",
-    remedy=f"{_POWER_CYCLE}; if it stays there, write its firmware anew",
+    remedy=f"{_POWER_CYCLE}; if it stays there, an update was not finished: "
+    "xethru flash IMAGE --port {path} writes its firmware anew",
     ends=True,
 )
 def _bootloader(probe: PortProbe) -> str | None:

@@ -1,4 +1,4 @@
-"""``xethru list``, ``ping``, ``info``, ``reset`` and ``stream``."""
+"""``xethru list``, ``ping``, ``info``, ``reset``, ``flash`` and ``stream``."""
 
 import sys
 import time
@@ -10,6 +10,8 @@ import numpy as np
 
 from xethru_protocol.cli.arguments import raw_config
 from xethru_protocol.cli.output import (
+    Progress,
+    bytes_text,
     counted,
     is_terminal,
     module_at,
@@ -20,10 +22,12 @@ from xethru_protocol.cli.output import (
     rewriting,
     warn,
 )
+from xethru_protocol.driver.firmware import UNFINISHED, FirmwareImage
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.messages import X4Value
 
 _STATE = {
@@ -92,6 +96,48 @@ def reset(arguments: Namespace) -> int:
         print_json({"port": port, "reset": True})
     else:
         print_line(f"{port}: restarting; a USB port vanishes for some seconds")
+    return 0
+
+
+def flash(arguments: Namespace) -> int:
+    """Write an image; only with ``--yes`` is anything sent."""
+    port = arguments.port
+    image = FirmwareImage.load(arguments.image)
+    size = f"{counted(image.pages, 'page')}, {bytes_text(len(image.data))}"
+    if not arguments.yes:
+        arguments.refuse(
+            f"this replaces the firmware of the module at {port} with {arguments.image} ({size}, "
+            f"checksum {image.checksum:08X}); nothing was sent. Add --yes if that is what you want"
+        )
+    progress = Progress("xethru flash")
+    state = ""
+
+    def note(done: int, total: int) -> None:
+        nonlocal state
+        state = f"{done} of {total} pages"
+        progress.show(lambda: state)
+
+    with module_at(port, arguments.baudrate) as module:
+        try:
+            module.firmware.write(image, note)
+        except BaseException as error:
+            if state and not isinstance(error, XeThruError):
+                warn(f"\nxethru flash: stopped after {state}; {UNFINISHED}")
+            raise
+        finally:
+            if state:
+                progress.finish(lambda: state)
+        about = module.info()
+    written = {"pages": image.pages, "bytes": len(image.data), "checksum": f"{image.checksum:08X}"}
+    if arguments.json:
+        now = {"firmware_id": about.firmware_id, "version": about.version}
+        print_json({"port": module.port, **written, **now})
+    else:
+        name = " ".join(filter(None, (about.firmware_id, about.version))) or "no name"
+        print_line(
+            f"{module.port}: wrote and verified {size}, checksum {image.checksum:08X}; "
+            f"the module reports {name}"
+        )
     return 0
 
 

@@ -288,8 +288,9 @@ class PortProbe:
         first = self._ask(m.Ping(), _ANSWER_LIMIT_S)
         if first.pong is not None or first.gone:
             return first
-        if self._ask(m.BootloaderGetDeviceInfo(), _REPLY_LIMIT_S).talks and not first.talks:
-            return Contact(bootloader=True)
+        second = self._ask(m.BootloaderGetDeviceInfo(), _REPLY_LIMIT_S)
+        if second.bootloader:
+            return second
         assert self._transport is not None
         if math.isfinite(self._transport.bytes_per_s):  # a UART
             for baudrate in _OTHER_BAUDRATES:
@@ -362,6 +363,8 @@ class PortProbe:
                 while (event := connection.next_event()) is not NEED_DATA:
                     if isinstance(event, m.Pong):
                         return Contact(pong=event.value, baudrate=baudrate)
+                    if isinstance(event, m.BootloaderSuccess):
+                        return Contact(bootloader=True)
                     damaged |= isinstance(event, FramingFault)
                     talks |= isinstance(event, Message)
         except Disconnected:

@@ -25,6 +25,7 @@ from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.board import AsyncDiagnostics, AsyncPins
 from xethru_protocol.driver.chip import AsyncPostprocessing, AsyncRegisters, AsyncX4
 from xethru_protocol.driver.files import AsyncFiles
+from xethru_protocol.driver.firmware import AsyncFirmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
@@ -103,6 +104,7 @@ class AsyncX4M300(RadarState):
         self.profile = AsyncProfile(self._call, self._listen)
         self.pins = AsyncPins(self._call)
         self.files = AsyncFiles(self._call, self._call_once)
+        self.firmware = AsyncFirmware(self._call_once)
         self.registers = AsyncRegisters(self._call)
         self.postprocessing = AsyncPostprocessing(self._call)
         self.diagnostics = AsyncDiagnostics(self._call)

@@ -12,6 +12,7 @@ the one outstanding request, all else to the reader of the stream; faults are co
 import math
 from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Concatenate, Literal, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar
 
@@ -20,6 +21,8 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codec import describe
 from xethru_protocol.wire.codes import (
+    BootloaderFraming,
+    BootloaderReply,
     InfoItem,
     PongCode,
     SensorMode,
@@ -225,7 +228,11 @@ class ModuleInfo:
 
 FRAMES = (m.DataFloat, m.BasebandIq)  # a tuple is the faster argument of isinstance
 _ENDLESS_S = 1e9
-_ANSWERS = (m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString)
+_BOOTLOADER_ERRORS = (m.BootloaderError, m.BootloaderFramingError)
+_ANSWERS = (
+    *(m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString),
+    *(m.BootloaderSuccess, m.BootloaderEchoed, *_BOOTLOADER_ERRORS),
+)
 # The module answers PINGs that waited for it one right after the other; a PONG that stays out
 # this long after the last one was probably never sent.
 _SETTLED_NS = 250_000_000
@@ -453,6 +460,20 @@ class Conversation:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
 
 
+_BOOTLOADER_REPLIES = ((m.BootloaderSuccess,), (m.BootloaderEchoed,))
+
+
+def _bootloader_error(
+    answer: m.BootloaderError | m.BootloaderFramingError, command: Command[Response]
+) -> DeviceError:
+    code, meaning = BootloaderReply.FRAMING_ERROR, ""
+    if isinstance(answer, m.BootloaderError):
+        code = BootloaderReply(answer.code)
+    elif answer.code in set(BootloaderFraming):
+        meaning = f" {BootloaderFraming(answer.code).name}"
+    return DeviceError(code, summary(command), code.name + meaning)
+
+
 def summary(message: m.Message) -> str:
     """One line about a message, for logs and errors.
 
@@ -569,14 +590,19 @@ class Link:
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
         if self.conversation.answer_owed and not isinstance(command, m.Ping):
-            yield from self._catch_up(timeout_s)
+            yield from self._catch_up(command, timeout_s)
         reply = yield from self._exchange(command, timeout_s)
         # the conversation checked it: the row's replies are what ReplyT stands for
         return reply  # type: ignore[return-value]
 
-    def _catch_up(self, timeout_s: float) -> Steps[None]:
+    def _catch_up(self, command: Command[Response], timeout_s: float) -> Steps[None]:
         """Receive until no answer to an abandoned request can come any more."""
         conversation = self.conversation
+        if ROWS[type(command)].replies in _BOOTLOADER_REPLIES:  # the bootloader knows no PING
+            echo = m.BootloaderEcho(data=self.clock().to_bytes(8, "little"))
+            with suppress(DeviceError):  # it is the application that answers
+                yield from self._exchange(echo, timeout_s)
+            return
         if not conversation.pongs_possible:
             yield from self._exchange(m.Ping(), timeout_s)
             return
@@ -619,6 +645,8 @@ class Link:
         if isinstance(answer, m.Error):
             meaning = error_name(answer.code, row.errors)
             raise DeviceError(answer.code, summary(command), meaning)
+        if isinstance(answer, _BOOTLOADER_ERRORS):
+            raise _bootloader_error(answer, command)
         self._follow(command)
         return answer
 
@@ -640,6 +668,7 @@ class Link:
         conversation = self.conversation
         content_id = row.content_id(command) if row.content_id else None
         item = command.item if isinstance(command, m.SystemGetInfo) else None
+        echoed = command.data if isinstance(command, m.BootloaderEcho) else None
         until_ns = conversation.deadline_ns(timeout_s)
         late_pongs = conversation.pongs_possible
         while True:
@@ -647,10 +676,16 @@ class Link:
                 answer = conversation.answers.popleft()
                 if isinstance(answer, m.Error) and not catching_up:
                     return answer
+                if isinstance(answer, _BOOTLOADER_ERRORS):
+                    if echoed is None:
+                        return answer
+                    conversation.stray_count += 1  # an ECHO has no errors: it is an earlier one's
+                    continue
                 if (
                     isinstance(answer, row.replies)
                     and (content_id is None or getattr(answer, "content_id", None) == content_id)
                     and (item is None or getattr(answer, "info", None) == item)
+                    and (echoed is None or getattr(answer, "data", None) == echoed)
                 ):
                     return answer
                 conversation.stray_count += 1

@@ -16,6 +16,7 @@ from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.board import Diagnostics, Pins
 from xethru_protocol.driver.chip import X4, Postprocessing, Registers
 from xethru_protocol.driver.files import Files
+from xethru_protocol.driver.firmware import Firmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
     POWER_UP_BAUD,
@@ -296,6 +297,8 @@ class X4M300(RadarState):
         IO pins.
     files
         Files in the module's flash, and its crash dump.
+    firmware
+        The bootloader; writing an image of the firmware.
     registers
         Registers of the radar chip.
     postprocessing
@@ -364,6 +367,7 @@ class X4M300(RadarState):
         self.profile = Profile(self._call, self._listen)
         self.pins = Pins(self._call)
         self.files = Files(self._call, self._call_once)
+        self.firmware = Firmware(self._call_once)
         self.registers = Registers(self._call)
         self.postprocessing = Postprocessing(self._call)
         self.diagnostics = Diagnostics(self._call)

@@ -6,7 +6,7 @@ module's is opened and the module behind it asked for its own (Protocol referenc
 
 import math
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 from xethru_protocol.driver.link import (
     POWER_UP_BAUD,
@@ -36,6 +36,8 @@ _FOREIGN_NS = 3_000_000_000  # how long a port is left alone that was another mo
 RECONNECTS_PER_CALL = 3  # then the module is in a restart loop, and the user should know
 
 T = TypeVar("T")
+Recognise: TypeAlias = Callable[[Link, str], Steps[bool]]
+"""Asks what answers at an open port whether it is the module that is looked for."""
 
 
 def identify(link: Link) -> Steps[None]:
@@ -88,7 +90,7 @@ def await_restart(link: Link, readies: int, timeout_s: float = RESTART_S) -> Ste
             if not ready and link.left_s(deadline_ns) <= 0:
                 raise link.conversation.silence("READY after the reset", timeout_s)
     except Disconnected:
-        yield from _find_again(link, deadline_ns, timeout_s, restore=False)
+        yield from find_again(link, deadline_ns, timeout_s, restore=False)
     if baudrate != link.baudrate:
         yield from link.set_baud_rate(baudrate, force=True)
 
@@ -96,7 +98,7 @@ def await_restart(link: Link, readies: int, timeout_s: float = RESTART_S) -> Ste
 def reconnect(link: Link, timeout_s: float = RESTART_S) -> Steps[str]:
     link.frames.interrupt()
     deadline_ns = link.conversation.deadline_ns(timeout_s)
-    yield from _find_again(link, deadline_ns, timeout_s, restore=True)
+    yield from find_again(link, deadline_ns, timeout_s, restore=True)
     return link.path
 
 
@@ -125,18 +127,32 @@ def recover(link: Link, reconnects: int, error: Disconnected) -> Steps[None]:
 # --- inside -------------------------------------------------------------------------------------
 
 
-def _find_again(link: Link, deadline_ns: int, timeout_s: float, *, restore: bool) -> Steps[None]:
+def find_again(
+    link: Link,
+    deadline_ns: int,
+    timeout_s: float,
+    *,
+    restore: bool,
+    is_ours: Recognise | None = None,
+    everywhere: bool | None = None,
+) -> Steps[None]:
+    """Open ports until the module answers at one.
+
+    ``is_ours`` recognises it, by default by its serial number; ``everywhere``: also at ports where
+    it never was, by default if the serial number is known.
+    """
+    everywhere = link.serial_number is not None if everywhere is None else everywhere
     lost, plan = link.path, link.plan
     foreign: dict[str, int] = {}
     why = "no port of it"
     while True:
-        elsewhere = () if link.serial_number is None else link.candidates()
+        elsewhere = link.candidates() if everywhere else ()
         for path in dict.fromkeys((link.path, link.home, *elsewhere)):
             asked_ns = foreign.get(path)
             if asked_ns is not None and link.clock() - asked_ns < _FOREIGN_NS:
                 continue
             try:
-                if (yield from _open_ours(link, path)):
+                if (yield from _open_ours(link, path, is_ours or _is_ours)):
                     if restore and plan is not None:
                         try:
                             yield from plan.restore(link)
@@ -167,7 +183,7 @@ def _find_again(link: Link, deadline_ns: int, timeout_s: float, *, restore: bool
         yield Sleep(min(_LOOK_AGAIN_S, left_s))
 
 
-def _open_ours(link: Link, path: str) -> Steps[bool]:
+def _open_ours(link: Link, path: str, is_ours: Recognise) -> Steps[bool]:
     """Open a port; returns whether our module answers there."""
     wanted = link.baudrate
     rates = (
@@ -179,7 +195,7 @@ def _open_ours(link: Link, path: str) -> Steps[bool]:
         yield OpenLine(path, baudrate)
         link.conversation.new_line(path)
         try:
-            ours = yield from _is_ours(link, path)
+            ours = yield from is_ours(link, path)
         except ResponseTimeout:
             if baudrate == rates[-1]:
                 raise

@@ -40,6 +40,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         (tmp_path / name).symlink_to(FIXTURES / "recordings" / name)
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("no recording")
+    # eight bytes at 410000h: a stack, and 410005h as the entry
+    image = ":020000040041B9\n:0800000000804420050041 00CE\n:00000001FF\n".replace(" ", "")
+    (tmp_path / "image.hex").write_text(image)
     (tmp_path / "packets.txt").write_text("7D 01 AE EA AA EE 7C 7E\n7D 10 6D 7E\n7D 10 6C 7E\n")
     (tmp_path / "wrong.txt").write_text("7D 10 6D 7E\n7D 1\n")
     with WireCapture(tmp_path / "line.xtwire") as capture:

@@ -206,7 +206,10 @@ def test_only_known_usb_ids_are_modules(monkeypatch: pytest.MonkeyPatch) -> None
         listed[-1].vid, listed[-1].pid = vendor_id, product_id
     monkeypatch.setattr("xethru_protocol.transport.list_ports.comports", lambda: listed)
     monkeypatch.setattr("xethru_protocol.transport._emulated_ports", lambda folder: iter(()))
-    assert [found.path for found in find_ports()] == ["/dev/ttyACM0", "/dev/ttyACM1"]
+    assert [(found.path, found.description) for found in find_ports()] == [
+        ("/dev/ttyACM0", "XeThru module"),
+        ("/dev/ttyACM1", "XeThru module in its bootloader"),
+    ]
 
 
 def test_missing_port_says_where_to_look(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil_tests.golden.vectors import load
 from hil_tests.unit.xethru_protocol.pty_module import (
     IDLE,
     MANUAL,
@@ -90,11 +91,11 @@ def gone(command: m.Message) -> Sequence[Said]:
 
 
 def only_bootloader(command: m.Message) -> Sequence[Said]:
-    # payload 00, whose checksum 7D is escaped
     is_known = isinstance(command, m.BootloaderGetDeviceInfo)
-    return [bytes.fromhex("7D 00 7F 7D 7E")] if is_known else []
+    return [BANNER.wire] if is_known else []
 
 
+BANNER = next(vector for vector in load() if vector.name == "bl_reply_device_info")
 MODULES = [
     ("not in the bootloader", lambda: PtyModule(only_bootloader), "fault", "bootloader"),
     ("speaks XeThru", lambda: PtyModule(silent, unasked=UNCHECKED), "fault", "no XeThru packets"),
@@ -119,6 +120,17 @@ MODULES = [
     ("transmitter on", lambda: PtyModule(stock(mode=MANUAL, tx_power=0)), "fault", "off"),
 ]
 SILENT = {"not in the bootloader", "speaks XeThru", "listens", "answers"}
+
+
+@pytest.mark.usefixtures("hurried")
+def test_what_is_no_banner_is_no_bootloader(capsys: Capture) -> None:
+    def answer(command: m.Message) -> Sequence[Said]:
+        asked = isinstance(command, m.BootloaderGetDeviceInfo)
+        return [m.UnknownMessage(code=0, payload=b"\x00")] if asked else []
+
+    with PtyModule(answer) as module:
+        _, finding = only_finding(capsys, module.path)
+    assert finding["check"] == "answers"
 
 
 @pytest.mark.parametrize(
