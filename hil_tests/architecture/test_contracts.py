@@ -1,5 +1,7 @@
 """The import contracts of pyproject.toml hold and can fail; folders are small, help is light."""
 
+import ast
+import re
 import shutil
 import subprocess
 import sys
@@ -113,6 +115,41 @@ def test_small_files_with_one_importer_are_part_of_it() -> None:
             if sum(f"{importer}.".startswith(prefixes) for importer in importers) == 1:
                 found.add(file.as_posix())
     assert found == set()
+
+
+# What a distribution is imported as, where that is another name.
+IMPORTED_AS = {
+    "pillow": "PIL",
+    "pyserial": "serial",
+    "pytest-timeout": "pytest_timeout",
+    "pytest-xdist": "xdist",
+    "rerun-sdk": "rerun",
+    "scikit-learn": "sklearn",
+}
+
+
+def imported(path: Path) -> set[str]:
+    """Return the packages that a file imports, anywhere in it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {name.name.split(".")[0] for name in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+def test_every_imported_package_is_declared() -> None:
+    project = tomllib.loads(PYPROJECT.read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *(name for extra in extras.values() for name in extra)]
+    names = [re.split(r"[\[<>=~!;]", requirement)[0] for requirement in wanted]
+    declared = {IMPORTED_AS.get(name, name) for name in names} | {"_typeshed"}  # types only
+    ours = {"emulator", "hil_tests", "slam", "xethru_protocol"}
+    for package in PRODUCT:
+        for path in (REPOSITORY / package).rglob("*.py"):
+            missing = imported(path) - declared - ours - sys.stdlib_module_names
+            assert not missing, f"{path} imports {missing}, which pyproject.toml does not declare"
 
 
 def loaded(program: str) -> set[str]:

@@ -24,6 +24,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -153,6 +154,7 @@ def _body(data: bytes) -> bytes:
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
+_IN_CHUNKS = (SCHEMA, CHANNEL, MESSAGE)
 _OF_SUMMARY = (8, 10, 11, 13, 14)  # indexes and statistics, behind the data
 _CODES = range(1, 16)  # private ones, from 128 on, are taken for damage
 
@@ -233,7 +235,8 @@ class RecordReader:
                 if following is None and is_record:
                     if code == CHUNK:
                         self._stream.seek(at + _HEAD.size)
-                        yield from _records_in(at, _content_before_cut(self._read()))
+                        with suppress(ValueError):
+                            yield from _records_in(at, _content_before_cut(self._read()))
                     yield Cut(at)
                     return
                 yield self._damage(at, following, "no record stands there")
@@ -389,10 +392,16 @@ def _unpacked(name: str, packed: bytes, size: int) -> bytes:
 
 
 def _records_in(at: int, content: bytes) -> Iterator[Record]:
+    """Yield the records of a chunk, up to where it was cut; ValueError for others than it may hold.
+
+    Zeros, which a few kilobytes may unpack to by the hundred megabytes, are none.
+    """
     here = 0
     while here + _HEAD.size <= len(content):
         code, length = _HEAD.unpack_from(content, here)
         here += _HEAD.size
+        if code not in _IN_CHUNKS:
+            raise ValueError(f"a chunk cannot hold a record of kind {code}")
         if here + length > len(content):
             return  # the chunk was cut here
         yield Record(at, code, content[here : here + length])

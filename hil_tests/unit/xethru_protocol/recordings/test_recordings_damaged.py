@@ -1,5 +1,6 @@
 """Recordings that are damaged, incomplete, refused or cut off: those of the vendor first."""
 
+import os
 import shutil
 import signal
 import struct
@@ -7,12 +8,15 @@ import subprocess
 import sys
 import tracemalloc
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from hil_tests.paths import FIXTURES
+from hil_tests.patience import seconds
 from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence, read_with_faults
 from xethru_protocol.recordings import (
     RecordingError,
@@ -307,6 +311,62 @@ def test_a_damaged_archive_gives_no_message(tmp_path: Path) -> None:
     (tmp_path / "x.npz").write_bytes(data)
     with pytest.raises(RecordingError, match="is cut or damaged"):
         next(read_recording(tmp_path / "x.npz"))
+
+
+def mcap_record(code: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", code, len(body)) + body
+
+
+def mcap_chunk(packed: bytes, claimed: int) -> bytes:
+    """Return a zstd chunk without a checksum, https://mcap.dev/spec#chunk-op0x06."""
+    head = struct.pack("<QQQII", 0, 0, claimed, 0, 4) + b"zstd" + struct.pack("<Q", len(packed))
+    return mcap_record(6, head + packed)
+
+
+@cache
+def packed_zeros(count: int) -> bytes:
+    packer = zstandard.ZstdCompressor(level=1).compressobj(size=count)
+    piece = bytes(1 << 22)
+    return b"".join(packer.compress(piece) for _ in range(count // len(piece))) + packer.flush()
+
+
+@pytest.mark.parametrize(
+    ("content", "claimed", "whole"),
+    [
+        (1 << 33, 1 << 33, True),
+        (1 << 33, 1000, True),
+        (1 << 33, 1 << 33, False),
+        (1 << 28, 1 << 28, True),
+    ],
+    ids=["8 GiB", "8 GiB that claim 1 kB", "8 GiB, cut", "256 MiB"],
+)
+def test_a_small_file_takes_no_large_memory(
+    content: int, claimed: int, whole: bool, tmp_path: Path
+) -> None:
+    """Bounded by the largest chunk that is believed, 256 MiB, and two copies of it; and soon."""
+    chunk = mcap_chunk(packed_zeros(content), claimed)
+    path = tmp_path / "zeros.mcap"
+    magic = b"\x89MCAP0\r\n"
+    header = mcap_record(1, bytes(8))
+    end = mcap_record(15, bytes(4)) + mcap_record(2, bytes(20)) + magic
+    path.write_bytes(magic + header + (chunk + end if whole else chunk[: len(chunk) // 2]))
+    assert path.stat().st_size < 300_000
+    limit = 4 << 30  # of addresses; a process takes a good one
+    script = (
+        "import resource, sys; from xethru_protocol.cli import main;"
+        f"resource.setrlimit(resource.RLIMIT_AS, ({limit}, {limit})); sys.exit(main(sys.argv[1:]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, "dump", path],
+        capture_output=True,
+        text=True,
+        timeout=seconds(2),
+        check=False,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 1
+    assert "it is cut or damaged: " in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("missing", [1, 8, 100])
