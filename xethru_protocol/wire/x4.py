@@ -110,10 +110,7 @@ def frame_area(
     start, end, offset = _f32(start_m), _f32(end_m), _f32(offset_m)
     if not (math.isfinite(start) and math.isfinite(end) and math.isfinite(offset)):
         raise LocalProtocolError("a frame area must have finite limits; give metres")
-    if start > end:
-        raise LocalProtocolError(
-            f"frame area {start_m} ... {end_m} m starts behind its end; swap the limits"
-        )
+    check_setting(X4Setting.FRAMEAREA, "frame area", (start, end))
     longest = _MAX_LENGTH_M[downconversion]
     if end - start > longest:
         end = _f32(start + longest)
@@ -153,7 +150,7 @@ def check_setting(setting: X4Setting, name: str, value: int | float | tuple[floa
         start_m, end_m = value
         if start_m > end_m:
             raise LocalProtocolError(
-                f"{name} {start_m} ... {end_m} m starts behind its end; swap the limits"
+                f"{name} {start_m:g} ... {end_m:g} m starts behind its end; swap the limits"
             )
     elif setting in LIMITS:
         smallest, largest = LIMITS[setting]
