@@ -50,9 +50,10 @@ HEADERS = {
 # Methods that the headers of ModuleConnector 1 declare, by section.
 DECLARED = {
     "ModuleConnector, auto": 17,
-    "X4M300, X4M200, X4M210": 68,
+    "X4M300, X4M200, X4M210": 69,
     "XEP": 80,
     "Transport": 8,
+    "Bootloader": 3,
     "Data": 38,
     "DataRecorder, RecordingOptions, PreferredSplitSize": 33,
     "DataReader, DataRecord": 23,

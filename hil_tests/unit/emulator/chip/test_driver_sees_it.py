@@ -7,18 +7,26 @@ from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
+from emulator.module.settings import DeviceOptions
 from emulator.scene.scene import load_scene
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import NoiseMapControl, PresenceState
+from xethru_protocol.wire.codes import (
+    NoiseMapControl,
+    OutputFeature,
+    PresenceState,
+    ProfileId,
+    RespirationState,
+)
 
 SECOND = 1_000_000_000
 
 
-def transport_of_the_corridor() -> LoopbackTransport:
+def transport_of_the_corridor(options: DeviceOptions | None = None) -> LoopbackTransport:
     scene = load_scene("visitor")
     identity = Identity(serial=scene.radars[0].serial)
-    return LoopbackTransport(radar_device(identity, echo_source(scene, 0, 0), Pace.REALTIME))
+    source = echo_source(scene, 0, 0)
+    return LoopbackTransport(radar_device(identity, source, Pace.REALTIME, options=options))
 
 
 def expected_state(time_s: float) -> PresenceState | None:
@@ -69,3 +77,21 @@ def test_settings_of_a_host_reach_the_profile() -> None:
             assert isinstance(message, m.PresenceSingle)
             states[zone] = message.state
     assert list(states.values()) == [PresenceState.NO_PRESENCE, PresenceState.PRESENCE]
+
+
+def test_an_x4m200_is_set_up_by_the_same_methods() -> None:
+    """Its start takes 20 s with a noise map at hand; Protocol reference 4.6, 7.4."""
+    transport = transport_of_the_corridor(DeviceOptions.of_model("x4m200"))
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        radar.profile.load(ProfileId.XTS_ID_APP_RESPIRATION_2)
+        radar.profile.set_noise_map(NoiseMapControl(6))
+        radar.profile.set_output(OutputFeature.RESP_STATUS)
+        radar.profile.set_output(OutputFeature.RESPIRATION_MOVINGLIST)
+        radar.profile.run()
+        began_s = transport.clock_ns() / SECOND
+        first = radar.profile.wait_until_initialized()
+        assert isinstance(first, m.RespStatus)
+        assert first.state != RespirationState.INITIALIZING
+        assert 15 < transport.clock_ns() / SECOND - began_s < 25
+        assert radar.read_message(m.RespirationMovingList).counter >= first.counter
+        assert radar.read_message(m.RespStatus).counter > first.counter

@@ -28,7 +28,7 @@ from xethru_protocol import (
     NoiseMapControl,
     RawConfig,
 )
-from xethru_protocol.driver import board, chip, files, profiles
+from xethru_protocol.driver import board, chip, files, firmware, profiles
 from xethru_protocol.driver.link import Part
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
@@ -594,6 +594,7 @@ PARTS = [
     (board.Pins, board.AsyncPins),
     (board.Diagnostics, board.AsyncDiagnostics),
     (files.Files, files.AsyncFiles),
+    (firmware.Firmware, firmware.AsyncFirmware),
 ]
 
 
