@@ -43,8 +43,13 @@ from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.recordings.vendor.writer import new_session_id
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import MatrixControl, OutputFeature, ProfileId
-from xethru_protocol.wire.errors import DeviceError, ResponseTimeout, XeThruError
+from xethru_protocol.wire.codes import FileType, MatrixControl, OutputFeature, ProfileId
+from xethru_protocol.wire.errors import (
+    DeviceError,
+    RemoteProtocolError,
+    ResponseTimeout,
+    XeThruError,
+)
 from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.rows import Response
 
@@ -55,6 +60,7 @@ class Listen:
     """How to get a module to send what is recorded: here, whatever it sends by itself."""
 
     profile_id: int | None = None  # that runs then; None if there is none, or it is not known
+    parameter_file: bytes | None = None  # the module's own
 
     def prepare(self, radar: X4M300) -> None:
         """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
@@ -164,6 +170,9 @@ class Profile(Listen):
                 f"this module does not load the profile {self._name}, which {self._kind.modules} "
                 f"has: {error}"
             ) from error
+        # the vendor's recorder stores this file beside the data; a module need not have it
+        with suppress(DeviceError, RemoteProtocolError):
+            self.parameter_file = radar.files.read(FileType.PARAMETER_FILE, 0)
         if self._zone_m is not None:
             zone_m = radar.profile.set_zone(*self._zone_m)
             warn(f"xethru record: the detection zone is {zone_m[0]:.3f} ... {zone_m[1]:.3f} m")
@@ -262,7 +271,7 @@ class Recorder:
             raise RecordingError(f"{wire} is a directory; name a file in it")
         files_to_replace(self.paths, replace=self._arguments.force)
 
-    def open(self) -> None:
+    def open(self, parameter_file: bytes | None = None) -> None:
         """Remove older files if that is allowed, and make new ones; RecordingError if not."""
         for path in files_to_replace(self.paths, replace=self._arguments.force):
             try:
@@ -277,6 +286,7 @@ class Recorder:
                 self._directory,
                 session_id=self._session_id,
                 profile_id=self._profile_id,
+                parameter_file=parameter_file,
                 **self._options,
             )
         if self._wire_path is not None:
@@ -436,7 +446,7 @@ def record(arguments: Namespace) -> int:
                 radar.raw_listener = recorder.take_bytes
                 mode.prepare(radar)
                 print_warnings(radar)
-                recorder.open()
+                recorder.open(mode.parameter_file)
                 with stop:
                     _record_from(radar, recorder, mode, arguments.duration, stop)
         except XeThruError as error:

@@ -26,7 +26,13 @@ from xethru_protocol.recordings import (
     recording_facts,
 )
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import OutputFeature, ProfileId, SensorMode, X4Setting
+from xethru_protocol.wire.codes import (
+    FileType,
+    OutputFeature,
+    ProfileId,
+    SensorMode,
+    X4Setting,
+)
 
 Capture = pytest.CaptureFixture[str]
 PRESENCE = m.PresenceSingle(counter=3, state=1, distance_m=1.5, direction=0, signal_quality=7)
@@ -155,6 +161,8 @@ def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) ->
     def answer(command: m.Message) -> Sequence[Said]:
         if isinstance(command, m.Ping):
             return [m.Pong(value=0xAAEEAEEA)]
+        if isinstance(command, m.GetFileLength):
+            return [m.Error(code=5)]  # not found: without a parameter file
         is_run = command == m.SetMode(mode=SensorMode.XTID_SM_RUN)
         return [m.Ack(), PRESENCE, PRESENCE] if is_run else [m.Ack()]
 
@@ -166,8 +174,10 @@ def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) ->
     assert asked == [
         m.SetMode(mode=SensorMode.XTID_SM_STOP),
         m.LoadApp(profile_id=ProfileId.XTS_ID_APP_PRESENCE_2),
+        m.GetFileLength(file_type=FileType.PARAMETER_FILE, identifier=0),
         m.SetMode(mode=SensorMode.XTID_SM_RUN),
     ]
+    assert recording_facts(out).parameter_file is None
     messages = [message for message, _ in read_recording(out)]
     assert messages == [PRESENCE, PRESENCE]
     assert describe_recording(out).profile_id == 0x014D4AB8
@@ -186,6 +196,7 @@ def profile_module(received: EmulatedModule, *sent: m.Response) -> PtyModule:
 def test_a_profile_is_set_up_as_asked(tmp_path: Path, capsys: Capture) -> None:
     emulated = EmulatedModule()
     emulated(m.LoadApp(profile_id=ProfileId.XTS_ID_APP_PRESENCE_2))
+    emulated.module.files.replace((FileType.PARAMETER_FILE, 0), b"[Debug]\nlevel=0;\n")
     # a setting of before, which the module keeps
     emulated(m.OutputSetControl(feature=OutputFeature.PULSEDOPPLER_BYTE, control=1))
     out = tmp_path / "recording"
@@ -205,6 +216,7 @@ def test_a_profile_is_set_up_as_asked(tmp_path: Path, capsys: Capture) -> None:
         OutputFeature.NOISEMAP_FLOAT: 3,
     }
     assert settings.sensitivity == 7
+    assert recording_facts(out).parameter_file == b"[Debug]\nlevel=0;\n"
     # the module snaps outward to its grid of 5.14 cm (4.4)
     assert settings.zone_m[0] <= 0.4
     assert 5.0 <= settings.zone_m[1] < 5.06
