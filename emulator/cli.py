@@ -40,7 +40,7 @@ link directory. One JSON line on stdout says that all ports are ready:
 
 scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
 gives every client the wheel odometry as TUM lines, the control path one for `xethru-emulator ctl`.
-start_skew_ns is when, in scene time, the module takes its frame of counter 0; radars are not
+start_skew_ns is when, in scene time, the module takes its first frame, counter 1; radars are not
 synchronised, and a host needs it where it cannot tell from when frames arrive.
 Ctrl-C, SIGTERM or SIGHUP ends it: links, sockets and a directory of its own are removed, exit 0.
 

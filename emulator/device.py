@@ -11,6 +11,7 @@ Source: protocol reference 8.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from emulator.chip import Pace
@@ -26,6 +27,7 @@ from emulator.module.module import (
     MessageStream,
     Module,
     Outbox,
+    StreamBegin,
 )
 from emulator.module.settings import DeviceOptions
 from emulator.profiles.run import ProfileStream
@@ -45,6 +47,7 @@ from xethru_protocol.wire.messages import (
     X4DriverWrite,
     X4DriverWriteI2c,
 )
+from xethru_protocol.wire.x4 import FIRST_COUNTER
 
 MOST_WAITING_BYTES = 2 * 7000 + 10 * 100
 """Of commands while one takes its time: as many as the firmware's message pool has (1.1)."""
@@ -75,10 +78,10 @@ _CLOCK_TOLERANCE_NS = 2
 class ChipStream(MessageStream):
     """Frames of a module in MANUAL mode.
 
-    Under `Pace.ASAP` the next frame is always due. Under `Pace.REALTIME` counter k is due at
-    ``scene_time_zero_ns`` + the scene time at which the module's clock shows k's nominal time; a
-    stream that starts late begins with the first counter still ahead, because the chip's counter
-    runs on.
+    Under `Pace.ASAP` the next frame is always due, and scene time stands still between two frames,
+    whatever happens between them: a stream after INIT or a reset begins where the one before it
+    ended. Under `Pace.REALTIME` a frame is due at ``scene_time_zero_ns`` + the scene time at which
+    the module's clock shows its nominal time; a stream begins with the first frame still ahead.
     """
 
     def __init__(
@@ -88,7 +91,9 @@ class ChipStream(MessageStream):
         self._pace = pace
         self._zero_ns = scene_time_zero_ns
         self._clock = clock
-        self._was_streaming = False
+        self._was_running = self._was_streaming = False
+        self._reached_ns = 0  # nominal scene time of the frame after the last one taken
+        self._begin: StreamBegin | None = None
 
     @property
     def streaming(self) -> bool:
@@ -96,41 +101,62 @@ class ChipStream(MessageStream):
         module = self._module
         return module.state in STREAMING and module.chip.running
 
+    @property
+    def begin(self) -> StreamBegin | None:
+        return self._begin
+
     def next_due_ns(self) -> int | None:
         """Return when the next frame is due; 0, long past, under `Pace.ASAP`."""
         if not self.streaming:
             return None
-        if self._pace is Pace.ASAP:
-            return 0
-        timeline = self._module.chip.timeline
-        nominal_ns = timeline.scene_time_ns(timeline.next_counter)
-        return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
+        return 0 if self._pace is Pace.ASAP else self._next_ns()
 
     def take(self) -> Response:
-        message = self._module.chip.next_frame()
-        self._was_streaming = self.streaming  # a transmitter that saw nothing for long is off now
+        chip = self._module.chip
+        message = chip.next_frame()
+        self._reached_ns = chip.timeline.scene_time_ns(chip.timeline.next_index)
+        self._note_running()  # a transmitter that saw nothing for long is off now
         return message
 
     def skip_due_before(self, time_ns: int) -> None:
-        due_ns = self.next_due_ns()
-        if due_ns is None or due_ns >= time_ns or self._pace is Pace.ASAP:
-            return
-        timeline = self._module.chip.timeline
-        # The clock's way back is exact to 1 ns: skip to just before, and go on one by one.
-        nominal_ns = self._clock.nominal_ns(time_ns - self._zero_ns)
-        timeline.skip_before(nominal_ns - _CLOCK_TOLERANCE_NS)
-        while (due_ns := self.next_due_ns()) is not None and due_ns < time_ns:
-            timeline.next_counter += 1
+        if self.streaming and self._pace is not Pace.ASAP:
+            self._move_on(time_ns, self._module.chip.timeline.skip_before)
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Begin with the first frame still ahead when a command started the stream."""
-        streaming = self.streaming
-        if streaming and not self._was_streaming:
-            self.skip_due_before(now_ns)
-        self._was_streaming = streaming
+        timeline = self._module.chip.timeline
+        if self._module.chip.running and not self._was_running:
+            if self._pace is Pace.ASAP:
+                timeline.pause_until(self._reached_ns)
+            else:
+                self._move_on(now_ns, timeline.pause_until)
+            if timeline.next_counter == FIRST_COUNTER:
+                number = 0 if self._begin is None else self._begin.number + 1
+                begin_ns = timeline.scene_time_ns(timeline.next_index)
+                self._begin = StreamBegin(number=number, scene_time_ns=begin_ns)
+        elif self.streaming and not self._was_streaming:
+            self.skip_due_before(now_ns)  # sweeps that went nowhere
+        self._note_running()
 
     def restarted(self, ready_ns: int) -> None:
-        self._was_streaming = False
+        self._note_running()
+
+    def _note_running(self) -> None:
+        self._was_running, self._was_streaming = self._module.chip.running, self.streaming
+
+    def _next_ns(self) -> int:
+        timeline = self._module.chip.timeline
+        nominal_ns = timeline.scene_time_ns(timeline.next_index)
+        return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
+
+    def _move_on(self, time_ns: int, move_to: Callable[[int], None]) -> None:
+        """Move on to the first frame due at a time or later."""
+        timeline = self._module.chip.timeline
+        # The clock's way back is exact to 1 ns: move to just before, and go on one by one.
+        nominal_ns = self._clock.nominal_ns(time_ns - self._zero_ns)
+        move_to(nominal_ns - _CLOCK_TOLERANCE_NS)
+        while self._next_ns() < time_ns:
+            move_to(timeline.scene_time_ns(timeline.next_index) + 1)
 
 
 class CombinedStream(MessageStream):
@@ -145,6 +171,10 @@ class CombinedStream(MessageStream):
         self._profile = profile
         self._due_ns: int | None
         self._choose()
+
+    @property
+    def begin(self) -> StreamBegin | None:
+        return self._raw.begin
 
     def next_due_ns(self) -> int | None:
         return self._due_ns
@@ -231,6 +261,11 @@ class Device:
         """Whether more commands should be read now; a host that never reads is held back."""
         room = self._waiting_bytes < MOST_WAITING_BYTES
         return room and not self._backlog and self._outbox.takes_replies
+
+    @property
+    def stream_begin(self) -> StreamBegin | None:
+        """Where the newest stream of radar frames begins in scene time."""
+        return self._stream.begin
 
     @property
     def listens(self) -> bool:

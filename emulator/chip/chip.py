@@ -1,7 +1,8 @@
 """The X4 chip and its driver: settings with the firmware's checks, registers, time, frames.
 
-A frame is a pure function of the source, the counter and the settings: raw RF counters come from
-an `EchoSource` as integers; the chip turns them into the float32 values the firmware sends.
+What a frame holds is a pure function of the source, the frame's place in scene time and the
+settings: raw RF counts come from an `EchoSource` as integers; the chip turns them into the float32
+values the firmware sends. The frame counter says nothing of scene time: see `Timeline`.
 Frames are synthesised in blocks because that is faster, and a block is discarded whenever a
 setting changes; block size never changes a value.
 
@@ -48,55 +49,80 @@ DAC_LEVELS = 2048
 
 
 class Timeline:
-    """Frame counters (unbounded, on the wire 32 bits) and their scene times since INIT.
+    """Since INIT: the chip's counter of frames, and where in scene time each frame lies.
 
-    INIT makes counter 0 scene time 0. Within a segment of constant rate, counter k lies at
-    ``start + frame_time_ns(k - first, rate)``; another rate begins a new segment at the next
-    counter. A pause changes nothing: the counter goes on where it was.
+    A frame's index counts frame periods of scene time from 0 and selects what the frame holds.
+    Within a segment of constant rate, index k lies at ``start + frame_time_ns(k - first, rate)``;
+    another rate begins a new segment at the next index.
+
+    The counter counts the sweeps of the chip: that of the first after INIT is 1, and it stands
+    still while the timer does, however much scene time passes (protocol reference 6.1).
+
+    Attributes
+    ----------
+    next_index, next_counter
+        Of the next frame; both unbounded, the counter has 32 bits on the wire.
 
     Examples
     --------
     >>> timeline = Timeline()
     >>> timeline.set_rate(100.0)
-    >>> timeline.next_counter = 50
+    >>> timeline.skip_before(500_000_000)
+    >>> timeline.next_index, timeline.next_counter
+    (50, 51)
     >>> timeline.set_rate(40.0)
     >>> timeline.scene_time_ns(50), timeline.scene_time_ns(54)
     (500000000, 600000000)
+    >>> timeline.pause_until(600_000_000)
+    >>> timeline.next_index, timeline.next_counter
+    (54, 51)
     """
 
     def __init__(self) -> None:
-        self.next_counter = 0
-        self._first_counter = 0
+        self.next_index = 0
+        self.next_counter = x4.FIRST_COUNTER
+        self._first_index = 0
         self._start_ns = 0
         self._rate_hz: float | None = None
 
     def set_rate(self, rate_hz: float) -> None:
-        """Run at another real frame rate (> 0) from the next counter on."""
+        """Run at another real frame rate (> 0) from the next index on."""
         if rate_hz != self._rate_hz:
-            self._start_ns = self.scene_time_ns(self.next_counter)
-            self._first_counter = self.next_counter
+            self._start_ns = self.scene_time_ns(self.next_index)
+            self._first_index = self.next_index
             self._rate_hz = rate_hz
 
-    def scene_time_ns(self, counter: int) -> int:
-        """Return the scene time of a counter of the current segment; 0 without a rate."""
+    def scene_time_ns(self, index: int) -> int:
+        """Return the scene time of an index of the current segment; 0 without a rate."""
         if self._rate_hz is None:
             return 0
-        return self._start_ns + frame_time_ns(counter - self._first_counter, self._rate_hz)
+        return self._start_ns + frame_time_ns(index - self._first_index, self._rate_hz)
+
+    def step(self) -> None:
+        """Move on by one sweep."""
+        self.next_index += 1
+        self.next_counter += 1
 
     def skip_before(self, scene_time_ns: int) -> None:
-        """Move on to the first counter not before a scene time."""
-        if self._rate_hz is None or self.scene_time_ns(self.next_counter) >= scene_time_ns:
+        """Let the sweeps before a scene time pass: the counter runs on."""
+        before = self.next_index
+        self.pause_until(scene_time_ns)
+        self.next_counter += self.next_index - before
+
+    def pause_until(self, scene_time_ns: int) -> None:
+        """Move on to the first index not before a scene time, while the chip does not sweep."""
+        if self._rate_hz is None or self.scene_time_ns(self.next_index) >= scene_time_ns:
             return
         elapsed_ns = scene_time_ns - self._start_ns
-        counter = self._first_counter + int(elapsed_ns * self._rate_hz / NS_PER_S) - 1
-        self.next_counter = max(counter, self.next_counter)
-        while self.scene_time_ns(self.next_counter) < scene_time_ns:
-            self.next_counter += 1
+        index = self._first_index + int(elapsed_ns * self._rate_hz / NS_PER_S) - 1
+        self.next_index = max(index, self.next_index)
+        while self.scene_time_ns(self.next_index) < scene_time_ns:
+            self.next_index += 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModuleClock:
-    """Nominal time of a counter to scene time, and back.
+    """Nominal time of a frame to scene time, and back.
 
     Attributes
     ----------
@@ -174,24 +200,24 @@ class EchoSource(Protocol):
     def rf_counters(
         self,
         capture: CaptureSettings,
-        frame_counters: NDArray[np.int64],
+        indices: NDArray[np.int64],
         scene_times_ns: NDArray[np.int64],
     ) -> NDArray[np.int64]:
-        """Return raw RF chip counters of a block of frames.
+        """Return raw RF counts of a block of frames.
 
         The result depends on the arguments and the source's own scene and seed alone.
 
         Parameters
         ----------
-        frame_counters
-            Shape (n_frames,); they select the noise.
+        indices
+            Shape (n_frames,): of the frames in scene time, see `Timeline`; they select the noise.
         scene_times_ns
-            Shape (n_frames,), int64: nominal scene time of each counter, without the radar's
+            Shape (n_frames,), int64: nominal scene time of each frame, without the radar's
             start skew and clock error (which the source adds itself).
 
         Returns
         -------
-        Shape (n_frames, n_samples), int64, clipped to [0, largest counter].
+        Shape (n_frames, n_samples), int64, clipped to [0, largest count].
         """
         ...
 
@@ -416,7 +442,7 @@ def _parse(text: str) -> dict[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Block:
-    first_counter: int
+    first_index: int
     values: NDArray[np.float32]
     is_zero: NDArray[np.bool_]
 
@@ -430,7 +456,7 @@ class Chip:
         Most frames synthesised at once: large blocks cost less per frame, small ones delay other
         radars less.
     block_phase
-        Blocks end with counters congruent to it modulo `largest_block`, so that of many radars
+        Blocks end with indices congruent to it modulo `largest_block`, so that of many radars
         in step only some synthesise at a time; None: each block is as long as it may be.
     board_offset_m
         FRAMEAREAOFFSET that the board stores, which INIT restores [module metres].
@@ -438,7 +464,7 @@ class Chip:
     Attributes
     ----------
     timeline
-        Which counter is next, and the scene time of each.
+        Which frame is next, and the scene time of each.
     powered
         False after ENABLE 0, until INIT.
     locked
@@ -467,7 +493,7 @@ class Chip:
         self.init()
 
     def init(self) -> None:
-        """Restart the chip: default settings, FPS 0, counter 0 at scene time 0."""
+        """Restart the chip: default settings, FPS 0, a new `Timeline`."""
         self.timeline = Timeline()
         self._registers = {
             space: _parse(text) | _DRIVER_DEFAULTS[space] for space, text in _RESET.items()
@@ -547,20 +573,20 @@ class Chip:
 
         Its values are RF amplitudes, shape (n_bins,); or all I, then all Q, shape (2 * n_bins,).
         """
-        counter = self.timeline.next_counter
+        index, counter = self.timeline.next_index, self.timeline.next_counter
         block = self._block
-        if block is None or not 0 <= counter - block.first_counter < len(block.values):
-            block = self._block = self._synthesise(counter, self._frames_from(counter))
+        if block is None or not 0 <= index - block.first_index < len(block.values):
+            block = self._block = self._synthesise(index, self._frames_from(index))
             self._block_frames = min(2 * self._block_frames, self._largest_block)
-        index = counter - block.first_counter
-        self.timeline.next_counter = counter + 1
-        self._guard_transmitter(bool(block.is_zero[index]))
-        return DataFloat(info=counter & 0xFFFFFFFF, values=block.values[index])
+        row = index - block.first_index
+        self.timeline.step()
+        self._guard_transmitter(bool(block.is_zero[row]))
+        return DataFloat(info=counter & 0xFFFFFFFF, values=block.values[row])
 
-    def _frames_from(self, counter: int) -> int:
+    def _frames_from(self, index: int) -> int:
         if self._block_phase is None:
             return self._block_frames
-        return min(self._block_frames, 1 + (self._block_phase - counter) % self._largest_block)
+        return min(self._block_frames, 1 + (self._block_phase - index) % self._largest_block)
 
     def _check_powered(self) -> None:
         if not self.powered:
@@ -609,21 +635,21 @@ class Chip:
             self._write_setting(X4Setting.TXPOWER, settings)
             self._apply(settings)
 
-    def _synthesise(self, first_counter: int, n_frames: int) -> _Block:
+    def _synthesise(self, first_index: int, n_frames: int) -> _Block:
         settings = self.settings
-        counters = np.arange(first_counter, first_counter + n_frames, dtype=np.int64)
+        indices = np.arange(first_index, first_index + n_frames, dtype=np.int64)
         scene_times_ns = np.array(
-            [self.timeline.scene_time_ns(int(counter)) for counter in counters], dtype=np.int64
+            [self.timeline.scene_time_ns(int(index)) for index in indices], dtype=np.int64
         )
         capture = self._capture()
         if capture.n_samples == 0 or _largest_counter(capture) <= 0:
             raw = np.zeros((n_frames, capture.n_samples), dtype=np.int64)
         else:
-            raw = self._source.rf_counters(capture, counters, scene_times_ns)
+            raw = self._source.rf_counters(capture, indices, scene_times_ns)
         convert = _baseband_values if settings.downconversion else _rf_values
         values = convert(raw, settings, self.area)
         is_zero = np.array([_is_zero(frame) for frame in values], dtype=np.bool_)
-        return _Block(first_counter=first_counter, values=values, is_zero=is_zero)
+        return _Block(first_index=first_index, values=values, is_zero=is_zero)
 
     def _capture(self) -> CaptureSettings:
         """Return which RF samples the chip takes, labelled as with the hardware's own offset."""

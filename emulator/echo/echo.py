@@ -14,7 +14,7 @@ Pulse p
     Gaussian envelope on the carrier (``emulator.echo.reflections``). The real pulse is a little
     asymmetric.
 Time t
-    Nominal time of the counter, made earlier by the module's fast clock and later by its start
+    Nominal time of the frame, made earlier by the module's fast clock and later by its start
     skew (``emulator.chip.chip``). The robot stands still within a frame: a sweep at 5 cm/s
     moves it by micrometres per pulse.
 Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
@@ -55,7 +55,7 @@ Shadow and transmission (``emulator.echo.walls``)
 Phase
     Each reflector's is fixed by its name (SHA-256), for every radar, aspect and seed.
 Phase jitter j
-    White (by frame counter) and slow (by time), common to all echoes and the leakage of a frame
+    White (by frame) and slow (by time), common to all echoes and the leakage of a frame
     (``emulator.echo.receiver``): figures of the strongest reflector of a real X4 recording. The
     envelope is not moved; amplitude jitter is left out.
 Leakage
@@ -67,7 +67,7 @@ Clutter c
     ten farthest bins of that recording. It ignores where the robot is, and radars do not share it.
 Noise w
     White and Gaussian (``emulator.scene.philox``), keyed by seed and the radar's serial, selected
-    by the frame counter. sigma is given at a working point and falls with the root of
+    by the frame's index. sigma is given at a working point and falls with the root of
     iterations x pulses per step; neither gain nor TX power change it. Flicker and interference
     are left out.
 Count q = 2**dac_step / (iterations pulses_per_step) / 1024, N = dac_max - dac_min + 1
@@ -224,15 +224,15 @@ class SceneEcho:
     def rf_counters(
         self,
         capture: CaptureSettings,
-        frame_counters: NDArray[np.int64],
+        indices: NDArray[np.int64],
         scene_times_ns: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Return raw RF chip counters, shape (n_frames, n_samples); see ``EchoSource``."""
         times_ns = self._clock.scene_times_ns(scene_times_ns)
-        jitter_rad = self._jitter.phases_rad(frame_counters, times_ns)
+        jitter_rad = self._jitter.phases_rad(indices, times_ns)
         return self._receiver.counters(
             self.echo(capture, scene_times_ns, jitter_rad),
-            frame_counters,
+            indices,
             times_ns,
             capture,
             gain=_TX_AMPLITUDE[capture.tx_power] * self._gain,

@@ -25,7 +25,7 @@ Source: I. J. Schoenberg, Quart. Appl. Math. 4 (1946) 45, on cardinal splines.
 Jitter of the carrier phase
 ---------------------------
 The sampler's clock jitters against the transmitter's: every echo of a frame, and the leakage, are
-turned by the same phase. White jitter is a new normal for every frame counter; slow jitter is a
+turned by the same phase. White jitter is a new normal for every frame; slow jitter is a
 stationary process of scene time that falls to 1/e after ``slow_correlation_s``. At 7.29 GHz one
 radian is 3.3 mm of range; the envelope is not moved, which for 0.03 rad would be 0.1 mm. Amplitude
 jitter, and jitter within a sweep, are left out.
@@ -205,21 +205,21 @@ class CarrierJitter:
         self._normals: list[float] = []
 
     def phases_rad(
-        self, frame_counters: NDArray[np.int64], scene_times_ns: NDArray[np.int64]
+        self, indices: NDArray[np.int64], scene_times_ns: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return what to add to the phase of each frame's carrier, shape (n_frames,) [rad].
 
         Parameters
         ----------
-        frame_counters
+        indices
             Shape (n_frames,), int64; they select the white part.
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
         """
-        white = [0.0] * len(frame_counters)
+        white = [0.0] * len(indices)
         if self._spec.white_rad > 0:
-            white = [self._white_at(counter) for counter in frame_counters.tolist()]
-        slow = [0.0] * len(frame_counters)
+            white = [self._white_at(index) for index in indices.tolist()]
+        slow = [0.0] * len(indices)
         if self._spec.slow_rad > 0:
             slow = [self._slow_at(time_ns) for time_ns in scene_times_ns.tolist()]
         phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad + np.array(slow)
@@ -230,9 +230,9 @@ class CarrierJitter:
         before = self._slow_rad_at(instant)
         return before + fraction * (self._slow_rad_at(instant + 1) - before)
 
-    def _white_at(self, counter: int) -> float:
-        """Return the normal of a counter; made for many at once, since frames come one by one."""
-        page, place = divmod(counter, _COUNTERS_AT_ONCE)
+    def _white_at(self, index: int) -> float:
+        """Return the normal of a frame; made for many at once, since frames come one by one."""
+        page, place = divmod(index, _COUNTERS_AT_ONCE)
         if page != self._page:
             counters = page * _COUNTERS_AT_ONCE + np.arange(_COUNTERS_AT_ONCE, dtype=np.int64)
             normals = counter_normals(counters, seed=self._seed, stream=self._white)
@@ -398,7 +398,7 @@ class Receiver:
     def counters(
         self,
         signal: NDArray[np.float64],
-        frame_counters: NDArray[np.int64],
+        indices: NDArray[np.int64],
         scene_times_ns: NDArray[np.int64],
         capture: CaptureSettings,
         *,
@@ -411,7 +411,7 @@ class Receiver:
         signal
             Shape (n_frames, capture.n_samples), float64, normalised units: echoes and leakage.
             Clutter is added in place.
-        frame_counters
+        indices
             Shape (n_frames,), int64; they select the noise.
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
@@ -431,9 +431,7 @@ class Receiver:
             dac_step=capture.dac_step,
         )
         self._clutter.add_to(signal, scene_times_ns, capture, gain)
-        units = frame_noise_units(
-            frame_counters, capture.n_samples, seed=self._seed, stream=self._stream
-        )
+        units = frame_noise_units(indices, capture.n_samples, seed=self._seed, stream=self._stream)
         counts: NDArray[np.float64] = units * (noise_sigma(self._noise, capture) / UNITS_PER_SIGMA)
         counts += signal
         counts += normalisation.dac_offset

@@ -327,6 +327,22 @@ class MessageKind(Enum):
     """DATA STRING and generic byte or float messages: the first to go."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamBegin:
+    """Where in scene time a stream of radar frames begins.
+
+    Attributes
+    ----------
+    number
+        From 0; INIT, a reset and a power cut end a stream, a pause does not.
+    scene_time_ns
+        Of its frame with counter 1, without the radar's start skew and clock error.
+    """
+
+    number: int
+    scene_time_ns: int
+
+
 class MessageStream(ABC):
     """Unsolicited messages of a module, made in steps that fall due one after the other."""
 
@@ -348,6 +364,11 @@ class MessageStream(ABC):
     @abstractmethod
     def command_done(self, command: m.Command[m.Response], now_ns: int) -> None:
         """Note that the module carried out, or refused, a command."""
+
+    @property
+    def begin(self) -> StreamBegin | None:
+        """The newest stream of radar frames that began; None before the first, or if unknown."""
+        return None
 
     # A recording goes on through a reset; a radar streams whether a host listens or not.
     def restarted(self, ready_ns: int) -> None:  # noqa: B027 - see above

@@ -2,7 +2,7 @@
 
 | verb | keys | does |
 |---|---|---|
-| state | | what every radar does: port, faults, playback |
+| state | | what every radar does: port, faults, playback, and where its stream begins |
 | fault add | fault, radar | arms a fault, written as in a scenario file |
 | fault list | radar | armed faults, and how often each was injected |
 | fault clear | id, radar | disarms one, or all |
@@ -15,6 +15,10 @@
 | loop | value, radar | true or false |
 | filter | kinds, radar | which kinds of messages are played; null: all |
 
+``stream`` in the state is the newest stream of radar frames: its number from 0 (INIT, a reset and
+a power cut end a stream) and the scene time of its frame with counter 1, without the radar's start
+skew; null before the first, and where the module is real or a recording.
+
 Without ``radar`` all are meant. The answer is ``{"ok":true,...}``, or
 ``{"ok":false,"error":"..."}`` with the remedy.
 """
@@ -24,9 +28,11 @@ from __future__ import annotations
 import json
 import selectors
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from emulator.device import Device
 from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlanError, parse_fault
 from emulator.playback import PlayStream, kinds
@@ -107,6 +113,7 @@ class Control:
                 "faults": _faults(device),
                 "injected": device.injected,
                 "playback": None if player is None else player.state(now_ns),
+                "stream": _stream(device),
             }
         return {"t_ns": now_ns, "radars": radars}
 
@@ -195,6 +202,11 @@ VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any] | No
     "loop": Control._loop,
     "filter": Control._filter,
 }
+
+
+def _stream(device: FaultyDevice) -> dict[str, int] | None:
+    begin = device.inner.stream_begin if isinstance(device.inner, Device) else None
+    return None if begin is None else asdict(begin)
 
 
 def _faults(device: FaultyDevice) -> list[dict[str, Any]]:

@@ -130,7 +130,7 @@ class NamedDevice:
     Attributes
     ----------
     start_skew_ns
-        Scene time at which it takes the frame of counter 0; None where unknown.
+        Scene time at which it takes the first frame of its first stream; None where unknown.
     present
         Whether its own port is there at a time, ns; None if it always is.
     uart_baud

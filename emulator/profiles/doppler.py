@@ -64,7 +64,7 @@ Powers = dict[MatrixInstance, NDArray[np.float64]]
 
 
 class ProfileSweep:
-    """Baseband frames of one zone, each selected by its counter.
+    """Baseband frames of one zone, each selected by its index in scene time.
 
     Attributes
     ----------
@@ -103,15 +103,15 @@ class ProfileSweep:
     def n_bins(self) -> int:
         return len(self.range_m)
 
-    def first_counter_from(self, scene_time_ns: int) -> int:
-        """Return the first counter that does not lie before a scene time."""
-        self.timeline.next_counter = 0
-        self.timeline.skip_before(scene_time_ns)
-        return self.timeline.next_counter
+    def first_index_from(self, scene_time_ns: int) -> int:
+        """Return the first index that does not lie before a scene time."""
+        self.timeline.next_index = 0
+        self.timeline.pause_until(scene_time_ns)
+        return self.timeline.next_index
 
-    def frame(self, counter: int) -> NDArray[np.complex128]:
+    def frame(self, index: int) -> NDArray[np.complex128]:
         """Return I + jQ of one frame, shape (n_bins,); its float32 values, exactly."""
-        self.timeline.next_counter = counter
+        self.timeline.next_index = index
         values = self._chip.next_frame().values.astype(np.float64)
         iq: NDArray[np.complex128] = values[: self.n_bins] + 1j * values[self.n_bins :]
         return iq

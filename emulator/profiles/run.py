@@ -1,8 +1,9 @@
 """The running profile as a stream of messages: it starts, pauses and ends with the mode.
 
-Assumed where the reference is silent: counters of all messages are those of radar frames; radar
-cross sections are 0, because released firmware computes none; bytes begin at -130 dB and go in
-steps of 0.5 dB, rounded to the nearest. Samples are amplitude, not power (11, row 23).
+Assumed where the reference is silent: counters of all messages are those of radar frames, of which
+the first after the start of a profile has counter 1, and a pause stops the count; radar cross
+sections are 0, because released firmware computes none; bytes begin at -130 dB and go in steps of
+0.5 dB, rounded to the nearest. Samples are amplitude, not power (11, row 23).
 
 A matrix is hundreds of messages, a range bin each; they are spread evenly over the frames until
 the next one, so that the module's queue of 50 slots can take them. Pulse-Doppler matrices are sent
@@ -15,10 +16,10 @@ host lost; of many the run goes through the last that fill the matrices (and tho
 noise map), which leaves the same state but for the noise map's adaptation.
 
 The radar runs on the emulator's clock under both paces: a presence message a second is what makes
-a profile useful to a host. Under `Pace.REALTIME` counter k is due at
-``scene_time_zero_ns`` + the scene time at which the module's clock shows k's nominal time, and a
-profile that starts begins with the first counter still ahead. Under `Pace.ASAP` the start of the
-profile is scene time 0, so that what a host gets does not depend on when it starts it, and nothing
+a profile useful to a host. Under `Pace.REALTIME` a frame is due at ``scene_time_zero_ns`` + the
+scene time at which the module's clock shows its nominal time, and a profile that starts begins with
+the first frame still ahead. Under `Pace.ASAP` the start of the profile is scene time 0, which
+stands still in a pause, so that what a host gets does not depend on when it starts it, and nothing
 is dropped.
 
 RUN after a pause fills the matrices anew (assumed) and keeps the noise map. A module that restarts
@@ -197,7 +198,8 @@ def matrix_reports(
 class ProfileRun:
     """A profile from RUN to STOP, or from one pause to the next.
 
-    ``zero_ns`` is the device time of scene time 0.
+    ``zero_ns`` is the device time of scene time 0, ``first_index`` that of the first frame in scene
+    time, ``first_counter`` what the chip calls it.
     """
 
     def __init__(
@@ -206,6 +208,7 @@ class ProfileRun:
         sweep: ProfileSweep,
         noise_map: NoiseMap,
         *,
+        first_index: int,
         first_counter: int,
         zero_ns: int,
         clock: ModuleClock,
@@ -213,6 +216,7 @@ class ProfileRun:
         self.processing = PresenceProcessing(sweep, noise_map)
         self._module = module
         self._sweep = sweep
+        self._first_index = first_index
         self._first_counter = first_counter
         self._zero_ns = zero_ns
         self._clock = clock
@@ -226,6 +230,14 @@ class ProfileRun:
         if self._ready:
             return self._due_ns(self._taken - 1)
         return None if self.silent else self._due_ns(self._taken)
+
+    @property
+    def next_index(self) -> int:
+        return self._first_index + self._taken
+
+    @property
+    def next_counter(self) -> int:
+        return self._first_counter + self._taken
 
     @property
     def silent(self) -> bool:
@@ -256,7 +268,7 @@ class ProfileRun:
             self._ready.clear()
 
     def _due_ns(self, index: int) -> int:
-        nominal_ns = self._sweep.timeline.scene_time_ns(self._first_counter + index)
+        nominal_ns = self._sweep.timeline.scene_time_ns(self._first_index + index)
         return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def _on(self, feature: int) -> int:
@@ -269,7 +281,7 @@ class ProfileRun:
 
     def _frame(self) -> None:
         counter = self._first_counter + self._taken
-        iq = self._sweep.frame(counter)
+        iq = self._sweep.frame(self._first_index + self._taken)
         self.processing.add(iq)
         self._taken += 1
         sampling_hz = self._module.options.baseband_sampling_hz
@@ -417,12 +429,12 @@ class ProfileStream(MessageStream):
             self._start(now_ns)
             return
         if self._paused:
-            self._start(now_ns, run.processing.noise_map)
+            self._start(now_ns, paused=run)
         elif self._was_silent:
             run.mute_before(now_ns)
         self._was_silent = run.silent
 
-    def _start(self, now_ns: int, noise_map: NoiseMap | None = None) -> None:
+    def _start(self, now_ns: int, paused: ProfileRun | None = None) -> None:
         settings = self._module.profile
         sweep = ProfileSweep(
             self._source,
@@ -432,15 +444,17 @@ class ProfileStream(MessageStream):
         )
         clock = self._clock
         if self._pace is Pace.ASAP:
-            zero_ns, first_counter = now_ns - clock.skew_ns, 0
+            first_index = 0 if paused is None else paused.next_index
+            zero_ns = now_ns - clock.scene_time_ns(sweep.timeline.scene_time_ns(first_index))
         else:
             zero_ns = self._zero_ns
-            first_counter = sweep.first_counter_from(clock.nominal_ns(now_ns - zero_ns))
+            first_index = sweep.first_index_from(clock.nominal_ns(now_ns - zero_ns))
         self._run = ProfileRun(
             self._module,
             sweep,
-            noise_map or self._first_map(sweep),
-            first_counter=first_counter,
+            self._first_map(sweep) if paused is None else paused.processing.noise_map,
+            first_index=first_index,
+            first_counter=x4.FIRST_COUNTER if paused is None else paused.next_counter,
             zero_ns=zero_ns,
             clock=clock,
         )

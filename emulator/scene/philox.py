@@ -64,13 +64,13 @@ def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:
 
 
 def frame_noise_units(
-    frame_counters: NDArray[np.int64], n_samples: int, *, seed: int, stream: int
+    indices: NDArray[np.int64], n_samples: int, *, seed: int, stream: int
 ) -> NDArray[np.int32]:
-    """Return white Gaussian noise of frames, each selected by its counter alone.
+    """Return white Gaussian noise of frames, each selected by its index alone.
 
     Parameters
     ----------
-    frame_counters
+    indices
         Shape (n,), int64, each >= 0, in any order.
     n_samples
         Values per frame, at most ``MAX_SAMPLES``.
@@ -83,9 +83,9 @@ def frame_noise_units(
     """
     if n_samples > MAX_SAMPLES:
         raise ValueError(f"{n_samples} samples: the longest frame has {MAX_SAMPLES}")
-    noise = np.empty((len(frame_counters), n_samples), dtype=np.int32)
-    for start, stop in _runs(frame_counters):
-        philox = _philox(seed, stream, int(frame_counters[start]) * _BLOCKS_PER_FRAME)
+    noise = np.empty((len(indices), n_samples), dtype=np.int32)
+    for start, stop in _runs(indices):
+        philox = _philox(seed, stream, int(indices[start]) * _BLOCKS_PER_FRAME)
         halves = _half_words(philox.random_raw((stop - start) * _WORDS_PER_FRAME))
         halves = halves.reshape(stop - start, 2, MAX_SAMPLES)
         run = noise[start:stop]
@@ -107,7 +107,7 @@ def standard_normals(count: int, *, seed: int, stream: int) -> NDArray[np.float6
 def counter_normals(counters: NDArray[np.int64], *, seed: int, stream: int) -> NDArray[np.float64]:
     """Return one normal for each counter: shape (n,), mean 0, variance 1.
 
-    ``counters`` is as in `frame_noise_units`; each selects its normal alone.
+    ``counters`` is as ``indices`` in `frame_noise_units`; each selects its normal alone.
     """
     units = np.empty(len(counters), dtype=np.int32)
     for start, stop in _runs(counters):
@@ -131,7 +131,7 @@ def _philox(seed: int, stream: int, counter: int = 0) -> np.random.Philox:
     if not (0 <= seed <= largest and 0 <= stream <= largest):
         raise ValueError(f"seed {seed} and stream {stream} must each lie in 0 ... 2**64 - 1")
     if counter < 0:
-        raise ValueError("frame counters must not be negative")
+        raise ValueError("frame indices must not be negative")
     return np.random.Philox(key=np.array([seed, stream], dtype=np.uint64), counter=counter)
 
 

@@ -48,8 +48,8 @@ class RadarSpec(Table):
     frame (x forward, y left, yaw counter-clockwise). ``range_offset_m`` is added to every true
     range (the module's own delay error; positive reads too far). ``gain_db`` is the error of its
     receiver's gain: it scales echoes, leakage and clutter, not the counts. ``start_skew_ms`` is
-    how much later than the nominal scene time of counter 0 this radar samples, and ``clock_ppm``
-    how fast its clock is: its frames come earlier and its bins are shorter
+    how much later than the nominal scene time of a frame this radar samples, and ``clock_ppm`` how
+    fast its clock is: its frames come earlier and its bins are shorter
     (``emulator.chip.chip``).
     """
 

@@ -14,7 +14,7 @@ from slam.app.records import LogLine, Scan, SessionInfo
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
-    end_counter,
+    end_tick,
     open_loopback,
     outlines_m,
     rig_of,
@@ -68,7 +68,7 @@ def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = 
         )
         truth = trajectory.poses if has_truth else _unknown
         log = SessionLog(path, info, odometry, truth_at=truth if has_truth else None)
-        scans = source.scans(end_counter(trajectory.duration_ns), StopFlag())
+        scans = source.scans(end_tick(trajectory.duration_ns), StopFlag())
         slam = make_slam(config, rig_of(scene), wheels_of(scene))
         record = run_slam(_damaged(scans, log, info), odometry, slam, truth, [log])
         log.close()

@@ -26,7 +26,7 @@ class RadarInfo:
     """One radar of a run: its identity, mount, and the range and time of its samples.
 
     `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
-    true metres are in every RadarFrame. `start_skew_ns` is the session time of counter 0.
+    true metres are in every RadarFrame. `start_skew_ns` is the session time of its first frame.
     `gain_db` is its gain over the mean of the rig: SLAM gets samples without it, the session holds
     them as received.
     """
@@ -97,9 +97,9 @@ class Scan:
 
     A tick is one frame period; `counter` numbers them from session time 0, and `t_ns` is when a
     radar without start skew samples. Every frame has its own stamp, in the period that begins with
-    `t_ns`. The counter of a frame is that of the tick, less the whole periods that its radar
-    started late. `host_ns` holds the arrival of each frame, nanoseconds since 1970; () if unknown.
-    A scan that is not `used` is recorded only: SLAM was not stepped with it.
+    `t_ns`, and the chip's counter, which begins anew with every stream. `host_ns` holds the arrival
+    of each frame, nanoseconds since 1970; () if unknown. A scan that is not `used` is recorded
+    only: SLAM was not stepped with it.
     """
 
     counter: int

@@ -203,6 +203,10 @@ def _whole_rate(requested_hz: float) -> int:
     return max(int(min(requested, float((1 << 32) - 1))), 1)
 
 
+FIRST_COUNTER = 1
+"""The chip's counter of the first frame after INIT, a reset or power-up. Protocol reference 6.1."""
+
+
 def frame_time_ns(counter: int, rate_hz: float) -> int:
     """Time of frame ``counter`` after frame 0 at a constant rate: the nearest ns, exactly.
 

@@ -23,6 +23,7 @@ from emulator.faults.kind import (
     frame_samples,
 )
 from emulator.scene.philox import Rng
+from xethru_protocol.wire.x4 import FIRST_COUNTER
 
 of_frame = Entry(Layer.STREAM, Target.FRAME)
 of_packet = Entry(Layer.STREAM, Target.PACKET)
@@ -128,8 +129,8 @@ def counter_wrap(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> 
 
 @of_frame("nothing; the counters of the frames show it", _Frames, lasting=True, hidden=_BACK)
 def counter_reset(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
-    """The frame counter begins again at 0."""
-    return _renumbered(packet, lambda counter: _since_first(counter, context))
+    """The frame counter begins again at 1, as after INIT."""
+    return _renumbered(packet, lambda counter: FIRST_COUNTER + _since_first(counter, context))
 
 
 @of_frame(

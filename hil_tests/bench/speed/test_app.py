@@ -17,7 +17,7 @@ from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
-    end_counter,
+    end_tick,
     open_loopback,
     rig_of,
     scene_and_config,
@@ -52,7 +52,7 @@ def test_whole_pipeline_without_synthesis(benchmark: BenchmarkFixture, tmp_path:
     trajectory = scene.trajectory()
     with open_loopback(scene, 0) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = list(source.scans(end_counter(trajectory.duration_ns), StopFlag()))
+        scans = list(source.scans(end_tick(trajectory.duration_ns), StopFlag()))
     poses = trajectory.poses
     # perfect odometry: only its length matters here
     track = OdometryTrack(

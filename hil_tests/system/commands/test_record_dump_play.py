@@ -40,7 +40,7 @@ def test_identical_messages(kind: list[str], tmp_path: Path, capsys: Capture) ->
         xethru(capsys, "record", "--port", served.paths[0], "--out", first, *count, *kind)
     messages = dumped(capsys, first)
     assert len(messages) == FRAMES
-    assert [message["fields"]["info"] for message in messages] == list(range(FRAMES))
+    assert [message["fields"]["info"] for message in messages] == list(range(1, FRAMES + 1))
     assert len(set(payloads(messages))) == FRAMES
 
     with emulator("play", first, "--rate", "0") as played:
@@ -119,4 +119,4 @@ def test_unplugging_keeps_what_came(tmp_path: Path, capsys: Capture) -> None:
     kept = re.search(rf"; kept (\d+) messages in {out}$", line)
     assert kept
     counters = [message["fields"]["info"] for message in dumped(capsys, out)]
-    assert counters == list(range(int(kept[1])))
+    assert counters == list(range(1, int(kept[1]) + 1))

@@ -17,7 +17,7 @@ import pytest
 
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.rig.emulated import end_counter
+from slam.app.rig.emulated import end_tick
 from slam.app.sweep.run import make_case, run_case
 
 pytestmark = pytest.mark.slow
@@ -113,7 +113,7 @@ def test_a_stressed_run_loses_frames_and_has_a_bound_on_what_is_left(tmp_path: P
     pytest.importorskip("gtsam")
     case = make_case(str(write_short_scene(tmp_path)), "paper", 0, stress="all", bound=True)
     run = run_case(case)
-    whole = 4 * end_counter(case.scene.trajectory().duration_ns)
+    whole = 4 * end_tick(case.scene.trajectory().duration_ns)
     # a tenth of the run silent, and a tenth of the other frames lost: 1180 of them, 0.9 % deviation
     assert run.frames == pytest.approx(0.81 * whole, abs=0.03 * whole)
     assert run.bound is not None

@@ -99,7 +99,7 @@ def test_a_signal_half_way(which: signal.Signals, times: int, code: int, tmp_pat
     assert is_gone(emulator)
     assert leftovers(tmp_path / "tmp") == []
     counters = finished_counters(out / "session.mcap")
-    assert counters == list(range(len(counters)))
+    assert counters == list(range(1, len(counters) + 1))
     assert abs(count_rows(out / "session.rrd")["/radar/left_rear/frame"] - len(counters)) <= 1
 
 
@@ -186,7 +186,7 @@ def test_kill_9_leaves_a_readable_session_and_no_emulator(tmp_path: Path) -> Non
     assert leftovers(tmp_path / "tmp") == []
     log = out / "session.mcap"
     counters = surviving_counters(log, "/radar/left_rear/frame")
-    assert counters == list(range(len(counters)))
+    assert counters == list(range(1, len(counters) + 1))
     # 2 MB on disk hold well over 100 scans; all but the last chunk of 256 KiB must be there
     assert len(counters) > 100
 

@@ -22,7 +22,7 @@ from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
     EmulatorProcess,
-    end_counter,
+    end_tick,
     open_loopback,
     open_ports,
     rig_of,
@@ -96,7 +96,7 @@ def results_of(
     track = OdometryTrack.from_lines(map(tum_line, times.tolist(), trajectory.poses(times)))
     with open_loopback(scene, 0) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans: Iterable[Scan] = source.scans(end_counter(trajectory.duration_ns), StopFlag())
+        scans: Iterable[Scan] = source.scans(end_tick(trajectory.duration_ns), StopFlag())
         scans = without_some(scans) if lose else scans
         return run_slam(scans, track, UwbRadarSlam(config, rig_of(scene)), trajectory.poses).results
 

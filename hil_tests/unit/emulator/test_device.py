@@ -1,6 +1,7 @@
 """The module's answers, modes, reset and streaming, driven with a virtual clock."""
 
 import re
+from typing import TypeGuard
 
 import pytest
 
@@ -8,6 +9,7 @@ from emulator.chip import Pace
 from emulator.chip.chip import ModuleClock
 from emulator.device import radar_device
 from emulator.module.memory import Identity
+from emulator.module.module import StreamBegin
 from emulator.module.settings import DeviceOptions
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
 from xethru_protocol.wire import messages as m
@@ -16,6 +18,10 @@ from xethru_protocol.wire.connection import Connection, Role
 
 SECOND = 1_000_000_000
 PRESENCE_2 = 0x014D4AB8
+
+
+def is_frame(message: m.Message) -> TypeGuard[m.DataFloat]:
+    return isinstance(message, m.DataFloat)
 
 
 def mode_of(host: BareHost) -> int:
@@ -155,7 +161,7 @@ def test_frames_flow_in_manual_mode_only(host: BareHost) -> None:
     host.set(X4Setting.FPS, 17.0)
     assert host.hear() == []
     assert host.ask(m.SetMode(mode=SensorMode.XTID_SM_MANUAL)) == m.Ack()
-    assert [frame.info for frame in host.frames(3)] == [0, 1, 2]
+    assert [frame.info for frame in host.frames(3)] == [1, 2, 3]
     host.send(m.SetMode(mode=SensorMode.XTID_SM_STOP))
     assert host.hear() == [m.Ack()]
 
@@ -169,15 +175,16 @@ def test_a_reply_waits_behind_no_frame_and_no_frame_follows_a_stop(host: BareHos
 
 
 def test_a_pause_continues_the_counter_and_init_resets_it(host: BareHost) -> None:
+    """Protocol reference 6.1: sweeps are counted, the first after INIT is 1."""
     host.stream()
     host.frames(5)
     host.set(X4Setting.FPS, 0.0)
     host.set(X4Setting.FPS, 17.0)
-    assert [frame.info for frame in host.frames(2)] == [5, 6]
+    assert [frame.info for frame in host.frames(2)] == [6, 7]
     host.ask(m.X4DriverInit())
     assert host.hear() == [], "INIT stops the stream"
     host.set(X4Setting.FPS, 17.0)
-    assert [frame.info for frame in host.frames(1)] == [0]
+    assert [frame.info for frame in host.frames(1)] == [1]
 
 
 def test_scene_time_continues_in_segments_over_a_rate_change() -> None:
@@ -190,6 +197,71 @@ def test_scene_time_continues_in_segments_over_a_rate_change() -> None:
     assert source.scene_times_ns[10] == SECOND // 10
     assert source.scene_times_ns[50] == SECOND // 2
     assert source.scene_times_ns[51] == SECOND // 2 + SECOND // 40
+
+
+@pytest.mark.parametrize("pace", list(Pace))
+def test_a_pause_in_real_time_passes_scene_time_but_no_sweeps(pace: Pace) -> None:
+    """Protocol reference 6.1: it stands still while FPS is 0. ASAP's time stands still, too."""
+    source = RampSource()
+    host = BareHost(ramp_device(pace, source))
+    host.stream(50.0)
+    before = [frame.info for frame in host.frames(5)]
+    while len(before) < 5:
+        before += [one.info for one in host.at(host.now_ns + SECOND // 50) if is_frame(one)]
+    host.set(X4Setting.FPS, 0.0)
+    host.at(host.now_ns + 10 * SECOND + 1)
+    source.scene_times_ns.clear()
+    host.set(X4Setting.FPS, 50.0)
+    after = [one.info for one in host.at(host.now_ns + SECOND // 50) if is_frame(one)]
+    assert [*before, after[0]] == [1, 2, 3, 4, 5, 6]
+    begin_ns = min(source.scene_times_ns.values())
+    assert begin_ns == SECOND // 10 if pace is Pace.ASAP else begin_ns > 10 * SECOND
+
+
+def test_frames_that_are_not_fetched_leave_gaps() -> None:
+    """Protocol reference 6.1: the chip counts on, also while nothing goes to the host."""
+    host = BareHost(ramp_device(Pace.REALTIME))
+    host.stream(50.0)
+    assert [frame.info for frame in host.frames(5)] == [1]
+    host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP))
+    host.at(SECOND + 1)
+    host.command(m.SetMode(mode=SensorMode.XTID_SM_MANUAL))
+    assert [one.info for one in host.at(SECOND + SECOND // 50) if is_frame(one)] == [52]
+
+
+def test_where_a_stream_begins_is_known() -> None:
+    """Under ASAP a later stream goes on where the one before it ended."""
+    source = RampSource()
+    device = ramp_device(source=source)
+    host = BareHost(device)
+    host.enter_manual()
+    before = device.stream_begin
+    assert before is None
+    host.set(X4Setting.FPS, 100.0)
+    assert device.stream_begin == StreamBegin(number=0, scene_time_ns=0)
+    host.frames(50)
+    host.set(X4Setting.FPS, 0.0)
+    host.set(X4Setting.FPS, 40.0)
+    host.frames(4)  # to 0.6 s
+    assert device.stream_begin == StreamBegin(number=0, scene_time_ns=0)
+    host.command(m.X4DriverInit())
+    host.set(X4Setting.FPS, 40.0)
+    assert device.stream_begin == StreamBegin(number=1, scene_time_ns=6 * SECOND // 10)
+    assert [frame.info for frame in host.frames(2)] == [1, 2]
+    assert host.ask(m.ModReset()) == m.Ack()
+    host.hear(20)
+    for now_ns in (SECOND, 10 * SECOND):
+        host.now_ns = now_ns
+        device.advance(now_ns)
+    host.hear(2)
+    host.enter_manual()
+    source.scene_times_ns.clear()
+    host.set(X4Setting.FPS, 50.0)
+    begin = device.stream_begin
+    assert begin is not None
+    assert begin.number == 2
+    assert host.frames(1)[0].info == 1
+    assert min(source.scene_times_ns.values()) == begin.scene_time_ns > 6 * SECOND // 10
 
 
 def test_reset_acks_goes_deaf_and_comes_back_stopped(host: BareHost) -> None:
@@ -299,7 +371,7 @@ def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
         device.advance(host.now_ns)
         for frame in host.frames(10):
             arrivals[frame.info] = host.now_ns
-    expected = {k: zero_ns + skew_ns + k * SECOND // 50 + 100_000 for k in range(100)}
+    expected = {k + 1: zero_ns + skew_ns + k * SECOND // 50 + 100_000 for k in range(100)}
     assert arrivals == expected
 
 
@@ -315,9 +387,9 @@ def test_after_lost_frames_none_comes_before_it_is_due() -> None:
     for _ in range(10):
         device.advance(host.now_ns)
         counters += [frame.info for frame in host.frames(100)]
-        assert counters[-1] * SECOND // 200 <= host.now_ns
+        assert (counters[-1] - 1) * SECOND // 200 <= host.now_ns
         host.now_ns += SECOND // 500
-    assert counters != list(range(len(counters)))  # some were lost
+    assert counters != list(range(1, len(counters) + 1))  # some were lost
 
 
 def test_a_late_start_in_realtime_skips_what_is_past() -> None:
@@ -330,7 +402,7 @@ def test_a_late_start_in_realtime_skips_what_is_past() -> None:
     host.now_ns += SECOND // 50
     device.advance(host.now_ns)
     (frame,) = host.frames(10)
-    assert frame.info == 501
+    assert frame.info == 1, "the timer has just begun"
     assert source.scene_times_ns[501] == 501 * SECOND // 50
 
 

@@ -16,7 +16,7 @@ from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
     EmulatorProcess,
-    end_counter,
+    end_tick,
     open_ports,
     outlines_m,
     rig_of,
@@ -67,7 +67,9 @@ def run_demo(
             odometry = read_odometry_socket(emulator.odometry_socket)
             link_log = LinkLog()
             rig = rig_of(loaded)
-            rig_source = stack.enter_context(open_ports(emulator.devices, rig, link_log.on_record))
+            rig_source = stack.enter_context(
+                open_ports(emulator.devices, rig, link_log.on_record, emulator.stream_begins_ns)
+            )
             early_bytes: list[tuple[str, Literal["rx", "tx"], bytes, int]] = []
             if wire:  # the log needs the modules' answers before it can begin
                 rig_source.listen(lambda *row: early_bytes.append(row))
@@ -89,7 +91,7 @@ def run_demo(
                 info=info,
                 rig=rig,
                 slam=make_slam(config, rig, wheels),
-                scans=_scans(rig_source, end_counter(trajectory.duration_ns), emulator, stop, kept),
+                scans=_scans(rig_source, end_tick(trajectory.duration_ns), emulator, stop, kept),
                 odometry=odometry,
                 truth_at=trajectory.poses,
                 lost_frames=lambda: rig_source.lost_frames,

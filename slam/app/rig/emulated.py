@@ -24,6 +24,7 @@ from typing import IO, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator import cli as emulator_cli
 from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
@@ -33,7 +34,7 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scen
 from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.files import RigWheels
-from slam.app.rig.sources import RadarLink, RecordObserver, RigSource
+from slam.app.rig.sources import RadarLink, RecordObserver, RigSource, StreamBegins
 from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount, Rig, transform
 from xethru_protocol.driver.link import RawConfig
@@ -84,7 +85,7 @@ class EmulatorProcess:
         self._cleanup = contextlib.ExitStack()
         self.devices: tuple[EmulatedDevice, ...] = ()
         self.odometry_socket = ""
-        self._control_socket = ""
+        self.control_socket = ""
 
     def __enter__(self) -> Self:
         with self._cleanup:
@@ -149,9 +150,21 @@ class EmulatorProcess:
                 EmulatedDevice(**{key: row[key] for key in keys}) for row in ready["devices"]
             )
             self.odometry_socket = ready["odometry"]
-            self._control_socket = ready["control"]
+            self.control_socket = ready["control"]
         except (ValueError, KeyError, TypeError):
             raise EmulatorError(f"the emulator's ready line is unknown: {line[:200]!r}") from None
+
+    def stream_begins_ns(self, radar: str) -> int:
+        """Return where the newest stream of a radar begins in scene time [ns].
+
+        Raises EmulatorError if the control socket does not say.
+        """
+        try:
+            path = Path(self.control_socket)
+            answer = json.loads(emulator_cli.ask(path, {"verb": "state", "radar": radar}))
+            return int(answer["radars"][radar]["stream"]["scene_time_ns"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise EmulatorError(f"the emulator does not say when {radar} began: {error}") from None
 
     def _end(self) -> None:
         if self._process.stdout is not None:
@@ -163,7 +176,7 @@ class EmulatorProcess:
             self._process.kill()
             self._process.wait()
         left = [Path(device.path) for device in self.devices]
-        left += [Path(path) for path in (self.odometry_socket, self._control_socket) if path]
+        left += [Path(path) for path in (self.odometry_socket, self.control_socket) if path]
         for path in left:
             path.unlink(missing_ok=True)
         for folder in {path.parent for path in left}:
@@ -238,11 +251,15 @@ def outlines_m(scene: Scene) -> tuple[NDArray[np.float64], ...]:
 
 
 def open_ports(
-    devices: tuple[EmulatedDevice, ...], rig: Rig, observer: RecordObserver
+    devices: tuple[EmulatedDevice, ...],
+    rig: Rig,
+    observer: RecordObserver,
+    begins: StreamBegins | None = None,
 ) -> RigSource:
     """Open emulated modules through their serial ports, as hardware would be.
 
-    Raises AppError if a port is missing or in use, or what answers there is no such radar.
+    `begins` as in `RigSource`. Raises AppError if a port is missing or in use, or what answers
+    there is no such radar.
     """
     links: list[RadarLink] = []
     by_name = {device.name: device for device in devices}
@@ -266,7 +283,7 @@ def open_ports(
                 )
             )
         unless_it_works.pop_all()
-    return RigSource(links)
+    return RigSource(links, begins)
 
 
 def open_loopback(scene: Scene, seed: int) -> RigSource:
@@ -293,8 +310,8 @@ def open_loopback(scene: Scene, seed: int) -> RigSource:
     return RigSource(links)
 
 
-def end_counter(duration_ns: int) -> int:
-    """Return the first frame counter after the end of the scene."""
+def end_tick(duration_ns: int) -> int:
+    """Return the first tick after the end of the scene."""
     period_ns = NS_PER_S / real_frame_rate(FRAME_RATE_HZ)
     return int(duration_ns / period_ns) + 1
 

@@ -26,7 +26,12 @@ from xethru_protocol.driver.link import ProtocolRecord, RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout, XeThruError
-from xethru_protocol.wire.x4 import MODULE_SPEED_MPS, Normalisation, frame_time_ns
+from xethru_protocol.wire.x4 import (
+    FIRST_COUNTER,
+    MODULE_SPEED_MPS,
+    Normalisation,
+    frame_time_ns,
+)
 
 LIGHT_MPS = 299_792_458.0
 TRUE_PER_MODULE_METRE = LIGHT_MPS / MODULE_SPEED_MPS
@@ -35,6 +40,11 @@ SILENCE_S = 5.0
 _POLL_S = 0.25
 
 
+StreamBegins = Callable[[str], int]
+"""Returns where the newest stream of a radar, by its name, begins in scene time [ns].
+
+Without the radar's start skew. AppError if that cannot be had.
+"""
 RecordObserver = Callable[[str, ProtocolRecord], None]
 """Gets a radar's name and what happened on its link."""
 
@@ -43,7 +53,7 @@ RecordObserver = Callable[[str, ProtocolRecord], None]
 class RadarLink:
     """An open driver and what it is called: its mount on the robot, its port, its serial number.
 
-    `start_skew_ns` is the session time of its counter 0, 0 or later; `gain_db` as in `RadarInfo`.
+    `start_skew_ns` is the session time of its first frame, 0 or later; `gain_db` as in `RadarInfo`.
     """
 
     mount: Mount
@@ -85,21 +95,18 @@ def sampler_limits(config: RawConfig) -> tuple[float, float]:
 def radar_frame(
     radar: int,
     frame: Frame,
-    rate_hz: float,
+    t_ns: int,
     *,
-    start_skew_ns: int = 0,
     limits: tuple[float, float] | None = None,
 ) -> RadarFrame:
-    """Turn a driver's frame into one for SLAM: true metres, time by the counter.
+    """Turn a driver's frame into one for SLAM, of true metres.
 
-    The counter is the only clock here: what the module's own clock is off by (tens of ppm, tens
-    of milliseconds after a quarter of an hour) does not show in it. `radar` is its index in the
-    rig, `rate_hz` the chip's real frame rate, as read back, `start_skew_ns` the session time of
-    counter 0, `limits` those of the sampler, see `RadarFrame`.
+    `radar` is its index in the rig, `t_ns` the session time at which the frame was taken, `limits`
+    those of the sampler, see `RadarFrame`.
     """
     return RadarFrame(
         radar=radar,
-        t_ns=start_skew_ns + frame_time_ns(frame.counter, rate_hz),
+        t_ns=t_ns,
         counter=frame.counter,
         # raw RF was configured, so they are real; RadarFrame refuses anything else
         samples=cast(NDArray[np.float32], frame.samples),
@@ -110,7 +117,7 @@ def radar_frame(
 
 
 def whole_periods(start_skew_ns: int, rate_hz: float) -> int:
-    """Return how many whole frame periods a radar started late, its counter behind the ticks.
+    """Return how many whole frame periods a radar started late.
 
     >>> whole_periods(190_000_000, 5.0), whole_periods(200_000_000, 5.0)
     (0, 1)
@@ -120,15 +127,54 @@ def whole_periods(start_skew_ns: int, rate_hz: float) -> int:
     return next(fitting, nearly - 1)
 
 
+class CounterTime:
+    """Time base `counter`: the ticks and the stamps of one radar's frames, by their counters.
+
+    The counter is the only clock here: what the module's own clock is off by (tens of ppm, tens
+    of milliseconds after a quarter of an hour) does not show in it. A counter that begins anew
+    begins another stream, of which somebody else must know where it lies in time.
+
+    Attributes
+    ----------
+    last_counter
+        Of the newest frame; 0 before the first of a stream.
+    expected
+        The tick of the frame after it.
+    """
+
+    def __init__(self, info: RadarInfo, begins: StreamBegins | None) -> None:
+        self._info = info
+        self._begins = begins
+        self._late = whole_periods(info.start_skew_ns, info.rate_hz)
+        self._first_index = 0  # frame periods of scene time before counter 1
+        self.last_counter = 0
+        self.expected = self._late
+
+    def take(self, counter: int) -> tuple[int, int]:
+        """Return the tick and the session time [ns] of the next frame that came."""
+        if counter <= self.last_counter and self._begins is not None:
+            begin_ns = self._begins(self._info.name)
+            self._first_index = round(begin_ns * self._info.rate_hz / NS_PER_S)
+        self.last_counter = counter
+        index = self._first_index + counter - FIRST_COUNTER
+        self.expected = index + self._late + 1
+        return index + self._late, self._info.start_skew_ns + frame_time_ns(
+            index, self._info.rate_hz
+        )
+
+
 class RigSource:
     """All radars of a robot as one stream of scans, in the order of time.
 
     `radars` is what the modules answered, after `start`; `lost_frames` counts the frames missing
-    between the counters that arrived, over all radars.
+    between those that arrived, over all radars. With `begins`, a radar that restarts during a run
+    is set up anew, and its frames are stamped by where its new stream begins; without, its silence
+    ends the run.
     """
 
-    def __init__(self, links: Sequence[RadarLink]) -> None:
+    def __init__(self, links: Sequence[RadarLink], begins: StreamBegins | None = None) -> None:
         self._links = self._open_links = tuple(links)
+        self._begins = begins
         self.radars: tuple[RadarInfo, ...] = ()
         self._limits: tuple[float, float] | None = None
         self.lost_frames = 0
@@ -176,58 +222,61 @@ class RigSource:
         self.radars = tuple(radars)
         self._limits = sampler_limits(config)
 
-    def scans(self, end_counter: int, stop: StopFlag) -> Iterator[Scan]:
-        """Yield the frames of ticks below `end_counter`, one scan per tick; see `Scan`.
+    def scans(self, end_tick: int, stop: StopFlag) -> Iterator[Scan]:
+        """Yield the frames of ticks below `end_tick`, one scan per tick; see `Scan`.
 
         Raises RadarSilentError if a radar sends no frame for 5 s, or its port is gone.
         """
-        # By tick, from here on: a radar's counter and the periods that it started late.
-        late = [whole_periods(info.start_skew_ns, info.rate_hz) for info in self.radars]
-        expected = list(late)
-        heads: list[Frame | None] = [None] * len(self._links)
+        times = [CounterTime(info, self._begins) for info in self.radars]
+        heads: list[tuple[int, RadarFrame] | None] = [None] * len(self._links)
         while True:
             stop.check()
             for radar, head in enumerate(heads):
                 if head is None:
-                    frame = self._next_frame(radar, expected[radar] - late[radar], stop)
-                    tick = frame.counter + late[radar]
-                    self.lost_frames += max(min(tick, end_counter) - expected[radar], 0)
-                    expected[radar] = tick + 1
-                    heads[radar] = frame
-            tick = min(expected) - 1
-            if tick >= end_counter:
+                    time_base = times[radar]
+                    received = self._next_frame(radar, time_base.last_counter, stop)
+                    expected = time_base.expected
+                    tick, t_ns = time_base.take(received.counter)
+                    self.lost_frames += max(min(tick, end_tick) - expected, 0)
+                    heads[radar] = tick, radar_frame(radar, received, t_ns, limits=self._limits)
+            waiting = [head for head in heads if head is not None]
+            tick = min(tick for tick, _ in waiting)
+            if tick >= end_tick:
                 return
-            frames = []
-            for radar, head in enumerate(heads):
-                if head is not None and expected[radar] - 1 == tick:
-                    info = self.radars[radar]
-                    frames.append(
-                        radar_frame(
-                            radar,
-                            head,
-                            info.rate_hz,
-                            start_skew_ns=info.start_skew_ns,
-                            limits=self._limits,
-                        )
-                    )
-                    heads[radar] = None
+            frames = tuple(frame for one, frame in waiting if one == tick)
+            for frame in frames:
+                heads[frame.radar] = None
             t_ns = frame_time_ns(tick, self.radars[frames[0].radar].rate_hz)
-            yield Scan(counter=tick, t_ns=t_ns, frames=tuple(frames))
+            yield Scan(counter=tick, t_ns=t_ns, frames=frames)
 
-    def _next_frame(self, radar: int, expected: int, stop: StopFlag) -> Frame:
+    def _next_frame(self, radar: int, last_counter: int, stop: StopFlag) -> Frame:
         link = self._links[radar]
         give_up = time.monotonic() + SILENCE_S
+        has_restarted = False
         while True:
             try:
                 return link.driver.read_frame(timeout_s=_POLL_S)
             except ResponseTimeout:
                 stop.check()
-                if time.monotonic() > give_up:
-                    raise RadarSilentError(
-                        f"radar {link.mount.name} at {link.port}: no frame for {SILENCE_S:g} s "
-                        f"after frame {expected - 1}"
-                    ) from None
+                if time.monotonic() <= give_up:
+                    continue
+                trouble = f"no frame for {SILENCE_S:g} s"
             except Disconnected as error:
+                trouble = str(error)
+            if has_restarted or not self._restart(link):
                 raise RadarSilentError(
-                    f"radar {link.mount.name} at {link.port}: {error} after frame {expected - 1}"
+                    f"radar {link.mount.name} at {link.port}: {trouble} after frame {last_counter}"
                 ) from None
+            has_restarted = True
+            give_up = time.monotonic() + SILENCE_S
+
+    def _restart(self, link: RadarLink) -> bool:
+        """Set up a radar that went silent, if somebody can say when it goes on."""
+        if self._begins is None:
+            return False
+        try:
+            self._begins(link.mount.name)
+            link.driver.reconnect()
+        except (AppError, XeThruError):
+            return False
+        return True

@@ -19,7 +19,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from queue import Empty, SimpleQueue
 from typing import Literal, TypeAlias
 
@@ -529,7 +528,6 @@ class LiveSource:
                 self._log.on_wire(name, way, data, host_ns)
 
     def _take_frame(self, radar: int, frame: Frame) -> None:
-        info = self.radars[radar]
         last = self._last_counters[radar]
         if last is not None and frame.counter > last:
             self.lost_frames += frame.counter - last - 1
@@ -537,8 +535,7 @@ class LiveSource:
         taken_ns = self.clocks[radar].stamp_ns(frame.counter, frame.arrival_ns)
         if not self._odometry.has_pose:
             return  # session time is unknown until then
-        made = radar_frame(radar, frame, info.rate_hz, limits=self._limits)
-        made = replace(made, t_ns=self._odometry.session_ns(taken_ns))
+        made = radar_frame(radar, frame, self._odometry.session_ns(taken_ns), limits=self._limits)
         self.ticks.take(made, frame.arrival_ns + self._unix_ns)
 
     def _warn_of_lag(self) -> None:

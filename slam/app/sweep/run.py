@@ -27,7 +27,7 @@ from slam.app.records import Scan, SessionInfo
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
-    end_counter,
+    end_tick,
     open_loopback,
     outlines_m,
     rig_of,
@@ -47,6 +47,7 @@ from slam.front_end import make_detector
 from slam.geometry import transform
 from slam.results import Slam
 from xethru_protocol.system import StopFlag
+from xethru_protocol.wire.x4 import FIRST_COUNTER
 
 # Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the
 # odometry's, 2**63.
@@ -115,7 +116,7 @@ def stressed_scans(
     silent_ns = (begin * duration_ns, (begin + stress.silent_share) * duration_ns)
 
     def is_dropped(frame: RadarFrame) -> bool:
-        words = _uniforms(seed, _DROPPED + frame.radar, frame.counter, 1)
+        words = _uniforms(seed, _DROPPED + frame.radar, frame.counter - FIRST_COUNTER, 1)
         return float(words[0]) < share
 
     for scan in scans:
@@ -153,7 +154,7 @@ class OutlierDetector:
         return [self._mixed(*pair) for pair in zip(frames, found, strict=True)]
 
     def _mixed(self, frame: RadarFrame, detections: Sequence[Detection]) -> tuple[Detection, ...]:
-        block = frame.counter * _BLOCKS_PER_FRAME
+        block = (frame.counter - FIRST_COUNTER) * _BLOCKS_PER_FRAME
         words = _uniforms(self.seed, _OUTLIERS + frame.radar, block, 3 * len(detections))
         span_m = self.max_range_m - self.min_range_m
         mixed = [
@@ -305,7 +306,7 @@ def loopback_source(
     duration_ns = trajectory.duration_ns
     radars = open_loopback(scene, seed if noise_seed is None else noise_seed)
     radars.start(RAW_CONFIG, FRAME_RATE_HZ)
-    scans = radars.scans(end_counter(duration_ns), stop)
+    scans = radars.scans(end_tick(duration_ns), stop)
     return RunSource(
         info=SessionInfo(
             scene=scene.name,

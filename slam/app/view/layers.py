@@ -102,7 +102,7 @@ class FrameLayer:
         host = scan.host_ns or (None,) * len(scan.frames)
         for frame, host_ns in zip(scan.frames, host, strict=True):
             block = self._blocks[frame.radar]
-            block.stamps.add(frame.t_ns, frame.counter, host_ns)
+            block.stamps.add(frame.t_ns, scan.counter, host_ns)
             block.frames.append(frame)
             if len(block.frames) == BLOCK_FRAMES:
                 self._send_frames(block)

@@ -68,8 +68,8 @@ only. {data}
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
   every command and answer under *Log*.
 
-Move the cursor of the time line below. `device_time` is the radars' own time, `frame` their
-frame counter, `host_time`, if there, when frames arrived.
+Move the cursor of the time line below. `device_time` is the radars' own time, `frame` the
+tick (frame periods since the start), `host_time`, if there, when frames arrived.
 """
 
 _TRUTH = "Grey: the *true* path, and crosses where the landmarks truly are. "

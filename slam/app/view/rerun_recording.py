@@ -55,7 +55,7 @@ ARROW_M = 0.25
 
 
 DEVICE_TIME, HOST_TIME, FRAME = "device_time", "host_time", "frame"
-"""The timelines: session time of the radars, time of day of arrival, frame counter."""
+"""The timelines: session time of the radars, time of day of arrival, tick."""
 
 _STATIC = " (static)"
 
@@ -67,7 +67,7 @@ _VIEWER_CLOSE_LIMIT_S = 5.0
 
 @dataclass(slots=True, kw_only=True)
 class Stamps:
-    """When rows happened: session times, frame counters, and nanoseconds since 1970.
+    """When rows happened: session times, ticks, and nanoseconds since 1970.
 
     `host_ns` is left out of the recording as soon as one of its rows has none.
     """

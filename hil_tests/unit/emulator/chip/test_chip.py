@@ -361,7 +361,7 @@ def test_of_modules_in_step_few_make_a_block_at_a_time() -> None:
 def test_the_same_rate_after_a_pause_continues_the_segment() -> None:
     timeline = Timeline()
     timeline.set_rate(10.0)
-    timeline.next_counter = 7
+    timeline.next_index = 7
     timeline.set_rate(10.0)
     assert timeline.scene_time_ns(7) == 700_000_000
     assert timeline.scene_time_ns(0) == 0
@@ -372,17 +372,18 @@ def test_the_same_rate_after_a_pause_continues_the_segment() -> None:
     start=st.integers(0, 2**33),
     ahead_ns=st.integers(-(10**9), 10**11),
 )
-def test_skipping_finds_the_first_counter_not_before(
+def test_skipping_finds_the_first_frame_not_before(
     rate_hz: float, start: int, ahead_ns: int
 ) -> None:
     timeline = Timeline()
     timeline.set_rate(rate_hz)
-    timeline.next_counter = start
+    timeline.next_index = start
     target_ns = timeline.scene_time_ns(start) + ahead_ns
     timeline.skip_before(target_ns)
-    assert timeline.next_counter >= start
-    if timeline.next_counter > start:
-        assert timeline.scene_time_ns(timeline.next_counter) >= target_ns
-        assert timeline.scene_time_ns(timeline.next_counter - 1) < target_ns
+    assert timeline.next_index >= start
+    assert timeline.next_counter - 1 == timeline.next_index - start, "the chip sweeps on"
+    if timeline.next_index > start:
+        assert timeline.scene_time_ns(timeline.next_index) >= target_ns
+        assert timeline.scene_time_ns(timeline.next_index - 1) < target_ns
     else:
         assert timeline.scene_time_ns(start) >= target_ns

@@ -120,17 +120,18 @@ def test_in_real_time_a_stream_begins_with_the_first_frame_still_ahead(
     assert due_ns is not None
     host.now_ns = due_ns
     device.advance(host.now_ns)
-    counter = host.frames(1)[0].info
+    assert host.frames(1)[0].info == 1
+    index = min(source.scene_times_ns)
     rate_hz = real_frame_rate(float(fps))
 
-    def frame_ns(counter: int) -> Fraction:
-        return true_ns(frame_time_ns(counter, rate_hz), ppm, skew_ns)
+    def frame_ns(index: int) -> Fraction:
+        return true_ns(frame_time_ns(index, rate_hz), ppm, skew_ns)
 
     # a source that knows the clock itself is asked for nominal times
-    assert source.scene_times_ns[counter] == frame_time_ns(counter, rate_hz)
-    assert abs(due_ns - frame_ns(counter)) <= 1
+    assert source.scene_times_ns[index] == frame_time_ns(index, rate_hz)
+    assert abs(due_ns - frame_ns(index)) <= 1
     assert due_ns >= start_ns
-    assert counter == 0 or frame_ns(counter - 1) < start_ns + 1
+    assert index == 0 or frame_ns(index - 1) < start_ns + 1
 
 
 def frames_of(source: EchoSource, pace: Pace) -> list[Frame]:
@@ -150,11 +151,11 @@ def test_a_fast_module_sends_the_same_frames_under_both_paces_and_in_real_time_e
     source = echo_source(scene, 0, 0)
     asap, realtime = (frames_of(source, pace) for pace in Pace)
     by_counter = {frame.counter: frame for frame in asap}
-    assert list(by_counter) == list(range(100))
+    assert list(by_counter) == list(range(1, 101))
     rate_hz = real_frame_rate(1.0)
     for frame in realtime:
         if frame.counter in by_counter:
             assert frame.samples.tobytes() == by_counter[frame.counter].samples.tobytes()
-        nominal_ns = frame_time_ns(frame.counter, rate_hz)
+        nominal_ns = frame_time_ns(frame.counter - 1, rate_hz)
         assert abs(frame.arrival_ns - true_ns(nominal_ns)) <= 1
         assert frame.counter < 90 or nominal_ns - frame.arrival_ns > 4_000_000

@@ -231,7 +231,7 @@ def test_bare_firmware_lacks_what_is_the_sensors(
 def test_bare_firmware_streams_without_modes(bare: BareHost) -> None:
     assert bare.ask(m.Ping()) == READY
     bare.set(X4Setting.FPS, 17.0)
-    assert [frame.info for frame in bare.frames(2)] == [0, 1]
+    assert [frame.info for frame in bare.frames(2)] == [1, 2]
 
 
 def test_i2c_and_postprocessing_of_the_sensor_firmware(host: BareHost) -> None:

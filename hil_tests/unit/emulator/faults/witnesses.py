@@ -63,7 +63,7 @@ def one_wrap(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
 
 
 def starts_again(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
-    assert counters(frames)[1:].count(0) == 3
+    assert counters(frames)[1:].count(1) == 3
 
 
 def twice(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:

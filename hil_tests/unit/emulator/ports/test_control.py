@@ -49,6 +49,7 @@ def test_a_fault_is_added_listed_counted_and_cleared(line: FaultyLine) -> None:
         "faults": [],
         "injected": {"missing_frames": 2},
         "playback": None,
+        "stream": {"number": 0, "scene_time_ns": 0},
     }
 
 

@@ -51,7 +51,7 @@ def test_messages_come_once_a_second_with_the_frame_counter() -> None:
     stream, _ = profile(room())
     heard = presence_until(stream, 10)
     assert np.diff([time_s for time_s, _ in heard]) == pytest.approx(17 / FRAME_HZ, abs=1e-6)
-    assert [message.counter for _, message in heard] == [17 * k - 1 for k in range(1, 11)]
+    assert [message.counter for _, message in heard] == [17 * k for k in range(1, 11)]
 
 
 @pytest.mark.parametrize(("range_m", "breaths"), [(1.0, 12.0), (3.0, 15.0), (6.0, 20.0)])

@@ -116,7 +116,7 @@ def test_the_bytes_of_every_port_hold_its_frames(
             if isinstance(message, DataFloat) and message.content_id == 0
         }
         for scan in scans:
-            assert frames[scan.counter] == scan.frames[index].samples.tobytes()
+            assert frames[scan.counter + 1] == scan.frames[index].samples.tobytes()
         ways = [chunk.way for chunk in read_chunks(out)]
         # the host spoke first: what was said before the log began is there, too
         assert ways[0] == "tx"

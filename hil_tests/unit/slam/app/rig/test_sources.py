@@ -2,7 +2,7 @@
 
 import dataclasses
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +16,7 @@ from emulator.scene.scene import PathSpec, Scene, load_scene
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.errors import AppError, RadarSilentError
 from slam.app.rig import sources
-from slam.app.rig.emulated import RAW_CONFIG, end_counter, open_loopback, rig_of
+from slam.app.rig.emulated import RAW_CONFIG, end_tick, open_loopback, rig_of
 from slam.app.rig.sources import RadarLink, RigSource, radar_frame
 from slam.geometry import Mount
 from xethru_protocol.driver.frames import Frame, FrameGeometry
@@ -35,10 +35,10 @@ def frame(counter: int) -> Frame:
 
 
 class Canned:
-    """A driver that gives prepared frames, then what a dead or unplugged radar gives."""
+    """A driver that gives prepared sweeps, 0 is the first, then what a dead radar gives."""
 
-    def __init__(self, counters: Sequence[int], end: type[Exception] = ResponseTimeout) -> None:
-        self._counters = list(counters)
+    def __init__(self, sweeps: Sequence[int], end: type[Exception] = ResponseTimeout) -> None:
+        self._sweeps = list(sweeps)
         self._end = end
         self.closed = 0
 
@@ -51,15 +51,33 @@ class Canned:
         return 5.0
 
     def read_frame(self, timeout_s: float) -> Frame:
-        if not self._counters:
+        if not self._sweeps:
             raise self._end("the port is gone")
-        return frame(self._counters.pop(0))
+        return frame(self._sweeps.pop(0) + 1)  # protocol reference 6.1: the first carries 1
 
     def close(self) -> None:
         self.closed += 1
 
 
-def rig_source(*drivers: Canned, skews_ns: Sequence[int] = ()) -> RigSource:
+class Restarting(Canned):
+    """Goes on with other sweeps after it was set up again."""
+
+    def __init__(self, sweeps: Sequence[int], later: Sequence[int]) -> None:
+        super().__init__(sweeps, Disconnected)
+        self._later = list(later)
+
+    def reconnect(self) -> str:
+        if not self._later:
+            raise Disconnected("it does not come back")
+        self._sweeps, self._later = self._later, []
+        return "port"
+
+
+def rig_source(
+    *drivers: Canned,
+    skews_ns: Sequence[int] = (),
+    begins: Callable[[str], int] | None = None,
+) -> RigSource:
     skews_ns = skews_ns or [0] * len(drivers)
     return RigSource(
         [
@@ -71,18 +89,19 @@ def rig_source(*drivers: Canned, skews_ns: Sequence[int] = ()) -> RigSource:
                 start_skew_ns=skew_ns,
             )
             for index, (driver, skew_ns) in enumerate(zip(drivers, skews_ns, strict=True))
-        ]
+        ],
+        begins,
     )
 
 
 def times_of(source: RigSource, end: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
-    """Return tick and time [ms] of each scan, with radar, counter and time [ms] of its frames."""
+    """Return tick and time [ms] of each scan, with radar, sweep and time [ms] of its frames."""
     source.start(RAW_CONFIG, 5)
     return [
         (
             scan.counter,
             scan.t_ns // MS,
-            [(one.radar, one.counter, one.t_ns // MS) for one in scan.frames],
+            [(one.radar, one.counter - 1, one.t_ns // MS) for one in scan.frames],
         )
         for scan in source.scans(end, StopFlag())
     ]
@@ -93,7 +112,7 @@ def radars_of(source: RigSource, end: int) -> list[tuple[int, list[int]]]:
 
 
 def test_module_metres_become_true_metres() -> None:
-    made = radar_frame(2, frame(10), rate_hz=5.0)
+    made = radar_frame(2, frame(10), 2_000_000_000)
     # light travels 299 792 458 m/s, the module reckons with 300 000 000
     assert made.range_start_m == pytest.approx(0.299792458, rel=1e-15)
     assert made.bin_length_m == pytest.approx(0.0064 * 0.99930819333, rel=1e-10)
@@ -142,7 +161,7 @@ def test_a_scans_time_is_the_ticks_whichever_radars_answered() -> None:
 
 
 def test_a_radar_that_started_periods_late_joins_the_scans_of_its_time() -> None:
-    """Counter 0 at 500 ms, 5 frames/s: it lies in the tick that begins at 400 ms."""
+    """Its first frame at 500 ms, 5 frames/s: it lies in the tick that begins at 400 ms."""
     source = rig_source(Canned(range(9)), Canned([0, 2, 3, 4]), skews_ns=[0, 500 * MS])
     assert times_of(source, 5) == [
         (0, 0, [(0, 0, 0)]),
@@ -160,6 +179,27 @@ def test_a_radar_that_starts_after_the_end_loses_nothing() -> None:
     assert source.lost_frames == 0
 
 
+def test_a_radar_that_restarts_goes_on_where_its_new_stream_begins() -> None:
+    drivers = Canned(range(9)), Restarting([0, 1], [0, 1, 3])
+    source = rig_source(*drivers, skews_ns=[0, 30 * MS], begins={"radar1": 800 * MS}.__getitem__)
+    assert times_of(source, 7) == [
+        (0, 0, [(0, 0, 0), (1, 0, 30)]),
+        (1, 200, [(0, 1, 200), (1, 1, 230)]),
+        (2, 400, [(0, 2, 400)]),
+        (3, 600, [(0, 3, 600)]),
+        (4, 800, [(0, 4, 800), (1, 0, 830)]),
+        (5, 1000, [(0, 5, 1000), (1, 1, 1030)]),
+        (6, 1200, [(0, 6, 1200)]),
+    ]
+    assert source.lost_frames == 3
+
+
+def test_a_radar_that_does_not_come_back_ends_the_run() -> None:
+    source = rig_source(Restarting([0, 1], []), begins={"radar0": 0}.__getitem__)
+    with pytest.raises(RadarSilentError, match="radar0 at port0: the port is gone after frame 2"):
+        times_of(source, 7)
+
+
 @given(st.integers(0, 10**11), st.floats(1.0, 400.0))
 def test_every_frame_lies_in_the_period_of_its_scan(start_skew_ns: int, rate_hz: float) -> None:
     period = Fraction(10**9) / Fraction(rate_hz)
@@ -170,8 +210,8 @@ def test_every_frame_lies_in_the_period_of_its_scan(start_skew_ns: int, rate_hz:
 @pytest.mark.parametrize(
     ("end", "error", "words"),
     [
-        (ResponseTimeout, RadarSilentError, "radar1 at port1: no frame for 0 s after frame 2"),
-        (Disconnected, RadarSilentError, "radar1 at port1: the port is gone after frame 2"),
+        (ResponseTimeout, RadarSilentError, "radar1 at port1: no frame for 0 s after frame 3"),
+        (Disconnected, RadarSilentError, "radar1 at port1: the port is gone after frame 3"),
         (DeviceError, AppError, "radar1 at port1: the module refused X4DRIVER_SET FRAME"),
     ],
 )
@@ -257,8 +297,8 @@ def test_the_real_driver_in_process_gives_1431_bins_at_the_chips_rate(short_scen
 
 def test_the_last_frame_is_the_last_one_within_the_scene() -> None:
     # 10 s at 5.018533 frames/s: counters 0 ... 50, as frame 50 comes at 9.963 s
-    assert end_counter(10_000_000_000) == 51
-    assert end_counter(0) == 1
+    assert end_tick(10_000_000_000) == 51
+    assert end_tick(0) == 1
 
 
 def test_the_rig_is_nominal_whatever_the_modules_are_like(short_scene: Scene) -> None:

@@ -421,7 +421,7 @@ def test_through_drift_and_jitter_the_map_is_as_good_as_with_perfect_clocks(driv
     for scan in heard.scans:
         for frame in scan.frames:
             clock = drive.scene.radars[frame.radar].clock
-            nominal_ns = frame_time_ns(frame.counter, drive.infos[frame.radar].rate_hz)
+            nominal_ns = frame_time_ns(frame.counter - 1, drive.infos[frame.radar].rate_hz)
             errors_ms[frame.radar].append((frame.t_ns - clock.scene_time_ns(nominal_ns)) * 1e-6)
     assert all(len(errors) > 280 for errors in errors_ms)
     assert max(np.abs(errors).max() for errors in errors_ms) < 3.0

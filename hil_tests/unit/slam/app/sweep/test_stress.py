@@ -22,8 +22,8 @@ N_TICKS, N_RADARS = 1000, 4
 SAMPLES = np.zeros(1, dtype=np.float32)
 
 
-def frame(radar: int, counter: int) -> RadarFrame:
-    return frame_of(SAMPLES, radar=radar, t_ns=counter * PERIOD_NS, counter=counter)
+def frame(radar: int, tick: int) -> RadarFrame:
+    return frame_of(SAMPLES, radar=radar, t_ns=tick * PERIOD_NS, counter=tick + 1)
 
 
 @cache
