@@ -204,15 +204,15 @@ def _turns_left(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> b
 class ArrivalClock:
     """Stamps the frames of one radar with the host's time at which they were taken.
 
-    A counter that begins anew, as after a restart of the module, begins a new line; what is known
-    of the drift is kept, for it is the same crystal. `rate_hz` is the chip's real frame rate, as
-    read back.
+    Another stream, or a counter that begins anew, as after a restart of the module, begins a new
+    line; what is known of the drift is kept, for it is the same crystal. `rate_hz` is the chip's
+    real frame rate, as read back.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._envelope = LowerEnvelope()
-        self._last_counter: int | None = None
+        self._last: tuple[int, int] | None = None  # stream and counter
         self._last_stamp_ns = 0
         self.restarts = 0
 
@@ -238,27 +238,29 @@ class ArrivalClock:
         """Time over which the drift was seen."""
         return self._envelope.baseline_ns / NS_PER_S
 
-    def stamp_ns(self, counter: int, arrival_ns: int) -> int:
+    def stamp_ns(self, counter: int, arrival_ns: int, stream: int = 0) -> int:
         """Return when a frame was taken, host time; later than the frame before it.
 
-        `arrival_ns` is the host's time when its last byte was read.
+        `arrival_ns` is the host's time when its last byte was read, `stream` its number as the
+        driver counts streams.
         """
-        if self._last_counter is not None and self._is_another_count(counter, arrival_ns):
+        if self._last is not None and self._is_another_count(counter, arrival_ns, stream):
             before, self._envelope = self._envelope, LowerEnvelope()
             if before.baseline_ns >= _KNOWN_AFTER_NS:
                 drift = before.line.slope
                 self._envelope = LowerEnvelope(drift=drift, drift_sigma=KNOWN_DRIFT_SIGMA)
             self.restarts += 1
-        self._last_counter = counter
+        self._last = stream, counter
         nominal_ns = frame_time_ns(counter, self._rate_hz)
         self._envelope.take(nominal_ns, arrival_ns)
         stamp_ns = self._envelope.line.host_ns(nominal_ns)
         self._last_stamp_ns = max(stamp_ns, self._last_stamp_ns + 1)
         return self._last_stamp_ns
 
-    def _is_another_count(self, counter: int, arrival_ns: int) -> bool:
-        assert self._last_counter is not None
-        if counter <= self._last_counter:
+    def _is_another_count(self, counter: int, arrival_ns: int, stream: int) -> bool:
+        assert self._last is not None
+        last_stream, last_counter = self._last
+        if stream != last_stream or counter <= last_counter:
             return True
         expected_ns = self._envelope.line.host_ns(frame_time_ns(counter, self._rate_hz))
         return not -_BREAK_NS <= arrival_ns - expected_ns <= _LATE_BREAK_NS

@@ -131,13 +131,13 @@ class CounterTime:
     """Time base `counter`: the ticks and the stamps of one radar's frames, by their counters.
 
     The counter is the only clock here: what the module's own clock is off by (tens of ppm, tens
-    of milliseconds after a quarter of an hour) does not show in it. A counter that begins anew
-    begins another stream, of which somebody else must know where it lies in time.
+    of milliseconds after a quarter of an hour) does not show in it. In another stream, or where it
+    begins anew, somebody else must know where in time that stream lies.
 
     Attributes
     ----------
     last_counter
-        Of the newest frame; 0 before the first of a stream.
+        Of the newest frame; 0 before the first.
     expected
         The tick of the frame after it.
     """
@@ -147,16 +147,18 @@ class CounterTime:
         self._begins = begins
         self._late = whole_periods(info.start_skew_ns, info.rate_hz)
         self._first_index = 0  # frame periods of scene time before counter 1
+        self._stream: int | None = None
         self.last_counter = 0
         self.expected = self._late
 
-    def take(self, counter: int) -> tuple[int, int]:
+    def take(self, frame: Frame) -> tuple[int, int]:
         """Return the tick and the session time [ns] of the next frame that came."""
-        if counter <= self.last_counter and self._begins is not None:
+        is_same = self._stream in (None, frame.stream) and frame.counter > self.last_counter
+        if not is_same and self._begins is not None:
             begin_ns = self._begins(self._info.name)
             self._first_index = round(begin_ns * self._info.rate_hz / NS_PER_S)
-        self.last_counter = counter
-        index = self._first_index + counter - FIRST_COUNTER
+        self._stream, self.last_counter = frame.stream, frame.counter
+        index = self._first_index + frame.counter - FIRST_COUNTER
         self.expected = index + self._late + 1
         return index + self._late, self._info.start_skew_ns + frame_time_ns(
             index, self._info.rate_hz
@@ -236,7 +238,7 @@ class RigSource:
                     time_base = times[radar]
                     received = self._next_frame(radar, time_base.last_counter, stop)
                     expected = time_base.expected
-                    tick, t_ns = time_base.take(received.counter)
+                    tick, t_ns = time_base.take(received)
                     self.lost_frames += max(min(tick, end_tick) - expected, 0)
                     heads[radar] = tick, radar_frame(radar, received, t_ns, limits=self._limits)
             waiting = [head for head in heads if head is not None]

@@ -382,7 +382,7 @@ class LiveSource:
     busy_s
         Time spent in SLAM, logs and views.
     lost_frames
-        Frames missing between the counters that arrived, over all radars.
+        Frames missing between the counters that arrived, over all radars and streams.
     """
 
     def __init__(  # noqa: PLR0917 - everything a run consists of
@@ -403,7 +403,7 @@ class LiveSource:
         self._unix_ns = time.time_ns() - time.monotonic_ns()
         self._began_ns = clock_ns()
         self._all_lost_ns: int | None = None
-        self._last_counters: list[int | None] = [None] * len(radars)
+        self._last_frames: list[Frame | None] = [None] * len(radars)
         self._drift_logged_ns = self._began_ns
         self._lag_warned_s = WARN_LAG_S
         self._unused_since_ns: int | None = None
@@ -432,7 +432,7 @@ class LiveSource:
             waited_s = (now_ns - self._began_ns) / NS_PER_S
             silent = [
                 radar.name
-                for radar, last in zip(self.radars, self._last_counters, strict=True)
+                for radar, last in zip(self.radars, self._last_frames, strict=True)
                 if last is None
             ]
             if silent and waited_s > START_LIMIT_S:
@@ -528,11 +528,11 @@ class LiveSource:
                 self._log.on_wire(name, way, data, host_ns)
 
     def _take_frame(self, radar: int, frame: Frame) -> None:
-        last = self._last_counters[radar]
-        if last is not None and frame.counter > last:
-            self.lost_frames += frame.counter - last - 1
-        self._last_counters[radar] = frame.counter
-        taken_ns = self.clocks[radar].stamp_ns(frame.counter, frame.arrival_ns)
+        last = self._last_frames[radar]
+        if last is not None and frame.stream == last.stream and frame.counter > last.counter:
+            self.lost_frames += frame.counter - last.counter - 1
+        self._last_frames[radar] = frame
+        taken_ns = self.clocks[radar].stamp_ns(frame.counter, frame.arrival_ns, frame.stream)
         if not self._odometry.has_pose:
             return  # session time is unknown until then
         made = radar_frame(radar, frame, self._odometry.session_ns(taken_ns), limits=self._limits)

@@ -125,6 +125,16 @@ def test_a_counter_that_repeats_or_goes_back_by_one_begins_a_new_line(back: int)
     assert clock.restarts == 1
 
 
+def test_another_stream_begins_a_new_line_whatever_its_counter() -> None:
+    """Three frames, a restart of three seconds, and the first two of the new stream are lost."""
+    clock = ArrivalClock(RATE_HZ)
+    for counter in (1, 2):
+        clock.stamp_ns(counter, taken_ns(counter, 0.0))
+    back_ns = taken_ns(2, 0.0) + 3 * NS_PER_S
+    assert clock.stamp_ns(3, back_ns, stream=1) == back_ns
+    assert clock.restarts == 1
+
+
 def test_frames_that_arrive_at_once_have_stamps_one_after_the_other() -> None:
     """The line passes through the last arrival, so each stamp would be that of the first frame."""
     clock = ArrivalClock(RATE_HZ)
