@@ -388,6 +388,11 @@ class FrameQueue:
         samples = _complex(values[:n], values[n:]) if geometry.downconversion else values
         self._queue(message.info, samples, geometry, arrival_ns)
 
+    def discard(self, why: str) -> None:
+        """Count what came as no frame of this geometry."""
+        self.discarded += 1
+        self.misfit = why
+
     def _discard(self, message: DataFloat) -> None:
         if message.content_id != 0:
             why = f"data with content id {message.content_id} came, which radar frames do not have"
@@ -402,8 +407,7 @@ class FrameQueue:
                 f"frames of {message.values.size} values come, not of the {self.geometry.n_values} "
                 "of configure_raw(); call it again"
             )
-        self.discarded += 1
-        self.misfit = why
+        self.discard(why)
 
     def _take_baseband(self, message: BasebandIq, arrival_ns: int) -> None:
         geometry = FrameGeometry(

@@ -570,6 +570,9 @@ class Link:
                     self.warn(f"{_MESSAGES} messages wait unread, so the oldest are dropped")
                 self.messages_dropped += 1
             self.messages.append(message)
+        elif isinstance(message, m.RadarMessage):
+            name = ROWS[type(message)].name
+            self.frames.discard(f"{name} comes, which read_message() and messages() return")
 
     @property
     def name(self) -> str:

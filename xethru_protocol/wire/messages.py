@@ -530,62 +530,65 @@ class RespStatusExt(_Opaque):
 
 
 # The vendor's library drops payloads below 40 bytes (RF) and 64 (baseband): as many bins at least.
-_RF_BINS = _BASEBAND_BINS = fields.Number("I", least=2)
-_Q15_BINS = fields.Number("I", least=3)
-_FRAMES_PER_S = fields.Number("I", "frames_per_second")
+_BINS, _Q15_BINS = (fields.Number("I", least=least) for least in (2, 3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _RadarRf(_Bulk):
-    """Header of the two RF messages. 7.5."""
+class RadarMessage(_Bulk):
+    """A radar frame of newer firmware: what the four kinds have in common. 7.5.
+
+    ``counter`` is the frame counter, ``frames_per_s`` a whole number on the wire. Ranges in module
+    metres; ``range_offset_m`` is the range of bin 0.
+    """
 
     counter: Annotated[int, fields.U32]
-    num_bins: Annotated[int, _RF_BINS]
+    num_bins: Annotated[int, _BINS]
     bin_length_m: Annotated[float, _BIN_LENGTH]
     sampling_frequency_hz: Annotated[float, _SAMPLING]
     carrier_frequency_hz: Annotated[float, _CARRIER]
-    frames_per_s: Annotated[int, _FRAMES_PER_S]
+    frames_per_s: Annotated[int, fields.Number("I", "frames_per_second")]
     range_offset_m: Annotated[float, _OFFSET]
+
+    @property
+    def ranges_m(self) -> npt.NDArray[np.float64]:
+        """Range of each bin, shape (num_bins,) [module metres]."""
+        bins = np.arange(self.num_bins, dtype=np.float64)
+        return self.range_offset_m + bins * self.bin_length_m
 
 
 @response(*appdata(AppDataId.XTS_ID_RADAR_RF), name="RADAR_RF", bulk=True)
-class RadarRf(_RadarRf):
-    """RF frame of newer firmware, as counts of the chip. 7.5.
+class RadarRf(RadarMessage):
+    """RF frame as counts of the chip: ``samples``, shape (num_bins,), uint32, read-only. 7.5."""
 
-    ``samples``: shape (num_bins,), uint32, read-only, by increasing range. ``counter`` is the frame
-    counter, ``frames_per_s`` a whole number on the wire. Ranges in module metres;
-    ``range_offset_m`` is the range of bin 0.
-    """
-
-    samples: Annotated[npt.NDArray[np.uint32], fields.Bins("num_bins", "", fields.UINT32, True)]
+    samples: Annotated[
+        npt.NDArray[np.uint32], fields.Bins("num_bins", dtype=fields.UINT32, last=True)
+    ]
 
 
 @response(*appdata(AppDataId.XTS_ID_RADAR_RF_NORMALIZED), name="RADAR_RF_NORMALIZED", bulk=True)
-class RadarRfNormalized(_RadarRf):
-    """RF frame of newer firmware; ``samples`` are float32, other fields as in `RadarRf`. 7.5."""
+class RadarRfNormalized(RadarMessage):
+    """RF frame: ``samples``, shape (num_bins,), float32, read-only. 7.5."""
 
     samples: Annotated[FloatArray, fields.Bins("num_bins", last=True)]
 
 
-@response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_FLOAT), name="RADAR_BASEBAND_FLOAT", bulk=True)
-class RadarBasebandFloat(_Bulk):
-    """Baseband frame of newer firmware, as float. 7.5.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _RadarBaseband(RadarMessage):
+    """Header of the two baseband messages. 7.5."""
 
-    ``i`` and ``q``: shape (num_bins,), float32, read-only. The correction fields belong to the
-    phase-noise correction: a bin, and its I and Q. Other fields as in `RadarRf`.
-    """
-
-    counter: Annotated[int, fields.U32]
-    num_bins: Annotated[int, _BASEBAND_BINS]
-    bin_length_m: Annotated[float, _BIN_LENGTH]
-    sampling_frequency_hz: Annotated[float, _SAMPLING]
-    carrier_frequency_hz: Annotated[float, _CARRIER]
-    frames_per_s: Annotated[int, _FRAMES_PER_S]
-    range_offset_m: Annotated[float, _OFFSET]
     decimation_factor: Annotated[int, fields.U32]
     correction_bin: Annotated[int, fields.U32]
     correction_i: Annotated[float, fields.F32]
     correction_q: Annotated[float, fields.F32]
+
+
+@response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_FLOAT), name="RADAR_BASEBAND_FLOAT", bulk=True)
+class RadarBasebandFloat(_RadarBaseband):
+    """Baseband frame: ``i`` and ``q``, shape (num_bins,), float32, read-only. 7.5.
+
+    The correction fields are of the phase-noise correction: a bin, and its I and Q.
+    """
+
     i: Annotated[FloatArray, fields.Bins("num_bins")]
     q: Annotated[FloatArray, fields.Bins("num_bins", last=True)]
 
@@ -596,33 +599,22 @@ class RadarBasebandFloat(_Bulk):
 
 
 @response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_Q15), name="RADAR_BASEBAND_Q15", bulk=True)
-class RadarBasebandQ15(_Bulk):
-    """Baseband frame of newer firmware, in 16-bit integers. 7.5.
+class RadarBasebandQ15(_RadarBaseband):
+    """Baseband frame in 16-bit integers. 7.5; other fields as in `RadarBasebandFloat`.
 
-    ``i`` and ``q``: shape (num_bins,), int16, read-only, as sent; `iq` scales them. Other fields
-    as in `RadarBasebandFloat`.
+    ``i`` and ``q``, shape (num_bins,), int16, read-only, are as sent; `iq` scales them.
     """
 
-    counter: Annotated[int, fields.U32]
     num_bins: Annotated[int, _Q15_BINS]
-    bin_length_m: Annotated[float, _BIN_LENGTH]
-    sampling_frequency_hz: Annotated[float, _SAMPLING]
-    carrier_frequency_hz: Annotated[float, _CARRIER]
-    frames_per_s: Annotated[int, _FRAMES_PER_S]
-    range_offset_m: Annotated[float, _OFFSET]
-    decimation_factor: Annotated[int, fields.U32]
-    correction_bin: Annotated[int, fields.U32]
-    correction_i: Annotated[float, fields.F32]
-    correction_q: Annotated[float, fields.F32]
     scaling_factor: Annotated[float, fields.F32]
-    i: Annotated[npt.NDArray[np.int16], fields.Bins("num_bins", "", fields.INT16)]
-    q: Annotated[npt.NDArray[np.int16], fields.Bins("num_bins", "", fields.INT16, True)]
+    i: Annotated[npt.NDArray[np.int16], fields.Bins("num_bins", dtype=fields.INT16)]
+    q: Annotated[npt.NDArray[np.int16], fields.Bins("num_bins", dtype=fields.INT16, last=True)]
 
     @property
     def iq(self) -> npt.NDArray[np.complex64]:
         """(``i`` + j ``q``) times the scaling factor, complex64, shape (num_bins,).
 
-        That the factor is meant so is inferred, not documented.
+        That the factor is meant so is inferred; no module that sends this was seen.
         """
         samples = self.i.astype(np.float32) + np.complex64(1j) * self.q.astype(np.float32)
         return np.asarray(samples * np.float32(self.scaling_factor), dtype=np.complex64)

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 import xethru_protocol
+from hil_tests.golden.builders import message_of
 from hil_tests.golden.vectors import load
 from hil_tests.unit.xethru_protocol.both_drivers import AsyncScripted, DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.emulated import Emulated
-from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
+from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame, framed
 from xethru_protocol import (
     X4M300,
     AsyncX4M300,
@@ -507,6 +508,32 @@ def test_messages_of_one_kind_are_taken_and_the_others_stay(running: Emulated) -
     with pytest.raises(ResponseTimeout, match="within 1 s"):
         radar.read_message(m.PresenceSingle, timeout_s=1.0)
     assert radar.messages_waiting(m.DataString) == 1
+
+
+def test_radar_messages_of_newer_firmware_are_delivered_in_either_framing(raw: Scripted) -> None:
+    """Protocol reference 7.5."""
+    radar, line = raw
+    sent = [v for v in load() if v.message.startswith("RADAR_")]
+    assert len(sent) == 4
+    radar.messages_waiting()
+    for vector in sent:
+        assert vector.payload is not None
+        line.say(vector.wire, framed(vector.payload))
+    assert radar.messages_waiting(m.RadarMessage) == 8
+    for vector in sent:
+        for _ in range(2):
+            message = radar.read_message(m.RadarMessage)
+            assert message == message_of(vector)
+            assert message.counter == 1000
+    assert radar.frames_discarded == 0
+
+
+def test_radar_messages_are_named_where_frames_are_waited_for(raw: Scripted) -> None:
+    radar, line = raw
+    (vector,) = (v for v in load() if v.message == "RADAR_BASEBAND_Q15")
+    line.say(vector.wire)
+    with pytest.raises(ResponseTimeout, match="RADAR_BASEBAND_Q15 comes, which read_message"):
+        radar.read_frame()
 
 
 def test_restarts_are_among_the_messages(running: Emulated) -> None:

@@ -69,6 +69,10 @@ def test_what_a_host_sends_is_not_judged_by_what_a_module_sends() -> None:
         (0x12, list(range(49, 100, 4))),
         (0x11, list(range(57, 100))),  # 57 + F
         (0x13, list(range(57, 100))),
+        (0xC1A3117E, [41]),  # 33 + 4 N
+        (0xB13B8F12, [41]),
+        (0x026F1379, [65]),  # 49 + 8 N
+        (0xEC8D0AA5, [61]),  # 53 + 4 N
         (0x723BFA1E, list(range(14, 100))),
     ],
     ids=lambda value: hex(value) if isinstance(value, int) else "",
@@ -76,7 +80,7 @@ def test_what_a_host_sends_is_not_judged_by_what_a_module_sends() -> None:
 def test_application_data_have_the_length_of_their_layout(
     message_id: int, expected: list[int]
 ) -> None:
-    """7.1 and 7.2: the length fields."""
+    """7.1, 7.2 and 7.5: the length fields."""
     fields = (7).to_bytes(4, "little") + (2).to_bytes(4, "little")
     assert lengths(b"\x50" + message_id.to_bytes(4, "little") + fields + b"\x00") == expected
 

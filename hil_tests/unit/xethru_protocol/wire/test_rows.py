@@ -4,6 +4,7 @@ from dataclasses import replace
 from enum import IntEnum
 from typing import Annotated, Any
 
+import numpy as np
 import pytest
 
 from hil_tests.golden.builders import message_of
@@ -130,6 +131,70 @@ def example(name: str) -> Any:  # noqa: ANN401 - rows differ in type
 def test_what_does_not_fit_the_wire_is_refused(message: m.Message, reason: str) -> None:
     with pytest.raises(LocalProtocolError, match=reason):
         encode(message)
+
+
+RADAR_MESSAGES = [v for v in KNOWN if v.message.startswith("RADAR_")]
+
+
+@pytest.mark.parametrize("vector", RADAR_MESSAGES, ids=lambda v: v.name)
+def test_a_radar_message_has_as_many_bins_as_it_announces(vector: Vector) -> None:
+    """7.5: the vendor's library does not check that; a driver must."""
+    assert vector.payload is not None
+    whole = vector.payload
+    bins = vector.decoded["num_bins"]
+    assert isinstance(decode_response(whole), m.RadarMessage)
+    wrong = [
+        *(
+            whole[:9] + count.to_bytes(4, "little") + whole[13:]
+            for count in (0, bins - 1, 2**32 - 1)
+        ),
+        whole + b"\x00",
+        whole + bytes(8),
+        whole[:-1],
+        whole[:20],
+    ]
+    for payload in wrong:
+        assert decode_response(payload) == m.UnknownMessage(code=0x50, payload=payload)
+
+
+@pytest.mark.parametrize(
+    ("name", "header", "per_bin", "shortest"),
+    [
+        ("RADAR_RF", 33, 4, 40),
+        ("RADAR_RF_NORMALIZED", 33, 4, 40),
+        ("RADAR_BASEBAND_FLOAT", 49, 8, 64),
+        ("RADAR_BASEBAND_Q15", 53, 4, 64),
+    ],
+)
+def test_radar_messages_that_the_vendors_library_drops_are_unknown(
+    name: str, header: int, per_bin: int, shortest: int
+) -> None:
+    """7.5: the shortest payloads that it accepts, id and opcode included."""
+    (vector,) = (v for v in RADAR_MESSAGES if v.message == name)
+    assert vector.payload is not None
+    for bins in range(6):
+        payload = vector.payload[:9] + bins.to_bytes(4, "little") + vector.payload[13:header]
+        payload += bytes(per_bin * bins)
+        taken = isinstance(decode_response(payload), m.RadarMessage)
+        assert taken is (len(payload) >= shortest)
+    with pytest.raises(LocalProtocolError, match="num_bins"):
+        encode(replace(example(name), num_bins=1))
+
+
+def test_radar_messages_have_their_ranges_and_complex_samples() -> None:
+    received: list[Any] = [
+        decode_response(encode(example(f"RADAR_{name}")))
+        for name in ("RF", "BASEBAND_FLOAT", "BASEBAND_Q15")
+    ]
+    rf, baseband, q15 = received
+    assert rf.samples.tolist() == [364800, 364801]
+    assert not rf.samples.flags.writeable
+    assert rf.ranges_m == pytest.approx([0.18, 0.18643004])
+    assert baseband.ranges_m == pytest.approx([0.18, 0.23144033])
+    assert baseband.iq.tolist() == [1 + 3j, 2 + 4j]
+    assert q15.iq.tolist() == [0.25 + 1.25j, -0.5 - 1.5j, 0.75 + 8191.75j, -1 - 8192j]
+    assert q15.i.dtype == np.int16
+    assert all(message.iq.dtype == np.complex64 for message in (baseband, q15))
 
 
 def test_page_index_is_big_endian() -> None:
