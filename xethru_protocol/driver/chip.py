@@ -185,12 +185,7 @@ def _pair(answer: tuple[float, float]) -> tuple[float, float]:
 
 
 class X4Settings:
-    """Settings of the X4 chip. Protocol reference 4.9, 9.3 to 9.7.
-
-    A value outside the limits raises `LocalProtocolError`, a refusal of the module `DeviceError`.
-    Frames that come are stopped for the change and started again. After a reconnect the driver
-    sets them again if `configure_raw` or `start` was called before.
-    """
+    """Settings of the X4 chip, for both drivers."""
 
     __slots__ = ()
 
@@ -210,7 +205,7 @@ class X4Settings:
         X4Setting.FRAMEAREAOFFSET,
         float,
         "Range of the antenna in the chip's own count (vendor: frame area offset) [m]. The module "
-        "has it from its calibration; another value moves every echo.",
+        "has it from its calibration; another value moves every range.",
     )
     downconversion = X4Row(
         X4Setting.DOWNCONVERSION,
@@ -272,7 +267,13 @@ def enable_x4(link: Link, on: bool) -> Steps[None]:
 
 
 class X4(X4Settings, Part):
-    """The radar chip behind an `X4M300`: each setting is an attribute."""
+    """The radar chip behind an `X4M300`: each setting is an attribute.
+
+    ``radar.x4.iterations = 8`` sets one, ``radar.x4.iterations`` asks the module. A value outside
+    the limits raises `LocalProtocolError`, a refusal of the module `DeviceError`. Frames that come
+    are stopped for the change and started again. After a reconnect the driver sets all of them
+    again if `configure_raw` or `start` was called before. Protocol reference 4.9, 9.3 to 9.7.
+    """
 
     __slots__ = ()
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from xethru_protocol.driver.link import (
+    FRAMES,
     SLOW_TIMEOUT_S,
     AsyncCall,
     AsyncPart,
@@ -231,7 +232,7 @@ def set_mode(link: Link, mode: SensorMode, parameter: int | None = None) -> Step
 
 def wait_for_message(link: Link, kind: type[MessageT], timeout_s: float) -> Steps[MessageT]:
     """Take the oldest message of a kind; those of others stay."""
-    waiting = keep_messages(link)
+    waiting = _waiting(link, kind)
 
     def find() -> MessageT | None:
         return next((message for message in waiting if isinstance(message, kind)), None)
@@ -246,7 +247,7 @@ def wait_for_message(link: Link, kind: type[MessageT], timeout_s: float) -> Step
 
 
 def messages_waiting(link: Link, kind: type[m.Response]) -> Steps[int]:
-    waiting = keep_messages(link)
+    waiting = _waiting(link, kind)
     yield from link.take_stale_input()
     return sum(isinstance(message, kind) for message in waiting)
 
@@ -282,6 +283,12 @@ def keep_messages(link: Link) -> deque[m.Response]:
 
 
 # --- inside -------------------------------------------------------------------------------------
+
+
+def _waiting(link: Link, kind: type[m.Response]) -> deque[m.Response]:
+    if kind in FRAMES:
+        raise LocalProtocolError(f"{kind.__name__} comes as frames: read_frame(), frames_waiting()")
+    return keep_messages(link)
 
 
 def _texts(messages: Iterable[m.Response]) -> list[m.DataString]:

@@ -350,6 +350,13 @@ def test_help_names_every_method_and_part(driver: type) -> None:
             assert f"\n{name}\n    " in manual, name
 
 
+def test_help_of_the_chip_of_a_driver_asks_the_module_nothing() -> None:
+    line = ScriptedTransport(PlainModule())
+    shown = pydoc.plain(pydoc.render_doc(X4M300(line).x4))
+    assert "iterations\n" in shown
+    assert line.received == []
+
+
 # --- registers, pins, diagnostics, post-processing -----------------------------------------------
 
 
@@ -534,6 +541,15 @@ def test_radar_messages_are_named_where_frames_are_waited_for(raw: Scripted) -> 
     line.say(vector.wire)
     with pytest.raises(ResponseTimeout, match="RADAR_BASEBAND_Q15 comes, which read_message"):
         radar.read_frame()
+
+
+@pytest.mark.parametrize("kind", [m.DataFloat, m.BasebandIq])
+def test_frames_are_no_messages(running: Emulated, kind: type[m.Response]) -> None:
+    radar, line, _ = running
+    for ask in (radar.read_message, radar.messages_waiting):
+        with pytest.raises(LocalProtocolError, match=r"comes as frames: read_frame\(\)"):
+            ask(kind)
+    assert line.now_ns < 1e9
 
 
 def test_restarts_are_among_the_messages(running: Emulated) -> None:
