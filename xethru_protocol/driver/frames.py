@@ -7,9 +7,10 @@ driver sends them; what a profile filters before it sends it (BASEBAND_IQ of a r
 on no lattice.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -26,6 +27,10 @@ _TAP_SUMS: Final = {3: 306, 4: 316}
 # Two float32 roundings lie between a counter and its sample: together less than 2 counts.
 _NEIGHBOURS: Final = (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)
 
+# From a counter to its sample and back are six roundings of at most 2**-25 each, relative to the
+# largest number among them. Together they are less than half a counter up to this one.
+_SURE: Final = 1 << 21
+
 Float32s = NDArray[np.float32]
 
 
@@ -39,12 +44,14 @@ class Lattice:
     Every step rounds to float32; a compiler may have fused RF's product and difference, so the
     value rounded once is accepted, too.
 
-    ``lowest`` and ``highest`` are the ends of the range.
+    ``scale`` is the number of counters per unit of a sample; ``lowest`` and ``highest`` are the
+    ends of the range.
     """
 
     quantum: np.float32
     dac_offset: np.float32
     tap_sum: np.float32
+    scale: np.float32
     min_counter: int
     max_counter: int
     lowest: float
@@ -90,51 +97,84 @@ class Lattice:
         largest = unit.max_counter * tap_sum // 2 if downconversion else unit.max_counter
         smallest = -largest if downconversion else 0
         offset = 0.0 if downconversion else unit.dac_offset
-        ends = _values(
-            np.array([smallest, largest], np.float32),
-            np.float32(unit.quantum),
-            np.float32(offset),
-            np.float32(tap_sum),
-        )
-        return cls(
-            quantum=np.float32(unit.quantum),
+        quantum, divisor = np.float32(unit.quantum), np.float32(tap_sum)
+        unbounded = cls(
+            quantum=quantum,
             dac_offset=np.float32(offset),
-            tap_sum=np.float32(tap_sum),
+            tap_sum=divisor,
+            scale=divisor / quantum,
             min_counter=smallest,
             max_counter=largest,
-            lowest=float(ends[0]),
-            highest=float(ends[1]),
+            lowest=-math.inf,
+            highest=math.inf,
         )
+        lowest, highest = unbounded._values(np.array([smallest, largest], np.float32))
+        return replace(unbounded, lowest=float(lowest), highest=float(highest))
 
     def off_lattice(self, samples: Float32s) -> int:
-        """Count the values as sent, shape (n,), that no counter can give: also NaN, infinities."""
-        # Nearly every frame is whole: one rounding to the lattice and back proves it. Bytes take
-        # a fourth of array_equal's time; a -0.0, which differs from 0.0 there, is judged below.
-        if samples.size == 0 or (
-            np.minimum.reduce(samples) >= self.lowest
-            and np.maximum.reduce(samples) <= self.highest
-            and self._rounded(samples).tobytes() == samples.tobytes()
-        ):
+        """Count the values as sent, shape (n,), that no counter can give: also NaN, infinities.
+
+        If they are more than half, it is at least so many: those of counters beyond 2**21, which
+        take long to judge, are left out then.
+        """
+        if samples.size == 0:
             return 0
+        low, high = np.minimum.reduce(samples), np.maximum.reduce(samples)
+        if low >= self.lowest and high <= self.highest:
+            # Nearly every frame is whole: one rounding to the lattice and back proves it. Bytes
+            # take a fourth of array_equal's time; a -0.0, which differs from 0.0 there, is judged
+            # below.
+            counters = self._counters(samples)
+            values = self._values(counters)
+            if values.tobytes() == samples.tobytes():
+                return 0
+            return self._count_off(samples, counters, values == samples)
+        # also behind a NaN, which makes both ends one
         with np.errstate(invalid="ignore"):  # comparing with a signalling NaN
             in_range = samples[(samples >= self.lowest) & (samples <= self.highest)]
-        doubtful = in_range[self._rounded(in_range) != in_range]
-        bad = samples.size - in_range.size + doubtful.size - self._count_neighbours(doubtful)
-        return int(bad)
+        return samples.size - in_range.size + self.off_lattice(in_range)
 
     def nearest(self, samples: Float32s) -> Float32s:
         """Return what the chip gives for finite samples, shape (n,), by the nearest counter."""
-        counters = np.rint((samples + self.dac_offset) * (self.tap_sum / self.quantum))
+        counters = np.rint((samples + self.dac_offset) * self.scale)
         counters = np.clip(counters, self.min_counter, self.max_counter).astype(np.float32)
-        return _values(counters, self.quantum, self.dac_offset, self.tap_sum)
+        return self._values(counters)
 
-    def _rounded(self, samples: Float32s) -> Float32s:
-        """Round each sample to the value of the nearest counter, found in float32."""
-        scale = self.tap_sum / self.quantum
+    def _counters(self, samples: Float32s) -> Float32s:
+        """Find each sample's counter in float32: the nearest, or one beside it."""
         counters = samples + self.dac_offset
-        counters *= scale
+        counters *= self.scale
         np.rint(counters, out=counters)
-        return _values(counters, self.quantum, self.dac_offset, self.tap_sum)
+        return counters
+
+    def _values(self, counters: Float32s) -> Float32s:
+        """Compute the samples of counters; each step rounds to float32, as in the firmware."""
+        values = counters * self.quantum
+        if self.tap_sum != 1.0:
+            values /= self.tap_sum
+        else:
+            values -= self.dac_offset
+        return values
+
+    def _fused(self, counters: Float32s | NDArray[np.float64]) -> Float32s:
+        """Compute RF samples of counters, rounded once: as one instruction for both steps does."""
+        exact = counters.astype(np.float64)
+        exact *= float(self.quantum)
+        exact -= float(self.dac_offset)
+        return exact.astype(np.float32)
+
+    def _count_off(self, samples: Float32s, counters: Float32s, on: NDArray[np.bool_]) -> int:
+        """Count samples between the ends of the range that are not known to be ``on`` it."""
+        if self.tap_sum == 1.0:
+            on |= self._fused(counters) == samples
+        off = samples.size - int(np.count_nonzero(on))
+        if off == 0 or self.max_counter <= _SURE:
+            return off
+        doubtful = ~on & (np.abs(counters) > _SURE)
+        unsure = int(np.count_nonzero(doubtful))
+        if 2 * (off - unsure) > samples.size:  # the verdict is clear without them
+            return off - unsure
+        return off - self._count_neighbours(samples[doubtful])
 
     def _count_neighbours(self, samples: Float32s) -> int:
         """Count samples that a counter near the most likely one gives, or the fused arithmetic."""
@@ -149,24 +189,10 @@ class Lattice:
             exact = np.rint(middle + steps * spacing)
             valid = (exact >= self.min_counter) & (exact <= self.max_counter)
             counters = exact.astype(np.float32)
-            separate = _values(counters, self.quantum, self.dac_offset, self.tap_sum)
-            found |= valid & (separate == samples)
             if self.tap_sum == 1.0:
-                fused = counters.astype(np.float64) * float(self.quantum) - float(self.dac_offset)
-                found |= valid & (fused.astype(np.float32) == samples)
+                found |= valid & (self._fused(counters) == samples)
+            found |= valid & (self._values(counters) == samples)
         return int(np.count_nonzero(found))
-
-
-def _values(
-    counters: Float32s, quantum: np.float32, dac_offset: np.float32, tap_sum: np.float32
-) -> Float32s:
-    """Compute the samples of counters; each operation rounds to float32, as in the firmware."""
-    values = counters * quantum
-    if tap_sum != 1.0:
-        values /= tap_sum
-    else:
-        values -= dac_offset
-    return values
 
 
 Samples = Float32s | NDArray[np.complex64]
@@ -274,6 +300,7 @@ def _complex(i: Float32s, q: Float32s) -> NDArray[np.complex64]:
 
 DEFAULT_FRAMES = 1024  # a minute at 17 frames/s; 6 MB of RF frames
 _COUNTER_WRAP = 1 << 32
+_ENOUGH = 128  # samples that are judged of a frame behind one that is no radar's, if most are off
 
 
 class FrameQueue:
@@ -327,6 +354,7 @@ class FrameQueue:
         self._frames: deque[Frame] = deque()
         self._in_burst = False
         self._gap = (0, 0)  # the last one: counter before it, frames missing in it
+        self._off_lattice = False  # more than half of the newest radar frame
         self._restarted = False
         self._outage_hz = 0.0  # rate of the stream that a broken line cut; 0: none was
         # counter and arrival [ns] of the first and the newest frame of this stream
@@ -383,10 +411,20 @@ class FrameQueue:
             self._discard(message)
             return
         if self.lattice is not None:
-            self._statistics.off_lattice_samples += self.lattice.off_lattice(values)
+            self._statistics.off_lattice_samples += self._count_off(self.lattice, values)
         n = geometry.n_bins
         samples = _complex(values[:n], values[n:]) if geometry.downconversion else values
         self._queue(message.info, samples, geometry, arrival_ns)
+
+    def _count_off(self, lattice: Lattice, values: Float32s) -> int:
+        """Count the samples off the lattice; where the verdict is clear, at least so many."""
+        if self._off_lattice:
+            off = lattice.off_lattice(values[:_ENOUGH])
+            if 2 * off > _ENOUGH:
+                return off
+        off = lattice.off_lattice(values)
+        self._off_lattice = 2 * off > values.size
+        return off
 
     def discard(self, why: str) -> None:
         """Count what came as no frame of this geometry."""

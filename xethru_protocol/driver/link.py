@@ -404,9 +404,14 @@ class Conversation:
         self._connection = Connection(Role.HOST)
         self.answers.clear()
 
-    def deadline_ns(self, timeout_s: float) -> int:
-        """Time of the clock [ns] at which a timeout is over; an infinite one takes 30 years."""
-        return self._clock() + round(min(timeout_s, _ENDLESS_S) * 1e9)
+    def deadline_ns(self, timeout_s: float, began_ns: int | None = None) -> int:
+        """Time of the clock [ns] at which a timeout is over; an infinite one takes 30 years.
+
+        It began at ``began_ns``, by default now.
+        """
+        if began_ns is None:
+            began_ns = self._clock()
+        return began_ns + round(min(timeout_s, _ENDLESS_S) * 1e9)
 
     def silence(
         self,
@@ -879,12 +884,21 @@ class Link:
 
     def next_frame(self, timeout_s: float) -> Steps[Frame]:
         frames = self.frames
+        if not frames:
+            began_ns, discarded = self.clock(), frames.discarded
+            yield Read(timeout_s)
+            if not frames:  # a frame takes two reads at most, unless the line is slow
+                yield from self._await_frame(timeout_s, began_ns, discarded)
+        return frames.pop()
+
+    def _await_frame(self, timeout_s: float, began_ns: int, discarded: int) -> Steps[None]:
+        frames = self.frames
         conversation = self.conversation
-        discarded = frames.discarded
-        deadline_ns = conversation.deadline_ns(timeout_s)
-        left_s = timeout_s
+        deadline_ns = conversation.deadline_ns(timeout_s, began_ns)
+        left_s = self.left_s(deadline_ns)
         while not frames:
-            yield Read(left_s)
+            if left_s > 0:
+                yield Read(left_s)
             if frames.discarded > discarded and frames.geometry is None and not self._warned:
                 self._warned = True
                 self.warn(frames.misfit)
@@ -899,7 +913,6 @@ class Link:
                     timeout_s,
                     "did the module stop, or its recording end?",
                 )
-        return frames.pop()
 
 
 Procedure: TypeAlias = Callable[Concatenate[Link, P], Steps[T]]

@@ -359,7 +359,8 @@ class X4M300(RadarState):
         self._sleep = sleep
         self._one_at_a_time = threading.Lock()
         # Held while the driver's state is used, not while a thread waits for the line.
-        self._turn = threading.Condition(threading.Lock())
+        self._lock = threading.Lock()
+        self._came = threading.Condition(self._lock)
         self._reading = False
         self._waiting = 0  # threads that wait for the one that reads
         self._inside: set[int] = set()  # threads in a call of the driver
@@ -630,7 +631,7 @@ class X4M300(RadarState):
             raise reentry(self._link.name)
         self._inside.add(thread)
         try:
-            with self._turn:
+            with self._lock:
                 step = next(procedure)
                 while True:
                     try:
@@ -652,9 +653,9 @@ class X4M300(RadarState):
             case Write(data):
                 if self.raw_listener is not None:
                     self.raw_listener("tx", data, self._link.clock())
-                self._without_turn(self._transport.write, data)
+                self._unlocked(self._transport.write, data)
             case Sleep(seconds):
-                self._without_turn(self._sleep, seconds)
+                self._unlocked(self._sleep, seconds)
             case _:
                 if self._reading and not isinstance(step, SetLineRate):
                     self._transport.close()  # the thread that reads leaves it
@@ -666,16 +667,16 @@ class X4M300(RadarState):
         """Wait until the thread that reads has done so; False if it has not in time."""
         self._waiting += 1
         try:
-            return self._turn.wait(min(max(timeout_s, 0.0), threading.TIMEOUT_MAX))
+            return self._came.wait(min(max(timeout_s, 0.0), threading.TIMEOUT_MAX))
         finally:
             self._waiting -= 1
 
-    def _without_turn(self, wait: Callable[[T], None], argument: T) -> None:
+    def _unlocked(self, wait: Callable[[T], None], argument: T) -> None:
         try:
-            self._turn.release()
+            self._lock.release()
             wait(argument)
         finally:
-            self._turn.acquire()
+            self._lock.acquire()
 
     def _pump(self, timeout_s: float) -> bool:
         """Read once and sort what came, or wait for the thread that does; False if nothing came."""
@@ -684,13 +685,13 @@ class X4M300(RadarState):
         data = b""
         self._reading = True
         try:
-            self._turn.release()
+            self._lock.release()
             data = self._transport.read(timeout_s)
         finally:
-            self._turn.acquire()
+            self._lock.acquire()
             self._reading = False
             if self._waiting:  # they go on when this thread waits again, or returns
-                self._turn.notify_all()
+                self._came.notify_all()
         if not data:
             return False
         arrival_ns = self._link.clock()

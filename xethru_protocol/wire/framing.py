@@ -265,9 +265,10 @@ class LinkStatistics:
     ``resyncs`` (starts that were rejected and scanned on behind) and ``faults`` by kind, one per
     damaged place. So ``bytes`` = bytes of packets + ``junk_bytes`` + bytes not judged yet.
     The connection: ``unknown`` packets, intact but described by no row of the message table.
-    The frame queue: ``frames_lost`` by gaps of the frame counter, and ``off_lattice_samples``,
-    which no chip counter can give, so that they were damaged although nothing else showed it
-    (NoEscape packets carry no checksum).
+    The frame queue: ``frames_lost`` by gaps of the frame counter, over a reconnect by the time
+    without frames; and ``off_lattice_samples``, which no chip counter can give, so that they were
+    damaged although nothing else showed it (NoEscape packets carry no checksum). Where most
+    samples of a frame are off the lattice, it is at least so many: the rest is not judged.
 
     >>> statistics = LinkStatistics(bytes=8, junk_bytes=8, resyncs=1)
     >>> statistics.faults[FaultKind.CHECKSUM] += 1

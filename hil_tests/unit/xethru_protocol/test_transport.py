@@ -6,6 +6,7 @@ import os
 import pty
 import resource
 import struct
+import sys
 import termios
 import threading
 import time
@@ -17,7 +18,7 @@ import pytest
 import serial
 from serial.tools.list_ports_common import ListPortInfo
 
-from hil_tests.patience import wait_until
+from hil_tests.patience import seconds, wait_until
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import SerialTransport, find_ports
 from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, PortUnavailable
@@ -56,6 +57,39 @@ def test_one_program_at_a_time(line: Line, port: SerialTransport) -> None:
         SerialTransport(line.path)
     port.close()
     SerialTransport(line.path).close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whether a port is exclusive")
+def test_port_is_exclusive_until_it_is_closed(line: Line) -> None:
+    """Also for programs that do not ask for the lock, such as the vendor's."""
+    port = SerialTransport(line.path)
+    assert is_exclusive(port.fileno())
+    port.close()
+    other = os.open(line.path, os.O_RDWR | os.O_NOCTTY)
+    assert not is_exclusive(other)
+    os.close(other)
+
+
+def is_exclusive(descriptor: int) -> bool:
+    get = 0x80045440  # TIOCGEXCL, which termios does not have
+    return bool(struct.unpack("i", fcntl.ioctl(descriptor, get, bytes(4)))[0])
+
+
+def test_closing_ends_the_wait_of_another_thread(line: Line, port: SerialTransport) -> None:
+    ends: list[object] = []
+
+    def read() -> None:
+        try:
+            ends.append(port.read(seconds(60)))
+        except Disconnected as error:
+            ends.append(str(error))
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    time.sleep(0.05)  # it waits now, or is about to: both must end
+    port.close()
+    reader.join(seconds(30))
+    assert ends == [f"{line.path} was closed"]
 
 
 def test_unplugged_port_is_disconnected_and_can_be_closed(

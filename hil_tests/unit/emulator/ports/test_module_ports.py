@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import os
 import select
 import socket
+import sys
+import termios
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -163,6 +166,19 @@ def test_every_module_answers_on_a_port_of_its_own(bench: Bench) -> None:
     assert bench.tcp_port(0) != bench.tcp_port(1)
     for index in (0, 1):
         assert bench.tcp(index).ask(m.Ping()) == PONG
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whether a port is exclusive")
+def test_a_killed_host_keeps_no_other_out(bench: Bench) -> None:
+    """It had the terminal exclusively, and a terminal remembers that."""
+    killed = bench.open("radar_1")
+    fcntl.ioctl(killed, termios.TIOCEXCL)
+    bench.turns()
+    os.close(killed)
+    bench.turns()
+    host = bench.pty("radar_1")
+    get_exclusive = 0x80045440  # TIOCGEXCL, which termios does not have
+    assert fcntl.ioctl(host.fd, get_exclusive, bytes(4)) == bytes(4)
 
 
 def test_the_same_bytes_come_through_tcp_and_terminal(bench: Bench) -> None:

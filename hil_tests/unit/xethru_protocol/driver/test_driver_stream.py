@@ -171,7 +171,24 @@ def test_lattice_is_that_of_the_settings(driver_on: DriverOn) -> None:
     radar.configure_raw(RawConfig(iterations=8, pulses_per_step=37))
     line.say(on_lattice(0, counts))
     radar.read_frame()
-    assert radar.statistics.off_lattice_samples > 1000
+    off = radar.statistics.off_lattice_samples
+    assert off > 1000
+    line.say(on_lattice(1, counts), on_lattice(2, counts[::-1]))
+    list(radar.frames(2))
+    # of the frames behind a clear one only the first 128 samples are judged
+    assert 64 < (radar.statistics.off_lattice_samples - off) / 2 <= 128
+
+
+def test_sound_frame_behind_one_that_is_none_is_judged_in_full(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    counts = np.linspace(0, 729_600, 1431).astype(np.uint32)
+    radar.configure_raw()
+    line.say(m.DataFloat(info=0, values=np.full(1431, 0.08, np.float32)))
+    values = on_lattice(1, counts).values.copy()
+    values[1430] = 0.08
+    line.say(m.DataFloat(info=1, values=values), m.DataFloat(info=2, values=values))
+    list(radar.frames(3))
+    assert radar.statistics.off_lattice_samples == 1431 + 1 + 1
 
 
 # --- configuring --------------------------------------------------------------------------------

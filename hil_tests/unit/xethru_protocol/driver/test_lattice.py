@@ -122,6 +122,31 @@ def test_one_damaged_sample_among_many_is_one() -> None:
     assert lattice().off_lattice(damaged) == 2
 
 
+def test_fused_arithmetic_is_on_the_lattice_and_its_neighbours_are_not() -> None:
+    """The working point of the reference (9.7), every 50th counter; one rounding, not two."""
+    counters = np.arange(0, 729_601, 50)
+    quantum, offset = np.float32(2.03450526e-07), np.float32(0.07421875)
+    fused = (counters * np.float64(quantum) - np.float64(offset)).astype(np.float32)
+    separate = counters.astype(np.float32) * quantum - offset
+    assert np.count_nonzero(fused != separate) > fused.size // 2
+    assert lattice().off_lattice(fused) == 0
+    beside = np.nextafter(fused, np.float32(9))
+    assert lattice().off_lattice(beside) == np.count_nonzero(beside != separate)
+
+
+def test_counters_beyond_float32_are_left_out_where_the_verdict_is_clear() -> None:
+    """At least so many: baseband counters reach 1e8, and samples of those above 2**21 take long."""
+    where = lattice(downconversion=True)
+    quantum = np.float32(2.03450526e-07)
+    sums = np.linspace(-(1 << 20), 1 << 20, 300).astype(np.int32).astype(np.float32)
+    large = np.array([1 << 24, (1 << 24) + 2, 3 << 23], np.float32)
+    on = np.concatenate([sums, large]) * quantum / np.float32(306)
+    assert where.off_lattice(on) == 0
+    off = np.nextafter(on, np.float32(9))
+    assert where.off_lattice(off[:300]) == 300
+    assert 300 <= where.off_lattice(off) <= 303
+
+
 class _EveryCounter:
     """An echo source whose samples run through the counters' whole range."""
 
