@@ -53,8 +53,6 @@ from xethru_protocol.wire.errors import (
 from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.rows import Response
 
-_FRAMES_AT_ONCE = 100
-
 
 class Listen:
     """How to get a module to send what is recorded: here, whatever it sends by itself."""
@@ -70,9 +68,13 @@ class Listen:
         return float("inf")
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
-        """Receive until a frame came or the time is over; other messages are not kept."""
+        """Receive until a message came or the time is over, and empty the driver's queues."""
         with suppress(ResponseTimeout):
-            radar.read_frame(timeout_s)
+            radar.read_message(m.Response, timeout_s)
+        for _ in range(radar.messages_waiting()):
+            radar.read_message(m.Response)
+        for _ in range(radar.frames_waiting()):
+            radar.read_frame()
 
 
 class RawFrames(Listen):
@@ -87,6 +89,11 @@ class RawFrames(Listen):
 
     def start(self, radar: X4M300) -> float:
         return max(2.0, 3.0 / radar.start(self._fps))
+
+    def wait(self, radar: X4M300, timeout_s: float) -> None:
+        """Receive until a frame came or the time is over; other messages are not kept."""
+        with suppress(ResponseTimeout):
+            radar.read_frame(timeout_s)
 
 
 _BOTH = MatrixControl.SLOW | MatrixControl.FAST
@@ -197,14 +204,6 @@ class Profile(Listen):
         radar.profile.run()
         # noise maps alone are sent only now and then
         return 10.0 if self._outputs is None or {*self._outputs} - {*_COMMON_OUTPUTS} else 60.0
-
-    def wait(self, radar: X4M300, timeout_s: float) -> None:
-        """Take a message, and the frames that the profile sends if its outputs are on."""
-        with suppress(ResponseTimeout):
-            radar.read_message(m.Response, timeout_s)
-        with suppress(ResponseTimeout):
-            for _ in radar.frames(_FRAMES_AT_ONCE, timeout_s=0.0):
-                pass
 
 
 _ANSWERS = (
