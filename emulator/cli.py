@@ -36,7 +36,7 @@ link directory. One JSON line on stdout says that all ports are ready:
 
   {"ready":true,"scene_time_zero_ns":N,"odometry":"PATH or null",
    "control":"PATH","devices":[{"name":"...","path":"...","serial":"...","start_skew_ns":N,
-                                "tcp":PORT or null}]}
+                                "tcp":PORT or null,"uart":BOOL}]}
 
 scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
 gives every client the wheel odometry as TUM lines, the control path one for `xethru-emulator ctl`.

@@ -42,6 +42,7 @@ _TURN_S = 0.005  # how long one task of asyncio may read on while data never end
 _LONGEST_WAIT_S = 86400.0  # poll() takes 31 bits of milliseconds; a caller waits again
 _BAUD = 115200  # what a UART module starts with; without meaning on USB and ptys
 _BITS_PER_BYTE = 10  # start and stop bit
+_SHARE = 0.8  # of a UART, for frames
 # Names of ports without a rate of their own: USB CDC and pseudo-terminals.
 _UNLIMITED = ("/dev/ttyACM", "/dev/pts/", "/dev/cu.usbmodem", "/dev/tty.usbmodem", "/dev/ttys")
 _NETWORK_TIMEOUT_S = 5.0  # to connect; pyserial's, too
@@ -184,7 +185,8 @@ class SerialTransport(LineTransport):
     @property
     def bytes_per_s(self) -> float:
         """What the line carries at most: 10 bits per byte on a UART, infinite elsewhere."""
-        if os.path.realpath(self.name).startswith(_UNLIMITED):
+        real = os.path.realpath(self.name)
+        if real.startswith(_UNLIMITED) and not _is_emulated_uart(real):
             return math.inf
         return self._port.baudrate / _BITS_PER_BYTE
 
@@ -463,6 +465,16 @@ def capacity_bytes_per_s(line: object) -> float:
     return float(getattr(line, "bytes_per_s", math.inf))
 
 
+def carried_rate_hz(wanted_hz: float, bytes_per_s: float, frame_bytes: int) -> float:
+    """Return the wanted frame rate, or less, whole Hz, if a line carries fewer frames.
+
+    A fifth of the line is kept for answers: behind frames that fill it they come late or never.
+    """
+    if math.isinf(bytes_per_s):
+        return wanted_hz
+    return min(wanted_hz, float(max(math.floor(bytes_per_s * _SHARE / frame_bytes), 1)))
+
+
 def set_rate(line: object, baudrate: int) -> None:
     change = getattr(line, "set_baudrate", None)
     if change is not None:
@@ -602,6 +614,7 @@ class PortInfo:
     description: str
     serial: str | None
     tcp: int | None = None  # TCP port of this machine at which an emulated module is, too
+    uart: bool = False  # an emulated one, with a baud rate
 
 
 def find_ports() -> tuple[PortInfo, ...]:
@@ -649,7 +662,7 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
             if not is_running(int(entry["pid"])):
                 continue
             devices = [
-                (str(one["path"]), str(one["name"]), one["serial"], one.get("tcp"))
+                (str(one["path"]), str(one["name"]), one["serial"], one.get("tcp"), one.get("uart"))
                 for one in entry["devices"]
             ]
         except (
@@ -662,7 +675,7 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
             RecursionError,
         ):
             continue  # not an emulator's entry, or one that is being written
-        for path, name, serial_number, tcp in devices:
+        for path, name, serial_number, tcp, uart in devices:
             if os.path.exists(path):  # False, too, for what can be no path
                 yield PortInfo(
                     path=path,
@@ -670,7 +683,13 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
                     description=f"emulated {name}",
                     serial=serial_number,
                     tcp=tcp,
+                    uart=bool(uart),
                 )
+
+
+def _is_emulated_uart(path: str) -> bool:
+    ports = _emulated_ports(run_directory())
+    return any(port.uart and os.path.realpath(port.path) == path for port in ports)
 
 
 def is_running(pid: int) -> bool:

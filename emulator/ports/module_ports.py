@@ -196,6 +196,7 @@ class DevicePorts:
         self.services: list[Service] = []
         self.moved: Callable[[], None] = lambda: None
         self._lines: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = []
+        self._is_uart = options.kind == "uart"
         for index, named in enumerate(devices):
             base = options.tcp_base
             tcp_port = base + index if base else base
@@ -209,6 +210,7 @@ class DevicePorts:
                 "serial": named.serial,
                 "start_skew_ns": named.start_skew_ns,
                 "tcp": None if tcp is None else tcp.port,
+                "uart": self._is_uart,
             }
             for named, link, tcp in self._lines
         ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -16,14 +15,6 @@ if TYPE_CHECKING:
     from xethru_protocol.driver.radar import X4M300
 
 RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
-_SHARE = 0.8  # of a UART; the rest is for answers
-
-
-def carried_rate_hz(wanted_hz: float, bytes_per_s: float) -> float:
-    """Return the wanted frame rate, or less if a UART carries fewer frames of 1431 bins."""
-    if math.isinf(bytes_per_s):
-        return wanted_hz
-    return min(wanted_hz, float(max(math.floor(bytes_per_s * _SHARE / RF_FRAME_BYTES), 1)))
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +55,9 @@ def radar(radar_place: RadarUnderTest) -> X4M300:
 @pytest.fixture
 def frame_rate_hz(radar_place: RadarUnderTest) -> float:
     """Frame rate to ask for: the spec's, or what a UART carries of whole RF frames [Hz]."""
-    return carried_rate_hz(radar_place.spec.fps, radar_place.place.bytes_per_s)
+    from xethru_protocol.transport import carried_rate_hz
+
+    return carried_rate_hz(radar_place.spec.fps, radar_place.place.bytes_per_s, RF_FRAME_BYTES)
 
 
 @pytest.fixture(scope="session")

@@ -135,7 +135,7 @@ def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
         help="range to read, in module metres (default 0.2 9.4)",
     )
     group.add_argument(
-        "--fps", type=frame_rate, default=17.0, help="frames per second (default 17)"
+        "--fps", type=frame_rate, help="frames per second (default 17; less if a UART carries less)"
     )
     group.add_argument(
         "--baseband", action="store_true", help="complex baseband bins instead of RF bins"

@@ -301,7 +301,7 @@ def _bootloader(probe: PortProbe) -> str | None:
 )
 def _no_packets(probe: PortProbe) -> str | None:
     contact = probe.contact
-    if contact.pong is None and contact.damaged:
+    if contact.pong is None and contact.damaged and not contact.talks:
         return "it sends bytes, but no XeThru packets, and answers at none of the known rates"
     return None
 
@@ -310,7 +310,8 @@ def _no_packets(probe: PortProbe) -> str | None:
     PORT_CHECKS,
     "listens",
     looks_at="what comes after PING",
-    remedy=f"{_POWER_CYCLE}; on a UART, check the line from host to module",
+    remedy="if frames fill a UART (115200 baud carry 2 a second of 1431 bins), stop what asks for "
+    f"them and wait half a minute; else check the line from host to module, or {_POWER_CYCLE}",
     ends=True,
 )
 def _no_answer(probe: PortProbe) -> str | None:
@@ -403,13 +404,14 @@ def _safe_mode(probe: PortProbe) -> str | None:
     PORT_CHECKS,
     "has profiles",
     looks_at="order code and firmware id",
-    remedy="for profiles, write the sensor firmware of the product; raw radar needs nothing",
+    remedy="nothing, for raw radar; an X4M200 or X4M300 gets its profiles with its sensor firmware",
     level=Level.NOTE,
 )
 def _bare_xep(probe: PortProbe) -> str | None:
     if not probe.is_bare_xep:
         return None
-    return f"bare {probe.info.firmware_id or 'XEP'} firmware without profiles: raw frames only"
+    name = probe.info.firmware_id or "XEP"
+    return f"bare {name} firmware, as on an X4M03 or X4M05: raw frames, no profiles"
 
 
 @Check(
@@ -421,7 +423,9 @@ def _bare_xep(probe: PortProbe) -> str | None:
 )
 def _other_product(probe: PortProbe) -> str | None:
     code = probe.info.order_code
-    return None if code is None or code == "X4M300" else f"it is an {code}, not an X4M300"
+    if probe.is_bare_xep or code == "X4M300":
+        return None
+    return f"it is an {code}, not an X4M300"
 
 
 @Check(
@@ -447,6 +451,8 @@ def _stale_firmware(probe: PortProbe) -> str | None:
     remedy="a program that wants presence must load PRESENCE_2; raw radar needs no profile",
 )
 def _wrong_profile(probe: PortProbe) -> str | None:
+    if probe.info.order_code != "X4M300":  # another product has profiles of its own
+        return None
     loaded = probe.profile_id
     if loaded is None or loaded in (ProfileId.XTS_ID_APP_NONE, ProfileId.XTS_ID_APP_PRESENCE_2):
         return None

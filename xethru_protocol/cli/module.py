@@ -13,6 +13,7 @@ from xethru_protocol.cli.output import (
     Progress,
     bytes_text,
     counted,
+    frame_rate,
     is_terminal,
     module_at,
     print_json,
@@ -149,7 +150,7 @@ def stream(arguments: Namespace) -> int:
     config = raw_config(arguments)
     with module_at(arguments.port, arguments.baudrate) as radar:
         radar.configure_raw(config)
-        rate = radar.start(arguments.fps)
+        rate = radar.start(frame_rate(radar, arguments.fps))
         print_warnings(radar)
         as_json = arguments.json or arguments.samples or not is_terminal(sys.stdout)
         live = None if as_json else _Live(radar)

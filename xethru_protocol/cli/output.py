@@ -210,6 +210,27 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
     _print_end(radar, losses)
 
 
+_USUAL_FPS = 17.0
+
+
+def frame_rate(radar: X4M300, wanted_hz: float | None) -> float:
+    """Return the rate to ask for: without a wanted one the usual, or what a UART carries."""
+    from xethru_protocol.transport import carried_rate_hz
+
+    if wanted_hz is not None:
+        return wanted_hz
+    assert radar.geometry is not None, "configured before"
+    frame_bytes = radar.geometry.frame_bytes
+    rate_hz = carried_rate_hz(_USUAL_FPS, radar.bytes_per_s, frame_bytes)
+    if rate_hz < _USUAL_FPS:
+        warn(
+            f"xethru: {rate_hz:g} frames/s instead of {_USUAL_FPS:g}: the line carries "
+            f"{radar.bytes_per_s / frame_bytes:.1f} of {frame_bytes} bytes; --baseband or a "
+            "smaller --frame-area make them shorter, --fps asks for another rate"
+        )
+    return rate_hz
+
+
 def print_warnings(radar: X4M300) -> None:
     for text in radar.warnings:
         warn(f"xethru: {text}")

@@ -210,6 +210,7 @@ _OTHER_BAUDRATES = (
     *(500000, 576000, 38400, 19200, 9600),
 )
 _ANSWER_LIMIT_S = 1.0
+_LONGEST_FRAME_BYTES = 6163  # Protocol reference 10
 _REPLY_LIMIT_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
 
 
@@ -285,14 +286,18 @@ class PortProbe:
     @cached_property
     def contact(self) -> Contact:
         """Send PING, at other rates too, and a command of the bootloader."""
+        assert self._transport is not None
+        bytes_per_s = self._transport.bytes_per_s
         first = self._ask(m.Ping(), _ANSWER_LIMIT_S)
+        if first.damaged and not first.talks and math.isfinite(bytes_per_s):
+            # the rest of a frame, perhaps: hear a whole one
+            first = self._ask(m.Ping(), _ANSWER_LIMIT_S + 2 * _LONGEST_FRAME_BYTES / bytes_per_s)
         if first.pong is not None or first.gone:
             return first
         second = self._ask(m.BootloaderGetDeviceInfo(), _REPLY_LIMIT_S)
         if second.bootloader:
             return second
-        assert self._transport is not None
-        if math.isfinite(self._transport.bytes_per_s):  # a UART
+        if math.isfinite(bytes_per_s) and not first.talks:  # a UART, perhaps of another rate
             for baudrate in _OTHER_BAUDRATES:
                 if self._reopen(baudrate):
                     contact = self._ask(m.Ping(), _REPLY_LIMIT_S, baudrate)
@@ -313,7 +318,7 @@ class PortProbe:
     @property
     def is_bare_xep(self) -> bool:
         """Whether the firmware has no profile layer."""
-        return self.info.order_code is None
+        return self.info.order_code is None or self.info.firmware_id == "XEP"
 
     @property
     def version(self) -> tuple[int, ...] | None:

@@ -19,6 +19,7 @@ from xethru_protocol.cli.output import (
     Progress,
     bytes_text,
     counted,
+    frame_rate,
     module_at,
     print_json,
     print_line,
@@ -80,7 +81,7 @@ class Listen:
 class RawFrames(Listen):
     """Radar frames of raw mode."""
 
-    def __init__(self, config: RawConfig, fps: float) -> None:
+    def __init__(self, config: RawConfig, fps: float | None) -> None:
         self._config = config
         self._fps = fps
 
@@ -88,7 +89,7 @@ class RawFrames(Listen):
         radar.configure_raw(self._config)
 
     def start(self, radar: X4M300) -> float:
-        return max(2.0, 3.0 / radar.start(self._fps))
+        return max(2.0, 3.0 / radar.start(frame_rate(radar, self._fps)))
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
         """Receive until a frame came or the time is over; other messages are not kept."""

@@ -23,6 +23,7 @@ from xethru_protocol.wire.codec import describe
 from xethru_protocol.wire.codes import (
     BootloaderFraming,
     BootloaderReply,
+    ErrorCode,
     InfoItem,
     PongCode,
     SensorMode,
@@ -441,7 +442,11 @@ class Conversation:
         if self.unexpected is None:
             what = f"answer to {summary(command)}"
             if self._frames_since:
-                likely = "it sends frames meanwhile; does it know this command in its mode?"
+                likely = (
+                    "it sends frames meanwhile: do they fill the line (a UART of 115200 baud "
+                    "carries 2 a second of 1431 bins), or does it not know this command in its "
+                    "mode?"
+                )
                 return self.silence(what, timeout_s, likely)
             return self.silence(what, timeout_s)
         row = ROWS[type(command)]
@@ -839,8 +844,9 @@ class Link:
         """Change the mode; firmware without modes is always as in MANUAL."""
         try:
             yield from self.request(m.SetMode(mode=mode), SLOW_TIMEOUT_S)
-        except DeviceError:
-            self.conversation.report("warning", f"the module does not know mode {mode.label}")
+        except DeviceError as error:
+            if error.code != ErrorCode.XTS_SPRE_NOT_RECOGNIZED:  # bare XEP, Protocol reference 8.3
+                self.conversation.report("warning", str(error))
 
     def set_baud_rate(self, baudrate: int, *, force: bool = False) -> Steps[None]:
         if baudrate not in BAUD_RATES and not force:

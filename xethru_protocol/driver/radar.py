@@ -164,6 +164,11 @@ class RadarState:
         return self._link.path
 
     @property
+    def bytes_per_s(self) -> float:
+        """What the line carries at most; infinite if it has no known limit."""
+        return self._link.bytes_per_s
+
+    @property
     def warnings(self) -> list[str]:
         """What probably fails although the module accepts it, and what failed without an error.
 

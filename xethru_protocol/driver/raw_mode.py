@@ -10,7 +10,7 @@ from xethru_protocol.driver.link import CONFIG_SETTINGS, SLOW_TIMEOUT_S, Link, R
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError
-from xethru_protocol.wire.messages import SetMode, X4DriverInit, X4DriverSet, X4Value
+from xethru_protocol.wire.messages import X4DriverInit, X4DriverSet, X4Value
 
 _QUANTISATION_M = 1e-5  # far below a bin, far above a float32 rounding
 _STOP = X4DriverSet(setting=X4Setting.FPS, value=0.0)
@@ -164,7 +164,7 @@ def leave(link: Link) -> Steps[None]:
         link.raw_mode = False
         link.conversation.wind_down()
         yield from link.request(_STOP)
-        yield from link.request(SetMode(mode=SensorMode.XTID_SM_STOP))
+        yield from link.set_mode_if_known(SensorMode.XTID_SM_STOP)
 
 
 def _warn_of_rate(link: Link, fps: float) -> None:

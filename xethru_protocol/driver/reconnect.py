@@ -45,17 +45,17 @@ def identify(link: Link) -> Steps[None]:
     if link.identified:
         return
     try:
+        # bare XEP refuses to tell it, and is looked for at the same port
         serial = (yield from link.info_text(InfoItem.XTID_SSIC_SERIALNUMBER)) or None
     except ResponseTimeout:
         serial = None
+        link.warn(
+            "the module does not answer what its serial number is; "
+            "if it vanishes, it is looked for at the same port only"
+        )
     except Disconnected:
         return  # the next command will see it
     link.identified, link.serial_number = True, serial
-    if serial is None:
-        link.warn(
-            "the module does not report its serial number; "
-            "if it vanishes, it is looked for at the same port only"
-        )
 
 
 def reset(link: Link, *, wait: bool = False, timeout_s: float = RESTART_S) -> Steps[None]:

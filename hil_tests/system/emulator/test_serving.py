@@ -14,6 +14,7 @@ from hil_tests.bench.virtual_time import counters_of
 from hil_tests.device.serving import emulator, open_radar
 from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds
+from xethru_protocol.cli import main
 from xethru_protocol.driver.files import FileName
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -30,6 +31,21 @@ FILE = FileName(file_type=0x80000001, identifier=7)
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")
 TIMER_HZ_AT_17 = 17.049379
 """What the chip's timer makes of FPS 17, measured. Protocol reference 9.6."""
+
+
+def test_the_usual_rate_is_what_a_uart_carries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Protocol reference 10: at 115200 baud 2.0 frames of 1431 bins, 7.8 of 181 baseband bins."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with emulator("serve", "--bare", "--link", "uart") as served:
+        for options, rate in (([], "1 frames/s"), (["--baseband"], "6 frames/s")):
+            assert main(["stream", "--port", served.paths[0], "--count", "3", *options]) == 0
+            printed = capsys.readouterr()
+            counters = [json.loads(line)["counter"] for line in printed.out.splitlines()]
+            assert counters == list(range(counters[0], counters[0] + 3))
+            assert printed.err.startswith(f"xethru: {rate} instead of 17: the line carries ")
+            assert "not stopped" not in printed.err
 
 
 @pytest.fixture

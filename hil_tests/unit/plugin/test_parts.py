@@ -11,7 +11,6 @@ import pytest
 
 from hil_tests.plugin import radar_targets
 from hil_tests.plugin.bench import Bench, PortBusyError, PortLock
-from hil_tests.plugin.fixtures import carried_rate_hz
 from hil_tests.plugin.gate import Measure, findings_of, gate
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import TappedTransport, WireTap
@@ -101,15 +100,6 @@ def test_measurements_beyond_their_limits_fail(value: float) -> None:
     with pytest.raises(pytest.fail.Exception, match=r"jitter is .* ms \(at least 1, at most 5\)"):
         measure("jitter", value, unit="ms", limit=(1.0, 5.0))
     assert len(measure.taken) == 1
-
-
-@pytest.mark.parametrize(
-    ("bytes_per_s", "rate_hz"),
-    # 80 % of the line over 5747 bytes, whole Hz, at least one
-    [(math.inf, 17.0), (92160.0, 12.0), (11520.0, 1.0), (960.0, 1.0)],
-)
-def test_rates_that_lines_carry(bytes_per_s: float, rate_hz: float) -> None:
-    assert carried_rate_hz(17.0, bytes_per_s) == rate_hz
 
 
 @pytest.mark.requires("profiles")

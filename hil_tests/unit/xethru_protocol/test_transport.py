@@ -20,7 +20,7 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from hil_tests.patience import seconds, wait_until
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.transport import SerialTransport, find_ports
+from xethru_protocol.transport import SerialTransport, carried_rate_hz, find_ports
 from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, PortUnavailable
 
 
@@ -268,3 +268,12 @@ def test_driver_that_cannot_be_made_gives_its_port_back(line: Line) -> None:
         X4M300.open(line.path, queue_frames=0)
     SerialTransport(line.path).close()
     assert refused.value
+
+
+@pytest.mark.parametrize(
+    ("bytes_per_s", "rate_hz"),
+    # 80 % of the line over 5747 bytes, whole Hz, at least one
+    [(math.inf, 17.0), (92160.0, 12.0), (11520.0, 1.0), (960.0, 1.0)],
+)
+def test_rates_that_lines_carry(bytes_per_s: float, rate_hz: float) -> None:
+    assert carried_rate_hz(17.0, bytes_per_s, 5747) == rate_hz

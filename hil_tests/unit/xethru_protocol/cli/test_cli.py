@@ -112,8 +112,9 @@ def test_list_shows_running_emulators_only(
     for number, pid in enumerate(["1e999", str(1 << 70), "-1", "0"], start=4):
         word = json.dumps(running | {"pid": "PID"}).replace('"PID"', pid)
         (folder / f"{number}.json").write_text(word)
-    about = {"kind": "emulated", "description": "emulated left", "serial": "42", "tcp": 5000}
-    assert emulated_ports(capsys) == [{"path": str(port), **about}]
+    about = {"kind": "emulated", "description": "emulated left", "serial": "42"}
+    also = {"tcp": 5000, "uart": False}
+    assert emulated_ports(capsys) == [{"path": str(port), **about, **also}]
 
 
 def announce(folder: Path, name: str = "left") -> None:

@@ -8,6 +8,7 @@ import sys
 import termios
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from hil_tests.unit.xethru_protocol.pty_module import (
     NOT_READY,
     SAFE_MODE,
     STOP,
+    Answer,
     PtyModule,
     Said,
     silent,
@@ -31,6 +33,7 @@ from xethru_protocol.cli.doctor import MACHINE_CHECKS, PORT_CHECKS
 from xethru_protocol.cli.port_probe import PortProbe, port_users
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.connection import Connection, Role
 
 Capture = pytest.CaptureFixture[str]
 FRAME = m.DataFloat(info=1, values=np.zeros(8, np.float32))
@@ -152,6 +155,37 @@ def test_what_is_wrong_with_a_module(
     assert (finding["check"], finding["level"]) == (check, level)
     assert code == (1 if level == "fault" else 0)
     assert word in finding["found"]
+
+
+@pytest.mark.parametrize(
+    ("make", "check"),
+    [
+        (
+            partial(stock, order_code="X4M03", firmware_id="XEP", mode=None, profile=None),
+            "has profiles",
+        ),
+        (partial(stock, order_code="X4M05", firmware_id="XEP", version="3.4.8"), "has profiles"),
+        (partial(stock, order_code="X4M200", profile=0x064E57AD), "is an X4M300"),
+    ],
+)
+def test_other_products_have_no_faults(
+    make: Callable[[], Answer], check: str, capsys: Capture
+) -> None:
+    with PtyModule(make()) as module:
+        code, finding = only_finding(capsys, module.path)
+    assert (code, finding["check"], finding["level"]) == (0, check, "note")
+
+
+@pytest.mark.usefixtures("hurried")
+def test_frames_that_fill_a_uart_are_no_foreign_bytes(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SerialTransport, "bytes_per_s", 11520.0)
+    with PtyModule(silent, unasked=UNCHECKED + Connection(Role.MODULE).send(FRAME)) as module:
+        _, finding = only_finding(capsys, module.path)
+        assert len([c for c in module.received if isinstance(c, m.Ping)]) <= 2  # no other rates
+    assert finding["check"] == "listens"
+    assert "115200 baud carry 2 a second" in finding["remedy"]
 
 
 @pytest.mark.parametrize("version", ["1.6.8", "1.6.10", "1.10.0", "2.0.0", "new"])

@@ -78,6 +78,31 @@ def test_firmware_without_modes_is_tolerated(driver_on: DriverOn) -> None:
     assert radar.configure_raw().n_bins == 1431
 
 
+def test_bare_xep_has_nothing_wrong_with_it(driver_on: DriverOn) -> None:
+    """X4M03 and X4M05: no modes, no serial number. Protocol reference 4.10, 8.3."""
+    heard: list[ProtocolRecord] = []
+    bare = PlainModule(None, instead={m.SetMode: [m.Error(code=1)]})
+    radar, line = driver_on(bare, observer=heard.append)
+    with radar:
+        radar.configure_raw()
+        radar.start(17.0)
+        line.say(frame(1))
+        assert radar.read_frame().counter == 1
+        radar.stop()
+    assert line.closed
+    assert radar.warnings == []
+    assert [record for record in heard if record.direction == "warning"] == []
+
+
+def test_a_mode_refused_for_another_reason_is_reported(driver_on: DriverOn) -> None:
+    heard: list[ProtocolRecord] = []
+    radar, _ = driver_on(
+        PlainModule(instead={m.SetMode: [m.Error(code=0x21)]}), observer=heard.append
+    )
+    radar.configure_raw()
+    assert [record for record in heard if record.direction == "warning"]
+
+
 def test_start_returns_the_real_rate_and_warns_above_the_possible(raw: Scripted) -> None:
     radar, _ = raw
     assert radar.start(17.0) == pytest.approx(17.049379, abs=1e-6)
