@@ -9,6 +9,7 @@ Source: protocol reference 4.12 and 1.2.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from xethru_protocol.wire.codes import (
@@ -31,6 +32,7 @@ _PAGES_PER_LOCK = 32
 _FIRST_LOCK = FIRST_PAGE // _PAGES_PER_LOCK
 _DATA_AT = 5  # of a page in the payload of WRITE_PAGE: behind C0 10, the number and a zero
 _FAST_START = 0x51  # a deprecated framing, which the parser still knows
+_SPECIAL = re.compile(rb"[\x7d-\x7f]")
 _NO_ESCAPE_HEADER = 5  # length and reserved
 
 
@@ -47,32 +49,36 @@ class PacketParser:
 
     def receive(self, data: bytes) -> Iterator[Found]:
         """Yield what is found: the buffer from a payload on, and its length; or damage."""
-        for byte in data:
-            if self._length == len(self.buffer):
+        at = 0
+        while at < len(data):
+            room = len(self.buffer) - self._length
+            if not room:
                 self._restart()
                 self._escaped = False
+                at += 1
                 yield BootloaderFraming.OUT_OF_BUFFER
-                continue
-            if self._fast or self._no_escape:
-                yield from self._count_down(byte)
-            elif self._escaped or byte not in (START, END, ESCAPE):
-                self._append(byte)
-            elif byte == ESCAPE:
-                self._escaped = True
+            elif self._fast or self._no_escape:
+                at += self._put(data[at : at + min(self._missing(), room)])
+                if not self._missing():
+                    yield self._counted()
+                    self._restart()
+            elif self._escaped:
+                self._escaped = False
+                at += self._take(data[at : at + 1])
+            elif (special := _SPECIAL.match(data, at)) is not None:
+                at += 1
+                yield from self._special(special[0][0])
+            elif data[at] == _FAST_START and not self._length:
+                self._fast = True
             else:
-                yield from self._delimiter(byte)
+                special = _SPECIAL.search(data, at, at + room)
+                end = at + room if special is None else special.start()
+                at += self._take(data[at:end])
 
-    def _append(self, byte: int) -> None:
-        if byte == _FAST_START and not self._length and not self._escaped:
-            self._fast = True
-        self._escaped = False
-        self._put(byte)
-        end = self._length
-        if self.buffer[0] != START and self.buffer[max(end - 4, 0) : end] == NO_ESCAPE_START:
-            self._restart()
-            self._no_escape = True
-
-    def _delimiter(self, byte: int) -> Iterator[Found]:
+    def _special(self, byte: int) -> Iterator[Found]:
+        if byte == ESCAPE:
+            self._escaped = True
+            return
         if byte == START and self._length:
             yield BootloaderFraming.LOST_BYTES
         elif byte == END and not self._length:
@@ -86,24 +92,39 @@ class PacketParser:
                 yield BootloaderFraming.CRC
         self._restart()
 
-    def _count_down(self, byte: int) -> Iterator[Found]:
-        """Take a byte of a packet that announced its length."""
-        self._put(byte)
+    def _take(self, data: bytes) -> int:
+        """Append bytes, up to a start of NoEscape framing; returns how many."""
+        before = bytes(self.buffer[max(self._length - 3, 0) : self._length])
+        first = self.buffer[0] if self._length else data[0]
+        found = -1 if first == START else (before + data).find(NO_ESCAPE_START)
+        if found < 0:
+            return self._put(data)
+        taken = self._put(data[: found + len(NO_ESCAPE_START) - len(before)])
+        self._restart()
+        self._no_escape = True
+        return taken
+
+    def _missing(self) -> int:
+        """Bytes up to the length, or of the packet that announced it."""
         at = 1 if self._fast else 0
         if self._length < at + 4:
-            return
-        announced = int.from_bytes(self.buffer[at : at + 4], "little")
-        if self._fast and self._length == announced + 6:
-            yield memoryview(self.buffer), self._length - 1
-        elif self._no_escape and self._length == announced + _NO_ESCAPE_HEADER:
-            yield memoryview(self.buffer)[_NO_ESCAPE_HEADER:], announced
-        else:
-            return
-        self._restart()
+            return at + 4 - self._length
+        return self._announced + (6 if self._fast else _NO_ESCAPE_HEADER) - self._length
 
-    def _put(self, byte: int) -> None:
-        self.buffer[self._length] = byte
-        self._length += 1
+    @property
+    def _announced(self) -> int:
+        at = 1 if self._fast else 0
+        return int.from_bytes(self.buffer[at : at + 4], "little")
+
+    def _counted(self) -> Found:
+        if self._fast:
+            return memoryview(self.buffer), self._length - 1
+        return memoryview(self.buffer)[_NO_ESCAPE_HEADER:], self._announced
+
+    def _put(self, data: bytes) -> int:
+        self.buffer[self._length : self._length + len(data)] = data
+        self._length += len(data)
+        return len(data)
 
     def _restart(self) -> None:
         self._length = 0

@@ -1,6 +1,7 @@
 """The emulated bootloader, by its source. Protocol reference 4.12, 1.2."""
 
 from collections.abc import Iterator
+from random import Random
 
 import pytest
 
@@ -18,17 +19,20 @@ VECTORS = {vector.name: vector for vector in load()}
 NOT_WRITTEN, WRITTEN = "E0", "E0 33"
 
 
-def found_in(data: bytes, size: int = 8000) -> Iterator[str]:
-    for found in PacketParser(size).receive(data):
-        if isinstance(found, BootloaderFraming):
-            yield found.name
-        else:
-            yield bytes(found[0][: found[1]]).hex(" ").upper()
+def found_in(data: bytes, size: int = 8000, chunk: int = 1 << 20) -> Iterator[str]:
+    parser = PacketParser(size)
+    for at in range(0, len(data), chunk):
+        for found in parser.receive(data[at : at + chunk]):
+            if isinstance(found, BootloaderFraming):
+                yield found.name
+            else:
+                yield bytes(found[0][: found[1]]).hex(" ").upper()
 
 
+@pytest.mark.parametrize("chunk", [1, 7, 1 << 20])
 @pytest.mark.parametrize("vector", STREAMS, ids=lambda v: v.name)
-def test_parser_finds_what_the_vendors_finds(vector: Vector) -> None:
-    found = list(found_in(vector.wire))
+def test_parser_finds_what_the_vendors_finds(vector: Vector, chunk: int) -> None:
+    found = list(found_in(vector.wire, chunk=chunk))
     names = {"CRC_ERROR": "CRC"}
     errors = [names.get(error, error) for error in vector.decoded["parser_errors"]]
     assert [item for item in found if item in BootloaderFraming.__members__] == errors
@@ -49,6 +53,17 @@ def test_parser_counts_the_bytes_of_the_deprecated_framing() -> None:
         fast,
         "10",
     ]
+
+
+def test_parser_finds_the_same_in_any_chunks() -> None:
+    """Whole runs of bytes are taken at once, so single bytes judge them."""
+    random = Random(1)
+    marks = bytes.fromhex("7D 7E 7F 7C 51 00 01 C0")
+    for _ in range(3000):
+        data = bytes(random.choices(marks, k=random.randrange(1, 80)))
+        data = data.replace(b"\x7c\x7c", b"\x7c\x7c\x7c\x7c\x02\x00\x00\x00\x00")
+        size = random.choice((12, 33, 64))
+        assert list(found_in(data, size)) == list(found_in(data, size, 1))
 
 
 class BootloaderHost:
