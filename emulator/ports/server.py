@@ -75,7 +75,13 @@ class Service(ABC):
 
 
 class Port:
-    """A device on its line, and the packet that is half sent."""
+    """A device on its line, and the packet that is half sent.
+
+    Attributes
+    ----------
+    wakes_ns
+        When it is to be served next, None: when its line is ready; as of its last turn.
+    """
 
     def __init__(self, link: ByteLink, device: ByteDevice, line: Line | None = None) -> None:
         self.link = link
@@ -83,6 +89,29 @@ class Port:
         self._line = line
         self._unsent = memoryview(b"")
         self._blocked = False
+        self.wakes_ns: int | None = 0
+        self._served_fd: int | None = None  # not yet
+
+    @property
+    def moved(self) -> bool:
+        """Whether its line came or went since its last turn began."""
+        return self.link.fileno() != self._served_fd
+
+    def is_due(self, now_ns: int) -> bool:
+        return self.wakes_ns is not None and self.wakes_ns <= now_ns
+
+    def serve(self, selector: selectors.BaseSelector, now_ns: int) -> None:
+        """Give the device and its line their share of a turn."""
+        self._served_fd = self.link.fileno()
+        self.advance(now_ns)
+        busy = False
+        if self.link.fileno() < 0:
+            self.cut()
+        else:
+            busy = self.send(now_ns)
+            if self.link.fileno() >= 0:  # else the host left while we wrote
+                wait_for(selector, self.link.fileno(), self.events, self.ready)
+        self.wakes_ns = now_ns if busy or self.moved else self.wake_ns(now_ns)
 
     @property
     def events(self) -> int:
@@ -121,6 +150,7 @@ class Port:
     def ready(self, events: int, now_ns: int) -> None:
         if events & selectors.EVENT_WRITE:
             self._blocked = False
+            self.wakes_ns = now_ns
         if events & selectors.EVENT_READ:
             self.receive(now_ns)
 
@@ -184,7 +214,6 @@ class Server:
         self._services = services
         self._clock_ns = clock_ns
         self._stopped = False
-        self._busy = True
         self._selector = selectors.DefaultSelector()
         self._wake_fd, self._waker_fd = os.pipe()
         os.set_blocking(self._wake_fd, False)
@@ -210,28 +239,27 @@ class Server:
         os.close(self._waker_fd)
 
     def turn(self, longest_wait_s: float | None = None) -> None:
-        """Serve once: wait for an event or a deadline, then give every port its share."""
+        """Serve once: wait for an event or a deadline, then give the ports their share.
+
+        Every port has one after something was read or a line came or went, which may concern any of
+        them (by a control socket, say, or two lines of one module); else those whose line takes
+        more, or whose deadline has come.
+        """
+        everyone = False
         for key, events in self._selector.select(self._wait_s(longest_wait_s)):
+            everyone |= bool(events & selectors.EVENT_READ)
             key.data(events, self._clock_ns())
         for service in self._services:
             service.advance(self._clock_ns())
-        self._busy = False
+        everyone = everyone or any(port.moved for port in self._ports)
         for port in self._ports:
             now_ns = self._clock_ns()
-            port.advance(now_ns)
-            if port.link.fileno() < 0:
-                port.cut()
-                continue
-            self._busy |= port.send(now_ns)
-            descriptor = port.link.fileno()
-            if descriptor >= 0:  # else the host left while we wrote
-                wait_for(self._selector, descriptor, port.events, port.ready)
+            if everyone or port.is_due(now_ns):
+                port.serve(self._selector, now_ns)
 
     def _wait_s(self, longest_wait_s: float | None) -> float:
-        if self._busy:
-            return 0.0
         now_ns = self._clock_ns()
-        wakes = [port.wake_ns(now_ns) for port in self._ports]
+        wakes = [port.wakes_ns for port in self._ports]
         wakes += [service.wake_ns(now_ns) for service in self._services]
         waits_s = [max(wake_ns - now_ns, 0) / NS_PER_S for wake_ns in wakes if wake_ns is not None]
         if longest_wait_s is not None:

@@ -7,6 +7,7 @@ propagation speed of exactly 3.0e8 m/s. Converting to true metres is the applica
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -195,6 +196,7 @@ def frame_rate_read_back(requested_hz: float) -> float:
     return real_frame_rate(requested_hz) if measured else _f32(requested_hz)
 
 
+@lru_cache(16)  # asked for every frame
 def _whole_rate(requested_hz: float) -> int:
     """Integer part of a request as the driver takes it, 32 bits, at least 1; 0 if it stops."""
     requested = _f32(requested_hz)

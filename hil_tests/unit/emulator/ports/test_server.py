@@ -275,6 +275,73 @@ def test_a_turn_sends_a_bounded_share() -> None:
     assert device.sent == PACKETS_PER_TURN
 
 
+def test_a_deadline_serves_the_ports_whose_own_has_come() -> None:
+    class Periodic(Idle):
+        def __init__(self, period_ns: int) -> None:
+            self.period_ns = self.due_ns = period_ns
+            self.served: list[int] = []
+
+        def advance(self, now_ns: int) -> None:
+            self.served.append(now_ns)
+            self.due_ns = now_ns // self.period_ns * self.period_ns + self.period_ns
+
+        def wake_ns(self, now_ns: int) -> int | None:
+            return self.due_ns
+
+    links, devices, clock = [PairLine(), PairLine()], [Periodic(10), Periodic(25)], Clock()
+    server = Server([Port(*pair) for pair in zip(links, devices, strict=True)], clock_ns=clock)
+    for clock.now_ns in range(0, 101, 5):
+        server.turn(longest_wait_s=0)
+    assert devices[0].served == list(range(0, 101, 10))
+    assert devices[1].served == list(range(0, 101, 25))
+    links[1].host_write(b"x")  # whatever happens on a line may concern every device
+    clock.now_ns += 1
+    server.turn(longest_wait_s=0)
+    assert [device.served[-1] for device in devices] == [101, 101]
+    server.close()
+    for link in links:
+        link.close()
+
+
+def test_a_line_that_is_hung_up_while_written_to_serves_every_port() -> None:
+    """The other line of the module has it now."""
+
+    class Counting(Idle):
+        served = 0
+
+        def advance(self, now_ns: int) -> None:
+            self.served += 1
+
+    class Speaking(Counting):
+        def next_packet(self, now_ns: int) -> bytes | None:
+            return b"x"
+
+    class HangsUp(PairLine):
+        up = True
+
+        def fileno(self) -> int:
+            return super().fileno() if self.up else -1
+
+        def write(self, data: memoryview) -> int:
+            if self.up:
+                server._selector.unregister(self.fileno())
+            self.up = False
+            return len(data)
+
+    links, waiting = [PairLine(), HangsUp()], Counting()
+    server = Server([Port(links[0], waiting), Port(links[1], Idle())], clock_ns=lambda: 0)
+    server.turn(longest_wait_s=0)
+    server._ports[1].device = Speaking()
+    links[1].host_write(b"y")
+    server.turn(longest_wait_s=0)
+    before = waiting.served
+    server.turn(longest_wait_s=60)  # at once
+    assert waiting.served == before + 1
+    server.close()
+    for link in links:
+        link.close()
+
+
 def test_a_deadline_beyond_what_the_system_waits_for_is_no_error() -> None:
     class Distant(Idle):
         def wake_ns(self, now_ns: int) -> int | None:
