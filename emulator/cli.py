@@ -372,21 +372,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="{realtime,asap}",
         help="which clock drives the modules (default realtime)",
     )
-    serve.add_argument(
-        "--model",
-        choices=["x4m300", "x4m200"],
-        default="x4m300",
-        help="product: with the presence profile, or with the respiration profile (default x4m300)",
-    )
-    serve.add_argument(
-        "--option",
-        action="append",
-        type=_option,
-        default=[],
-        metavar="NAME=VALUE",
-        help="how the modules behave where the reference allows more than one answer; may be "
-        "repeated; `xethru-emulator options` lists them",
-    )
+    _add_product(serve)
     _add_link_dir(serve)
     _add_faults(serve)
     serve.add_argument(
@@ -516,6 +502,30 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return arguments
 
 
+def _add_product(serve: argparse.ArgumentParser) -> None:
+    serve.add_argument(
+        "--model",
+        choices=["x4m300", "x4m200"],
+        default="x4m300",
+        help="product: with the presence profile, or with the respiration profile (default x4m300)",
+    )
+    serve.add_argument(
+        "--option",
+        action="append",
+        type=_option,
+        default=[],
+        metavar="NAME=VALUE",
+        help="how the modules behave where the reference allows more than one answer; may be "
+        "repeated; `xethru-emulator options` lists them",
+    )
+    serve.add_argument(
+        "--firmware",
+        type=_firmware,
+        metavar="NAME",
+        help="sensor (default) or xep, the newest of each, or a version: sensor-1.5.10, xep-3.3.0",
+    )
+
+
 def _add_link_dir(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--link-dir",
@@ -547,6 +557,16 @@ def _whole(least: int, most: int, shown: str | None = None) -> Callable[[str], i
         return value
 
     return value_of
+
+
+def _firmware(text: str) -> str:
+    from xethru_protocol.wire.versions import firmware_named
+
+    try:
+        firmware_named(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def _option(text: str) -> tuple[str, object]:

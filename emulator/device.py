@@ -34,9 +34,12 @@ from emulator.profiles.run import ProfileStream
 from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.codes import SystemCode
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.framing import NeedData
+from xethru_protocol.wire.framing import Framing, NeedData
 from xethru_protocol.wire.messages import (
+    BasebandAp,
+    BasebandIq,
     Command,
+    DataFloat,
     InjectFrame,
     PresenceSingle,
     Response,
@@ -47,7 +50,13 @@ from xethru_protocol.wire.messages import (
     X4DriverWrite,
     X4DriverWriteI2c,
 )
-from xethru_protocol.wire.x4 import FIRST_COUNTER
+from xethru_protocol.wire.versions import (
+    BAUD_RATE,
+    BOARD_CONFIGURATION,
+    Q_SIGN,
+    firmware_named,
+)
+from xethru_protocol.wire.x4 import DEFAULT_OFFSET_M, FIRST_COUNTER
 
 MOST_WAITING_BYTES = 2 * 7000 + 10 * 100
 """Of commands while one takes its time: as many as the firmware's message pool has (1.1)."""
@@ -397,9 +406,16 @@ class Device:
             return None
         if isinstance(message, PresenceSingle):
             self.module.pins.follow(message.state, message.direction)
-        packet = self._connection.send(message)
+        packet = self._connection.send(message, self._framing(message))
         # the firmware escapes into a buffer and loses what does not fit
         return packet[:NORMAL_BUFFER] if packet[0] == NORMAL_START else packet
+
+    def _framing(self, message: Response) -> Framing | None:
+        """Return how old firmware frames baseband; None: as usual."""
+        if BAUD_RATE.is_in(self.module.firmware):
+            return None
+        raw = isinstance(message, DataFloat) and self.module.chip.settings.downconversion
+        return Framing.NORMAL if raw or isinstance(message, (BasebandIq, BasebandAp)) else None
 
     def wake_ns(self, now_ns: int) -> int | None:
         """Return when `advance` (and then `next_packet`) should be called next; None if never.
@@ -451,7 +467,15 @@ def radar_device(
     # neighbours in a series of modules take turns in making blocks
     block_phase = None if pace is Pace.ASAP else int(identity.serial) % largest_block
     options = options or DeviceOptions()
-    chip = Chip(source, largest_block, block_phase, options.board_offset_m)
+    firmware = firmware_named(options.firmware)
+    stored = BOARD_CONFIGURATION.is_in(firmware)
+    chip = Chip(
+        source,
+        largest_block,
+        block_phase,
+        options.board_offset_m if stored else DEFAULT_OFFSET_M,
+        negates_q=Q_SIGN.is_in(firmware),
+    )
     module = Module(identity, chip, options, memory)
     clock = clock or ModuleClock()
     profile = ProfileStream(

@@ -157,6 +157,8 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
             stays = links.port_on_reset == "stay"
             changes = {"port_on_reset": "stay" if stays else "vanish"} | dict(options.option)
+            if options.firmware is not None:
+                changes["firmware"] = options.firmware
             device_options = DeviceOptions.of_model(options.model, **changes)
             if device_options.shipped_profile not in device_options.profiles:
                 raise CannotServeError(

@@ -460,6 +460,8 @@ class Chip:
         in step only some synthesise at a time; None: each block is as long as it may be.
     board_offset_m
         FRAMEAREAOFFSET that the board stores, which INIT restores [module metres].
+    negates_q
+        Whether the driver negates Q, as it does since XEP 2.1.0 (17).
 
     Attributes
     ----------
@@ -478,6 +480,8 @@ class Chip:
         largest_block: int = DEFAULT_LARGEST_BLOCK,
         block_phase: int | None = None,
         board_offset_m: float = x4.DEFAULT_OFFSET_M,
+        *,
+        negates_q: bool = True,
     ) -> None:
         self._source = source
         self._largest_block = largest_block
@@ -485,6 +489,7 @@ class Chip:
         self._block: _Block | None = None
         self._block_frames = 1
         self._board_offset_m = float(np.float32(board_offset_m))
+        self._negates_q = negates_q
         self.power_up()
 
     def power_up(self) -> None:
@@ -648,6 +653,8 @@ class Chip:
             raw = self._source.rf_counters(capture, indices, scene_times_ns)
         convert = _baseband_values if settings.downconversion else _rf_values
         values = convert(raw, settings, self.area)
+        if settings.downconversion and not self._negates_q:
+            values[:, self.area.n_bins :] *= -1
         is_zero = np.array([_is_zero(frame) for frame in values], dtype=np.bool_)
         return _Block(first_index=first_index, values=values, is_zero=is_zero)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Protocol
 
@@ -18,6 +18,7 @@ from emulator.chip.chip import Refusal
 from emulator.module.modes import Start
 from emulator.module.settings import ProfileSettings
 from xethru_protocol.wire.codes import FORMAT_KEY, FileError, InfoItem
+from xethru_protocol.wire.versions import FIRMWARE_ID, Firmware
 
 MAX_FILES = 20
 MAX_OPEN = 10
@@ -57,6 +58,16 @@ class Identity:
     def core_id(self) -> str:
         """The microcontroller's own number, 16 characters."""
         return f"EMUL{self.serial}"
+
+    def with_firmware(self, firmware: Firmware) -> Identity:
+        """Return the strings that the module answers with firmware of other versions."""
+        old = not FIRMWARE_ID.is_in(firmware)
+        return replace(
+            self,
+            firmware_id=self.order_code if old else self.firmware_id,
+            version=firmware.sensor or self.version,
+            xep_version=firmware.xep or self.xep_version,
+        )
 
     def info(self, item: int, *, base_firmware: bool = False) -> str | None:
         """Return the text of one info item; None for an item this firmware does not know.

@@ -30,6 +30,7 @@ from xethru_protocol.wire.codes import (
     PresenceState,
     TraceLevel,
 )
+from xethru_protocol.wire.versions import firmware_named
 
 CRASH_DUMP = (int(FileType.CRASH_DUMP), 0)
 PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
@@ -72,7 +73,7 @@ def _placeholder_noise_maps() -> tuple[bytes, bytes]:
 
 def _as_shipped(options: DeviceOptions) -> SavedState:
     """Return the flash of a new module: the profile layer has put a parameter file there."""
-    if options.firmware == "xep":
+    if firmware_named(options.firmware).sensor is None:
         return SavedState()
     return SavedState(files={PARAMETER_FILE: StoredFile(data=SHIPPED_PARAMETERS)})
 
@@ -89,6 +90,8 @@ class Module:
 
     Attributes
     ----------
+    firmware
+        Versions of what it plays.
     profile
         Settings of the profile loaded last.
     postprocessing
@@ -120,9 +123,11 @@ class Module:
         options: DeviceOptions | None = None,
         memory: Memory | None = None,
     ) -> None:
-        self.identity = identity
-        self.chip = chip
         self.options = options or DeviceOptions()
+        self.firmware = firmware_named(self.options.firmware)
+        named = "-" in self.options.firmware
+        self.identity = identity.with_firmware(self.firmware) if named else identity
+        self.chip = chip
         self._memory = memory
         saved = (None if memory is None else memory.load()) or _as_shipped(self.options)
         self._saved_profiles = {key: value.copy() for key, value in saved.profiles.items()}
@@ -139,7 +144,7 @@ class Module:
             unlocked=saved.unfinished_update,
         )
         self.parameter_file_name = saved.parameter_file_name
-        self.pins = IoPins(base_firmware=self.options.firmware == "xep")
+        self.pins = IoPins(base_firmware=self.firmware.sensor is None)
         self._faults = 0  # in a row
         self._last_fault_ns = 0
         self.noise_maps: Callable[[], tuple[bytes, bytes]] = _placeholder_noise_maps
@@ -303,7 +308,7 @@ class Module:
             return State.BOOTLOADER
         if self._faults >= SAFE_MODE_FAULTS:
             return State.SAFE
-        if self.options.firmware == "xep":
+        if self.firmware.sensor is None:
             return State.XEP
         return State.REG if self.certification else None
 

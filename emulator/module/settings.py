@@ -28,6 +28,7 @@ from xethru_protocol.wire.codes import (
     ProfileId,
     TxCenterFrequency,
 )
+from xethru_protocol.wire.versions import FIRMWARE_NAMES, firmware_named
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +95,8 @@ class DeviceOptions:
     ----------
     firmware
         "sensor": a stock X4M300. "xep": the bare base firmware, which has no profiles and no
-        modes.
+        modes. The newest of each; "sensor-1.5.10" or "xep-3.3.0" plays that version, as far as
+        its place in the table of versions says (17). `ValueError` lists those that are known.
     profiles
         What LOADAPP accepts (4.3).
     shipped_profile
@@ -148,7 +150,7 @@ class DeviceOptions:
         Time without fault after which the count of consecutive faults is cleared (8.5).
     """
 
-    firmware: Literal["sensor", "xep"] = "sensor"
+    firmware: str = "sensor"
     profiles: frozenset[ProfileId] = X4M300_PROFILES
     shipped_profile: ProfileId = ProfileId.XTS_ID_APP_PRESENCE_2
     default_output: OutputFeature = OutputFeature.PRESENCE_SINGLE
@@ -171,6 +173,9 @@ class DeviceOptions:
     x4_init_ns: int = 0
     file_delete_ns: int = 100_000_000
     watchdog_memory_ns: int = 300_000_000_000
+
+    def __post_init__(self) -> None:
+        firmware_named(self.firmware)
 
     @classmethod
     def of_model(cls, model: str, **changes: Any) -> DeviceOptions:  # noqa: ANN401 - of any field
@@ -276,7 +281,7 @@ def _member_names(kind: type[IntEnum]) -> dict[IntEnum, str]:
     return {member: member.name.removeprefix(prefix[: prefix.rfind("_") + 1]) for member in kind}
 
 
-_OPTION_TYPES = get_type_hints(DeviceOptions)
+_OPTION_TYPES = get_type_hints(DeviceOptions) | {"firmware": Literal.__getitem__(FIRMWARE_NAMES)}
 _MEANINGS = {
     name: " ".join(meaning.split())
     for name, meaning in re.findall(

@@ -28,6 +28,7 @@ from xethru_protocol.transport import find_ports, is_private, is_running, run_di
 from xethru_protocol.wire.codes import PongCode, ProfileId, SensorMode
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.messages import Ping
+from xethru_protocol.wire.versions import Firmware, lacking
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +82,6 @@ def _is_readable(entry: Path) -> bool:
 MACHINE_CHECKS: list[Check[Machine]] = []
 PORT_CHECKS: list[Check[PortProbe]] = []
 
-_OLDEST_SOUND_FIRMWARE = (1, 6, 8)  # Protocol reference 15, item 10
 _FEW = 4
 _POWER_CYCLE = "take the module's power away for some seconds"
 
@@ -431,17 +431,22 @@ def _other_product(probe: PortProbe) -> str | None:
 @Check(
     PORT_CHECKS,
     "firmware",
-    looks_at="firmware version",
-    remedy="write firmware 1.6.8 or newer with the vendor's tool",
+    looks_at="the version list",
+    remedy="write the newest firmware, 1.6.8 or later, with the vendor's tool",
 )
 def _stale_firmware(probe: PortProbe) -> str | None:
-    version = probe.version
-    if probe.is_bare_xep or version is None or version >= _OLDEST_SOUND_FIRMWARE:
+    version = probe.info.version
+    firmware = Firmware(xep=version) if probe.is_bare_xep else Firmware(sensor=version)
+    if probe.info.version_list is not None:
+        firmware = Firmware.of_list(probe.info.version_list)
+    rows = lacking(firmware)
+    faults = [f"{row.topic}: {row.before}" for row in rows if row.is_fault]
+    absent = [row.topic for row in rows if row.commands]
+    if not faults and not absent:
         return None
-    return (
-        f"firmware {probe.info.version} sets the chip's DAC settle time wrongly, "
-        "which costs 3 dB of signal"
-    )
+    parts = [f"faults: {'; '.join(faults)}"] * bool(faults)
+    parts += [f"it lacks: {'; '.join(absent)}"] * bool(absent)
+    return f"{firmware.name}: " + "; ".join(parts)
 
 
 @Check(

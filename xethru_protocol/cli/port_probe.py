@@ -8,7 +8,6 @@ import getpass
 import grp
 import math
 import os
-import re
 import shlex
 import stat
 import time
@@ -319,12 +318,6 @@ class PortProbe:
     def is_bare_xep(self) -> bool:
         """Whether the firmware has no profile layer."""
         return self.info.order_code is None or self.info.firmware_id == "XEP"
-
-    @property
-    def version(self) -> tuple[int, ...] | None:
-        """Firmware version; None if it is no three numbers."""
-        found = re.match(r"(\d+)\.(\d+)\.(\d+)", self.info.version or "")
-        return None if found is None else tuple(map(int, found.groups()))
 
     @cached_property
     def profile_id(self) -> int | None:

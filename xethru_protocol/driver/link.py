@@ -35,12 +35,14 @@ from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import (
     DeviceError,
     LocalProtocolError,
+    OldFirmwareError,
     RemoteProtocolError,
     ResponseTimeout,
     XeThruError,
 )
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault, LinkStatistics
 from xethru_protocol.wire.rows import ROWS, Command, Response, Row
+from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, Firmware, needed_by
 
 
 class Read(NamedTuple):  # several per frame: twice as fast to make as a frozen dataclass
@@ -562,6 +564,7 @@ class Link:
         self.reconnects = 0
         self.raw_mode = False
         self.closed = False
+        self._version_list: tuple[tuple[int, int], str | None] | None = None  # and of which start
         self._tokens = deque(_TOKENS)
         self._tokens_out = 0  # asked for and not answered, or answered too late
         self._token_at: int | None = None  # PINGs before the first token that is out
@@ -604,6 +607,7 @@ class Link:
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
         if self.conversation.answer_owed and not isinstance(command, m.Ping):
             yield from self._catch_up(command, timeout_s)
+        yield from self._check_version(command)
         reply = yield from self._exchange(command, timeout_s)
         # the conversation checked it: the row's replies are what ReplyT stands for
         return reply  # type: ignore[return-value]
@@ -810,9 +814,40 @@ class Link:
 
     def info_text(self, item: InfoItem) -> Steps[str | None]:
         try:
-            return (yield from self.request(m.SystemGetInfo(item=item))).text
-        except DeviceError:
-            return None
+            text = (yield from self.request(m.SystemGetInfo(item=item))).text
+        except (DeviceError, OldFirmwareError):
+            text = None
+        if item is InfoItem.XTID_SSIC_VERSIONLIST:
+            self._version_list = self._start, text
+        return text
+
+    @property
+    def _start(self) -> tuple[int, int]:
+        """What changes when the module restarts, perhaps with other firmware."""
+        return self.conversation.reboots, self.reconnects
+
+    def firmware(self) -> Steps[Firmware]:
+        """Return the versions of what runs on the module; asked for once, empty if it refuses."""
+        if self._version_list is None or self._version_list[0] != self._start:
+            try:
+                yield from self.info_text(InfoItem.XTID_SSIC_VERSIONLIST)
+            except RemoteProtocolError:  # what is wrong will show where it matters
+                self._version_list = self._start, None
+        text = None if self._version_list is None else self._version_list[1]
+        return Firmware() if text is None else Firmware.of_list(text)
+
+    def _check_version(self, command: Command[Response]) -> Steps[None]:
+        """Raise `OldFirmwareError` for a command that the module's firmware does not know."""
+        needed = needed_by(command)
+        if not needed:
+            return
+        firmware = yield from self.firmware()
+        for row in needed:
+            if not row.is_in(firmware):
+                raise OldFirmwareError(
+                    f"{summary(command)} needs {row.since} or newer ({row.topic}); "
+                    f"{self.name} has {firmware.name}: update it"
+                )
 
     def x4_settings(self) -> Steps[dict[X4Setting, m.X4Value | None]]:
         without_getter = {
@@ -847,6 +882,10 @@ class Link:
         except DeviceError as error:
             if error.code != ErrorCode.XTS_SPRE_NOT_RECOGNIZED:  # bare XEP, Protocol reference 8.3
                 self.conversation.report("warning", str(error))
+        except ResponseTimeout:
+            stops = mode is SensorMode.XTID_SM_STOP
+            if not stops or STOP_WITHOUT_PROFILE.is_in((yield from self.firmware())):
+                raise
 
     def set_baud_rate(self, baudrate: int, *, force: bool = False) -> Steps[None]:
         if baudrate not in BAUD_RATES and not force:

@@ -8,9 +8,10 @@ import numpy as np
 from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.driver.link import CONFIG_SETTINGS, SLOW_TIMEOUT_S, Link, RawConfig, Steps
 from xethru_protocol.wire import x4
-from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
-from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError
+from xethru_protocol.wire.codes import ErrorCode, PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.errors import DeviceError, LocalProtocolError, RemoteProtocolError
 from xethru_protocol.wire.messages import X4DriverInit, X4DriverSet, X4Value
+from xethru_protocol.wire.versions import X4_GETS
 
 _QUANTISATION_M = 1e-5  # far below a bin, far above a float32 rounding
 _STOP = X4DriverSet(setting=X4Setting.FPS, value=0.0)
@@ -52,14 +53,17 @@ def _apply(link: Link, config: RawConfig) -> Steps[FrameGeometry]:
     yield from link.set_mode_if_known(SensorMode.XTID_SM_MANUAL)
     yield from link.request(X4DriverInit(), SLOW_TIMEOUT_S)
     offset_m = yield from _offset_m(link, config)
-    predicted = config.area(offset_m)
+    predicted = None if offset_m is None else config.area(offset_m)
     for setting, value in config.settings():
         yield from link.request(X4DriverSet(setting=setting, value=value))
     for setting, value in config.settings():
         if setting is not X4Setting.FRAMEAREA:
-            _check(link, setting, value, (yield from link.x4_get(setting)))
+            found = yield from _read_back(link, setting)
+            if found is not None:
+                _check(link, setting, value, found)
     geometry = yield from read_geometry(link, config.downconversion)
-    _check_geometry(link, geometry, config, predicted)
+    if predicted is not None:
+        _check_geometry(link, geometry, config, predicted)
     link.plan = RawPlan(config=config)
     link.frames.geometry = geometry
     link.frames.lattice = config.lattice
@@ -77,11 +81,25 @@ def _check(link: Link, setting: X4Setting, wanted: X4Value, found: X4Value) -> N
         )
 
 
-def _offset_m(link: Link, config: RawConfig) -> Steps[float]:
+def _read_back(link: Link, setting: X4Setting) -> Steps[X4Value | None]:
+    """Return a setting as the module has it; None from old firmware that has no GET for it."""
+    try:
+        return (yield from link.x4_get(setting))
+    except DeviceError as error:
+        firmware = yield from link.firmware()
+        if error.code != ErrorCode.XTS_SPRE_NOT_RECOGNIZED or X4_GETS.is_in(firmware):
+            raise
+    link.warn(f"{firmware.name} cannot tell {setting.name}; {X4_GETS.since} can")
+    return None
+
+
+def _offset_m(link: Link, config: RawConfig) -> Steps[float | None]:
     """Return the offset that will hold; what INIT restored is of the module's own antenna (9.3)."""
     if config.offset_m is not None:
         return config.offset_m
-    offset_m = yield from link.x4_get(X4Setting.FRAMEAREAOFFSET)
+    offset_m = yield from _read_back(link, X4Setting.FRAMEAREAOFFSET)
+    if offset_m is None:
+        return None
     if not isinstance(offset_m, float) or not math.isfinite(offset_m):
         raise RemoteProtocolError(f"{link.name} reads back FRAMEAREAOFFSET as {offset_m}")
     return offset_m

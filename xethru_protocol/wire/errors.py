@@ -5,6 +5,7 @@
     XeThruError
     ├── ProtocolError
     │   ├── LocalProtocolError    we asked for something the protocol cannot express
+    │   │   └── OldFirmwareError  ... or what the module's firmware does not know
     │   └── RemoteProtocolError   the peer sent something the protocol does not allow
     ├── DeviceError               the module answered ERROR
     └── TransportError
@@ -29,6 +30,10 @@ class ProtocolError(XeThruError):
 
 class LocalProtocolError(ProtocolError):
     """We tried to send what the protocol cannot express."""
+
+
+class OldFirmwareError(LocalProtocolError):
+    """A command was not sent: the module's firmware does not know it."""
 
 
 class RemoteProtocolError(ProtocolError):

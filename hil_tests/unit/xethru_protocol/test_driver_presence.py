@@ -35,6 +35,7 @@ def test_profile_is_set_up_and_run_by_the_recipe(loaded: Emulated) -> None:
         m.SetMode(mode=STOP),
         m.LoadApp(profile_id=0x014D4AB8),
         m.SetSensitivity(sensitivity=8),
+        m.SystemGetInfo(item=7),  # old firmware has no noise map control (17)
         m.NoiseMapSetControl(control=3),
         m.AppSetLedControl(mode=0, intensity=0),
         m.OutputSetControl(feature=0x723BFA1E, control=1),
@@ -323,6 +324,7 @@ def test_noise_map_and_factory_preset(loaded: Emulated) -> None:
     radar.profile.delete_noise_map()
     radar.profile.factory_preset()
     assert module.received[3:] == [
+        m.SystemGetInfo(item=7),
         m.StoreNoiseMap(),
         m.LoadNoiseMap(),
         m.DeleteNoiseMap(),

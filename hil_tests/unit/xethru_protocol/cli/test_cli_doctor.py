@@ -111,12 +111,14 @@ MODULES = [
     ("not in safe mode", lambda: PtyModule(stock(pong=SAFE_MODE)), "fault", "safe mode"),
     (
         "has profiles",
-        lambda: PtyModule(stock(order_code=None, firmware_id="XEP", mode=None, profile=None)),
+        lambda: PtyModule(
+            stock(order_code=None, firmware_id="XEP", version="3.4.8", mode=None, profile=None)
+        ),
         "note",
         "bare XEP firmware",
     ),
     ("is an X4M300", lambda: PtyModule(stock(order_code="X4M200")), "note", "X4M200"),
-    ("firmware", lambda: PtyModule(stock(version="1.6.7")), "fault", "1.6.7"),
+    ("firmware", lambda: PtyModule(stock(version="1.5.10")), "fault", "lacks: DELETE_NOISEMAP"),
     ("right profile", lambda: PtyModule(stock(profile=0x064E57AD)), "fault", "RESPIRATION_2"),
     ("profile loaded", lambda: PtyModule(stock(mode=STOP, profile=0)), "note", "mode STOP"),
     ("radar runs", lambda: PtyModule(stock(mode=IDLE)), "note", "mode IDLE"),
@@ -161,7 +163,14 @@ def test_what_is_wrong_with_a_module(
     ("make", "check"),
     [
         (
-            partial(stock, order_code="X4M03", firmware_id="XEP", mode=None, profile=None),
+            partial(
+                stock,
+                order_code="X4M03",
+                firmware_id="XEP",
+                version="3.4.8",
+                mode=None,
+                profile=None,
+            ),
             "has profiles",
         ),
         (partial(stock, order_code="X4M05", firmware_id="XEP", version="3.4.8"), "has profiles"),

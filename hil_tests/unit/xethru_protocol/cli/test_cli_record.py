@@ -28,6 +28,7 @@ from xethru_protocol.recordings import (
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
     FileType,
+    InfoItem,
     OutputFeature,
     ProfileId,
     SensorMode,
@@ -174,6 +175,7 @@ def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) ->
     assert asked == [
         m.SetMode(mode=SensorMode.XTID_SM_STOP),
         m.LoadApp(profile_id=ProfileId.XTS_ID_APP_PRESENCE_2),
+        m.SystemGetInfo(item=InfoItem.XTID_SSIC_VERSIONLIST),  # whether it has files (17)
         m.GetFileLength(file_type=FileType.PARAMETER_FILE, identifier=0),
         m.SetMode(mode=SensorMode.XTID_SM_RUN),
     ]

@@ -286,9 +286,9 @@ def test_replies_to_nothing_and_to_something_else_are_not_taken(driver_on: Drive
     ("command", "came", "text"),
     [
         (
-            m.GetSensitivity(),
-            m.ReplyByte(content_id=0x10A5112B, values=b"\x05"),
-            r"answered APP_GET SENSITIVITY with REPLY BYTE .*where REPLY INT was expected",
+            m.GetProfileId(),
+            m.ReplyByte(values=b"\x05"),
+            r"answered DIR GET_PROFILEID with REPLY BYTE .*where REPLY INT was expected",
         ),
         (
             m.X4DriverGet(setting=X4Setting.DACMAX),

@@ -25,13 +25,17 @@ def test_file_is_written_in_chunks_and_read_back(emulated: Emulated) -> None:
     radar.files.write(USER, 7, CONTENT)
     assert module.files[USER, 7] == CONTENT
     assert module.open == set()
-    assert module.received == [
-        m.CreateFile(file_type=USER, identifier=7, length=519),
-        m.SetFileData(file_type=USER, identifier=7, offset=0, data=CONTENT[:256]),
-        m.SetFileData(file_type=USER, identifier=7, offset=256, data=CONTENT[256:512]),
-        m.SetFileData(file_type=USER, identifier=7, offset=512, data=b"the end"),
-        m.CloseFile(file_type=USER, identifier=7, commit=1),
-    ]
+    assert (
+        module.received
+        == [
+            m.SystemGetInfo(item=7),  # old firmware has no files (17)
+            m.CreateFile(file_type=USER, identifier=7, length=519),
+            m.SetFileData(file_type=USER, identifier=7, offset=0, data=CONTENT[:256]),
+            m.SetFileData(file_type=USER, identifier=7, offset=256, data=CONTENT[256:512]),
+            m.SetFileData(file_type=USER, identifier=7, offset=512, data=b"the end"),
+            m.CloseFile(file_type=USER, identifier=7, commit=1),
+        ]
+    )
     assert radar.files.read(USER, 7) == CONTENT
     assert module.open == set()
     assert module.received[-4:-1] == [

@@ -418,6 +418,8 @@ def test_verdict_of_a_system_test_is_in_its_info(driver_on: DriverOn) -> None:
     """Protocol reference 4.10: code | passed << 8; certification tells 0 although it worked."""
 
     def module(command: m.Message) -> Sequence[m.Message | bytes]:
+        if isinstance(command, m.SystemGetInfo):
+            return [m.Error(code=1)]
         assert isinstance(command, m.SystemTest)
         replies: dict[int, m.Message] = {
             0x11: m.ReplyByte(content_id=0x5090, info=0x0111, values=bytes([1, *[0] * 255])),

@@ -255,7 +255,7 @@ def test_rate_is_that_of_the_port(machine: PtyMachine) -> None:
         assert _speed(radar) == termios.B921600
         radar.set_baud_rate(230400)
         assert _speed(radar) == termios.B230400
-        assert machine.received("home")[0] == m.SetBaudRate(baudrate=230400)
+        assert machine.received("home")[1] == m.SetBaudRate(baudrate=230400)
 
 
 def _speed(radar: X4M300) -> int:
