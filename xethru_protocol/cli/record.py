@@ -35,6 +35,7 @@ from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
     RecordingError,
+    RecordingOptions,
     RecordingWriter,
     Split,
     WireCapture,
@@ -213,7 +214,7 @@ _ANSWERS = (
 )
 
 
-class Recorder:
+class RecordingFiles:
     """Writes what a driver receives to files.
 
     Files are made, and older ones removed, only by `open`: a module that does not answer must
@@ -224,7 +225,7 @@ class Recorder:
     """
 
     def __init__(
-        self, arguments: Namespace, profile_id: int | None, options: Mapping[str, Any]
+        self, arguments: Namespace, profile_id: int | None, options: RecordingOptions
     ) -> None:
         self.messages = 0  # taken
         self.failure: XeThruError | None = None  # why nothing more is written
@@ -282,13 +283,11 @@ class Recorder:
             remove_empty_directories(path)
         self._were_there = {path: path.exists() for path in self.paths}
         if self._directory is not None:
-            self._writer = RecordingWriter(
-                self._directory,
-                session_id=self._session_id,
-                profile_id=self._profile_id,
-                parameter_file=parameter_file,
-                **self._options,
-            )
+            options = self._options.copy()
+            options["session_id"] = self._session_id
+            options["profile_id"] = self._profile_id
+            options["parameter_file"] = parameter_file
+            self._writer = RecordingWriter(self._directory, **options)
         if self._wire_path is not None:
             self._wire = WireCapture(self._wire_path, {"port": self._arguments.port})
         early, self._early = self._early or [], None
@@ -397,7 +396,7 @@ def _profile_of(arguments: Namespace) -> Profile | None:
     return Profile(name, outputs=names, zone_m=arguments.zone, sensitivity=arguments.sensitivity)
 
 
-def _writer_options(arguments: Namespace) -> dict[str, Any]:
+def _writer_options(arguments: Namespace) -> RecordingOptions:
     """Return the parameters of `RecordingWriter`; ends the program on wrong usage."""
     limits = (
         {name: min(value for key, value in given if key == name) for name, _ in given}
@@ -408,7 +407,7 @@ def _writer_options(arguments: Namespace) -> dict[str, Any]:
     for name, _ in arguments.basename:
         if name not in kinds:
             arguments.refuse(f"--basename: no data files are called {name!r}; {', '.join(kinds)}")
-    options = {
+    options: RecordingOptions = {
         "user_header": arguments.user_header.encode(),
         "split": split,
         "split_directories": directories,
@@ -439,7 +438,7 @@ def record(arguments: Namespace) -> int:
         mode = profile
     options = _writer_options(arguments)
     stop = StopFlag("previous")
-    with Recorder(arguments, mode.profile_id, options) as recorder:
+    with RecordingFiles(arguments, mode.profile_id, options) as recorder:
         recorder.check()
         try:
             with module_at(arguments.port, arguments.baudrate) as radar:
@@ -469,7 +468,7 @@ def record(arguments: Namespace) -> int:
 
 
 def _record_from(
-    radar: X4M300, recorder: Recorder, mode: Listen, duration_s: float | None, stop: StopFlag
+    radar: X4M300, recorder: RecordingFiles, mode: Listen, duration_s: float | None, stop: StopFlag
 ) -> None:
     progress = Progress("xethru record")
     recorder.listen_to(radar)
@@ -494,7 +493,7 @@ def _record_from(
         progress.finish(recorder.numbers)
 
 
-def _end(recorder: Recorder, stop: StopFlag) -> str:
+def _end(recorder: RecordingFiles, stop: StopFlag) -> str:
     if recorder.failure is not None:
         return "failure"
     if stop.requested:

@@ -220,9 +220,11 @@ def _head(summary: RecordingSummary) -> Iterator[str]:
     )
     for name, count in sorted(summary.messages.items()):
         yield f"  {count} {name}"
-    for layout in summary.frames.values():
-        if layout.downconversion is not None:
-            yield f"  frames of {layout}{_HINT if layout.inferred else ''}"
+    told = [layout for layout in summary.frames.values() if layout.downconversion is not None]
+    for layout in told[:_FEW]:
+        yield f"  frames of {layout}{_HINT if layout.inferred else ''}"
+    if len(told) > _FEW:
+        yield f"  and of {len(told) - _FEW} other sizes"
     if summary.start_ns is not None and summary.duration_ns is not None:
         start = datetime.fromtimestamp(summary.start_ns // 10**9, UTC)
         ms = summary.start_ns % 10**9 // 10**6

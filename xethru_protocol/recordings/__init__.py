@@ -26,7 +26,12 @@ from xethru_protocol.recordings.records import (
     RecordingFault,
 )
 from xethru_protocol.recordings.vendor.record_reader import Record, RecordingReader
-from xethru_protocol.recordings.vendor.writer import RecordingWriter, Split, session_directory
+from xethru_protocol.recordings.vendor.writer import (
+    RecordingOptions,
+    RecordingWriter,
+    Split,
+    session_directory,
+)
 from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chunks, read_note
 
 __all__ = [
@@ -40,6 +45,7 @@ __all__ = [
     "RecordingFacts",
     "RecordingFault",
     "RecordingFormat",
+    "RecordingOptions",
     "RecordingReader",
     "RecordingSummary",
     "RecordingWriter",

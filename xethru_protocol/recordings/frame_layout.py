@@ -77,6 +77,8 @@ class FrameLayouts:
             case DataFloat(content_id=0, values=values):
                 length = len(values)
                 self._counts[length] += 1
+                if _is_rf(length):
+                    return
                 if self._bin_count is not None and length in (self._bin_count, 2 * self._bin_count):
                     self._answered[length] = length != self._bin_count
                 kept = self._frames.setdefault(length, [])
@@ -88,7 +90,7 @@ class FrameLayouts:
         return {length: self._layout(length) for length, _ in self._counts.most_common()}
 
     def _layout(self, length: int) -> FrameLayout:
-        if length % 2 or length > 2 * _MOST_BASEBAND_BINS:
+        if _is_rf(length):
             return FrameLayout(values=length, downconversion=False)
         if self.downconversion is not None:
             return FrameLayout(values=length, downconversion=self.downconversion)
@@ -99,6 +101,11 @@ class FrameLayouts:
         if roughness is None or _SMOOTH <= roughness <= _ROUGH:
             return FrameLayout(values=length, downconversion=None)
         return FrameLayout(values=length, downconversion=roughness < _SMOOTH, inferred=True)
+
+
+def _is_rf(length: int) -> bool:
+    """Whether so many values can be nothing else."""
+    return length % 2 == 1 or length > 2 * _MOST_BASEBAND_BINS
 
 
 def _roughness(halves: npt.NDArray[np.float64]) -> float | None:

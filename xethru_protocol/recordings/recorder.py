@@ -2,13 +2,13 @@
 
 import time
 from collections.abc import Callable, Iterable
-from datetime import tzinfo
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Protocol, Self, Unpack
 
 from xethru_protocol.recordings.records import RecordingError
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE
 from xethru_protocol.recordings.vendor.writer import (
+    RecordingOptions,
     RecordingWriter,
     new_session_id,
     session_directory,
@@ -76,7 +76,7 @@ class Recorder:
         kinds: Iterable[type[Response]] | None = None,
         on_error: Callable[[RecordingError], None] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
-        **options: Any,  # noqa: ANN401 - of RecordingWriter, which names and checks them
+        **options: Unpack[RecordingOptions],
     ) -> None:
         self.directory: Path | None = None
         self.messages = 0
@@ -106,10 +106,11 @@ class Recorder:
         if self._writer is not None:
             raise RecordingError(f"{self.directory} is being recorded already")
         self._since_1970_ns = time.time_ns() - self._clock()
-        zone: tzinfo | None = self._options.get("timezone")
-        options = dict(self._options)
+        options = self._options.copy()
         options["session_id"] = session_id = options.get("session_id") or new_session_id()
-        self.directory = session_directory(self._folder, session_id, time.time_ns(), zone)
+        self.directory = session_directory(
+            self._folder, session_id, time.time_ns(), options.get("timezone")
+        )
         self._writer = RecordingWriter(self.directory, **options)
         self._before = self._radar.listener
         self._radar.listener = self._take
@@ -119,7 +120,9 @@ class Recorder:
         writer, self._writer = self._writer, None
         if writer is None:
             return
-        self._radar.listener, self._before = self._before, None
+        if self._radar.listener == self._take:
+            self._radar.listener = self._before
+        self._before = None
         try:
             writer.close()
         except RecordingError as error:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Self
+from typing import Self, TypedDict
 
 from xethru_protocol.recordings.records import MS_NS, GrowingFile, RecordingError, writing
 from xethru_protocol.recordings.vendor.layouts import (
@@ -75,9 +75,26 @@ FileListener = Callable[[type[Response], Path], None]
 MetaFileListener = Callable[[str, Path], None]
 
 
+class RecordingOptions(TypedDict, total=False):
+    """The parameters of `RecordingWriter` but the directory."""
+
+    session_id: str | None
+    profile_id: int | None
+    parameter_file: bytes | str | None
+    user_header: bytes
+    split: Split | None
+    split_directories: Split | None
+    basenames: Mapping[type[Response], str] | None
+    interval_s: float | None
+    flush_on_write: bool
+    timezone: tzinfo | None
+    on_file: FileListener | None
+    on_meta_file: MetaFileListener | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Options:
-    """How to write; as the parameters of `RecordingWriter`."""
+    """How each directory of a recording is written."""
 
     parameter_file: bytes | None
     user_header: bytes

@@ -18,7 +18,7 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
-from xethru_protocol.cli.record import Recorder
+from xethru_protocol.cli.record import RecordingFiles
 from xethru_protocol.recordings import (
     describe_recording,
     read_note,
@@ -63,7 +63,7 @@ def test_duration_ends_it(
     module: PtyModule, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     of_the_frames = property(lambda recorder: 0.05 * recorder.messages)
-    monkeypatch.setattr(Recorder, "elapsed_s", of_the_frames)
+    monkeypatch.setattr(RecordingFiles, "elapsed_s", of_the_frames)
     out = tmp_path / "recording"
     arguments = ["--out", str(out), "--duration", "0.3", "--json", "--session-id", "first try"]
     assert main(["record", "--port", module.path, *arguments]) == 0

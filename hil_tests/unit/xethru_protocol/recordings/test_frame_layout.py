@@ -14,6 +14,7 @@ from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import empty_room, load_scene
 from hil_tests.unit.emulator.doubles import IDENTITY
+from hil_tests.unit.xethru_protocol.recordings.messages import xethru
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingWriter, describe_recording
@@ -107,3 +108,17 @@ def test_a_summary_has_each_size_of_frames(tmp_path: Path) -> None:
     frames = describe_recording(tmp_path).frames
     assert [str(frames[size]) for size in (5, 400)] == ["5 RF bins", "400 RF bins"]
     assert len(frames) == 2
+
+
+def test_dump_names_a_few_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RecordingWriter(tmp_path) as writer:
+        for n_values in (3, 3, 5, 7, 9, 9, 9, 400):
+            writer.write(m.DataFloat(info=1, values=np.zeros(n_values, np.float32)), 0)
+    lines = xethru(capsys, "dump", tmp_path).splitlines()
+    told = [line for line in lines if line.startswith(("  frames of", "  and of"))]
+    assert told == [
+        "  frames of 9 RF bins",
+        "  frames of 3 RF bins",
+        "  frames of 5 RF bins",
+        "  and of 2 other sizes",
+    ]

@@ -104,6 +104,17 @@ def test_two_recordings_have_directories_of_their_own(
     assert all(len(session_id) == 36 for session_id in found)
 
 
+def test_a_listener_set_meanwhile_stays(
+    radar: X4M300, line: LoopbackTransport, tmp_path: Path
+) -> None:
+    def later(message: m.Response, arrival_ns: int) -> None:
+        """Hear nothing."""
+
+    with Recorder(radar, tmp_path, clock=line.clock_ns):
+        radar.listener = later
+    assert radar.listener is later
+
+
 def test_an_error_ends_the_recording_and_not_the_driver(
     radar: X4M300, line: LoopbackTransport, tmp_path: Path
 ) -> None:
