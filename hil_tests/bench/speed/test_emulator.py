@@ -4,9 +4,12 @@ The bar of the design: four radars at 400 frames/s with synthesis in under a qua
 p99 of the interval error under 5 ms on an idle machine. Nothing is asserted about time here.
 """
 
+import contextlib
 import os
 import select
+import threading
 import time
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -23,7 +26,7 @@ from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.framing import NeedData
+from xethru_protocol.wire.framing import NeedData, encode_normal
 from xethru_protocol.wire.x4 import real_frame_rate
 
 FAST = RawConfig(iterations=16, pulses_per_step=10)
@@ -103,6 +106,51 @@ def test_sixty_four_radars_in_real_time(benchmark: BenchmarkFixture) -> None:
     benchmark.extra_info.update(measured)
     assert measured["lost"] == 0
     assert measured["received"] > 0.9 * 64 * 17 * SECONDS
+
+
+FLOODS = {
+    "nothing": b"",
+    "starts and escaped starts": b"\x7d\x7f\x7d\x7f\x7d",
+    "empty packets": b"\x7d\x7e",
+    "noescape starts": b"\x7c\x7c\x7c\x7c\x00",
+    "unknown commands": encode_normal(b"\x77"),
+    "pings": encode_normal(bytes.fromhex("01 AE EA AA EE")),
+}
+
+
+@contextlib.contextmanager
+def flooded(path: str, pattern: bytes) -> Iterator[None]:
+    """Write a pattern to a port as fast as it takes it, and read what comes."""
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    ended = threading.Event()
+
+    def flood() -> None:
+        data, at = pattern * (1 + 100_000 // max(len(pattern), 1)), 0
+        while not ended.is_set():
+            readable, _, _ = select.select([descriptor], [descriptor] if data else [], [], 0.1)
+            with contextlib.suppress(BlockingIOError):
+                if readable:
+                    os.read(descriptor, 65536)
+                at += os.write(descriptor, data[at : at + 4096])
+                at %= len(pattern) or 1
+
+    writer = threading.Thread(target=flood)
+    writer.start()
+    yield
+    ended.set()
+    writer.join()
+    os.close(descriptor)
+
+
+@pytest.mark.parametrize("name", FLOODS)
+@pytest.mark.benchmark(group="PONG of a module beside another client's garbage (bar: 20 ms)")
+def test_answer_beside_a_flood(benchmark: BenchmarkFixture, name: str) -> None:
+    with (
+        emulator("serve", "--bare", "--count", "2") as served,
+        X4M300.open(served.paths[1]) as radar,
+        flooded(served.paths[0], FLOODS[name]),
+    ):
+        benchmark.pedantic(radar.ping, rounds=300, warmup_rounds=10)  # type: ignore[no-untyped-call] # as above
 
 
 @pytest.mark.timeout(300)
