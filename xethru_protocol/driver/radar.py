@@ -528,7 +528,8 @@ class X4M300(RadarState):
     def start(self, fps: float) -> float:
         """Start frames at ``fps`` [Hz]; returns the rate at which the chip really runs.
 
-        Frames of an earlier stream that were not read yet are dropped.
+        Frames of an earlier stream that were not read yet are dropped. Without `configure_raw`, the
+        settings that a module in mode MANUAL has are taken for those that are wanted.
 
         A rate above what the settings allow or the line carries is tried, with a warning: the
         firmware does not refuse it (Protocol reference 9.6, 10).

@@ -148,6 +148,15 @@ def start(link: Link, fps: float) -> Steps[float]:
 
 def _take_over(link: Link) -> Steps[None]:
     """Take the settings that the module has for those the user wants."""
+    try:
+        mode = yield from link.mode()
+    except DeviceError:  # bare XEP firmware has no modes: it is always as in MANUAL
+        mode = SensorMode.XTID_SM_MANUAL
+    if mode is not SensorMode.XTID_SM_MANUAL:
+        raise LocalProtocolError(
+            f"{link.name} is in mode {mode.label}, in which no radar frames come; "
+            "call configure_raw() first"
+        )
     values: dict[str, X4Value] = {}
     for name, setting in CONFIG_SETTINGS.items():
         values[name] = yield from link.x4_get(setting)

@@ -19,7 +19,7 @@ import xethru_protocol
 from hil_tests.golden.builders import message_of
 from hil_tests.golden.vectors import load
 from hil_tests.unit.xethru_protocol.both_drivers import AsyncScripted, DriverOn, Scripted
-from hil_tests.unit.xethru_protocol.emulated import Emulated
+from hil_tests.unit.xethru_protocol.emulated import Emulated, EmulatedModule
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame, framed
 from xethru_protocol import (
     X4M300,
@@ -284,6 +284,18 @@ def test_start_takes_the_settings_that_it_finds(emulated: Emulated) -> None:
     assert radar._link.frames.lattice == RawConfig().lattice
     line.say(frame(1, 716))
     assert radar.read_frame().samples.shape == (716,)
+
+
+@pytest.mark.parametrize(("stopped", "mode"), [(True, "STOP"), (False, "RUN")])
+def test_start_in_another_mode_says_what_to_call(
+    driver_on: DriverOn, stopped: bool, mode: str
+) -> None:
+    """Protocol reference 8.3: X4 settings are taken, but frames come in MANUAL only."""
+    module = EmulatedModule(stopped=stopped)
+    radar, _ = driver_on(module)
+    with pytest.raises(LocalProtocolError, match=rf"mode {mode}.*; call configure_raw\(\) first"):
+        radar.start(17)
+    assert not any(isinstance(command, m.X4DriverSet) for command in module.received)
 
 
 def test_init_forgets_what_was_configured(raw: Scripted) -> None:
