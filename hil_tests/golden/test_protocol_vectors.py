@@ -111,6 +111,9 @@ def test_message_without_row_arrives_whole(vector: Vector) -> None:
     message = received(vector)
     assert vector.payload is not None
     assert message == UnknownMessage(code=vector.payload[0], payload=vector.payload)
+    name, fields = describe(message)
+    assert name == (vector.message if vector.from_host else "UNKNOWN")
+    assert fields == {"code": vector.payload[0], "payload": vector.decoded["payload"]}
 
 
 @pytest.mark.parametrize("vector", [*MESSAGES, *STREAMS], ids=lambda v: v.name)

@@ -325,11 +325,12 @@ def _check(link: Link, image: FirmwareImage, banner: str) -> Steps[bool]:
 
 def _write(link: Link, image: FirmwareImage, is_open: bool, on_progress: OnProgress) -> Steps[None]:
     """Write page 0 and all others upwards, since every sixteenth erases those behind it."""
-    yield from _write_page(link, 0, image.page_zero)
+    attempts = _ATTEMPTS if is_open else 1  # in between an ECHO is asked for
+    yield from _write_page(link, 0, image.page_zero, attempts)
     for done in range(image.pages):
         on_progress(done, image.pages)
         page = image.data[done * PAGE_BYTES : (done + 1) * PAGE_BYTES]
-        answer = yield from _write_page(link, FIRST_PAGE + done, page)
+        answer = yield from _write_page(link, FIRST_PAGE + done, page, attempts)
         if is_open and answer != b"\x33":
             raise RemoteProtocolError(
                 f"{link.path} did not write page {FIRST_PAGE + done}; switch its power off and on"
@@ -337,9 +338,9 @@ def _write(link: Link, image: FirmwareImage, is_open: bool, on_progress: OnProgr
     on_progress(image.pages, image.pages)
 
 
-def _write_page(link: Link, number: int, data: bytes) -> Steps[bytes]:
+def _write_page(link: Link, number: int, data: bytes, attempts: int) -> Steps[bytes]:
     """Write a page, again if the line damaged it; to write it twice does no harm."""
-    for attempt in range(_ATTEMPTS):
+    for attempt in range(attempts):
         try:
             command = m.BootloaderWritePage(page=number, data=data)
             return (yield from link.request(command, SLOW_TIMEOUT_S)).data
@@ -347,7 +348,7 @@ def _write_page(link: Link, number: int, data: bytes) -> Steps[bytes]:
             damaged = (
                 isinstance(error, ResponseTimeout) or error.code == BootloaderReply.FRAMING_ERROR
             )
-            if not damaged or attempt == _ATTEMPTS - 1:
+            if not damaged or attempt == attempts - 1:
                 raise
             link.warn(f"page {number} is written again: {error}")
             link.conversation.answer_owed = True  # more reports of the damage may follow

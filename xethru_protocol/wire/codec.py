@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from xethru_protocol.wire.codes import ElementType, ResponseCode
+from xethru_protocol.wire.codes import BootloaderCode, CommandCode, ElementType, ResponseCode
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.fields import FLOAT32, hex_bytes
 from xethru_protocol.wire.messages import DataFloat  # importing messages enters all rows
@@ -108,6 +108,14 @@ def decode_response_at(buffer: bytes, start: int, end: int) -> Response:
     return decode_response(buffer[start:end])
 
 
+_UNKNOWN_SUB_COMMAND = "BOOTLOADER unknown sub-command"  # a bootloader answers it otherwise
+
+
+def _is_bootloaders(payload: bytes) -> bool:
+    bootloader = payload[:1] == bytes((CommandCode.XTS_SPC_BOOTLOADER,))
+    return bootloader and len(payload) > 1 and payload[1] not in set(BootloaderCode)
+
+
 _NOT_FINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
 
 
@@ -120,10 +128,11 @@ def describe(message: Message) -> tuple[str, dict[str, Any]]:
     Floats that are no JSON numbers are shown as "NaN", "Infinity" and "-Infinity".
     """
     if isinstance(message, UnknownMessage):
-        return "UNKNOWN", {"code": message.code, "payload": hex_bytes(message.payload)}
+        shown: dict[str, Any] = {"code": message.code, "payload": hex_bytes(message.payload)}
+        return _UNKNOWN_SUB_COMMAND if _is_bootloaders(message.payload) else "UNKNOWN", shown
     row = ROWS[type(message)]
     fields = _fields(message, row)
-    shown: dict[str, Any] = {}
+    shown = {}
     for name, kind in row.kinds:
         shown |= kind.show(name, fields.get(name), fields)
     shown |= row.derived(message)

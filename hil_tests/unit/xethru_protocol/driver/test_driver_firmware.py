@@ -350,6 +350,20 @@ def test_an_image_for_another_bootloader_is_not_written(
     assert module.runs_application
 
 
+def test_a_signed_image_goes_to_the_vendors_bootloader(driver_on: DriverOn) -> None:
+    """No command is sent of which it is not known that this bootloader has it."""
+    module = UpdatableModule()
+    module.banner = b"XETHRU BOOTLOADER V:1.0 "
+    certificate = sum(PADDED).to_bytes(4, "little") + bytes(range(1, 255)) * 2
+    radar, line = driver_on(module)
+    radar.firmware.write(FirmwareImage(data=PADDED, certificate=certificate))
+    assert module.content == PADDED
+    pages = [c for c in line.received if isinstance(c, m.BootloaderWritePage)]
+    assert pages[0] == m.BootloaderWritePage(page=0, data=certificate.ljust(512, b"\xff"))
+    unproven = (m.BootloaderPageSize, m.BootloaderPageCount, m.BootloaderEcho)
+    assert not [c for c in line.received if isinstance(c, unproven)]
+
+
 def test_a_flash_that_is_too_small_is_not_written(driver_on: DriverOn) -> None:
     module = UpdatableModule()
     module.bootloader = Bootloader(CORE_ID, page_count=2)
