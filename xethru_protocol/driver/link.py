@@ -41,7 +41,7 @@ from xethru_protocol.wire.errors import (
     XeThruError,
 )
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault, LinkStatistics
-from xethru_protocol.wire.rows import ROWS, Command, Response, Row
+from xethru_protocol.wire.rows import ROWS, Command, Response, Row, UnknownMessage
 from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, Firmware, needed_by
 
 
@@ -236,6 +236,7 @@ _ANSWERS = (
     *(m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString),
     *(m.BootloaderSuccess, m.BootloaderEchoed, *_BOOTLOADER_ERRORS),
 )
+_ANSWER_CODES = (b"\x01", b"\x10", b"\x11", b"\x20")  # PONG, ACK, REPLY, ERROR
 # The module answers PINGs that waited for it one right after the other; a PONG that stays out
 # this long after the last one was probably never sent.
 _SETTLED_NS = 250_000_000
@@ -380,10 +381,17 @@ class Conversation:
                 self._rebooted_since = True
         else:
             self._take_data(message, arrival_ns)
+            if self.expected and isinstance(message, UnknownMessage):
+                self._look_at(message)
         if self._observer is not None:
             row = ROWS.get(type(message))
             if row is None or not row.bulk:
                 self.report("rx", summary(message))
+
+    def _look_at(self, message: UnknownMessage) -> None:
+        """Keep an answer that makes no sense, for the error that there will be."""
+        if message.payload[:1] in _ANSWER_CODES and self.unexpected is None:
+            self.unexpected = message
 
     def new_line(self, name: str) -> None:
         """Begin anew on a line that was just opened: no answer is due and no packet half-read."""

@@ -10,7 +10,8 @@ from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import load_scene
 from hil_tests.unit.emulator.doubles import IDENTITY, ramp_device
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import OutputFeature, PongCode
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
 
@@ -21,6 +22,20 @@ def test_virtual_time_makes_a_silent_module_time_out_at_once() -> None:
         with pytest.raises(ResponseTimeout):
             radar.read_frame(timeout_s=3600.0)
         assert transport.clock_ns() >= 3600 * 10**9
+
+
+def test_time_passes_for_a_host_whose_module_never_stops_sending() -> None:
+    """Without a profile this question stays without an answer (Protocol reference 4.4)."""
+    transport = LoopbackTransport(ramp_device())
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        radar.configure_raw()
+        radar.start(10)
+        began_ns = transport.clock_ns()
+        question = m.OutputGetControl(feature=OutputFeature.PRESENCE_SINGLE)
+        with pytest.raises(ResponseTimeout, match="it sends frames meanwhile"):
+            radar.request(question, 0.2)
+        assert 0.2e9 <= transport.clock_ns() - began_ns < 0.3e9
+        assert radar.ping() is PongCode.XTS_SPRP_READY
 
 
 def test_a_reset_takes_no_wall_time() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
-from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame
+from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame, framed
 from xethru_protocol.driver.link import Link, ProtocolRecord, RawConfig
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
@@ -311,6 +311,14 @@ def test_answer_that_does_not_fit_is_named(
     with pytest.raises(RemoteProtocolError, match=text):
         radar.request(command)
     assert line.now_ns < 0.6e9  # not the whole timeout: what was to come has come
+
+
+def test_answer_that_is_cut_off_is_named(driver_on: DriverOn) -> None:
+    """REPLY INT with one element announced and none there: 11 11, id, info, length (5.2)."""
+    payload = bytes.fromhex("11 11 17000000 00000000 01000000")
+    radar, _ = driver_on(lambda command: [framed(payload)])
+    with pytest.raises(RemoteProtocolError, match=r"with .*11 11 17 .*where REPLY"):
+        radar.request(m.X4DriverGet(setting=X4Setting.DACMAX))
 
 
 def test_anything_but_a_pong_is_no_pong(driver_on: DriverOn) -> None:
