@@ -16,6 +16,7 @@ from xethru_protocol.recordings import (
     RecordingError,
     RecordingFacts,
     RecordingFault,
+    RecordingReader,
     RecordingWriter,
     Split,
     WireCapture,
@@ -73,6 +74,56 @@ def test_vendor_directories_give_back_what_was_written(
                 assert writer.write(message, t_ns)
         if timed:
             assert payloads(list(read_recording(path))) == payloads(timed)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    timed=stored_messages(),
+    files=st.none() | st.integers(1, 3),
+    directories=st.none() | st.integers(1, 3),
+    header=st.binary(max_size=5),
+    data=st.data(),
+)
+def test_single_records_are_those_of_the_stream(
+    timed: list[tuple[m.Response, int | None]],
+    files: int | None,
+    directories: int | None,
+    header: bytes,
+    data: st.DataObject,
+) -> None:
+    """Seeks against a search through all records."""
+    if not timed:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        with RecordingWriter(
+            folder,
+            user_header=header,
+            split=Split(records=files),
+            split_directories=None if directories is None else Split(records=directories),
+            timezone=UTC,
+        ) as writer:
+            for message, t_ns in timed:
+                assert t_ns is not None
+                assert writer.write(message, t_ns)
+        with RecordingReader(folder) as reader:
+            records = list(reader)
+            found = [(record.message, record.t_ns) for record in records]
+            assert payloads(list(found)) == payloads(timed)
+            assert payloads(list(read_recording(folder))) == payloads(timed)
+            assert reader.duration_ns == records[-1].t_ns - records[0].t_ns
+            position_ms = data.draw(st.integers(0, reader.duration_ns // MS))
+            reader.seek_ms(position_ms)
+            later = [one for one in records if one.t_ns >= reader.start_ns + position_ms * MS]
+            assert reader.peek().position == later[0].position
+            position = data.draw(st.integers(0, reader.size_bytes))
+            reader.seek_byte(position)
+            behind = [one for one in records if one.position + len(one.data) > position]
+            assert reader.at_end == (not behind)
+            wanted = type(data.draw(st.sampled_from(timed))[0])
+            reader.set_filter(wanted)
+            assert [one.position for one in reader] == [
+                one.position for one in behind if isinstance(one.message, wanted)
+            ]
 
 
 def test_every_stored_kind_is_a_response_of_the_table() -> None:

@@ -180,7 +180,8 @@ class _Part:
         stem = f"{base}_{_local_time(time_ms, self.options.timezone):%Y%m%d_%H%M%S}"
         name = stem + kind.suffix
         again_ms = time_ms % 1000
-        while name in self.meta.files:  # several files within one second
+        # Several files within one second; the vendor's recorder takes the time of their end.
+        while name in self.meta.files:
             name = f"{stem}_{again_ms:03d}ms{kind.suffix}"
             again_ms += 1
         file = _DataFile(
