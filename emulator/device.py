@@ -129,7 +129,11 @@ class ChipStream(MessageStream):
 
     def skip_due_before(self, time_ns: int) -> None:
         if self.streaming and self._pace is not Pace.ASAP:
-            self._move_on(time_ns, self._module.chip.timeline.skip_before)
+            chip = self._module.chip
+            first_index = chip.timeline.next_index
+            self._move_on(time_ns, chip.timeline.skip_before)
+            chip.pass_over(first_index)
+            self._note_running()
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Begin with the first frame still ahead when a command started the stream."""

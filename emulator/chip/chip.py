@@ -588,6 +588,22 @@ class Chip:
         self._guard_transmitter(bool(block.is_zero[row]))
         return DataFloat(info=counter & 0xFFFFFFFF, values=block.values[row])
 
+    def pass_over(self, first_index: int) -> None:
+        """Let the guard see the frames from an index to the next, which the host never gets.
+
+        Assumed: frames of the same settings are all zero, or none is; so one is looked at where
+        that is not known.
+        """
+        passed = self.timeline.next_index - first_index
+        if passed <= 0 or (self._block is not None and not self._zero_frames):
+            return
+        self._block = self._synthesise(first_index, 1)
+        is_zero = bool(self._block.is_zero[0])
+        for _ in range(passed if is_zero else 1):
+            self._guard_transmitter(is_zero)
+            if not self.running:
+                return
+
     def _frames_from(self, index: int) -> int:
         if self._block_phase is None:
             return self._block_frames

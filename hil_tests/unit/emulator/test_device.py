@@ -11,7 +11,14 @@ from emulator.device import radar_device
 from emulator.module.memory import Identity
 from emulator.module.module import StreamBegin
 from emulator.module.settings import DeviceOptions
-from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
+from hil_tests.unit.emulator.doubles import (
+    IDENTITY,
+    BareHost,
+    FormulaSource,
+    RampSource,
+    ramp_device,
+    working_point,
+)
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
@@ -350,6 +357,19 @@ def test_commands_wait_behind_one_that_waits(host: BareHost) -> None:
         pongs += sum(isinstance(message, m.Pong) for message in host.hear(50))
     assert pongs == sent // len(ping)
     assert host.device.wants_data
+
+
+@pytest.mark.parametrize("level", [16 * 300 * 152 // 2, 0])
+def test_the_guard_counts_frames_that_a_host_never_gets(level: int) -> None:
+    """8.4: 100 zero frames, although only the first 50 found room in the queue."""
+    source = FormulaSource(lambda index: 0 * index + level)
+    host = BareHost(radar_device(IDENTITY, source, Pace.REALTIME))
+    host.enter_manual()
+    working_point(host.device.module.chip)
+    host.set(X4Setting.FPS, 100.0)
+    for now_ns in range(0, SECOND * 6 // 5, SECOND // 100):  # the host does not read
+        host.device.advance(now_ns)
+    assert host.device.module.chip.running is (level == 0)
 
 
 def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
