@@ -121,15 +121,15 @@ class Progress:
             return
         self._shown_s = now_s
         if self._rewrites:
-            show(rewriting(state(), sys.stderr))
+            show(rewriting(one_line(state()), sys.stderr))
             self._is_open = True
         else:
-            show(f"{self._name}: {state()}\n")
+            warn(f"{self._name}: {state()}")
 
     def finish(self, state: Callable[[], str]) -> None:
         """Bring a rewritten line up to date and end it."""
         if self._is_open:
-            show(rewriting(state(), sys.stderr) + "\n")
+            show(rewriting(one_line(state()), sys.stderr) + "\n")
             self._is_open = False
 
 

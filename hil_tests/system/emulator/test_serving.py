@@ -131,7 +131,10 @@ def test_the_speed_must_fit_and_can_be_changed(
             assert radar.ping() is PongCode.XTS_SPRP_READY
 
 
-def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", ["pty", "tcp"])
+def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(
+    by: str, tmp_path: Path
+) -> None:
     wire = tmp_path / "line.xtwire"
     passed: dict[str, bytes] = {"rx": b"", "tx": b""}
 
@@ -139,8 +142,11 @@ def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(tmp_path
         passed[direction] += data
 
     with (
-        emulator("serve", "--bare") as module,
-        emulator("proxy", "--port", module.paths[0], "--wire", str(wire)) as proxy,
+        emulator("serve", "--bare", "--tcp", "0") as module,
+        emulator(
+            *("proxy", "--wire", str(wire), "--port"),
+            module.paths[0] if by == "pty" else f"tcp://127.0.0.1:{module.tcp_ports[0]}",
+        ) as proxy,
     ):
         with open_radar(proxy.paths[0]) as radar:
             radar.raw_listener = heard

@@ -24,7 +24,7 @@ from xethru_protocol.cli import main
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.transport import open_line
+from xethru_protocol.transport import AsyncSerialTransport, open_line
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
@@ -235,6 +235,47 @@ def test_a_server_that_hangs_up_is_found_again(served: Served) -> None:
             redirector.hang_up()
             with pytest.raises(Disconnected, match="hung up; is the module gone, or has another"):
                 radar.read_frame(seconds(1))
+
+
+@pytest.mark.parametrize("is_cancelled", [False, True])
+def test_other_tasks_go_on_while_a_network_port_is_opened(
+    is_cancelled: bool, served: Served
+) -> None:
+    url = f"tcp://127.0.0.1:{served.tcp_ports[0]}"
+    _opened(url).close()
+    entered, released = threading.Event(), threading.Event()
+    opened: list[AsyncSerialTransport] = []
+
+    def open_slowly(path: str, baudrate: int) -> AsyncSerialTransport:
+        entered.set()
+        assert released.wait(seconds(2)), "the loop was held up"
+        opened.append(AsyncSerialTransport(path, baudrate))
+        return opened[-1]
+
+    async def reconnect() -> None:
+        radar = AsyncX4M300(
+            AsyncSerialTransport(url), clock=patient_ns, open_port=open_slowly, candidates=list
+        )
+        reconnecting = asyncio.create_task(radar.reconnect(seconds(3)))
+        while not entered.is_set():
+            await asyncio.sleep(0.001)
+        if is_cancelled:
+            reconnecting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await reconnecting
+            released.set()
+            while not opened:
+                await asyncio.sleep(0.001)
+            await asyncio.sleep(0)
+        else:
+            released.set()
+            assert await reconnecting == url
+        await radar.close()
+
+    asyncio.run(reconnect())
+    for line in opened:
+        with pytest.raises(Disconnected, match="was closed"):
+            line._port.fileno()
 
 
 @pytest.mark.parametrize(

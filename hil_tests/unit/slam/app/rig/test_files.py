@@ -14,11 +14,20 @@ from emulator.scene.scene import empty_room
 from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from slam.app.errors import AppError
 from slam.app.rig import files as rig_match
-from slam.app.rig.files import RigFile, RigRadar, RigWheels, load_rig, open_rig, write_rig
+from slam.app.rig.files import (
+    RigFile,
+    RigRadar,
+    RigWheels,
+    are_emulated,
+    load_rig,
+    open_rig,
+    write_rig,
+)
 from slam.app.rig.sources import RadarLink
 from slam.config import WheelNoise
 from xethru_protocol.driver.link import Observer, ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.transport import PortInfo
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 RADAR = """\
@@ -220,6 +229,29 @@ def test_a_rig_file_names_ports_itself(bench: Bench, tmp_path: Path) -> None:
     elsewhere = right.model_copy(update={"port": "tcp://nowhere:1"})
     with pytest.raises(AppError, match="tcp://nowhere:1: there is no port"):
         bench.find(rig=RigFile(radars=(left, elsewhere)))
+
+
+@pytest.mark.parametrize(
+    ("port", "is_one"),
+    [
+        ("tcp://127.0.0.1:5000", True),
+        ("socket://localhost:5000", True),
+        ("tcp://127.0.0.1:5001", False),
+        ("tcp://pi:5000", False),
+        ("/dev/ttyACM0", False),
+    ],
+)
+def test_an_emulated_module_is_known_at_its_tcp_port_too(
+    port: str, is_one: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drive with it is not called a real one."""
+    found = PortInfo(path="/x/left", kind="emulated", description="", serial=LEFT, tcp=5000)
+    monkeypatch.setattr(rig_match, "find_ports", lambda: (found,))
+    bench.serials = {port: LEFT, "b": RIGHT}
+    links = bench.find(port, "b")
+    assert are_emulated(links) is is_one
+    for link in links:
+        link.driver.close()
 
 
 @pytest.mark.parametrize(
