@@ -14,6 +14,7 @@ from hil_tests.device.serving import emulator
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.recordings.messages import dumped, xethru
 from xethru_protocol.cli import main
+from xethru_protocol.recordings import recording_facts
 
 pytestmark = pytest.mark.slow
 
@@ -98,6 +99,26 @@ def test_outputs_of_a_profile(tmp_path: Path, capsys: Capture) -> None:
         "PRESENCE_MOVINGLIST",
         "PULSEDOPPLER_FLOAT",
     }
+
+
+def test_respiration_of_an_x4m200(tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "recording"
+    setup = ["--profile", "respiration", "--output", "status,movinglist", "--zone", "0.4", "2"]
+    with emulator("serve", "--bare", "--model", "x4m200", "--pace", "asap") as served:
+        command = ["record", "--port", served.paths[0], "--out", str(out)]
+        assert main([*command, *setup, "--count", "4"]) == 0
+        # what an X4M300 has and this one has not
+        capsys.readouterr()
+        assert main([*command, "--profile", "presence", "--force"]) == 1
+    assert "does not load the profile presence, which an X4M300 has" in capsys.readouterr().err
+    messages = dumped(capsys, out)
+    assert [message["message"] for message in messages] == [
+        *("RESP_STATUS", "RESPIRATION_MOVINGLIST"),
+        *("RESP_STATUS", "RESPIRATION_MOVINGLIST"),
+    ]
+    facts = recording_facts(out)
+    assert facts.profile_id == 0x064E57AD
+    assert facts.parameter_file
 
 
 def test_unplugging_keeps_what_came(tmp_path: Path, capsys: Capture) -> None:
