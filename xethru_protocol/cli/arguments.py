@@ -264,7 +264,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         type=not_empty,
         action="append",
         default=[],
-        help="examine this port; may be given several times (default: all that are found)",
+        help="examine this port, also tcp:// or rfc2217://; may be given several times (default: "
+        "all that are found)",
     )
     _add_json(one)
     for name, about, run in (

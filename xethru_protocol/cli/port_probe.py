@@ -107,7 +107,7 @@ class _Attributes(dict[str, object]):
         value = getattr(self._named, name)
         if isinstance(value, tuple):
             return shlex.join(map(str, value))
-        return shlex.quote(value) if isinstance(value, str) else value
+        return shlex.quote(str(value)) if isinstance(value, str | Path) else value
 
 
 _LONGEST_NAME = 60

@@ -178,6 +178,7 @@ def _opened(url: str, reconnect_s: float = 0.0) -> X4M300:
     return radars[0]
 
 
+@pytest.mark.slow
 def test_both_drivers_stream_over_every_kind_of_port(url: str, served: Served) -> None:
     with _opened(url) as radar:
         assert radar.info().serial_number == served.serials[0]
@@ -207,6 +208,7 @@ def test_both_drivers_stream_over_every_kind_of_port(url: str, served: Served) -
     assert counters == list(range(counters[0], counters[0] + 20))
 
 
+@pytest.mark.slow
 def test_the_baud_rate_is_set_on_the_server_too() -> None:
     """The emulated UART answers only a host whose own side has the module's rate."""
     with (
@@ -221,6 +223,7 @@ def test_the_baud_rate_is_set_on_the_server_too() -> None:
         assert redirector.baudrates[-1] == 921600
 
 
+@pytest.mark.slow
 def test_a_server_that_hangs_up_is_found_again(served: Served) -> None:
     with closing(Redirector(served.paths[0])) as redirector:
         with _opened(redirector.url, reconnect_s=seconds(5)) as radar:
@@ -237,6 +240,7 @@ def test_a_server_that_hangs_up_is_found_again(served: Served) -> None:
                 radar.read_frame(seconds(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_cancelled", [False, True])
 def test_other_tasks_go_on_while_a_network_port_is_opened(
     is_cancelled: bool, served: Served
@@ -318,6 +322,7 @@ def test_plain_tcp_is_no_rfc2217(monkeypatch: pytest.MonkeyPatch) -> None:
             open_line(f"rfc2217://127.0.0.1:{number}")
 
 
+@pytest.mark.slow
 def test_doctor_examines_a_network_port(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
     url = f"tcp://127.0.0.1:{served.tcp_ports[0]}"
     _opened(url).close()
