@@ -877,7 +877,9 @@ class PacketReader:
         resume = fitting[behind] if behind < len(fitting) else end + 1
         if good and len(content) > MAX_NORMAL_BYTES:
             return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES, resume)
-        kind = FaultKind.EMPTY if good or not content else FaultKind.CHECKSUM
+        inside = self._buffer[at + 1 : min(stop, at + 4)]
+        is_empty = len(inside) <= 2 and unescape(inside) in (b"", b"\x7d")
+        kind = FaultKind.EMPTY if is_empty else FaultKind.CHECKSUM
         return self._reject(kind, first, end + 1, resume)
 
     def _accept_normal(

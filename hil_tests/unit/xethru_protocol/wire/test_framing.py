@@ -77,6 +77,10 @@ def test_wrong_length_field_is_not_waited_for(length: int) -> None:
         (b"\x00\x01" + ACK + b"\x02" + ACK, [(FaultKind.GARBAGE, 0), (FaultKind.GARBAGE, 6)]),
         (b"\x7d\x10\x6c\x7e" * 2 + ACK, [(FaultKind.CHECKSUM, 0), (FaultKind.CHECKSUM, 4)]),
         (b"\x7d\x10" + ACK, [(FaultKind.TRUNCATED, 0)]),
+        (
+            b"\x7d\x01" + encode_no_escape(b"\x10") + b"\x7f\x7d\x05\x06\x7e" + ACK,
+            [(FaultKind.CHECKSUM, 0), (FaultKind.GARBAGE, 12), (FaultKind.CHECKSUM, 13)],
+        ),
         (b"\x7c" * 50 + ACK, [(FaultKind.HEADER, 0)]),
         (b"\x7d" + bytes(MAX_NORMAL_WIRE_BYTES) + ACK, [(FaultKind.OVERSIZE, 0)]),
     ],
