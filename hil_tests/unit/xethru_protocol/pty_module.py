@@ -168,7 +168,7 @@ class PtyMachine:
     def __init__(self, runtime: Path) -> None:
         self._folder = runtime / "ports"
         self._folder.mkdir()
-        (runtime / "xethru").mkdir()
+        (runtime / "xethru").mkdir(mode=0o700)
         names = ("home", "decoy", "elsewhere")
         devices = [{"path": self.path(name), "name": name, "serial": "?"} for name in names]
         announced = json.dumps({"pid": os.getpid(), "devices": devices})

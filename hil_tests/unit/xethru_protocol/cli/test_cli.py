@@ -94,7 +94,7 @@ def emulated_ports(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the folder in which emulators are registered."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    (tmp_path / "xethru").mkdir()
+    (tmp_path / "xethru").mkdir(mode=0o700)
     return tmp_path / "xethru"
 
 

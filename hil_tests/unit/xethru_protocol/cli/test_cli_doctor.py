@@ -380,7 +380,7 @@ def test_what_dead_emulators_left(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "xethru"
-    folder.mkdir()
+    folder.mkdir(mode=0o700)
     dead = 1 << 22  # above any process id
     stale = [folder / f"{dead}.json", folder / f"ports-{dead}-abc"]
     stale[0].write_text("{}")
@@ -398,7 +398,7 @@ def test_what_dead_emulators_left(
 def test_all_found_ports_are_examined(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "xethru").mkdir()
+    (tmp_path / "xethru").mkdir(mode=0o700)
     with PtyModule(stock()) as module:
         device = {"path": module.path, "name": "left", "serial": "1", "tcp": None}
         word = json.dumps({"pid": os.getpid(), "ready": True, "devices": [device]})
