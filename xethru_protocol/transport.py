@@ -24,6 +24,7 @@ import socket
 import stat
 import tempfile
 import termios
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -38,6 +39,7 @@ from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 _CHUNK_BYTES = 65536
 _WRITE_TIMEOUT_S = 5.0
+_LOOK_AGAIN_S = 0.005  # whether another thread has read what is waited for
 _TURN_S = 0.005  # how long one task of asyncio may read on while data never end
 _LONGEST_WAIT_S = 86400.0  # poll() takes 31 bits of milliseconds; a caller waits again
 _BAUD = 115200  # what a UART module starts with; without meaning on USB and ptys
@@ -271,6 +273,7 @@ class Rfc2217Transport(SocketTransport):
         self._held = b""  # an incomplete telnet command
         self._came = b""  # read while an answer about the line was waited for
         self._outgoing = bytearray()
+        self._flushing = threading.Lock()  # the thread that reads answers telnet commands
         self._offered = {(verb, option) for verb in (_WILL, _DO) for option in _OPTIONS}
         self._answers: dict[int, bytes] = {}
         self._speaks = False  # the server knows RFC 2217
@@ -339,8 +342,9 @@ class Rfc2217Transport(SocketTransport):
         return data
 
     def _flush(self) -> None:
-        if self._outgoing:
-            del self._outgoing[: super().write_some(bytes(self._outgoing))]
+        with self._flushing:
+            if self._outgoing:
+                del self._outgoing[: super().write_some(bytes(self._outgoing))]
 
     def _wait(self, done: Callable[[], bool]) -> bool:
         """Receive until ``done()``; False if that did not happen in time."""
@@ -353,6 +357,9 @@ class Rfc2217Transport(SocketTransport):
                 return False
             try:
                 data = super()._take() if self._readable.poll(_whole_ms(left_s)) else None
+            except RuntimeError:  # another thread waits for the line, and takes the answer, too
+                time.sleep(_LOOK_AGAIN_S)
+                continue
             except OSError as error:
                 raise Disconnected(self._lost()) from error
             if data == b"":

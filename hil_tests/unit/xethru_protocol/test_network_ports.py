@@ -4,6 +4,7 @@ Expected bytes are those of RFC 854 and RFC 2217.
 """
 
 import asyncio
+import concurrent.futures
 import contextlib
 import math
 import shutil
@@ -20,6 +21,7 @@ from serial import rfc2217
 
 from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import patient_ns, seconds, wait_until
+from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.link import RawConfig
@@ -221,6 +223,22 @@ def test_the_baud_rate_is_set_on_the_server_too() -> None:
         assert radar.ping() is PongCode.XTS_SPRP_READY
         assert radar._transport.bytes_per_s == 92160.0  # type: ignore[attr-defined]
         assert redirector.baudrates[-1] == 921600
+
+
+def test_the_baud_rate_is_set_while_another_thread_reads() -> None:
+    with (
+        PtyModule() as module,
+        closing(Redirector(module.path)) as redirector,
+        _opened(redirector.url) as radar,
+        concurrent.futures.ThreadPoolExecutor() as threads,
+    ):
+        radar.configure_raw()
+        reading = threads.submit(radar.read_frame, seconds(60))
+        for rate in (230400, 921600, 460800):
+            radar.set_baud_rate(rate)
+        radar.start(17.0)
+        assert reading.result(seconds(60)).counter == 0
+        assert redirector.baudrates[-3:] == [230400, 921600, 460800]
 
 
 @pytest.mark.slow

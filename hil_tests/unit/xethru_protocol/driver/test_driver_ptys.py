@@ -1,6 +1,7 @@
 """Both drivers on real ports: modules that vanish and return, and several asyncio tasks."""
 
 import asyncio
+import concurrent.futures
 import functools
 import os
 import pty
@@ -79,6 +80,35 @@ def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, n
         assert all(isinstance(c, m.Ping | m.SystemGetInfo) for c in machine.received("decoy"))
         assert machine.received("decoy") or name == "home"
         assert m.X4DriverSet(setting=X4Setting.FPS, value=17.0) in machine.received(name)
+
+
+@pytest.mark.parametrize("name", ["home", "elsewhere"])
+def test_it_does_too_while_threads_use_it(machine: PtyMachine, name: str) -> None:
+    with X4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0) as radar:
+        radar.configure_raw()
+        radar.start(17.0)
+        assert radar.read_frame().counter == 0
+        pongs = 0
+
+        def ask() -> None:
+            nonlocal pongs
+            while radar.reconnects == 0:
+                radar.ping()
+            radar.ping()
+            pongs += 1
+
+        with concurrent.futures.ThreadPoolExecutor() as threads:
+            asking = [threads.submit(ask) for _ in range(2)]
+            machine.unplug("home")
+            timer = return_as(machine, name)
+            while radar.read_frame().stream == 0:
+                pass
+            streams = {got.stream for got in radar.frames(5)}
+            for one in asking:
+                one.result(seconds(30))
+        timer.join()
+        assert (radar.port, radar.reconnects, streams) == (machine.path(name), 1, {1})
+        assert pongs == 2
 
 
 @pytest.mark.parametrize("name", ["home", "elsewhere"])
