@@ -172,6 +172,21 @@ def test_init_ends_the_stream(radar: X4M300) -> None:
     assert late <= 2
 
 
+def test_the_counter_begins_at_1_with_init_and_goes_on_after_a_pause(radar: X4M300) -> None:
+    """Protocol reference 6.1; that the first is 1 was read in microcode, not yet on a wire."""
+    radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
+    radar.start(17.0)
+    assert [frame.counter for frame in radar.frames(3)] == [1, 2, 3]
+    radar.stop()
+    radar.start(17.0)
+    # frames that the host did not read were swept, too
+    assert radar.read_frame().counter > 3
+    radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
+    radar.start(17.0)
+    assert radar.read_frame().counter == 1
+    radar.stop()
+
+
 def test_a_host_that_pauses_gets_whole_frames_afterwards(
     radar: X4M300, radar_place: RadarUnderTest
 ) -> None:
