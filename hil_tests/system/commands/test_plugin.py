@@ -89,7 +89,7 @@ def test_strict_fails_where_a_capability_is_missing(tmp_path: Path, address: str
     done = run(tmp_path, *baud, "--hil-strict")
     assert done.returncode == 1
     assert "--hil-strict: tcp-127.0.0.1" in done.stdout
-    assert "needs uart (USB, TCP and pseudo-terminals have no baud rate)" in done.stdout
+    assert "needs uart (USB, tcp:// and pseudo-terminals have no baud rate)" in done.stdout
 
 
 def test_a_planted_bug_is_caught_and_its_artefacts_show_it(tmp_path: Path, address: str) -> None:
