@@ -735,10 +735,11 @@ def _baseband_values(
 ) -> NDArray[np.float32]:
     taps = CHANNELS[settings.tx_center_frequency]
     i_raw, q_raw = downconvert(raw, taps, area.first_index % 2)
-    scale = np.float32(taps.absolute_sum)
-    quantum = np.float32(_normalisation(settings).quantum)
-    i_values = i_raw.astype(np.float32) * quantum / scale
-    q_values = -(q_raw.astype(np.float32) * quantum / scale)
+    # the driver multiplies both factors first, each step in float32
+    per_sum = np.float32(1.0) / np.float32(taps.absolute_sum)
+    factor = np.float32(_normalisation(settings).quantum) * per_sum
+    i_values = i_raw.astype(np.float32) * factor
+    q_values = -(q_raw.astype(np.float32) * factor)
     return np.concatenate([i_values, q_values], axis=1)
 
 

@@ -39,8 +39,9 @@ class Lattice:
     """The float32 values that counters of one setting become, by the firmware's arithmetic.
 
     RF: ``counter * quantum - dac_offset`` for the counters 0 ... ``max_counter``. Baseband:
-    ``counter * quantum / tap_sum`` for sums of counters weighted by taps of total 0, so from
-    ``-max_counter`` to ``max_counter``; Q is sent with the opposite sign, which is the same set.
+    ``counter * quantum`` for sums of counters weighted by taps of total 0, so from
+    ``-max_counter`` to ``max_counter``; the firmware has multiplied the quantum by 1 / ``tap_sum``
+    before. Q is sent with the opposite sign, which is the same set.
     Every step rounds to float32; a compiler may have fused RF's product and difference, so the
     value rounded once is accepted, too.
 
@@ -97,12 +98,12 @@ class Lattice:
         largest = unit.max_counter * tap_sum // 2 if downconversion else unit.max_counter
         smallest = -largest if downconversion else 0
         offset = 0.0 if downconversion else unit.dac_offset
-        quantum, divisor = np.float32(unit.quantum), np.float32(tap_sum)
+        quantum = np.float32(unit.quantum) * (np.float32(1.0) / np.float32(tap_sum))
         unbounded = cls(
             quantum=quantum,
             dac_offset=np.float32(offset),
-            tap_sum=divisor,
-            scale=divisor / quantum,
+            tap_sum=np.float32(tap_sum),
+            scale=np.float32(1.0) / quantum,
             min_counter=smallest,
             max_counter=largest,
             lowest=-math.inf,
@@ -150,9 +151,7 @@ class Lattice:
     def _values(self, counters: Float32s) -> Float32s:
         """Compute the samples of counters; each step rounds to float32, as in the firmware."""
         values = counters * self.quantum
-        if self.tap_sum != 1.0:
-            values /= self.tap_sum
-        else:
+        if self.tap_sum == 1.0:
             values -= self.dac_offset
         return values
 
@@ -178,7 +177,7 @@ class Lattice:
 
     def _count_neighbours(self, samples: Float32s) -> int:
         """Count samples that a counter near the most likely one gives, or the fused arithmetic."""
-        scale = float(self.tap_sum) / float(self.quantum)
+        scale = 1.0 / float(self.quantum)
         middle: NDArray[np.float64] = np.rint(
             (samples.astype(np.float64) + float(self.dac_offset)) * scale
         )

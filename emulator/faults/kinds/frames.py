@@ -229,7 +229,7 @@ def off_lattice_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Cont
     lattice = context.lattice
     if lattice is None:
         return None
-    half = np.float32(lattice.quantum / lattice.tap_sum / 2)
+    half = np.float32(lattice.quantum / 2)
     highest = np.float32(lattice.highest)
 
     def between(samples: Samples) -> Samples:

@@ -90,16 +90,16 @@ def test_baseband_samples_are_sums_over_the_filter(tx_center_frequency: int, tap
         downconversion=True,
         tx_center_frequency=tx_center_frequency,
     )
-    quantum, scale = np.float32(1 / 1024), np.float32(taps)
+    factor = np.float32(1 / 1024) * (np.float32(1) / np.float32(taps))
     sums = np.arange(-8 * taps // 2, 8 * taps // 2 + 1).astype(np.float32)
-    i = sums * quantum / scale
+    i = sums * factor
     assert where.off_lattice(i) == 0
     assert where.off_lattice(-i) == 0
     between = np.nextafter(i[i > 0], np.float32(9))
     assert where.off_lattice(between) == between.size
     # +-N/2048 = +-8/2048 is the end of the range
     assert where.off_lattice(float32s(8 / 2048, -8 / 2048)) == 0
-    assert where.off_lattice((sums[-1:] + np.float32(1)) * quantum / scale) == 1
+    assert where.off_lattice((sums[-1:] + np.float32(1)) * factor) == 1
 
 
 def test_what_lies_beyond_the_range_or_is_no_number_is_off_the_lattice() -> None:
@@ -134,13 +134,47 @@ def test_fused_arithmetic_is_on_the_lattice_and_its_neighbours_are_not() -> None
     assert lattice().off_lattice(beside) == np.count_nonzero(beside != separate)
 
 
+@pytest.mark.parametrize(
+    ("setting", "i", "q"),
+    [
+        (
+            3,
+            (6.64870992e-10, 8.20783225e-06, 0.000820827787, 0.0111546842),
+            (-2.04115395e-07, 6.64864347e-05, 0.00508913584, -0.00997306593),
+        ),
+        (
+            4,
+            (6.43830766e-10, 7.94809057e-06, 0.000794852211, 0.0108016878),
+            (-1.9765605e-07, 6.43824314e-05, 0.00492808735, -0.00965746213),
+        ),
+    ],
+)
+def test_baseband_samples_are_those_of_the_compiled_driver(
+    setting: int, i: tuple[float, ...], q: tuple[float, ...]
+) -> None:
+    """9.7, of the counters below, by the vendor's x4driver.c compiled with its firmware's flags.
+
+    It multiplies the quantum and 1 / S first; dividing by S last gives other last bits.
+    """
+    samples = float32s(*i, *q)
+    counters = float32s(1, 12345, 1234567, 16777217, -307, 99999, 7654321, -15000001)
+    where = lattice(downconversion=True, tx_center_frequency=setting)
+    assert where.off_lattice(samples) == 0
+    np.testing.assert_array_equal(where.nearest(samples), samples)
+    taps = {3: 306, 4: 316}[setting]
+    factor = np.float32(2.03450526e-07) * (np.float32(1) / np.float32(taps))
+    np.testing.assert_array_equal(counters * factor, samples)
+    beside = np.nextafter(samples[:2], np.float32(9))
+    assert where.off_lattice(beside) == 2
+
+
 def test_counters_beyond_float32_are_left_out_where_the_verdict_is_clear() -> None:
     """At least so many: baseband counters reach 1e8, and samples of those above 2**21 take long."""
     where = lattice(downconversion=True)
     quantum = np.float32(2.03450526e-07)
     sums = np.linspace(-(1 << 20), 1 << 20, 300).astype(np.int32).astype(np.float32)
     large = np.array([1 << 24, (1 << 24) + 2, 3 << 23], np.float32)
-    on = np.concatenate([sums, large]) * quantum / np.float32(306)
+    on = np.concatenate([sums, large]) * (quantum * (np.float32(1) / np.float32(306)))
     assert where.off_lattice(on) == 0
     off = np.nextafter(on, np.float32(9))
     assert where.off_lattice(off[:300]) == 300
