@@ -79,8 +79,9 @@ _LONG_COMMANDS = (
 )
 
 ASAP_BLOCK = 32
-# Radars in step refill at the same moment: four blocks of 8 cost 2 ms, four of 32 cost 7 ms.
-REALTIME_BLOCK = 8
+# Radars in step refill at the same moment: four blocks of 16 cost 3 ms, four of 32 cost 7 ms.
+# In blocks of 8 a frame costs half as much again.
+REALTIME_BLOCK = 16
 _CLOCK_TOLERANCE_NS = 2
 
 
