@@ -24,6 +24,8 @@ from xethru_protocol.wire.codes import (
 
 _VERSION = re.compile(r"(\d+)\.(\d+)\.(\d+)(?:-([a-z]+)(?:\.(\d+))?)?")
 _BASE = "XEP"
+# What the sensor firmware calls itself: before 1.3.1 as the product (Protocol reference 17).
+_SENSORS = ("Annapurna", "X4M300", "X4M200", "X4M210")
 Key = tuple[int, int, int, bool, str, int]
 Concerns = Callable[[Any], bool]
 
@@ -56,12 +58,17 @@ class Firmware:
         Firmware(sensor='1.6.8', xep='3.4.8')
         >>> Firmware.of_list("XEP:3.4.8;X4C51:2.1.0")
         Firmware(sensor=None, xep='3.4.8')
+
+        An application of somebody else on XEP has versions of its own, which say nothing here:
+
+        >>> Firmware.of_list("Lidar:0.1.0;XEP:3.4.8")
+        Firmware(sensor=None, xep='3.4.8')
         """
         words = re.split("[;:]", version_list)
         versions = dict(zip(words[::2], words[1::2], strict=False))
         xep = versions.get(_BASE)
         return cls(
-            sensor=words[1] if len(words) > 1 and words[0] != _BASE else None,
+            sensor=next((versions[name] for name in _SENSORS if name in versions), None),
             xep=xep if xep and version_key(xep) else None,
         )
 
@@ -69,6 +76,11 @@ class Firmware:
     def name(self) -> str:
         """How messages call it."""
         return f"XEP {self.xep}" if self.sensor is None else f"sensor firmware {self.sensor}"
+
+    @property
+    def is_released(self) -> bool:
+        """Whether its versions are those of a release, of which the table is certain."""
+        return self.sensor in {None, *SENSOR_VERSIONS} and self.xep in {None, *XEP_VERSIONS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +109,7 @@ class Difference:
     is_fault: bool = False
 
     def is_in(self, firmware: Firmware) -> bool:
-        """Whether a module has it as today; of a version nobody knows it is assumed."""
+        """Whether a module has it as today; assumed of a text that is no version."""
         for since, has in ((self.sensor, firmware.sensor), (self.xep, firmware.xep)):
             oldest = None if since is None else version_key(since)
             version = None if has is None else version_key(has)

@@ -45,6 +45,26 @@ def test_a_module_that_tells_no_version_is_asked_anything(driver_on: DriverOn) -
         radar.request(m.GetSensitivity())
 
 
+@pytest.mark.parametrize(
+    "version_list",
+    [
+        "Annapurna:1.5.10-rc.1;XEP:3.3.0",  # before the release that is the first with it
+        "Annapurna:1.5.3;XEP:3.1.0",
+        "Annapurna:1.4.7-dev;XEP:3.0.0",
+        "Annapurna:1.4.7;XEP:3.1.0",
+        "Annapurna:9.0.0;XEP:9.0.0",
+        "Annapurna:new;XEP:old",
+        "Lidar:0.1.0;XEP:3.4.8",  # an application on XEP that is not the vendor's
+        "DSP:1.0.0;XEP:3.4.8",
+    ],
+)
+def test_firmware_that_is_no_release_answers_for_itself(
+    driver_on: DriverOn, version_list: str
+) -> None:
+    radar, _ = driver_on(module_with(version_list))
+    assert radar.request(m.GetSensitivity()).values == (5,)
+
+
 def test_files_need_an_xep_that_has_them(driver_on: DriverOn) -> None:
     radar, _ = driver_on(module_with("X4M300:1.0.7;XEP:1.0.5"))
     with pytest.raises(OldFirmwareError, match=r"needs XEP 1\.1\.0-beta or newer \(files\)"):
