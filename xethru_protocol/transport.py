@@ -82,8 +82,8 @@ class LineTransport:
 
     def __init__(self, name: str, descriptor: int) -> None:
         self.name = name
-        self._fd = descriptor
         self._wake, self._waker = os.pipe()  # ends the wait of another thread
+        self._fd = descriptor
         # select(), which pyserial's write uses, cannot wait on descriptors above 1023
         self._readable, self._writable = select.poll(), select.poll()
         self._readable.register(self._fd, select.POLLIN)
@@ -159,6 +159,11 @@ class LineTransport:
             os.write(self._waker, b"!")
             os.close(self._waker)
             os.close(self._wake)
+
+    def __del__(self) -> None:
+        # a pseudo-terminal would stay exclusive, and the two descriptors open
+        if getattr(self, "_fd", -1) >= 0:  # missing if the line could not be opened
+            self.close()
 
     def _lost(self) -> str:
         return f"{self.name} was closed" if self._fd < 0 else f"{self.name} {self._gone}"

@@ -1,5 +1,6 @@
 """Records what a driver receives while the program goes on using it."""
 
+import threading
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -93,6 +94,8 @@ class Recorder:
         self._since_1970_ns = 0
         self._writer: RecordingWriter | None = None
         self._before: Listener | None = None
+        # One thread may stop it while another receives; a callback of a file may stop it, too.
+        self._lock = threading.RLock()
 
     def __enter__(self) -> Self:
         self.start()
@@ -112,21 +115,22 @@ class Recorder:
             self._folder, session_id, time.time_ns(), options.get("timezone")
         )
         self._writer = RecordingWriter(self.directory, **options)
-        self._before = self._radar.listener
-        self._radar.listener = self._take
+        if self._radar.listener != self._take:  # one that stayed behind another recorder's
+            self._before = self._radar.listener
+            self._radar.listener = self._take
 
     def stop(self) -> None:
         """Complete the files; calling it again does nothing."""
-        writer, self._writer = self._writer, None
-        if writer is None:
-            return
-        if self._radar.listener == self._take:
-            self._radar.listener = self._before
-        self._before = None
-        try:
-            writer.close()
-        except RecordingError as error:
-            self._fail(error)
+        with self._lock:
+            writer, self._writer = self._writer, None
+            if writer is None:
+                return
+            if self._radar.listener == self._take:
+                self._radar.listener = self._before
+            try:
+                writer.close()
+            except RecordingError as error:
+                self._fail(error)
 
     def is_recording(self, kind: type[Response] | None = None) -> bool:
         """Whether messages are stored, or those of one type."""
@@ -138,11 +142,12 @@ class Recorder:
         return kind in KIND_OF_MESSAGE and (self._kinds is None or kind in self._kinds)
 
     def _take(self, message: Response, arrival_ns: int) -> None:
-        if self._writer is not None and self.failure is None and self._is_wanted(type(message)):
-            try:
-                self.messages += self._writer.write(message, arrival_ns + self._since_1970_ns)
-            except RecordingError as error:
-                self._fail(error)
+        with self._lock:
+            if self._writer is not None and self.failure is None and self._is_wanted(type(message)):
+                try:
+                    self.messages += self._writer.write(message, arrival_ns + self._since_1970_ns)
+                except RecordingError as error:
+                    self._fail(error)
         if self._before is not None:
             self._before(message, arrival_ns)
 

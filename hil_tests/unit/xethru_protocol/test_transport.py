@@ -1,6 +1,7 @@
 """Serial transport on pseudo-terminals."""
 
 import fcntl
+import gc
 import math
 import os
 import pty
@@ -65,6 +66,18 @@ def test_port_is_exclusive_until_it_is_closed(line: Line) -> None:
     port = SerialTransport(line.path)
     assert is_exclusive(port.fileno())
     port.close()
+    other = os.open(line.path, os.O_RDWR | os.O_NOCTTY)
+    assert not is_exclusive(other)
+    os.close(other)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whether a port is exclusive")
+def test_a_port_that_is_dropped_is_as_free_as_a_closed_one(line: Line) -> None:
+    before = set(os.listdir("/proc/self/fd"))
+    port = SerialTransport(line.path)
+    del port
+    gc.collect()
+    assert set(os.listdir("/proc/self/fd")) == before
     other = os.open(line.path, os.O_RDWR | os.O_NOCTTY)
     assert not is_exclusive(other)
     os.close(other)

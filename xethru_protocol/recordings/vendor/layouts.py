@@ -560,7 +560,7 @@ def _parse_files(data: bytes, position: int) -> list[str] | None:
     position += _FILES.size
     while kind == _FILE_LIST and len(names) < count:
         name, position = _name_at(data, position)
-        if not name:
+        if not name or "\0" in name:
             return None
         names.append(name)
     return names if kind == _FILE_LIST else None

@@ -1,5 +1,6 @@
 """A recorder takes what a driver receives, and leaves the driver as it was."""
 
+import threading
 import time
 from collections.abc import Iterator
 from datetime import UTC
@@ -9,7 +10,10 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.loopback import LoopbackTransport
+from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import ramp_device
+from hil_tests.unit.xethru_protocol.recordings.messages import frame
+from xethru_protocol.driver.link import Listener
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
     Recorder,
@@ -113,6 +117,51 @@ def test_a_listener_set_meanwhile_stays(
     with Recorder(radar, tmp_path, clock=line.clock_ns):
         radar.listener = later
     assert radar.listener is later
+
+
+def test_recorders_end_in_any_order(radar: X4M300, line: LoopbackTransport, tmp_path: Path) -> None:
+    heard: list[int] = []
+    radar.listener = lambda message, t_ns: heard.append(t_ns)
+    first, second = (
+        Recorder(radar, tmp_path, clock=line.clock_ns, session_id=name) for name in ("a", "b")
+    )
+    first.start()
+    second.start()
+    first.stop()
+    radar.ping()
+    assert len(heard) == 1
+    second.stop()
+    first.start()
+    radar.ping()
+    assert len(heard) == 2
+    first.stop()
+
+
+def test_another_thread_stops_a_recorder_between_two_records(tmp_path: Path) -> None:
+    radar = Radar()
+    stops: list[threading.Thread] = []
+
+    def stop_meanwhile(kind: type[m.Response], path: Path) -> None:
+        if not stops:
+            stops.append(threading.Thread(target=recorder.stop))
+            stops[0].start()
+            stops[0].join(0.1)
+
+    recorder = Recorder(radar, tmp_path, split=Split(seconds=1), on_file=stop_meanwhile)
+    recorder.start()
+    for second in (1, 3):
+        assert radar.listener is not None
+        radar.listener(frame(second), second * 10**9)
+    stops[0].join(seconds(30))
+    assert recorder.failure is None
+    assert radar.listener is None
+    assert counters(recorder.directory) == [1, 3]
+
+
+class Radar:
+    """Something that is listened to."""
+
+    listener: Listener | None = None
 
 
 def test_an_error_ends_the_recording_and_not_the_driver(
