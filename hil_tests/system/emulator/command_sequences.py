@@ -7,7 +7,9 @@ within the time that the reference allows, be of the right class, and come once.
 module must still send raw frames and, if it has profiles, presence messages. Then the emulator
 gets SIGTERM right behind one more command.
 
-    python -m hil_tests.system.emulator.command_sequences --count 1000 --seed 0
+    XETHRU_TEST_PATIENCE=1 python -m hil_tests.system.emulator.command_sequences --seed 0
+
+With patience 1, for an idle machine, the limits are the reference's own.
 """
 
 from __future__ import annotations
