@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emulator.chip import Pace
 from emulator.chip.chip import CaptureSettings
-from emulator.device import Device, radar_device
+from emulator.device import REALTIME_BLOCK, Device, radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, SensorMode
@@ -24,9 +24,9 @@ from xethru_protocol.wire.connection import Connection, Role
 
 SECOND = 1_000_000_000
 PRESENCE_2 = 0x014D4AB8
-FRAMES_PER_CALL = 24
-"""Eight steps of one visit of a queue may begin three blocks of eight frames."""
-AHEAD_NS = round(8 / 17.049379 * SECOND)
+FRAMES_PER_CALL = 2 * REALTIME_BLOCK
+"""The eight steps of one visit of a queue end one block and begin another."""
+AHEAD_NS = round(REALTIME_BLOCK / 17.049379 * SECOND)
 """By how much a block is ahead of its first frame."""
 RUN, IDLE, MANUAL, STOP = (
     SensorMode.XTID_SM_RUN,
