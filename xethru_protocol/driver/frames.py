@@ -356,9 +356,9 @@ class FrameQueue:
         self._off_lattice = False  # more than half of the newest radar frame
         self._restarted = False
         self._outage_hz = 0.0  # rate of the stream that a broken line cut; 0: none was
-        # counter and arrival [ns] of the first and the newest frame of this stream
+        # counter and arrival [ns] of the first frame of this stream, and of the newest since `clear`
         self._first: tuple[int, int] | None = None
-        self._last: tuple[int, int] = (0, 0)
+        self._last: tuple[int, int] | None = None
         self._baseband_geometry: FrameGeometry | None = None
 
     def __len__(self) -> int:
@@ -375,6 +375,7 @@ class FrameQueue:
         self._frames.clear()
         self._in_burst = False
         self._outage_hz = 0.0
+        self._last = None
         self.break_off()
 
     def break_off(self) -> None:
@@ -484,8 +485,9 @@ class FrameQueue:
 
     def _begin_stream(self, arrival_ns: int) -> None:
         if self._first is not None:  # streams without a frame are not counted
-            away_s = (arrival_ns - self._last[1]) * 1e-9
-            self._statistics.frames_lost += max(round(away_s * self._outage_hz) - 1, 0)
+            if self._last is not None:
+                away_s = (arrival_ns - self._last[1]) * 1e-9
+                self._statistics.frames_lost += max(round(away_s * self._outage_hz) - 1, 0)
             self.stream += 1
         self._first = None
         self._restarted = False
@@ -496,7 +498,7 @@ class FrameQueue:
         """Return the rate of the newest stream: as set, or by its counters; 0 if not known."""
         if self.rate_hz is not None:
             return self.rate_hz
-        if self._first is None:
+        if self._first is None or self._last is None:
             return 0.0
         (first, first_ns), (last, last_ns) = self._first, self._last
         counted = (last - first) % _COUNTER_WRAP

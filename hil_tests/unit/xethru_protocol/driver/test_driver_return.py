@@ -169,6 +169,25 @@ def test_stream_goes_on_after_an_unplug_under_another_name(
     assert any("looking for the module for 20 s" in text for text in radar.warnings)
 
 
+def test_the_time_in_which_the_radar_was_stopped_has_no_frames_to_lose(
+    plugged: DriverOn, machine: Machine
+) -> None:
+    back = PlainModule()
+    back.stream = (frame(1),)
+    machine.plug(HOME, back, from_s=103.0)
+    radar, line = plugged(reconnect_s=20.0)
+    radar.configure_raw()
+    radar.start(17.0)
+    line.say(frame(1))
+    radar.read_frame()
+    radar.stop()
+    line.now_ns = 100 * 10**9
+    radar.start(17.0)
+    unplug(line)
+    assert radar.read_frame().stream == 1
+    assert radar.frames_lost <= 17.1 * 4  # it was 1750
+
+
 @pytest.mark.parametrize("setting", ["FPS", "ITERATIONS"])
 def test_a_setting_that_was_being_changed_is_changed_after_the_outage(
     plugged: DriverOn, machine: Machine, setting: str
