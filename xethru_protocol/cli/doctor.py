@@ -432,7 +432,7 @@ def _other_product(probe: PortProbe) -> str | None:
     PORT_CHECKS,
     "firmware",
     looks_at="the version list",
-    remedy="write the newest firmware, 1.6.8 or later, with the vendor's tool",
+    remedy="write the newest firmware, 1.6.8 or later, with xethru flash or the vendor's tool",
 )
 def _stale_firmware(probe: PortProbe) -> str | None:
     version = probe.info.version

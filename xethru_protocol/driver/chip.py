@@ -116,11 +116,11 @@ class X4Row(Setting[V]):
         if fps is None:
             yield from self._change(link, wanted)
             return
-        # else nobody knows which settings the next frame has; a reconnect is to start them again
+        # else it is not known which settings the next frame has; a reconnect is to start them again
         yield from link.request(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
         try:
             yield from self._change(link, wanted)
-        except DeviceError:
+        except (DeviceError, RemoteProtocolError):
             yield from raw_mode.run_at(link, fps)
             raise
         yield from raw_mode.run_at(link, fps)

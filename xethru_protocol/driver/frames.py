@@ -356,7 +356,7 @@ class FrameQueue:
         self._off_lattice = False  # more than half of the newest radar frame
         self._restarted = False
         self._outage_hz = 0.0  # rate of the stream that a broken line cut; 0: none was
-        # counter and arrival [ns] of the first frame of this stream, and of the newest since `clear`
+        # counter and arrival [ns]: of this stream's first frame, of the newest one since `clear`
         self._first: tuple[int, int] | None = None
         self._last: tuple[int, int] | None = None
         self._baseband_geometry: FrameGeometry | None = None

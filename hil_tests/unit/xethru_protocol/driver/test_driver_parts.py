@@ -248,18 +248,24 @@ def test_a_setting_changed_while_frames_come_stops_them_for_it(emulated: Emulate
     assert getattr(plan, "fps", None) == 17.0
 
 
-def test_frames_go_on_after_a_setting_that_the_module_refuses(raw: Scripted) -> None:
+@pytest.mark.parametrize(
+    ("answer", "error"),
+    [(m.Error(code=1), DeviceError), (m.ReplyInt(content_id=0, values=(1,)), RemoteProtocolError)],
+)
+def test_frames_go_on_after_a_setting_that_the_module_refuses(
+    raw: Scripted, answer: m.Message, error: type[XeThruError]
+) -> None:
     radar, line = raw
     plain = line._answer
 
     def refusing(command: m.Message) -> Sequence[m.Message | bytes]:
         if isinstance(command, m.X4DriverSet) and command.setting is X4Setting.DACMIN:
-            return [m.Error(code=1)]
+            return [answer]
         return plain(command)
 
     line._answer = refusing
     radar.start(17)
-    with pytest.raises(DeviceError):
+    with pytest.raises(error):
         radar.x4.dac_min = 0
     assert getattr(radar._link.plan, "fps", None) == 17.0
     assert line.received[-2] == m.X4DriverSet(setting=X4Setting.FPS, value=17.0)
