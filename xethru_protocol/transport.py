@@ -38,6 +38,7 @@ from serial.tools import list_ports
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 _CHUNK_BYTES = 65536
+_FULL_BYTES, _MOST_PARTS = 2048, 8  # after so many bytes more may wait already; so many calls
 _WRITE_TIMEOUT_S = 5.0
 _LOOK_AGAIN_S = 0.005  # whether another thread has read what is waited for
 _TURN_S = 0.005  # how long one task of asyncio may read on while data never end
@@ -95,7 +96,7 @@ class LineTransport:
             # A line under load has data already, and one call is faster than two.
             data = self._take()
             if data:
-                return data
+                return self._with_more(data)
             if not self._readable.poll(_whole_ms(timeout_s)):
                 return b""
             data = self._take()
@@ -104,6 +105,19 @@ class LineTransport:
         if data == b"":  # readable, yet nothing there: hung up
             raise Disconnected(self._lost())
         return data or b""
+
+    def _with_more(self, data: bytes) -> bytes:
+        """Add what is there already: a pty gives 4095 bytes a call, less than a frame."""
+        parts = [data]
+        while len(parts[-1]) >= _FULL_BYTES and len(parts) < _MOST_PARTS:
+            try:
+                more = self._take()
+            except OSError:  # the next read reports it; what came before is not lost
+                break
+            if not more:
+                break
+            parts.append(more)
+        return b"".join(parts)
 
     def _take(self) -> bytes | None:
         """Take what is there; b"" or None, by the kind of port, if nothing is."""
