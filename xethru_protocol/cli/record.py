@@ -48,6 +48,7 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FileType, MatrixControl, OutputFeature, ProfileId
 from xethru_protocol.wire.errors import (
     DeviceError,
+    OldFirmwareError,
     RemoteProtocolError,
     ResponseTimeout,
     XeThruError,
@@ -180,7 +181,7 @@ class Profile(Listen):
                 f"has: {error}"
             ) from error
         # the vendor's recorder stores this file beside the data; a module need not have it
-        with suppress(DeviceError, RemoteProtocolError):
+        with suppress(DeviceError, OldFirmwareError, RemoteProtocolError):
             self.parameter_file = radar.files.read(FileType.PARAMETER_FILE, 0)
         if self._zone_m is not None:
             zone_m = radar.profile.set_zone(*self._zone_m)
@@ -193,8 +194,9 @@ class Profile(Listen):
     def _set_outputs(self, radar: X4M300, names: Sequence[str]) -> None:
         """Switch others off first: switching one off switches its rival off, too (4.7)."""
         for name, (feature, _) in self._kind.outputs.items():
-            with suppress(DeviceError):  # a module without this output does not send it
-                if name not in names and radar.profile.output(feature):
+            # a module without this output does not send it
+            with suppress(DeviceError, OldFirmwareError):
+                if name not in names and _may_be_on(radar, feature):
                     radar.profile.set_output(feature, 0)
         for name in names:
             try:
@@ -206,6 +208,13 @@ class Profile(Listen):
         radar.profile.run()
         # noise maps alone are sent only now and then
         return 10.0 if self._outputs is None or {*self._outputs} - {*_COMMON_OUTPUTS} else 60.0
+
+
+def _may_be_on(radar: X4M300, feature: OutputFeature) -> bool:
+    try:
+        return radar.profile.output(feature) != 0
+    except OldFirmwareError:  # it has the output perhaps, and no question for it
+        return True
 
 
 _ANSWERS = (

@@ -891,13 +891,20 @@ class Link:
     def set_mode_if_known(self, mode: SensorMode) -> Steps[None]:
         """Change the mode; firmware without modes is always as in MANUAL."""
         try:
-            yield from self.request(m.SetMode(mode=mode), SLOW_TIMEOUT_S)
+            if mode is SensorMode.XTID_SM_STOP:
+                yield from self.stop_profile()
+            else:
+                yield from self.request(m.SetMode(mode=mode), SLOW_TIMEOUT_S)
         except DeviceError as error:
             if error.code != ErrorCode.XTS_SPRE_NOT_RECOGNIZED:  # bare XEP, Protocol reference 8.3
                 self.conversation.report("warning", str(error))
+
+    def stop_profile(self) -> Steps[None]:
+        """Change to mode STOP, which old firmware without a profile does not answer."""
+        try:
+            yield from self.request(m.SetMode(mode=SensorMode.XTID_SM_STOP), SLOW_TIMEOUT_S)
         except ResponseTimeout:
-            stops = mode is SensorMode.XTID_SM_STOP
-            if not stops or STOP_WITHOUT_PROFILE.is_in((yield from self.firmware())):
+            if STOP_WITHOUT_PROFILE.is_in((yield from self.firmware())):
                 raise
 
     def set_baud_rate(self, baudrate: int, *, force: bool = False) -> Steps[None]:

@@ -105,7 +105,7 @@ def load(link: Link, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> Steps
 
 
 def _load(link: Link, profile_id: int) -> Steps[None]:
-    yield from link.request(m.SetMode(mode=SensorMode.XTID_SM_STOP), SLOW_TIMEOUT_S)
+    yield from link.stop_profile()
     yield from link.request(m.LoadApp(profile_id=profile_id), SLOW_TIMEOUT_S)
     link.raw_mode = False
 
@@ -216,7 +216,7 @@ def run(link: Link) -> Steps[None]:
 
 
 def stop(link: Link) -> Steps[None]:
-    yield from link.request(m.SetMode(mode=SensorMode.XTID_SM_STOP), SLOW_TIMEOUT_S)
+    yield from link.stop_profile()
     link.plan = None
 
 

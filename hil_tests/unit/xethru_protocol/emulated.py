@@ -12,6 +12,7 @@ from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FORMAT_KEY, FileType, SensorMode
+from xethru_protocol.wire.versions import firmware_named
 
 STORAGE = 0x18000
 
@@ -19,9 +20,10 @@ STORAGE = 0x18000
 class EmulatedModule:
     """A stopped module that notes its commands."""
 
-    def __init__(self, *, stopped: bool = True) -> None:
-        options = DeviceOptions(storage_bytes=STORAGE)
-        self.module = Module(Identity(serial="123456789012"), Chip(RampSource()), options)
+    def __init__(self, *, stopped: bool = True, firmware: str = "sensor") -> None:
+        options = DeviceOptions(storage_bytes=STORAGE, firmware=firmware)
+        identity = Identity(serial="123456789012").with_firmware(firmware_named(firmware))
+        self.module = Module(identity, Chip(RampSource()), options)
         if stopped:
             answer(self.module, m.SetMode(mode=SensorMode.XTID_SM_STOP))
         self.module.files.format(FORMAT_KEY)

@@ -224,6 +224,20 @@ def test_a_profile_is_set_up_as_asked(tmp_path: Path, capsys: Capture) -> None:
     assert 5.0 <= settings.zone_m[1] < 5.06
 
 
+@pytest.mark.parametrize("firmware", ["sensor-1.0.7", "sensor-1.4.7"])
+def test_old_firmware_records_what_it_can(tmp_path: Path, firmware: str) -> None:
+    """Reference 17: 1.0.7 has no files, 1.4.7 none of the questions for outputs."""
+    emulated = EmulatedModule(firmware=firmware, stopped=False)
+    emulated(m.OutputSetControl(feature=OutputFeature.BASEBAND_IQ, control=1))
+    with profile_module(emulated, PRESENCE) as module:
+        arguments = ["--profile", "presence", "--output", "single", "--count", "1"]
+        assert main(["record", "--port", module.path, "--out", str(tmp_path), *arguments]) == 0
+    outputs = emulated.module.profile.outputs
+    assert [feature for feature, control in outputs.items() if control] == [
+        OutputFeature.PRESENCE_SINGLE
+    ]
+
+
 def test_outputs_that_exclude_each_other_are_warned_of(tmp_path: Path, capsys: Capture) -> None:
     emulated = EmulatedModule()
     with profile_module(emulated, PRESENCE) as module:

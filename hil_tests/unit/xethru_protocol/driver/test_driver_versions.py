@@ -1,13 +1,15 @@
 """What the drivers do not ask of old firmware. Protocol reference 17."""
 
+from contextlib import nullcontext
+
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.scripted import PlainModule
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import X4Setting
-from xethru_protocol.wire.errors import DeviceError, OldFirmwareError
+from xethru_protocol.wire.codes import SensorMode, X4Setting
+from xethru_protocol.wire.errors import DeviceError, OldFirmwareError, ResponseTimeout
 
 LIST = m.SystemGetInfo(item=7)
 
@@ -63,6 +65,26 @@ def test_firmware_that_is_no_release_answers_for_itself(
 ) -> None:
     radar, _ = driver_on(module_with(version_list))
     assert radar.request(m.GetSensitivity()).values == (5,)
+
+
+@pytest.mark.parametrize(
+    ("version_list", "goes_on"),
+    [("X4M300:1.0.7;XEP:1.0.5", True), ("X4M300:1.1.4;XEP:1.1.3", False)],
+)
+def test_stop_without_a_profile_has_no_answer_of_old_firmware(
+    driver_on: DriverOn, version_list: str, goes_on: bool
+) -> None:
+    """17: sensor 1.1.4 is the first that acknowledges it."""
+    instead: dict[m.Message | type[m.Message], list[m.Message | bytes]] = {
+        LIST: [m.ReplyString(content_id=0x58, info=7, text=version_list)],
+        m.SetMode(mode=SensorMode.XTID_SM_STOP): [],
+        m.LoadApp: [m.Ack()],
+    }
+    radar, line = driver_on(PlainModule(instead=instead))
+    with nullcontext() if goes_on else pytest.raises(ResponseTimeout, match="answer to SETMODE"):
+        radar.profile.load()
+        radar.profile.stop()
+    assert any(isinstance(command, m.LoadApp) for command in line.received) is goes_on
 
 
 def test_files_need_an_xep_that_has_them(driver_on: DriverOn) -> None:
