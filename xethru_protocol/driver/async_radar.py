@@ -24,6 +24,7 @@ from typing import Any, Literal, Self
 from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.board import AsyncDiagnostics, AsyncPins
 from xethru_protocol.driver.chip import AsyncPostprocessing, AsyncRegisters, AsyncX4
+from xethru_protocol.driver.conversation import Observer
 from xethru_protocol.driver.files import AsyncFiles
 from xethru_protocol.driver.firmware import AsyncFirmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
@@ -31,7 +32,6 @@ from xethru_protocol.driver.link import (
     TIMEOUT_S,
     Link,
     ModuleInfo,
-    Observer,
     OpenLine,
     P,
     Procedure,

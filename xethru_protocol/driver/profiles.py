@@ -17,8 +17,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
+from xethru_protocol.driver.conversation import FRAMES
 from xethru_protocol.driver.link import (
-    FRAMES,
     SLOW_TIMEOUT_S,
     AsyncCall,
     AsyncPart,

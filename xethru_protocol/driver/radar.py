@@ -15,6 +15,7 @@ from typing import ClassVar, Self
 from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.board import Diagnostics, Pins
 from xethru_protocol.driver.chip import X4, Postprocessing, Registers
+from xethru_protocol.driver.conversation import Listener, Observer, RawListener
 from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.firmware import Firmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
@@ -23,14 +24,11 @@ from xethru_protocol.driver.link import (
     TIMEOUT_S,
     CloseLine,
     Link,
-    Listener,
     ModuleInfo,
-    Observer,
     OpenLine,
     P,
     Procedure,
     RawConfig,
-    RawListener,
     Read,
     ReplyT,
     SetLineRate,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Protocol, Self, Unpack
 
+from xethru_protocol.driver.conversation import Listener
 from xethru_protocol.recordings.records import RecordingError
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE
 from xethru_protocol.recordings.vendor.writer import (
@@ -15,8 +16,6 @@ from xethru_protocol.recordings.vendor.writer import (
     session_directory,
 )
 from xethru_protocol.wire.rows import Response
-
-Listener = Callable[[Response, int], None]
 
 
 class HasListener(Protocol):

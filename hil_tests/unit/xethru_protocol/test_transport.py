@@ -225,7 +225,10 @@ def test_read_takes_all_that_waits_and_loses_none_of_it(
     assert port.read(0.0) == b"a" * 4095 + b"b" * 4095 + b"c" * 4095
 
 
-def test_only_a_uart_has_a_limit(port: SerialTransport, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_a_uart_has_a_limit(
+    port: SerialTransport, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # emulated UARTs of others are none here
     assert port.bytes_per_s == math.inf
     for real, limit in [
         ("/dev/ttyUSB0", 11520.0),

@@ -28,7 +28,7 @@ from slam.app.errors import AppError, naming
 from slam.app.rig.sources import RadarLink, RecordObserver
 from slam.config import WheelNoise
 from slam.geometry import Mount, Rig
-from xethru_protocol.driver.link import ProtocolRecord
+from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import InfoItem

@@ -31,8 +31,8 @@ from slam.app.rig.sources import RadarLink, radar_frame
 from slam.app.run.runner import LinkLog
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
+from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
-from xethru_protocol.driver.link import ProtocolRecord
 from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 

@@ -31,7 +31,7 @@ from slam.geometry import Rig
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, StepResult
 from slam.robust.pipeline import RobustSlam
-from xethru_protocol.driver.link import ProtocolRecord
+from xethru_protocol.driver.conversation import ProtocolRecord
 
 
 def make_slam(

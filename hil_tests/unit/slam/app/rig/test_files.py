@@ -25,7 +25,7 @@ from slam.app.rig.files import (
 )
 from slam.app.rig.sources import RadarLink
 from slam.config import WheelNoise
-from xethru_protocol.driver.link import Observer, ProtocolRecord
+from xethru_protocol.driver.conversation import Observer, ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import PortInfo
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
