@@ -134,6 +134,7 @@ def _check_geometry(
 
 
 def start(link: Link, fps: float) -> Steps[float]:
+    x4.check_setting(X4Setting.FPS, "a frame rate", fps)
     if not x4.timer_rate(fps):
         raise LocalProtocolError(
             f"a frame rate must be positive, not {fps:g}, at which the module stops; stop() stops"

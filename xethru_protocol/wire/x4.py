@@ -147,6 +147,8 @@ def check_setting(setting: X4Setting, name: str, value: int | float | tuple[floa
     Traceback (most recent call last):
     xethru_protocol.wire.errors.LocalProtocolError: dac_step must be 0 ... 3, not 4
     """
+    if not all(map(math.isfinite, value if isinstance(value, tuple) else (value,))):
+        raise LocalProtocolError(f"{name} must be finite, not {value}")
     if isinstance(value, tuple):
         start_m, end_m = value
         if start_m > end_m:

@@ -4,6 +4,7 @@ The API of `xethru_protocol` itself: its names, lazily imported, and typed.
 """
 
 import inspect
+import math
 import pydoc
 import re
 import subprocess
@@ -180,6 +181,20 @@ def test_values_beyond_the_limits_are_not_sent(raw: Scripted, name: str) -> None
             setattr(radar.x4, name, value)
     with pytest.raises(LocalProtocolError, match=f"{name} cannot be 'much'"):
         setattr(radar.x4, name, "much")
+    assert line.received == []
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_only_finite_numbers_are_sent(raw: Scripted, value: float) -> None:
+    radar, line = raw
+    line.received.clear()
+    for name in ("fps", "offset_m"):
+        with pytest.raises(LocalProtocolError, match=f"^{name} must be finite, not {value}$"):
+            setattr(radar.x4, name, value)
+    with pytest.raises(LocalProtocolError, match=r"^frame_area_m must be finite, not "):
+        radar.x4.frame_area_m = (value, value)
+    with pytest.raises(LocalProtocolError, match=f"^a frame rate must be finite, not {value}$"):
+        radar.start(value)
     assert line.received == []
 
 
