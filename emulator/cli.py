@@ -80,6 +80,7 @@ _PROXY_HELP = (
 )
 _CTL_HELP = """\
 Controls a running emulator: SOCKET is the "control" of its ready line, or one of its ports.
+What it asks for is done to every radar, unless --radar names one.
 
   state                          what every radar does
   fault add KIND [KEY=VALUE...]  arm a fault; keys as in a scenario file, or parameters of the kind
@@ -486,7 +487,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     ctl.add_argument("socket", type=Path, metavar="SOCKET|PORT", help="control socket, or a port")
     ctl.add_argument("words", nargs="+", metavar="VERB", help="what to do, see above")
-    ctl.add_argument("--radar", metavar="NAME", help="which radar; all if left out")
+    ctl.add_argument("--radar", metavar="NAME", help="only this radar, as named in the ready line")
     ctl.set_defaults(usage_error=ctl.error)
 
     arguments = parser.parse_args(argv)

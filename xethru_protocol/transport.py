@@ -477,9 +477,11 @@ def _why_unreachable(url: str, host: str, error: Exception) -> str:
         reason = getattr(error, "strerror", None) or "no such name can exist"
         return f"{url} cannot be reached: there is no host {host} ({reason})"
     if isinstance(error, ConnectionRefusedError):
+        plain = not url.lower().startswith("rfc2217:")
+        servers = "ser2net, an adapter, or 'xethru-emulator serve --tcp'"
         return (
-            f"{url} cannot be reached: nothing listens there; does ser2net, an adapter, or "
-            "'xethru-emulator serve --tcp' run on that machine?"
+            f"{url} cannot be reached: nothing listens there; does "
+            f"{servers if plain else 'ser2net or an adapter'} run on that machine?"
         )
     if isinstance(error, TimeoutError):
         return f"{url} cannot be reached: no answer within {_NETWORK_TIMEOUT_S:g} s; is it on?"

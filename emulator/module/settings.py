@@ -96,7 +96,7 @@ class DeviceOptions:
     firmware
         "sensor": a stock X4M300. "xep": the bare base firmware, which has no profiles and no
         modes. The newest of each; "sensor-1.5.10" or "xep-3.3.0" plays that version, as far as
-        its place in the table of versions says (17). `ValueError` lists those that are known.
+        its place in the table of versions says (17).
     profiles
         What LOADAPP accepts (4.3).
     shipped_profile

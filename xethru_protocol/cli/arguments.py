@@ -282,8 +282,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "stream",
         "read radar frames",
         "module:stream",
-        "On a terminal: a live summary; else one JSON object per frame. The module is stopped "
-        "at the end, however it comes.",
+        "On a terminal: a live summary; else one JSON object per frame. However it ends, the "
+        "module is stopped.",
     )
     _add_port(one)
     _add_json(one)

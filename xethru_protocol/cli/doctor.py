@@ -432,7 +432,8 @@ def _other_product(probe: PortProbe) -> str | None:
     PORT_CHECKS,
     "firmware",
     looks_at="the version list",
-    remedy="write the newest firmware, 1.6.8 or later, with xethru flash or the vendor's tool",
+    remedy="write the newest firmware (1.6.8; bare XEP: 3.4.8) "
+    "with xethru flash or the vendor's tool",
 )
 def _stale_firmware(probe: PortProbe) -> str | None:
     version = probe.info.version
@@ -444,9 +445,9 @@ def _stale_firmware(probe: PortProbe) -> str | None:
     absent = [row.topic for row in rows if row.commands]
     if not faults and not absent:
         return None
-    parts = [f"faults: {'; '.join(faults)}"] * bool(faults)
-    parts += [f"it lacks: {'; '.join(absent)}"] * bool(absent)
-    return f"{firmware.name}: " + "; ".join(parts)
+    parts = [f"has faults ({'; '.join(faults)})"] * bool(faults)
+    parts += [f"lacks {'; '.join(absent)}"] * bool(absent)
+    return f"{firmware.name} " + " and ".join(parts)
 
 
 @Check(

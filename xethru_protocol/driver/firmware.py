@@ -153,7 +153,7 @@ class FirmwareImage:
         first = FLASH_START + FIRST_PAGE * PAGE_BYTES
         if not (first <= entry < end and entry & 1):
             raise FirmwareError(
-                f"it would start at address {entry:X}h, outside of itself; "
+                f"its start address, {entry:X}h, lies outside of it; "
                 "is it firmware for a module with bootloader, which begins at 410000h?"
             )
 

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from typing import Concatenate, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar
+from typing import Concatenate, NamedTuple, ParamSpec, Protocol, SupportsFloat, TypeAlias, TypeVar
 
 from xethru_protocol.driver.conversation import (
     BOOTLOADER_ERRORS,
@@ -414,7 +414,8 @@ class Link:
             case m.LoadApp():
                 self.frames.rate_hz = None
                 self.frames.restart()
-            case m.X4DriverSet(setting=X4Setting.FPS, value=float(rate)):
+            case m.X4DriverSet(setting=X4Setting.FPS, value=SupportsFloat() as value):
+                rate = float(value)  # also of whole numbers and numpy's
                 self.frames.rate_hz = x4.real_frame_rate(rate) if rate > 0 else 0.0
 
     def _answer(
@@ -701,6 +702,13 @@ class Link:
             if left_s <= 0 and not frames:
                 if frames.discarded > discarded:
                     raise conversation.silence("frame", timeout_s, frames.misfit)
+                if not frames.rate_hz and frames.last_counter is None:
+                    raise conversation.silence(
+                        "frame",
+                        timeout_s,
+                        "was the radar started, by start(fps) or by a profile that sends "
+                        "BASEBAND_IQ?",
+                    )
                 if frames.last_counter is None:
                     raise conversation.silence("frame", timeout_s)
                 raise conversation.silence(

@@ -359,7 +359,8 @@ class Profile(Part):
     """The profile of a module behind an `X4M300`: load, set up, run.
 
     Presence on an X4M300, respiration and sleep on an X4M200. What it sends comes by
-    `X4M300.messages`, its BASEBAND_IQ by `X4M300.frames`.
+    `X4M300.messages`, its BASEBAND_IQ by `X4M300.frames`. The module takes settings from `load` on
+    and refuses most of them while the profile runs.
     """
 
     __slots__ = ("_listen",)

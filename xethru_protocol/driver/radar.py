@@ -311,8 +311,8 @@ class X4M300(RadarState):
 
     Ranges are metres as the module counts them, with 3.0e8 m/s. What goes wrong raises an
     `XeThruError`: `DeviceError` if the module refuses, `ResponseTimeout` if it is silent,
-    `Disconnected` if it is gone, `LocalProtocolError` if a value makes no sense. What only may go
-    wrong is in `warnings`.
+    `Disconnected` if it is gone, `LocalProtocolError` if a value makes no sense. `warnings`
+    holds what will probably fail although the module accepted it.
 
     Parameters
     ----------

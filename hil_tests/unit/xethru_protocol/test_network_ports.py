@@ -325,9 +325,10 @@ def test_what_is_wrong_with_a_name_is_said(
 def test_where_nothing_listens_it_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as listener:
         number = listener.getsockname()[1]
-    for scheme in ("tcp", "rfc2217"):
-        with pytest.raises(PortUnavailable, match="nothing listens there; does ser2net"):
+    for scheme, has_emulator in (("tcp", True), ("rfc2217", False)):  # it serves bytes only
+        with pytest.raises(PortUnavailable, match="nothing listens there; does ser2net") as caught:
             open_line(f"{scheme}://127.0.0.1:{number}")
+        assert ("xethru-emulator serve --tcp" in str(caught.value)) is has_emulator
     assert main(["doctor", "--port", f"tcp://127.0.0.1:{number}"]) == 1
     assert "nothing listens there" in capsys.readouterr().out
 

@@ -238,15 +238,15 @@ def _match(
     named: Sequence[str],
     note: Callable[[str], None],
 ) -> tuple[RadarLink, ...]:
+    wanted = {radar.serial for radar in rig.radars}
     by_serial: dict[str, _Module] = {}
     for module in modules:
         twin = by_serial.setdefault(module.serial, module)
-        if twin is not module:
+        if twin is not module and module.serial in wanted:
             raise AppError(
                 f"two modules have the serial number {module.serial}, at {twin.port} and "
                 f"{module.port}; are these two names of one port, or a module's copy?"
             )
-    wanted = {radar.serial for radar in rig.radars}
     foreign = [module for module in modules if module.serial not in wanted]
     missing = [radar for radar in rig.radars if radar.serial not in by_serial]
     if missing:

@@ -34,6 +34,7 @@ from xethru_protocol.cli.port_probe import PortProbe, port_users
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.versions import XEP_VERSIONS
 
 Capture = pytest.CaptureFixture[str]
 FRAME = m.DataFloat(info=1, values=np.zeros(8, np.float32))
@@ -118,7 +119,7 @@ MODULES = [
         "bare XEP firmware",
     ),
     ("is an X4M300", lambda: PtyModule(stock(order_code="X4M200")), "note", "X4M200"),
-    ("firmware", lambda: PtyModule(stock(version="1.5.10")), "fault", "lacks: DELETE_NOISEMAP"),
+    ("firmware", lambda: PtyModule(stock(version="1.5.10")), "fault", "lacks DELETE_NOISEMAP"),
     ("right profile", lambda: PtyModule(stock(profile=0x064E57AD)), "fault", "RESPIRATION_2"),
     ("profile loaded", lambda: PtyModule(stock(mode=STOP, profile=0)), "note", "mode STOP"),
     ("radar runs", lambda: PtyModule(stock(mode=IDLE)), "note", "mode IDLE"),
@@ -195,6 +196,15 @@ def test_frames_that_fill_a_uart_are_no_foreign_bytes(
         assert len([c for c in module.received if isinstance(c, m.Ping)]) <= 2  # no other rates
     assert finding["check"] == "listens"
     assert "115200 baud carry 2 a second" in finding["remedy"]
+
+
+def test_the_newest_firmware_is_named_for_bare_xep_too(capsys: Capture) -> None:
+    old_xep = stock(order_code=None, firmware_id="XEP", version="3.3.0", mode=None, profile=None)
+    with PtyModule(old_xep) as module:
+        _, (report,) = examined(capsys, "--port", module.path)
+    _, finding = not_well(report)
+    assert finding["check"] == "firmware"
+    assert f"bare XEP: {XEP_VERSIONS[-1]}" in finding["remedy"]
 
 
 @pytest.mark.parametrize("version", ["1.6.8", "1.6.10", "1.10.0", "2.0.0", "new"])

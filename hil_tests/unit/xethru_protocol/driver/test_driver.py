@@ -443,6 +443,7 @@ def test_trouble_before_the_last_answer_or_frame_explains_no_silence(driver_on: 
     radar, line = driver_on()
     line.say(b"\x00junk", m.System(code=0x10))
     radar.configure_raw()
+    radar.start(5)
     with pytest.raises(ResponseTimeout, match="is it an X4M300"):
         radar.read_frame()
     line.say(b"\x00junk", m.System(code=0x10), frame(1))
@@ -453,6 +454,14 @@ def test_trouble_before_the_last_answer_or_frame_explains_no_silence(driver_on: 
     with pytest.raises(ResponseTimeout, match="is it another device"):
         radar.read_frame()
     assert (radar.fault_count, radar.reboots) == (3, 2)
+
+
+def test_frames_of_a_radar_that_was_not_started_are_not_blamed_on_it(driver_on: DriverOn) -> None:
+    radar, _ = driver_on()
+    for prepare in (radar.ping, radar.configure_raw):
+        prepare()
+        with pytest.raises(ResponseTimeout, match=r"was the radar started, by start\(fps\)"):
+            radar.read_frame()
 
 
 def test_info_has_what_the_module_tells(driver_on: DriverOn) -> None:

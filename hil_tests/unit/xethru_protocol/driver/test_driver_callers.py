@@ -7,8 +7,10 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hil_tests.patience import seconds
@@ -241,9 +243,9 @@ def drop(prepare: Callable[[X4M300], object]) -> list[str]:
     return [str(one.message) for one in caught if issubclass(one.category, ResourceWarning)]
 
 
-def begin(radar: X4M300) -> None:
+def begin(radar: X4M300, fps: float = 17.0) -> None:
     radar.configure_raw()
-    radar.start(17.0)
+    radar.start(fps)
 
 
 def begin_and(end: Callable[[X4M300], object]) -> Callable[[X4M300], object]:
@@ -254,8 +256,9 @@ def begin_and(end: Callable[[X4M300], object]) -> Callable[[X4M300], object]:
     return prepare
 
 
-def test_driver_dropped_while_its_radar_transmits_is_warned_of() -> None:
-    (text,) = drop(begin)
+@pytest.mark.parametrize("fps", [17.0, 17, np.float32(17), np.int64(17)])
+def test_driver_dropped_while_its_radar_transmits_is_warned_of(fps: float) -> None:
+    (text,) = drop(partial(begin, fps=fps))
     assert "the port" in text
     assert "with X4M300.open(...)" in text
 

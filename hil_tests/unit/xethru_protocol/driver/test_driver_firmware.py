@@ -107,9 +107,9 @@ def test_the_vendors_certificate_is_page_zero() -> None:
         (hex_file(DATA, AT_400000 + record(0, 0, b"\x01\x02")), "it announces"),
         (hex_file(DATA, AT_400000 + record(0, 0x200, b"\x01")), "below address 410000h"),
         (hex_file(DATA, AT_400000 + record(0, 0xFFFF, b"\x01")), "below address 410000h"),
-        (application(1300, 0x400101), "400101h, outside of itself"),
-        (application(1300, 0x410100), "outside of itself"),
-        (application(1300, 0x410000 + 1301), "outside of itself"),
+        (application(1300, 0x400101), "400101h, lies outside of it"),
+        (application(1300, 0x410100), "lies outside of it"),
+        (application(1300, 0x410000 + 1301), "lies outside of it"),
         (application(0x5B0000 - 0x410000 + 1), "ends at address 5B0001h"),
     ],
 )
