@@ -514,7 +514,7 @@ def _whole_ms(timeout_s: float) -> int:
 
 
 def _why(path: str, error: Exception) -> str:
-    in_use = f"port {path} is in use by another program; close that first"
+    in_use = f"port {path} is in use by another program, or twice by this one; close that first"
     not_serial = f"{path} is not a serial port"
     reasons = {
         errno.ENOENT: f"there is no port {path}; 'xethru list' shows the ports there are",

@@ -320,8 +320,13 @@ def _set_mode(link: Link, mode: SensorMode) -> Steps[None]:
 def _set(link: Link, command: m.Command[m.Ack]) -> Steps[None]:
     """Send a setting and remember it; the last of each kind counts."""
     yield from _need_profile(link)
-    yield from link.request(command)
     plan = link.plan
+    try:
+        yield from link.request(command)
+    except DeviceError as error:
+        if isinstance(plan, ProfilePlan) and (plan.mode is not None or not plan.loaded):
+            error.add_note("a profile that was run refuses most settings: load() it, set, run()")
+        raise
     if isinstance(plan, ProfilePlan):
         kind: object = type(command)
         if isinstance(command, m.OutputSetControl | m.DebugOutputSetControl):

@@ -102,6 +102,9 @@ class RadarState:
         reconnect_s: float,
         candidates: Callable[[], Sequence[str]] = known_ports,
     ) -> None:
+        if not hasattr(transport, "write"):
+            name = type(self).__name__
+            raise TypeError(f"{name} needs an open line; {name}.open({transport!r}) opens a port")
         self._transport = transport
         self.raw_listener: RawListener | None = None
         self._link = Link(

@@ -43,6 +43,18 @@ def test_profile_is_set_up_and_run_by_the_recipe(loaded: Emulated) -> None:
     ]
 
 
+def test_what_a_running_profile_refuses_is_explained(loaded: Emulated) -> None:
+    """Protocol reference 8.3."""
+    radar, _, _ = loaded
+    radar.profile.run()
+    with pytest.raises(DeviceError) as caught:
+        radar.profile.set_led(LedMode.OFF)
+    (note,) = caught.value.__notes__
+    assert "load() it, set, run()" in note
+    radar.profile.load()
+    radar.profile.set_led(LedMode.OFF)
+
+
 def test_settings_are_read_as_they_were_set(loaded: Emulated) -> None:
     radar, _, _ = loaded
     radar.profile.set_sensitivity(2)

@@ -1,13 +1,14 @@
 """The drivers, sync and async, on a scripted module."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame, framed
+from xethru_protocol import X4M300, AsyncX4M300
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.link import Link, RawConfig
 from xethru_protocol.wire import messages as m
@@ -454,6 +455,12 @@ def test_trouble_before_the_last_answer_or_frame_explains_no_silence(driver_on: 
     with pytest.raises(ResponseTimeout, match="is it another device"):
         radar.read_frame()
     assert (radar.fault_count, radar.reboots) == (3, 2)
+
+
+@pytest.mark.parametrize("driver", [X4M300, AsyncX4M300])
+def test_a_path_is_no_open_line(driver: Callable[[str], object]) -> None:
+    with pytest.raises(TypeError, match=r"X4M300\.open\('/dev/ttyACM0'\) opens a port"):
+        driver("/dev/ttyACM0")
 
 
 def test_frames_of_a_radar_that_was_not_started_are_not_blamed_on_it(driver_on: DriverOn) -> None:
