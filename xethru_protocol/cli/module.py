@@ -123,7 +123,8 @@ def flash(arguments: Namespace) -> int:
             module.firmware.write(image, note)
         except BaseException as error:
             if state and not isinstance(error, XeThruError):
-                warn(f"\nxethru flash: stopped after {state}; {UNFINISHED}")
+                progress.finish(lambda: state)
+                warn(f"xethru flash: stopped after {state}; {UNFINISHED}")
             raise
         finally:
             if state:

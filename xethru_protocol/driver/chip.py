@@ -149,7 +149,7 @@ class X4Row(Setting[V]):
                 value = operator.index(value)
             else:
                 value = float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise LocalProtocolError(f"{self.name} cannot be {value!r}: {self.__doc__}") from None
         x4.check_setting(self.setting, self.name, value)
         return value

@@ -14,6 +14,7 @@ from xethru_protocol.driver.link import (
     Steps,
 )
 from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import FileError
 from xethru_protocol.wire.errors import (
     DeviceError,
@@ -21,6 +22,7 @@ from xethru_protocol.wire.errors import (
     RemoteProtocolError,
     XeThruError,
 )
+from xethru_protocol.wire.framing import NO_ESCAPE_START, is_misread
 
 CHUNK_BYTES = 256  # as the vendor's host reads and writes
 
@@ -173,15 +175,26 @@ def _read_chunks(
 
 def _write_chunks(link: Link, part: m.SetFileData, on_progress: OnProgress | None) -> Steps[None]:
     total = len(part.data)
-    for done in range(0, total, CHUNK_BYTES):
+    done = 0
+    while done < total:
         if on_progress is not None:
             on_progress(done, total)
-        piece = part.data[done : done + CHUNK_BYTES]
-        yield from link.request(
-            replace(part, offset=part.offset + done, data=piece), SLOW_TIMEOUT_S
-        )
+        data = bytes(part.data[done : done + CHUNK_BYTES])
+        piece = _receivable(replace(part, offset=part.offset + done, data=data))
+        yield from link.request(piece, SLOW_TIMEOUT_S)
+        done += len(piece.data)
     if on_progress is not None:
         on_progress(total, total)
+
+
+def _receivable(piece: m.SetFileData) -> m.SetFileData:
+    """Return as much of a piece as a module does not misread."""
+    begin = piece.data.find(NO_ESCAPE_START)
+    if begin >= 0:
+        piece = replace(piece, data=piece.data[: begin + len(NO_ESCAPE_START) - 1])
+    while is_misread(encode(piece)) and len(piece.data) > 1:  # by its checksum
+        piece = replace(piece, data=piece.data[:-1])
+    return piece
 
 
 def _then_close(link: Link, file_type: int, identifier: int, body: Steps[T]) -> Steps[T]:

@@ -23,6 +23,7 @@ from xethru_protocol.driver.link import (
 )
 from xethru_protocol.system import read_bounded
 from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import (
     BootloaderKey,
     BootloaderReply,
@@ -37,6 +38,7 @@ from xethru_protocol.wire.errors import (
     ResponseTimeout,
     XeThruError,
 )
+from xethru_protocol.wire.framing import is_misread
 
 PAGE_BYTES = 512
 FLASH_START = 0x400000
@@ -138,6 +140,7 @@ class FirmwareImage:
         data = bytes(flash[first:end]).ljust((last + 1) * PAGE_BYTES - first, _PADDING)
         image = cls(data=data, certificate=bytes(flash[:PAGE_BYTES]) if announced > 4 else None)
         image._check_start(FLASH_START + end)
+        image._check_pages()
         if announced and image.certificate is None:
             checksum = int.from_bytes(flash[:4], "little")
             if announced < 4 or checksum != image.checksum:
@@ -156,6 +159,22 @@ class FirmwareImage:
                 f"its start address, {entry:X}h, lies outside of it; "
                 "is it firmware for a module with bootloader, which begins at 410000h?"
             )
+
+    def _check_pages(self) -> None:
+        """Refuse what the bootloader would misread, before it has a part of it."""
+        pages = [(FIRST_PAGE + at, self.page(at)) for at in range(self.pages)]
+        for number, page in [(0, self.page_zero), *pages]:
+            payload = encode(m.BootloaderWritePage(page=number, data=page))
+            if is_misread(payload):
+                raise FirmwareError(
+                    f"page {number} has four bytes 7C in a row, or three and the checksum of its "
+                    "packet; the bootloader takes them for the start of another packet and "
+                    "answers no more until its power was off. Build the image so that they move"
+                )
+
+    def page(self, at: int) -> bytes:
+        """Return page ``at`` of `pages`."""
+        return self.data[at * PAGE_BYTES : (at + 1) * PAGE_BYTES]
 
 
 def _intel_hex(content: bytes) -> tuple[bytes, bytes]:
@@ -329,8 +348,7 @@ def _write(link: Link, image: FirmwareImage, is_open: bool, on_progress: OnProgr
     yield from _write_page(link, 0, image.page_zero, attempts)
     for done in range(image.pages):
         on_progress(done, image.pages)
-        page = image.data[done * PAGE_BYTES : (done + 1) * PAGE_BYTES]
-        answer = yield from _write_page(link, FIRST_PAGE + done, page, attempts)
+        answer = yield from _write_page(link, FIRST_PAGE + done, image.page(done), attempts)
         if is_open and answer != b"\x33":
             raise RemoteProtocolError(
                 f"{link.path} did not write page {FIRST_PAGE + done}; switch its power off and on"

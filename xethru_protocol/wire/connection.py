@@ -7,6 +7,7 @@
 from enum import Enum
 
 from xethru_protocol.wire.codec import decode_command, decode_response_at, encode
+from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.framing import (
     Direction,
     Framing,
@@ -16,6 +17,7 @@ from xethru_protocol.wire.framing import (
     PacketReader,
     encode_no_escape,
     encode_normal,
+    is_misread,
 )
 from xethru_protocol.wire.rows import ROWS, Command, Message, Response, UnknownMessage
 
@@ -84,11 +86,17 @@ class Connection:
         """Bytes that carry ``message``.
 
         ``framing`` None: as a real module or host frames this message (Protocol reference 1.3).
-        Raises `LocalProtocolError` if a field does not fit its place on the wire.
+        Raises `LocalProtocolError` if a field does not fit its place on the wire, or if a module
+        would misread the packet (`is_misread`).
         """
         if framing is None:
             bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
         else:
             bulk = framing is Framing.NO_ESCAPE
         payload = encode(message, bulk=bulk)
+        if self._is_host and not bulk and is_misread(payload):
+            raise LocalProtocolError(
+                f"{ROWS[type(message)].name} has four bytes 7C in a row, or three and its "
+                "checksum; a module takes them for the start of another packet and answers no more"
+            )
         return encode_no_escape(payload) if bulk else encode_normal(payload)

@@ -208,6 +208,20 @@ def encode_normal(payload: bytes) -> bytes:
     return b"\x7d" + escaped + b"\x7e"
 
 
+def is_misread(payload: bytes) -> bool:
+    r"""Whether a module takes a part of this Normal packet for the start of a NoEscape packet.
+
+    The vendor's parser looks for it everywhere, behind the escapes and in the checksum, and takes
+    what follows for a length: it answers no more for as long. Protocol reference 1.2.
+
+    >>> is_misread(b"\x10\x7c\x7c\x7c"), is_misread(b"\x7d\x7c\x7c\x7c")
+    (False, True)
+    """
+    return b"\x7c\x7c\x7c" in payload and NO_ESCAPE_START in payload + bytes(
+        (START ^ xor(payload),)
+    )
+
+
 def encode_no_escape(payload: bytes) -> bytes:
     r"""Frame a payload behind its length; `LocalProtocolError` if it is empty or too long.
 

@@ -279,7 +279,8 @@ class Normalisation:
 
 
 def _f32(value: float) -> float:
-    return float(np.float32(value))
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, which the callers refuse
+        return float(np.float32(value))
 
 
 def _snap_down(x: float) -> int:

@@ -574,4 +574,4 @@ def _name_at(data: bytes, position: int) -> tuple[str, int]:
         name = data[end - length : end].rstrip(b"\0").decode()
     except (struct.error, UnicodeDecodeError):
         return "", position
-    return (name, end) if end <= len(data) else ("", position)
+    return (name, end) if end <= len(data) and "\0" not in name else ("", position)

@@ -454,7 +454,7 @@ def _split_directories(path: Path) -> list[_Part]:
 
 def _by_number(path: Path) -> list[str | int]:
     """Sort key of names that end in numbers: 2 comes before 10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
 
 
 def _usable_meta(directory: Path) -> Meta | None:

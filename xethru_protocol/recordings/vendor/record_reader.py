@@ -31,6 +31,8 @@ from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.rows import Response
 
+_FURTHEST = 1 << 48  # byte of a recording; sums of such numbers stay within 64 bits
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Record:
@@ -84,7 +86,8 @@ class RecordingReader:
         metas: list[Meta] = []
         entries: list[npt.NDArray[np.void]] = []
         self._files: list[dict[tuple[int, int], tuple[Path, Kind]]] = []
-        for directory, _ in parts_of(path):
+        directories = [directory for directory, _ in parts_of(path)]
+        for directory in directories:
             meta = read_meta(directory)
             if meta is None:
                 raise RecordingError(f"{directory} has no {META_NAME}; read_recording does without")
@@ -95,7 +98,7 @@ class RecordingReader:
         self.start_ns = first.start_ms * MS_NS
         self.session_id = first.session_id.decode("utf-8", "replace")
         self.profile_id = first.profile_id
-        self._build_index(metas, entries)
+        self._build_index(directories, metas, entries)
         end_ms = last.start_ms + last.duration_ms
         if not last.complete and len(self._t_ms):  # its recorder was killed
             end_ms = int(self._t_ms[-1])
@@ -198,13 +201,20 @@ class RecordingReader:
         found = int(np.argmax(self._wanted[self._next :]))
         return self._next + found if self._wanted[self._next + found] else len(self)
 
-    def _build_index(self, metas: list[Meta], entries: list[npt.NDArray[np.void]]) -> None:
+    def _build_index(
+        self, directories: list[Path], metas: list[Meta], entries: list[npt.NDArray[np.void]]
+    ) -> None:
         """Join the indexes of all meta files: records in order, without headers."""
         columns: list[tuple[npt.NDArray[np.int64], ...]] = []
         self.size_bytes = 0
         self.largest_record_bytes = 0
         for part, (meta, all_of) in enumerate(zip(metas, entries, strict=True)):
             records = all_of[all_of["kind"] == RECORD]
+            if (np.maximum(records["begin"], records["end"]) > _FURTHEST).any():
+                raise RecordingError(
+                    f"the index of {directories[part]} is damaged: it has a record beyond "
+                    f"byte {_FURTHEST}; read_recording does without"
+                )
             known = np.isin(records["data_type"], list(KIND_OF_TYPE))
             known &= ~_are_titles(records)
             kept = records[known]

@@ -86,6 +86,6 @@ def test_an_interruption_says_what_to_do(image: str, number: signal.Signals, cod
             process.send_signal(number)
             _, error = process.communicate()
     assert process.returncode == code
-    assert "stopped after 1 of 3 pages" in error
+    assert "\nxethru flash: stopped after 1 of 3 pages" in f"\n{error}"
     assert "stays in its bootloader; write an image again" in error
     assert "Traceback" not in error

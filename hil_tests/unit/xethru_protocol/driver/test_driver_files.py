@@ -1,5 +1,6 @@
 """Files of a module, by both drivers. Protocol reference 4.11, 16 (chunks of 256 bytes)."""
 
+import re
 from collections.abc import Sequence
 
 import pytest
@@ -43,6 +44,23 @@ def test_file_is_written_in_chunks_and_read_back(emulated: Emulated) -> None:
         m.GetFileData(file_type=USER, identifier=7, offset=256, length=256),
         m.GetFileData(file_type=USER, identifier=7, offset=512, length=7),
     ]
+
+
+def test_no_packet_of_a_file_looks_like_a_noescape_start(emulated: Emulated) -> None:
+    """Protocol reference 1.2, the recommendations: never send 7C7C7C7C in a Normal packet."""
+    radar, _, module = emulated
+    sent: list[bytes] = []
+    radar.raw_listener = lambda direction, data, _: sent.append(data) if direction == "tx" else None
+    for last in range(256):  # one of them gives the packet the checksum 7C
+        content = b"ab" + b"|" * 6 + bytes((last,)) + b"|||"
+        radar.files.write(USER, 1, content)
+        assert module.files[USER, 1] == content
+        radar.files.delete(USER, 1)
+    assert len(sent) > 256 * 4
+    for packet in sent:
+        assert b"||||" not in re.sub(rb"\x7f(.)", rb"\1", packet, flags=re.DOTALL)
+    with pytest.raises(LocalProtocolError, match="CREATE_NEW_FILE has four bytes 7C in a row"):
+        radar.files.write(USER, 0x7C7C7C7C, b"x")
 
 
 def test_progress_is_reported_at_the_start_and_after_each_chunk(driver_on: DriverOn) -> None:

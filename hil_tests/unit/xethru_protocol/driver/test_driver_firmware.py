@@ -1,5 +1,7 @@
 """Firmware images, and writing them by both drivers. Protocol reference 4.12."""
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 
 import pytest
@@ -52,6 +54,17 @@ def announced(checksum: int) -> str:
 
 DATA = application(1300)
 PADDED = DATA + b"\xff" * (3 * 512 - 1300)
+
+
+def _ending_like_a_start() -> bytes:
+    """Return a page that ends in three bytes 7C, whose packet has the checksum 7C."""
+    page = bytearray(application(509) + b"\x7c" * 3)
+    packet = bytes.fromhex("7D C0 10 00 80 00") + page
+    page[8] ^= functools.reduce(operator.xor, packet) ^ 0x7C
+    return bytes(page)
+
+
+ENDS_LIKE_A_START = _ending_like_a_start()
 
 
 # --- images
@@ -111,6 +124,8 @@ def test_the_vendors_certificate_is_page_zero() -> None:
         (application(1300, 0x410100), "lies outside of it"),
         (application(1300, 0x410000 + 1301), "lies outside of it"),
         (application(0x5B0000 - 0x410000 + 1), "ends at address 5B0001h"),
+        (DATA[:700] + b"\x7c" * 4 + DATA[704:], "page 129 has four bytes 7C in a row"),
+        (ENDS_LIKE_A_START, "page 128 has four bytes 7C in a row, or three and the checksum"),
     ],
 )
 def test_what_is_no_image_is_refused(content: bytes, reason: str) -> None:

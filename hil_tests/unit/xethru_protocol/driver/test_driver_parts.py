@@ -198,6 +198,18 @@ def test_only_finite_numbers_are_sent(raw: Scripted, value: float) -> None:
     assert line.received == []
 
 
+def test_numbers_beyond_float32_are_not_sent(raw: Scripted) -> None:
+    """They neither raise an error of Python nor a warning of numpy."""
+    radar, line = raw
+    line.received.clear()
+    for name in ("fps", "offset_m"):
+        with pytest.raises(LocalProtocolError, match=f"^{name} cannot be"):
+            setattr(radar.x4, name, 10**400)
+    with pytest.raises(LocalProtocolError, match="cannot carry value=1e"):
+        radar.x4.fps = 1e39
+    assert line.received == []
+
+
 def test_a_frame_area_has_two_ends_in_order(raw: Scripted) -> None:
     radar, _ = raw
     with pytest.raises(LocalProtocolError, match="starts behind its end"):

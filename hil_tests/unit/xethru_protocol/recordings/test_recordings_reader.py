@@ -190,6 +190,27 @@ def test_a_recording_without_meta_file_is_refused(tmp_path: Path) -> None:
         RecordingReader(tmp_path / "r")
 
 
+@pytest.mark.parametrize("at", [17, 25], ids=["begin", "end"])
+def test_an_index_with_a_place_that_no_file_has_is_refused(tmp_path: Path, at: int) -> None:
+    shutil.copytree(RECORDINGS / "split_directories", tmp_path / "r")
+    meta = min((tmp_path / "r").rglob(META))
+    content = bytearray(meta.read_bytes())
+    first = 89 + int.from_bytes(content[85:89], "little")  # behind the head and the session id
+    content[first + at : first + at + 8] = b"\xff" * 8
+    meta.write_bytes(content)
+    with pytest.raises(RecordingError, match=f"index of .*{meta.parent.name} is damaged"):
+        RecordingReader(tmp_path / "r")
+
+
+def test_names_that_no_file_can_have_cost_no_record(tmp_path: Path) -> None:
+    directory = tmp_path / "xethru_recording_2\u00b2"  # no number, though a digit
+    shutil.copytree(RECORDINGS / "every_kind", directory)
+    meta = directory / META
+    meta.write_bytes(meta.read_bytes().replace(b"xethru_datafloat", b"xethru\0datafloat"))
+    with RecordingReader(tmp_path) as reader, RecordingReader(EVERY_KIND) as original:
+        assert [record.data for record in reader] == [record.data for record in original]
+
+
 def test_iq_records_hold_their_bytes(tmp_path: Path) -> None:
     content = (RECORDINGS / "iq" / "xethru_baseband_iq_20261121_003557.dat").read_bytes()
     with RecordingReader(RECORDINGS / "iq") as reader:
