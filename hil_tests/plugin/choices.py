@@ -41,8 +41,8 @@ def add_options(parser: pytest.Parser) -> None:
         "--radar",
         action="append",
         metavar="SPEC",
-        help="radar to test, repeatable: emu[:SCENE][?seed=S&fps=F&line=pty], /dev/ttyACM0, "
-        "serial=NUMBER, auto, tcp://HOST:PORT, rfc2217://HOST:PORT, replay:RECORDING "
+        help="radar to test, repeatable: emu[:SCENE][?seed=S&fps=F&line=pty&firmware=xep], "
+        "/dev/ttyACM0, serial=NUMBER, auto, tcp://HOST:PORT, rfc2217://HOST:PORT, replay:RECORDING "
         f"(environment {ENVIRONMENT}, ini {INI}; default emu)",
     )
     group.addoption(

@@ -6,6 +6,7 @@ others. `AsyncX4M300` has the same methods as coroutines.
 """
 
 import itertools
+import os
 import threading
 import time
 import warnings
@@ -131,7 +132,7 @@ class RadarState:
     @classmethod
     def open(
         cls,
-        path: str,
+        path: str | os.PathLike[str],
         *,
         baudrate: int = POWER_UP_BAUD,
         clock: Callable[[], int] = time.monotonic_ns,
@@ -144,7 +145,7 @@ class RadarState:
         ``path`` is a serial port, ``tcp://HOST:PORT`` or ``rfc2217://HOST:PORT``. ``baudrate`` is
         the rate at which a UART module talks now; USB, ptys and ``tcp://`` have none.
         """
-        transport = cls._port_type(path, baudrate)
+        transport = cls._port_type(os.fspath(path), baudrate)
         try:
             radar = cls(
                 transport,

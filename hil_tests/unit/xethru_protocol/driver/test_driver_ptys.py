@@ -63,6 +63,12 @@ def return_as(machine: PtyMachine, name: str) -> threading.Timer:
     return timer
 
 
+def test_a_port_may_be_named_by_a_path_object(machine: PtyMachine) -> None:
+    with X4M300.open(Path(machine.path("home")), clock=patient_ns) as radar:
+        radar.ping()
+        assert radar.port == machine.path("home")
+
+
 @pytest.mark.parametrize("name", ["home", "elsewhere"])
 def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, name: str) -> None:
     with X4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0) as radar:
