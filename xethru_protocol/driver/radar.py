@@ -288,7 +288,8 @@ class X4M300(RadarState):
     raw frames
         `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
     all other messages
-        `messages`, `read_message`, `messages_waiting`; `listener` is called with every one
+        `messages`, `read_message`, `messages_waiting`; `listener` is called with every one,
+        `raw_listener` with the bytes of both directions
     the module and its line
         `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`
     any command of the protocol
