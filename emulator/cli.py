@@ -150,7 +150,7 @@ def _control(arguments: argparse.Namespace) -> int:
     try:
         request = request_of(arguments.words)
     except ValueError as error:
-        arguments.usage_error(str(error))
+        arguments.usage_error(one_line(str(error)))
     if arguments.radar is not None:
         request["radar"] = arguments.radar
     path = _socket_of(arguments.socket)
@@ -231,13 +231,12 @@ def _number(text: str) -> float:
 
 def _socket_of(path: Path) -> Path:
     """Return the control socket of the emulator that has a port; a socket is itself."""
-    from xethru_protocol.transport import is_private, run_directory
+    from xethru_protocol.transport import announcements, run_directory
 
     with contextlib.suppress(OSError):  # too long, for example: connecting reports it
         if path.is_socket():
             return path
-    folder = run_directory()
-    for entry in sorted(folder.glob("*.json")) if is_private(folder) else ():
+    for entry in announcements(run_directory()):
         try:
             announced = json.loads(entry.read_text())
             ports = [Path(device["path"]) for device in announced["devices"]]

@@ -681,10 +681,16 @@ def _usb_ports() -> Iterator[PortInfo]:
             )
 
 
-def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
+def announcements(folder: Path) -> list[Path]:
+    """Return the files in which emulators say what they serve; none of a folder of others."""
     if not is_private(folder):
-        return
-    for file in sorted(folder.glob("*.json")):
+        return []
+    # a pipe or a device there could be read for ever
+    return [path for path in sorted(folder.glob("*.json")) if path.is_file()]
+
+
+def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
+    for file in announcements(folder):
         try:
             entry: dict[str, Any] = json.loads(file.read_text())
             if not is_running(int(entry["pid"])):

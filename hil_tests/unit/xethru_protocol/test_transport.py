@@ -21,7 +21,13 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from hil_tests.patience import seconds, wait_until
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.transport import SerialTransport, carried_rate_hz, find_ports
+from xethru_protocol.transport import (
+    SerialTransport,
+    announcements,
+    carried_rate_hz,
+    find_ports,
+    run_directory,
+)
 from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, PortUnavailable
 
 
@@ -309,3 +315,15 @@ def test_driver_that_cannot_be_made_gives_its_port_back(line: Line) -> None:
 )
 def test_rates_that_lines_carry(bytes_per_s: float, rate_hz: float) -> None:
     assert carried_rate_hz(17.0, bytes_per_s, 5747) == rate_hz
+
+
+def test_a_pipe_among_the_announcements_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = run_directory()
+    folder.mkdir(mode=0o700)
+    os.mkfifo(folder / "1.json")
+    (folder / "2.json").symlink_to("/dev/zero")
+    (folder / "3.json").write_text("{}")
+    assert announcements(folder) == [folder / "3.json"]
