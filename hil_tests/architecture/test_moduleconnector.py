@@ -116,7 +116,7 @@ INSTANCES = {"recorder": recordings.Recorder, "reader": recordings.RecordingRead
 
 
 class Checker:
-    """Follows an expression as far as types tell, and raises where it cannot be right."""
+    """Follows an expression as far as its types are known, and raises where it cannot be right."""
 
     def __init__(self, radar: X4M300) -> None:
         self._radar = radar

@@ -326,6 +326,6 @@ class AsyncX4M300(RadarState):
 
 
 def _close(opening: asyncio.Future[Transport | AsyncTransport]) -> None:
-    """Close a line that nobody waits for any more."""
+    """Close a line whose opening was cancelled."""
     if not opening.cancelled() and opening.exception() is None:
         opening.result().close()

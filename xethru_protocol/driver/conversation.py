@@ -60,7 +60,7 @@ class Conversation:
     answers
         Those that came since the last question.
     expected
-        What would answer it besides ERROR; empty if nobody waits for an answer.
+        What would answer it besides ERROR; empty if no command waits for an answer.
     answer_owed
         Whether the answer of a request that was given up may still come. The module answers in
         order, so a PING brings both sides into step again: all before its PONG belongs to nothing

@@ -410,7 +410,7 @@ def _await_application(link: Link, core_id: str | None, readies: int) -> Steps[N
 def _await(
     link: Link, is_ours: reconnect.Recognise, everywhere: bool, timeout_s: float
 ) -> Steps[None]:
-    """Wait until what restarts answers, at its port or, where it can be told, at another."""
+    """Wait until what restarts answers, at its port or at another that is found to be its own."""
     deadline_ns = link.conversation.deadline_ns(timeout_s)
     try:
         while True:

@@ -353,7 +353,7 @@ class Link:
     def _catch_up(self, command: Command[Response], timeout_s: float) -> Steps[None]:
         """Receive until no answer to an abandoned request can come any more."""
         conversation = self.conversation
-        if ROWS[type(command)].replies in _BOOTLOADER_REPLIES:  # the bootloader knows no PING
+        if ROWS[type(command)].replies in _BOOTLOADER_REPLIES:  # the bootloader does not have PING
             echo = m.BootloaderEcho(data=self.clock().to_bytes(8, "little"))
             with suppress(DeviceError):  # it is the application that answers
                 yield from self._exchange(echo, timeout_s)

@@ -496,7 +496,7 @@ class Profile(Part):
         Raises
         ------
         DeviceError
-            If there is none of this name.
+            If the module has no parameter file of this name.
         """
         return self._call(parameter_file, name)
 

@@ -35,7 +35,8 @@ class RawPlan:
 
 def configure_raw(link: Link, config: RawConfig | None = None) -> Steps[FrameGeometry]:
     config = config or RawConfig()
-    if config.offset_m is None:  # before the module is touched; its own offset tells about bins
+    # before anything is sent; the exact bins depend on the module's own offset
+    if config.offset_m is None:
         x4.frame_area(*config.frame_area_m, downconversion=config.downconversion)
     else:
         config.area(config.offset_m)
@@ -89,7 +90,7 @@ def _read_back(link: Link, setting: X4Setting) -> Steps[X4Value | None]:
         firmware = yield from link.firmware()
         if error.code != ErrorCode.XTS_SPRE_NOT_RECOGNIZED or X4_GETS.is_in(firmware):
             raise
-    link.warn(f"{firmware.name} cannot tell {setting.name}; {X4_GETS.since} can")
+    link.warn(f"{firmware.name} cannot read back {setting.name}; {X4_GETS.since} can")
     return None
 
 

@@ -45,7 +45,7 @@ def identify(link: Link) -> Steps[None]:
     if link.identified:
         return
     try:
-        # bare XEP refuses to tell it, and is looked for at the same port
+        # bare XEP does not report it, and is looked for at the same port
         serial = (yield from link.info_text(InfoItem.XTID_SSIC_SERIALNUMBER)) or None
     except ResponseTimeout:
         serial = None

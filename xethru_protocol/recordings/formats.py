@@ -158,7 +158,8 @@ def describe_recording(
 ) -> RecordingSummary:
     """Read a whole recording, or the named radar's part, and summarise it.
 
-    ``downconversion`` says whether its frames are baseband; None: as far as it can be told.
+    ``downconversion`` says whether its frames are baseband; None: decide by the
+    recording, where it shows that.
     """
     path = Path(path)
     layouts = FrameLayouts(downconversion)

@@ -21,7 +21,7 @@ from xethru_protocol.wire.rows import Response
 
 _MOST_BASEBAND_BINS = 188  # Protocol reference 9.4
 _ENOUGH_FRAMES = 64
-_FEWEST_BINS = 8  # to tell smooth from rough
+_FEWEST_BINS = 8  # fewer do not show whether a frame is smooth
 # 0 for equal neighbours, 1 for independent ones. Emulated RF frames have 0.95 to 1.4, emulated and
 # real baseband 0.09 to 0.45.
 _SMOOTH, _ROUGH = 0.55, 0.85
@@ -31,7 +31,7 @@ _SMOOTH, _ROUGH = 0.55, 0.85
 class FrameLayout:
     """What frames with a number of ``values`` are.
 
-    ``downconversion`` is None where that cannot be told; ``inferred``: it is a conclusion from the
+    ``downconversion`` is None where that is not known; ``inferred``: it is a conclusion from the
     frames' content and may be wrong.
     """
 

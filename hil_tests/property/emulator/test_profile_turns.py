@@ -46,7 +46,7 @@ OTHERS = (
 
 
 class CountingSource(RampSource):
-    """Refuses to work more than a call may."""
+    """A `RampSource` that fails when one call asks for more frames than a turn may make."""
 
     def __init__(self) -> None:
         super().__init__()

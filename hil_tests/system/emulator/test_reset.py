@@ -1,6 +1,6 @@
 """A module that restarts: with its port closed, open, and while streaming, through a real port.
 
-How long it took is told by when the first frame arrived.
+The arrival of the first frame shows how long it took.
 """
 
 import time

@@ -66,7 +66,7 @@ def test_one_program_at_a_time(line: Line, port: SerialTransport) -> None:
     SerialTransport(line.path).close()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whether a port is exclusive")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows whether a port is exclusive")
 def test_port_is_exclusive_until_it_is_closed(line: Line) -> None:
     """Also for programs that do not ask for the lock, such as the vendor's."""
     port = SerialTransport(line.path)
@@ -77,7 +77,7 @@ def test_port_is_exclusive_until_it_is_closed(line: Line) -> None:
     os.close(other)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whether a port is exclusive")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows whether a port is exclusive")
 def test_a_port_that_is_dropped_is_as_free_as_a_closed_one(line: Line) -> None:
     before = set(os.listdir("/proc/self/fd"))
     port = SerialTransport(line.path)

@@ -168,7 +168,7 @@ def test_every_module_answers_on_a_port_of_its_own(bench: Bench) -> None:
         assert bench.tcp(index).ask(m.Ping()) == PONG
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whether a port is exclusive")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows whether a port is exclusive")
 def test_a_killed_host_keeps_no_other_out(bench: Bench) -> None:
     """It had the terminal exclusively, and a terminal remembers that."""
     killed = bench.open("radar_1")

@@ -460,7 +460,7 @@ def test_pins_tell_what_they_do(emulated: Emulated) -> None:
 
 
 def test_verdict_of_a_system_test_is_in_its_info(driver_on: DriverOn) -> None:
-    """Protocol reference 4.10: code | passed << 8; certification tells 0 although it worked."""
+    """Protocol reference 4.10: code | passed << 8; certification reports 0 although it worked."""
 
     def module(command: m.Message) -> Sequence[m.Message | bytes]:
         if isinstance(command, m.SystemGetInfo):

@@ -100,8 +100,8 @@ def test_settings_that_old_firmware_cannot_tell_are_not_checked(driver_on: Drive
     radar, _ = driver_on(module_with("XEP:3.0.0;X4C51:2.1.0", *gets))
     assert radar.configure_raw(RawConfig()).n_bins == 1431
     assert radar.warnings == [
-        "XEP 3.0.0 cannot tell FRAMEAREAOFFSET; XEP 3.3.0 can",
-        "XEP 3.0.0 cannot tell ITERATIONS; XEP 3.3.0 can",
+        "XEP 3.0.0 cannot read back FRAMEAREAOFFSET; XEP 3.3.0 can",
+        "XEP 3.0.0 cannot read back ITERATIONS; XEP 3.3.0 can",
     ]
     radar, _ = driver_on(module_with("XEP:3.3.0;X4C51:2.1.0", *gets))
     with pytest.raises(DeviceError, match="FRAMEAREAOFFSET"):

@@ -1,4 +1,4 @@
-"""What a recorder can be told: session, splitting, names, rate; against the vendor's recorder.
+"""Options of a recorder: session, splitting, names, rate; against the vendor's recorder.
 
 ``fixtures/recordings/split_files`` was recorded with a file length of 1 s and a user header,
 ``split_directories`` with a directory size of 60 bytes.

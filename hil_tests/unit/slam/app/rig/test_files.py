@@ -255,7 +255,7 @@ def test_an_emulated_module_is_known_at_its_tcp_port_too(
 
 
 def test_foreign_modules_with_one_number_are_passed_over(bench: Bench) -> None:
-    """Bare emulated modules all have the same number unless told another."""
+    """Bare emulated modules all have the same number unless another is given."""
     bench.serials = {"a": LEFT, "b": OTHER, "c": OTHER, "d": RIGHT}
     links = bench.find()
     assert [link.port for link in links] == ["a", "d"]
