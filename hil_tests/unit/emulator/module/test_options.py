@@ -14,7 +14,7 @@ def test_every_field_is_listed_with_a_default_that_can_be_set() -> None:
     texts = {one.name: one for one in option_texts()}
     assert list(texts) == [one.name for one in fields(DeviceOptions)]
     changes = dict(option_of(f"{name}={one.default}") for name, one in texts.items())
-    assert replace(DeviceOptions(), **changes) == DeviceOptions()  # type: ignore[arg-type]
+    assert replace(DeviceOptions(), **changes) == DeviceOptions()  # type: ignore[arg-type] # of any field
     assert all(one.meaning and one.allowed for one in texts.values())
 
 
