@@ -73,7 +73,10 @@ class SessionInfo:
     has_detections
         Whether ranges were recorded that SLAM takes instead of what it finds in frames.
     started_unix_ns
-        Time of day at session time 0; None if it has no meaning.
+        Time of day at session time 0, 0 where session time is the time of day; None if it has no
+        meaning.
+    odometry_clock
+        Text of the option --odometry-clock of a live run, "" of any other.
     """
 
     scene: str
@@ -89,6 +92,7 @@ class SessionInfo:
     time_base: str = "counter"
     started_unix_ns: int | None = None
     has_detections: bool = False
+    odometry_clock: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
