@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, Self
@@ -48,6 +48,45 @@ def locked(path: Path) -> Iterator[None]:
         except OSError:
             pass  # no locks here
         yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Give the block a path beside ``path`` to write to, then put that file in its place.
+
+    Whoever reads ``path`` finds the file of before or all of the new one, also after a kill or a
+    power failure. An error or a signal in the block leaves the file of before. What is there and
+    no regular file, such as a pipe or ``/dev/stdout``, is written to itself.
+
+    Raises OSError if the file cannot be written, or another process is just doing so.
+    """
+    if path.exists() and not path.is_file():
+        yield path
+        return
+    target = Path(os.path.realpath(path))  # a link stays one
+    fresh = target.with_name(f".unfinished.{target.name}")
+    fresh.touch()
+    try:
+        with locked(fresh):
+            try:
+                yield fresh
+                _sync(fresh)
+                fresh.replace(target)
+            except BaseException:
+                fresh.unlink(missing_ok=True)
+                raise
+    except PathInUseError:
+        raise OSError(errno.EBUSY, "another process is writing it") from None
+    with suppress(OSError):  # some file systems have no such thing for folders
+        _sync(target.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
     finally:
         os.close(descriptor)
 

@@ -20,6 +20,7 @@ from xethru_protocol.system import (
     StopRequestedError,
     locked,
     read_bounded,
+    written_whole,
 )
 
 ENDLESS = "/dev/zero"
@@ -191,3 +192,79 @@ def test_what_never_ends_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         load_plan(ENDLESS)
     assert main(["demo", "--scene", ENDLESS, "--out", str(tmp_path)]) == 1
     assert "longer than" in capsys.readouterr().err
+
+
+def test_a_file_is_the_old_one_until_the_new_one_is_whole(tmp_path: Path) -> None:
+    result = tmp_path / "map.png"
+    result.write_text("before")
+    with written_whole(result) as fresh:
+        assert fresh.suffix == ".png"  # what writes pictures goes by it
+        fresh.write_text("af")
+        assert result.read_text() == "before"
+        fresh.write_text("after")
+    assert result.read_text() == "after"
+    assert list(tmp_path.iterdir()) == [result]
+
+
+@pytest.mark.parametrize(
+    "ending", [OSError(errno.ENOSPC, "disk full"), StopRequestedError(signal.SIGTERM), ValueError()]
+)
+def test_what_ends_the_writing_leaves_the_old_file_and_no_half_one(
+    ending: BaseException, tmp_path: Path
+) -> None:
+    result = tmp_path / "summary.json"
+
+    def write() -> None:
+        with written_whole(result) as fresh:
+            fresh.write_text("half of it")
+            raise ending
+
+    for before in ([], [result]):
+        with pytest.raises(type(ending)):
+            write()
+        assert list(tmp_path.iterdir()) == before
+        result.write_text("before")
+    assert result.read_text() == "before"
+
+
+def test_the_next_writer_replaces_what_a_killed_one_left(tmp_path: Path) -> None:
+    result = tmp_path / "out.json"
+    code = (
+        "import os, pathlib, sys\n"
+        "from xethru_protocol.system import written_whole\n"
+        "with written_whole(pathlib.Path(sys.argv[1])) as fresh:\n"
+        "    fresh.write_text('a long text of a killed process')\n"
+        "    os.kill(os.getpid(), 9)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(result)], timeout=seconds(20))
+    assert not result.exists()
+    with written_whole(result) as fresh:
+        fresh.write_text("new")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("out.json", "new")]
+
+
+def test_two_do_not_write_one_file_at_a_time(tmp_path: Path) -> None:
+    result = tmp_path / "out.json"
+    with written_whole(result) as fresh:
+        fresh.write_text("first")
+        with pytest.raises(OSError, match="another process is writing it"), written_whole(result):
+            pytest.fail("both write")
+    assert result.read_text() == "first"
+
+
+def test_links_stay_links_and_what_is_no_file_is_written_to_itself(tmp_path: Path) -> None:
+    target, link, pipe = (tmp_path / name for name in ("target", "link", "pipe"))
+    link.symlink_to(target)
+    with written_whole(link) as fresh:
+        fresh.write_text("through the link")
+    assert link.is_symlink()
+    assert target.read_text() == "through the link"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        with written_whole(pipe) as fresh:
+            fresh.write_text("to the reader")
+        assert os.read(reader, 100) == b"to the reader"
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
