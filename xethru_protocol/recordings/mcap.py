@@ -153,9 +153,9 @@ def _body(data: bytes) -> bytes:
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
+MESSAGE_INDEX, ATTACHMENT, STATISTICS, METADATA, DATA_END = 7, 9, 11, 12, 15
 _IN_CHUNKS = (SCHEMA, CHANNEL, MESSAGE)
-_OF_SUMMARY = (8, 10, 11, 13, 14)  # indexes and statistics, behind the data
+_OF_SUMMARY = (8, 10, STATISTICS, 13, 14)  # indexes and statistics, behind the data
 _CODES = range(1, 16)  # private ones, from 128 on, are taken for damage
 
 _HEAD = struct.Struct("<BQ")
@@ -170,6 +170,9 @@ _LONGEST_NAME_BYTES = 8
 _NAME_AT = _HEAD.size + _CHUNK.size
 _PIECE_BYTES = 1 << 20
 _FOOTER_BYTES, _DATA_END_BYTES = 20, 4
+_TAIL_BYTES = _HEAD.size + _FOOTER_BYTES + len(MAGIC)
+_END_TIME_AT = 34  # in statistics, behind six counts and the time of the first message
+_MOST_INDEX_BYTES = 1 << 26
 
 DAMAGES = (struct.error, ValueError, RuntimeError, KeyError, zstandard.ZstdError)
 """What taking a damaged record apart may raise."""
@@ -528,6 +531,29 @@ class McapWriter(Writer):
 
     def finish(self) -> None:
         super().finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+
+
+def end_time_of(stream: BinaryIO, size: int) -> int | None:
+    """Return the newest time [ns] of a message by the file's own index; None where it has none.
+
+    Only the index is read, and of a wrong one no more than `_MOST_INDEX_BYTES`.
+    """
+    stream.seek(max(size - _TAIL_BYTES, 0))
+    tail = stream.read(_TAIL_BYTES)
+    code, length = _HEAD.unpack_from(tail.ljust(_HEAD.size, b"\0"))
+    if (code, length) != (FOOTER, _FOOTER_BYTES) or tail[-len(MAGIC) :] != MAGIC:
+        return None
+    (at,) = struct.unpack_from("<Q", tail, _HEAD.size)
+    if not max(size - _MOST_INDEX_BYTES, len(MAGIC)) <= at < size:
+        return None
+    while at + _HEAD.size <= size - _TAIL_BYTES:
+        stream.seek(at)
+        code, length = _HEAD.unpack(stream.read(_HEAD.size))
+        if code == STATISTICS and _END_TIME_AT + 8 <= length <= size - at:
+            (end_ns,) = struct.unpack("<Q", stream.read(_END_TIME_AT + 8)[_END_TIME_AT:])
+            return int(end_ns)
+        at += _HEAD.size + length
+    return None
 
 
 def statistics_of(path: Path) -> Statistics:

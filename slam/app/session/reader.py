@@ -44,6 +44,7 @@ from xethru_protocol.recordings.mcap import (
     Damage,
     Message,
     Metadata,
+    end_time_of,
     unpack_array,
     unpack_string,
 )
@@ -237,12 +238,18 @@ class RecordedSession:
     ----------
     cut_at_byte
         Where the file ends too early, after `records` has come to its end; None where it is whole.
+    end_ns
+        Session time of the newest message by the file's own index; None for a file without one,
+        as a run leaves it that was killed.
     """
 
-    def __init__(self, path: Path, info: SessionInfo, *, size: int | None = None) -> None:
+    def __init__(
+        self, path: Path, info: SessionInfo, *, size: int | None = None, end_ns: int | None = None
+    ) -> None:
         self.path = path
         self._size = size  # when it was opened: a run may be writing it still
         self.info = info
+        self.end_ns = end_ns
         self.cut_at_byte: int | None = None
 
     @property
@@ -412,7 +419,10 @@ def open_session(path: Path) -> RecordedSession:
         )
     if not radars:
         raise AppError(f"{path}: ends before any radar is named; record the session again")
-    return RecordedSession(path, read_session_table(path, head, tuple(radars)), size=size)
+    with open_mcap(path, size) as opened:
+        end_ns = end_time_of(*opened)
+    info = read_session_table(path, head, tuple(radars))
+    return RecordedSession(path, info, size=size, end_ns=end_ns)
 
 
 def _radar_info(path: Path, message: Message) -> RadarInfo:

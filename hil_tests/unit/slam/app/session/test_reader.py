@@ -232,6 +232,22 @@ def test_damage_names_the_file(session_file: Path, tmp_path: Path) -> None:
     assert str(path) in str(caught.value)
 
 
+def test_the_end_comes_from_the_index_without_a_pass_over_the_file(
+    session_file: Path, tmp_path: Path
+) -> None:
+    with session_file.open("rb") as stream:
+        newest_ns = max(message.log_time for *_, message in make_reader(stream).iter_messages())
+    assert open_session(session_file).end_ns == newest_ns >= (N_SCANS - 1) * FRAME_NS
+    whole = session_file.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for n_bytes in (len(whole) - 1, len(whole) - 40, len(whole) // 2):
+        cut.write_bytes(whole[:n_bytes])
+        assert open_session(cut).end_ns is None
+    for wrong in (0, 1, len(whole) // 2, len(whole) - 20, 2**63):  # where the index is said to be
+        cut.write_bytes(whole[:-28] + wrong.to_bytes(8, "little") + whole[-20:])
+        open_session(cut)  # whatever it finds there
+
+
 def test_a_session_that_grows_reads_the_same_again(tmp_path: Path) -> None:
     """What a run adds after it was opened would have scans without the odometry read before."""
     path = write_session(tmp_path / "session.mcap", 60)
