@@ -33,6 +33,9 @@ class RadarFrame:
     # Smallest and largest value the module's sampler can give, normalised RF amplitude; a sample at
     # one of them was cut off there. None if unknown.
     limits: tuple[float, float] | None = None
+    # Counters follow on each other within a stream only; a new one begins wherever the module's
+    # counter may have begun anew
+    stream: int = 0
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 1 or self.samples.dtype != np.float32:

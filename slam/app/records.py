@@ -133,8 +133,10 @@ class Snapshot:
         Shape (m, 2) and (m, 2, 2), map frame.
     nis_per_dof
         One value per observation that was associated with a landmark at this state.
+    wall_spans_m
+        Ends of the stretches of wall that answered until then, shape (k, 2, 2), map frame.
     step
-        Everything that led to the state, for views; None if it was read from a file.
+        Everything that led to the state, for views; None if it was read from a file without it.
     """
 
     counter: int
@@ -148,6 +150,7 @@ class Snapshot:
     landmarks_m: NDArray[np.float64]
     landmark_covariances_m2: NDArray[np.float64]
     nis_per_dof: tuple[float, ...]
+    wall_spans_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2, 2)))
     step: StepResult | None = None
 
 

@@ -4,11 +4,19 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from hil_tests.system.recorded_session import write_shorter_scene
+from hil_tests.unit.slam.app.session.test_steps import assert_same_step
+from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.cli import main
+from slam.app.records import Snapshot
+from slam.app.run.replay import recorded_source
+from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
+from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
 
@@ -71,3 +79,46 @@ def test_what_is_left_of_a_cut_file_is_the_beginning_of_the_run(
     n_flushed = 14  # of preset paper: states that were in the window when the file ended
     assert len(expected) / 4 < len(lines) < len(expected)
     assert lines[:-n_flushed] == expected[: len(lines) - n_flushed]
+
+
+def test_what_led_to_every_state_is_recorded(recorded: Recorded) -> None:
+    """The replay's own steps against the numbers in the file, taken apart by hand."""
+    session = recorded.folder / "session.mcap"
+    listener = Listener()
+    execute(recorded_source(open_session(session), StopFlag()), [listener])
+    with session.open("rb") as stream:
+        messages = [m for _, _, m in make_reader(stream).iter_messages(topics=["/slam/step"])]
+    assert [m.log_time for m in messages] == [live.t_ns for live in listener.snapshots]
+    n_detections = 0
+    for message, live in zip(messages, listener.snapshots, strict=True):
+        step = live.step
+        assert step is not None
+        # CDR: 4 bytes of head, then doubles at multiples of 8 from there; the array comes last
+        row = np.frombuffer(message.data[4 + (len(message.data) - 4) % 8 :], "<f8")
+        report, n_own, n_spans = step.report, len(step.detections), len(live.wall_spans_m)
+        size = 14 + 9 * n_own + 6 * len(step.fixes) + 7 * len(step.observations)
+        size += sum(2 * len(a.candidate_ids) for a in step.associations) + len(step.rejected)
+        size += sum(f in step.fixes for o in step.observations for f in o.fixes) + 4 * n_spans
+        if report is not None:
+            size += 3 * len(report.continued) + 8 * len(report.predicted)
+            assert row[-size:][10:14].tolist() == [
+                report.nis,
+                report.dof,
+                report.carried,
+                report.lost,
+            ]
+        row = row[-size:]
+        assert row[:3].tolist() == [n_own, len(step.fixes), len(step.observations)]
+        ranges = row[14 : 14 + 9 * n_own].reshape(-1, 9)
+        assert ranges[:, 0].tolist() == [one.radar for one in step.detections]
+        assert (live.t_ns + ranges[:, 1].astype(int)).tolist() == [
+            one.t_ns for one in step.detections
+        ]
+        assert ranges[:, 2].tolist() == [one.range_m for one in step.detections]
+        assert tuple(ranges[:, 8].tolist()) == (step.range_sigmas_m or (0.0,) * n_own)
+        n_detections += n_own
+    assert n_detections > 100
+    states = [r for r in open_session(session).records() if isinstance(r, Snapshot)]
+    for found, live in zip(states, listener.snapshots, strict=True):
+        assert found.wall_spans_m.tolist() == live.wall_spans_m.tolist()
+        assert_same_step(found.step, live.step)

@@ -114,6 +114,7 @@ def radar_frame(
         range_start_m=frame.geometry.range_start_m * TRUE_PER_MODULE_METRE,
         bin_length_m=frame.geometry.bin_length_m * TRUE_PER_MODULE_METRE,
         limits=limits,
+        stream=frame.stream,
     )
 
 

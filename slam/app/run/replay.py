@@ -22,7 +22,7 @@ from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress, note
 from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
-from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
+from slam.app.run.runner import LinkLog, RunSource, execute, frames_between, make_slam
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
@@ -139,13 +139,13 @@ class _RecordedScans:
     Attributes
     ----------
     n_lost
-        Frames missing so far between counters; a counter that begins anew is no loss.
+        Frames missing so far between counters of one stream.
     """
 
     def __init__(self, session: RecordedSession, lines: Sequence[LogLine], stop: StopFlag) -> None:
         self._session, self._lines, self._stop = session, lines, stop
         self._truth: dict[int, NDArray[np.float64]] = {}
-        self._last: list[int | None] = [None] * len(session.info.radars)
+        self._last: list[RadarFrame | None] = [None] * len(session.info.radars)
         self.n_lost = 0
         self.link_log = LinkLog()
 
@@ -170,9 +170,8 @@ class _RecordedScans:
     def _count_lost(self, scan: Scan) -> None:
         for frame in scan.frames:
             last = self._last[frame.radar]
-            if last is not None and frame.counter > last:
-                self.n_lost += frame.counter - last - 1
-            self._last[frame.radar] = frame.counter
+            self.n_lost += 0 if last is None else frames_between(last, frame)
+            self._last[frame.radar] = frame
 
 
 class Comparison(SessionObserver):

@@ -287,6 +287,14 @@ def _snapshot(
     )
 
 
+def frames_between(last: RadarFrame, frame: RadarFrame) -> int:
+    """Return how many frames of a radar are missing between two; 0 if a new stream began.
+
+    Sessions of older versions hold no numbers of streams: a counter that falls is a new stream.
+    """
+    return max(frame.counter - last.counter - 1, 0) if frame.stream == last.stream else 0
+
+
 class LinkState(StrEnum):
     """State of a radar's link."""
 
@@ -315,8 +323,8 @@ class LinkCount:
     ----------
     frames, lost, faults
         Frames that came; counters missing between them; warnings in the log of its link.
-    last_counter
-        Of its newest frame; None before the first.
+    last
+        Its newest frame; None before the first.
     longest_gap
         Most frames lost in a row.
     state
@@ -326,7 +334,7 @@ class LinkCount:
     frames: int = 0
     lost: int = 0
     faults: int = 0
-    last_counter: int | None = None
+    last: RadarFrame | None = None
     longest_gap: int = 0
     state: LinkState | None = None
 
@@ -351,12 +359,11 @@ class LinkStates:
                 if scan.used:
                     yield from self._change(radar.name, scan.t_ns, LinkState.SILENT)
                 continue
-            before = count.last_counter
-            gap = 0 if before is None else max(frame.counter - before - 1, 0)
+            gap = 0 if count.last is None else frames_between(count.last, frame)
             count.frames += 1
             count.lost += gap
             count.longest_gap = max(count.longest_gap, gap)
-            count.last_counter = frame.counter
+            count.last = frame
             state = LinkState.FRAMES_LOST if gap else LinkState.STREAMING
             yield from self._change(radar.name, frame.t_ns, state)
 

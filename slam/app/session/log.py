@@ -38,6 +38,7 @@ from slam.app.session.messages import (
     session_table,
     state_row,
 )
+from slam.app.session.steps import step_row
 from slam.geometry import between, compose
 from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,
@@ -197,11 +198,13 @@ class SessionLog(SessionObserver):
     """Writes a session as it happens.
 
     Topics: `/radar/<name>/frame` with the frame counter in the record's sequence number and a
-    latched `/radar/<name>/info` (JSON); `/scan` after the frames of each scan, with their counters
+    latched `/radar/<name>/info` (JSON), `/radar/<name>/stream` before the first frame of every
+    stream but number 0; `/scan` after the frames of each scan, with their counters
     and the true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`,
     `/landmarks`, `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit
-    (`state_row`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
-    that another program found in `/radar/<name>/detections`. A metadata record is `session_table`.
+    (`state_row`), `/slam/step`, what led to each (`step_row`); where there are such, raw bytes in
+    `/radar/<name>/rx` and `tx`, and ranges that another program found in
+    `/radar/<name>/detections`. A metadata record is `session_table`.
 
     Parameters
     ----------
@@ -239,6 +242,7 @@ class SessionLog(SessionObserver):
         self._t_ns = start_ns
         self._rare_channels: dict[str, int] = {}
         self._names = [radar.name for radar in info.radars]
+        self._streams = [0] * len(self._names)
         self._frame_channels: list[int] = []
         self._file.add_metadata(METADATA_NAME, session_table(info))
         for radar in info.radars:
@@ -249,6 +253,7 @@ class SessionLog(SessionObserver):
             self._file.write(channel, start_ns, pack_string(radar_text(radar)))
         self._scans = self._file.channel("/scan", DOUBLE_ARRAY)
         self._unused_scans = self._file.channel("/scan_unused", DOUBLE_ARRAY)
+        self._steps = self._file.channel("/slam/step", DOUBLE_ARRAY)
         self._states = self._file.channel("/slam/state", DOUBLE_ARRAY)
         self._odometry = self._file.channel("/odom", ros.ODOMETRY)
         self._truth = self._file.channel("/truth", ros.POSE)
@@ -274,6 +279,10 @@ class SessionLog(SessionObserver):
             self.on_odometry(sample)
         arrivals = scan.host_ns or (None,) * len(scan.frames)
         for frame, host_ns in zip(scan.frames, arrivals, strict=True):
+            if frame.stream != self._streams[frame.radar]:
+                self._streams[frame.radar] = frame.stream
+                channel = self._rare_channel(self._names[frame.radar], "stream", ros.NUMBER)
+                self._write(channel, frame.t_ns, ros.number(frame.stream))
             self._file.write(
                 self._frame_channels[frame.radar],
                 frame.t_ns,
@@ -315,8 +324,12 @@ class SessionLog(SessionObserver):
             ("odom", "base_link"): snapshot.odometry,
         }
         self._write(self._transforms, t_ns, ros.transforms(t_ns, links))
-        row = pack_array(DOUBLE_ARRAY, state_row(snapshot), "state")
-        self._file.write(self._states, t_ns, row, sequence=snapshot.counter)
+        if snapshot.step is not None:  # before its state, which a reader waits for
+            step = step_row(snapshot.step, snapshot.wall_spans_m)
+            message = pack_array(DOUBLE_ARRAY, step, "step")
+            self._file.write(self._steps, t_ns, message, sequence=snapshot.counter)
+        state = pack_array(DOUBLE_ARRAY, state_row(snapshot), "state")
+        self._file.write(self._states, t_ns, state, sequence=snapshot.counter)
 
     def on_log(self, line: LogLine) -> None:
         message = ros.log_line(line.t_ns, line.radar, line.text, warning=line.warning)

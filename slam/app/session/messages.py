@@ -8,7 +8,8 @@ The row of a state, float64, in /slam/state::
     n_landmarks times: id, x, y, cov_xx, cov_xy, cov_yx, cov_yy,
     n_nis times: NIS per degree of freedom
 
-in the units and frames of `Snapshot`; an unknown truth is NaN.
+in the units and frames of `Snapshot`; an unknown truth is NaN. What led to the state is in
+/slam/step, see `slam.app.session.steps`.
 
 Composite messages are made and serialised by the rosbags library.
 """
@@ -96,6 +97,7 @@ POSE = "geometry_msgs/msg/PoseStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 LOG = "rcl_interfaces/msg/Log"
+NUMBER = "std_msgs/msg/UInt32"
 
 _LOG_INFO, LOG_WARN = 20, 30
 _POINT_FIELD_FLOAT32, _POINT_FIELD_UINT32 = 7, 6
@@ -238,6 +240,10 @@ def log_line(t_ns: int, radar: str, text: str, *, warning: bool) -> Message:
     )
 
 
+def number(value: int) -> Message:
+    return _type(NUMBER)(data=value)
+
+
 @cache
 def _landmark_fields() -> list[Message]:
     fields = LANDMARK_DTYPE.fields
@@ -293,6 +299,7 @@ def session_table(info: SessionInfo) -> dict[str, str]:
         "time_base": info.time_base,
         "has_detections": json.dumps(info.has_detections),
         "started_unix_ns": "" if info.started_unix_ns is None else str(info.started_unix_ns),
+        "odometry_clock": info.odometry_clock,
         "true_landmarks_m": json.dumps(info.true_landmarks_m.tolist()),
         "outlines_m": json.dumps([line.tolist() for line in info.outlines_m]),
         "config": info.config_json,
@@ -355,6 +362,7 @@ def read_session_table(
             time_base=table.get("time_base", "counter"),
             has_detections=bool(json.loads(table.get("has_detections", "false"))),
             started_unix_ns=int(started) if started else None,
+            odometry_clock=table.get("odometry_clock", ""),
         )
     except (KeyError, ValueError, TypeError) as error:
         raise AppError(f"{path}: metadata {METADATA_NAME!r} cannot be read: {error!r}") from None

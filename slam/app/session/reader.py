@@ -31,6 +31,7 @@ from slam.app.session.messages import (
     read_session_table,
     snapshot_of,
 )
+from slam.app.session.steps import with_step
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Mount, Rig
 from xethru_protocol.driver.link import RawConfig
@@ -167,7 +168,11 @@ SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot
 
 
 def _frame(
-    message: Message, index: int, radar: RadarInfo, limits: tuple[float, float] | None
+    message: Message,
+    index: int,
+    radar: RadarInfo,
+    limits: tuple[float, float] | None,
+    stream: int,
 ) -> RadarFrame:
     samples = unpack_array(FLOAT_ARRAY, message.data)
     if len(samples) != radar.n_bins:
@@ -180,6 +185,7 @@ def _frame(
         range_start_m=radar.range_start_m * TRUE_PER_MODULE_METRE,
         bin_length_m=radar.bin_length_m * TRUE_PER_MODULE_METRE,
         limits=limits,
+        stream=stream,
     )
 
 
@@ -206,9 +212,12 @@ def _scan_end(message: Message) -> ScanEnd:
     )
 
 
-def _state(message: Message) -> Snapshot:
+def _state(message: Message, step: Message | None) -> Snapshot:
     row = unpack_array(DOUBLE_ARRAY, message.data)
-    return snapshot_of(message.sequence, message.t_ns, row)
+    state = snapshot_of(message.sequence, message.t_ns, row)
+    if step is None or step.t_ns != state.t_ns:  # none was recorded, or damage took it
+        return state
+    return with_step(state, unpack_array(DOUBLE_ARRAY, step.data))
 
 
 def _odometry(message: Message) -> TumSample:
@@ -225,7 +234,6 @@ def _log_line(message: Message) -> LogLine:
 _READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
-    "/slam/state": _state,
     "/odom": _odometry,
     "/log": _log_line,
 }
@@ -355,11 +363,24 @@ class RecordedSession:
             f"/radar/{radar.name}/frame": (index, radar, _limits_of(radar))
             for index, radar in enumerate(self.info.radars)
         }
+        of_stream = {
+            f"/radar/{radar.name}/stream": index for index, radar in enumerate(self.info.radars)
+        }
+        streams = [0] * len(self.info.radars)
+        step: Message | None = None
         for entry in self._messages():
             record: SessionRecord | None = None
             with self._naming(entry):
                 if entry.topic in radar_of:
-                    record = _frame(entry, *radar_of[entry.topic])
+                    index, radar, limits = radar_of[entry.topic]
+                    record = _frame(entry, index, radar, limits, streams[index])
+                elif entry.topic in of_stream:
+                    number = ros.deserialise(entry.data, ros.NUMBER)
+                    streams[of_stream[entry.topic]] = int(number.data)
+                elif entry.topic == "/slam/step":
+                    step = entry
+                elif entry.topic == "/slam/state":
+                    record = _state(entry, step)
                 elif entry.topic in _READERS:
                     record = _READERS[entry.topic](entry)
             if record is not None:
@@ -376,7 +397,14 @@ class RecordedSession:
     def _naming(self, entry: Message) -> Iterator[None]:
         try:
             yield
-        except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
+        except (
+            ValueError,
+            TypeError,
+            AssertionError,
+            IndexError,
+            OverflowError,
+            struct.error,
+        ) as error:
             raise AppError(
                 f"{self.path}: a message of {entry.topic} at "
                 f"{entry.t_ns / 1e9:.3f} s cannot be read: {error}"

@@ -132,6 +132,17 @@ def line(text: str, *, warning: bool = False, radar: str = "radar0") -> LogLine:
     return LogLine(t_ns=0, radar=radar, warning=warning, text=text)
 
 
+def test_counters_of_two_streams_are_no_gap() -> None:
+    """A radar that restarts soon begins anew with a counter above its last one."""
+    links = LinkStates(session_info(1).radars)
+    for counter, stream in ((1, 0), (2, 0), (5, 1), (7, 1), (8, 2), (3, 2), (5, 2)):
+        one = scan(counter, 1)
+        frames = (replace(one.frames[0], stream=stream),)
+        list(links.on_scan(replace(one, frames=frames)))
+    assert (links.counts["radar0"].frames, links.counts["radar0"].lost) == (7, 2)
+    assert links.counts["radar0"].longest_gap == 1
+
+
 def test_a_gap_in_the_counters_is_a_loss_until_the_next_frame() -> None:
     links = LinkStates(session_info(1).radars)
     changes = [

@@ -175,12 +175,14 @@ def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:
         wheels={"scale_sigma": 1 / 3},
         outlines_m=(np.array([[0.1, 1 / 3], [2.0, 3.0]]), np.zeros((3, 2))),
         started_unix_ns=1_790_000_000_123_456_789,
+        odometry_clock="unix",
     )
     path = tmp_path / "s.mcap"
     SessionLog(path, sent).close()
     found = open_session(path).info
     assert (found.config_json, found.wheels) == (sent.config_json, sent.wheels)
     assert found.started_unix_ns == sent.started_unix_ns
+    assert found.odometry_clock == "unix"
     assert [line.tolist() for line in found.outlines_m] == [
         line.tolist() for line in sent.outlines_m
     ]
