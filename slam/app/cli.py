@@ -418,8 +418,9 @@ _COMMANDS = (
         "repeat a run over scenes, presets and seeds",
         _add_sweep,
         "Runs every scene with every preset and seed in process, without ports, "
-        "and writes each run's summary and the statistics of each group. Stopped, the same "
-        "command goes on where it was. All numbers are simulated.",
+        "and writes each run's summary and the statistics of each group. Runs that are done are "
+        "kept in OUT.part, and the same command goes on with them; if OUT is there already, it "
+        "prints that result again. All numbers are simulated.",
         "STRESS is one of: "
         + "; ".join(f"{name}: {stress.help}" for name, stress in STRESSES.items())
         + ".",

@@ -1,7 +1,8 @@
 """`uwb-slam sweep`: the same run over scenes, presets, settings, stresses and seeds.
 
-The file of results is a JSON object, ``{"command": {...}, "runs": [...]}``, whole after every run:
-each is appended over the closing brackets by one write.
+OUT.part holds lines of JSON: what the runs depend on, then a run each. A run is appended by one
+write and on disk before the next begins, so a full disk or a kill costs the run in hand at most.
+OUT is ``{"command": {...}, "runs": [...], "groups": [...]}``.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ import sys
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack, closing, suppress
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from joblib import cpu_count
 from pydantic import TypeAdapter, ValidationError
 
 from slam.app.errors import AppError, UsageError, naming
-from slam.app.run.output import print_table
+from slam.app.run.output import note, print_table
 from slam.app.sweep import CLEAN
 from slam.app.sweep.bound import PURPOSE, load_gtsam
 from slam.app.sweep.run import Case, SweepRun, make_case, program_version, run_case
@@ -34,25 +35,29 @@ from slam.app.sweep.statistics import (
     summarise_groups,
 )
 from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
-from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked, one_line
+from xethru_protocol.system import (
+    PathInUseError,
+    StopFlag,
+    StopRequestedError,
+    locked,
+    one_line,
+    read_bounded,
+    written_whole,
+)
 
-_TAIL = b"\n]}\n"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Contents:
-    command: dict[str, str]
-    runs: list[SweepRun]
-
-
-_READER: TypeAdapter[_Contents] = TypeAdapter(_Contents)
+_RUN_READER: TypeAdapter[SweepRun] = TypeAdapter(SweepRun)
+_RUNS_READER: TypeAdapter[list[SweepRun]] = TypeAdapter(list[SweepRun])
+_MOST_BYTES = 1 << 30
+_BEFORE_LINES = b'{"command": {\n'
+"""How OUT.part began when it was one JSON object."""
 
 
 class PartFile:
     """The file OUT.part: an existing file that is begun if it is empty, or read and continued.
 
     ``command`` holds what the runs depend on, by name, and must be what the file says; ``runs``
-    are those done so far, in their order.
+    are those done so far, in their order. A last line without its end is taken away: it was being
+    written when the program or the disk failed.
 
     Raises AppError and changes nothing if it holds the runs of another command, or no such thing.
     """
@@ -64,44 +69,101 @@ class PartFile:
             content = path.read_bytes()
         except OSError as error:
             raise AppError(f"{path}: cannot be read: {error.strerror or error}") from None
-        if content:
-            self.runs = _runs_of(path, content, command)
-            self._end = content.rindex(_TAIL)
-            return
-        head = f'{{"command": {json.dumps(dict(command), indent=1)},\n"runs": ['.encode()
+        head = _line({"command": dict(command)})
+        self._end = content.rfind(b"\n") + 1
+        if self._end:
+            self.runs = _runs_of(path, content[: self._end], command)
+        elif not head.startswith(content):
+            raise _not_a_part(path, "not what a sweep leaves unfinished")
         with naming(path):
-            path.write_bytes(head + _TAIL)
-        self._end = len(head)
+            if self._end < len(content):
+                os.truncate(path, self._end)
+            if not self._end:
+                self._append(head)
 
     def add(self, run: SweepRun) -> None:
-        text = json.dumps(asdict(run), allow_nan=False).encode()
-        separator = b",\n" if self.runs else b"\n"
-        with naming(self.path), self.path.open("r+b", buffering=0) as file:
-            file.seek(self._end)
-            file.write(separator + text + _TAIL)
-            os.fsync(file.fileno())
-        self._end += len(separator) + len(text)
+        with naming(self.path):
+            self._append(_line(asdict(run)))
         self.runs.append(run)
+
+    def _append(self, line: bytes) -> None:
+        """Append a line, all or nothing: what a full disk took of it is taken away again."""
+        with self.path.open("r+b", buffering=0) as file:
+            file.seek(self._end)
+            try:
+                written = 0
+                while written < len(line):  # the second write names the reason of a short one
+                    written += file.write(line[written:])
+                os.fsync(file.fileno())
+            except BaseException:
+                with suppress(OSError):
+                    file.truncate(self._end)
+                raise
+        self._end += len(line)
+
+
+def _line(value: object) -> bytes:
+    return json.dumps(value, allow_nan=False).encode() + b"\n"
+
+
+def _not_a_part(path: Path, what: str) -> AppError:
+    return AppError(f"{path}: {what}; choose another --json, or move this file away to begin anew")
 
 
 def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[SweepRun]:
-    remedy = "choose another --json, or move this file away"
+    """Read whole lines."""
+    if content.startswith(_BEFORE_LINES):
+        raise _not_a_part(path, "an older version left it, and its runs cannot be continued")
+    head, *rest = content.splitlines()
     try:
-        known = _READER.validate_json(content)
-    except ValidationError:
+        known = json.loads(head)["command"]
+    except (ValueError, LookupError, TypeError, RecursionError):
+        known = None
+    if not isinstance(known, dict):
+        raise _not_a_part(path, "not what a sweep leaves unfinished")
+    runs = []
+    for number, line in enumerate(rest, start=2):
+        try:
+            runs.append(_RUN_READER.validate_json(line))
+        except ValidationError:
+            raise _not_a_part(path, f"line {number} is damaged, or no run of a sweep") from None
+    differing = [name for name in command if known.get(name) != command[name]]
+    if differing or set(known) != set(command):
+        names = ", ".join(differing or sorted(set(known) ^ set(command)))
         raise AppError(
-            f"{path}: damaged, or not what a sweep left unfinished; {remedy} to begin anew"
-        ) from None
-    if not content.endswith(_TAIL):
-        raise AppError(f"{path}: somebody else wrote behind the runs of a sweep; {remedy}")
-    differing = [name for name in command if known.command.get(name) != command[name]]
-    if differing or set(known.command) != set(command):
-        names = ", ".join(differing or sorted(set(known.command) ^ set(command)))
-        raise AppError(
-            f"{path}: holds {len(known.runs)} runs of another sweep (other: {names}); "
-            f"give that one's command to go on with it, {remedy}"
+            f"{path}: holds {len(runs)} runs of another sweep (other: {names}); give that one's "
+            "command to go on with it, choose another --json, or move this file away to begin anew"
         )
-    return known.runs
+    return runs
+
+
+def _finished(out: Path, command: Mapping[str, str]) -> list[SweepRun]:
+    """Return the runs of a result that this command wrote before; none if there is no such file.
+
+    The result of another command is replaced at the end, and a line says so. Raises AppError for
+    what is no result of a sweep.
+    """
+    try:
+        content = read_bounded(out, _MOST_BYTES)
+        result = json.loads(content) if content else None
+        is_sweep = result is None or {"runs", "groups"} <= result.keys()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise AppError(f"{out}: cannot be read: {error.strerror or error}") from None
+    except (ValueError, AttributeError, RecursionError):
+        is_sweep = False
+    if not is_sweep:
+        raise AppError(
+            f"{out}: is not the result of a sweep, and would be lost; choose another --json"
+        )
+    if result is None:
+        return []
+    with suppress(ValidationError):
+        if result.get("command") == command:
+            return _RUNS_READER.validate_python(result["runs"])
+    note(f"{out}: the result of another sweep; it is replaced when this one is done")
+    return []
 
 
 def run_sweep(
@@ -117,16 +179,17 @@ def run_sweep(
     jobs: int | None = None,
     dask: str | None = None,
 ) -> None:
-    """Run all cells, write `{"runs": [...], "groups": [...]}`, print one line per group.
+    """Run all cells, write ``out``, print one line per group.
 
-    OUT.part holds the runs done so far, and the same command goes on with it. The scene is the lab
-    and the preset robust, if none is given; ``settings`` are dotted keys of a preset and the values
-    to try. ``jobs`` is the number of processes, None for one per core; ``dask`` the address of a
-    scheduler that runs them instead.
+    OUT.part holds the runs done so far, and the same command goes on with it. A command whose
+    result is there already prints it again. The scene is the lab and the preset robust, if none is
+    given; ``settings`` are dotted keys of a preset and the values to try. ``jobs`` is the number of
+    processes, None for one per core; ``dask`` the address of a scheduler that runs them instead.
 
-    Raises AppError before the first run for a wrong name, or a file that cannot be written or is
-    not this sweep's; later for a scene too short, or a worker process or a cluster that died.
-    Raises StopRequestedError after a signal; OUT.part stays if it holds a run.
+    Raises AppError before the first run for a wrong name, or a file that cannot be written, is not
+    this sweep's, or is no sweep's; later for a scene too short, a full disk, or a worker process
+    or a cluster that died. Raises StopRequestedError after a signal; OUT.part stays if it holds a
+    run.
     """
     presets = presets or ["robust"]
     # a wrong name ends the command before any run
@@ -138,6 +201,7 @@ def run_sweep(
     if out.exists() and not out.is_file():
         # it would be replaced: as root, even a device for everybody
         raise AppError(f"{out}: is no regular file, must be one")
+    command = _command(cases, presets, n_seeds, settings, bound=bound)
     path = out.with_name(f"{out.name}.part")
     with ExitStack() as held:
         with naming(path):  # what cannot be written ends the command before any run, too
@@ -149,11 +213,22 @@ def run_sweep(
                 raise AppError(
                     f"{path}: another sweep is writing there; choose another --json"
                 ) from None
-        part = PartFile(path, _command(cases, presets, n_seeds, settings, bound=bound))
-        done = {run.key for run in part.runs}
-        missing = [case for case in cases if case.key not in done]
-        with closing(_results(missing, jobs or cpu_count(), dask, stop)) as results:
-            _run(cases, part, results, out)
+        held.callback(_remove_empty, path)
+        runs = _finished(out, command)
+        part = PartFile(path, command)
+        if runs:
+            note(f"{out}: holds the result of this command; remove it to run everything again")
+        else:
+            done = {run.key for run in part.runs}
+            missing = [case for case in cases if case.key not in done]
+            with closing(_results(missing, jobs or cpu_count(), dask, stop)) as results:
+                runs = _run(cases, part, results, out, command)
+        part.path.unlink(missing_ok=True)
+        groups = summarise_groups(runs)
+    for group in groups:
+        sys.stdout.write(f"{one_line(group_line(group))}\n")
+    for clean, rows in stress_tables(groups):
+        print_table(*stress_table(clean, rows))
 
 
 def _cases(
@@ -212,14 +287,21 @@ def _digest(*texts: str) -> str:
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()
 
 
-def _run(cases: Sequence[Case], part: PartFile, results: Iterator[SweepRun], out: Path) -> None:
+def _run(
+    cases: Sequence[Case],
+    part: PartFile,
+    results: Iterator[SweepRun],
+    out: Path,
+    command: Mapping[str, str],
+) -> list[SweepRun]:
+    """Do the missing runs and write the result; return all runs in the order of the cases."""
     n_done = len(part.runs)
     if n_done:
-        at = one_line(str(part.path))
-        sys.stderr.write(f"{at}: {n_done} of {len(cases)} runs are done, going on\n")
+        note(f"{part.path}: {n_done} of {len(cases)} runs are done, going on")
 
-    def left() -> str:
-        return f"; {len(part.runs)} of {len(cases)} runs are in {part.path}" if part.runs else ""
+    def kept() -> str:
+        at = f"{len(part.runs)} of {len(cases)} runs are in {part.path}"
+        return f"; {at}, and the same command goes on with them" if part.runs else ""
 
     started = time.monotonic()
     try:
@@ -232,27 +314,33 @@ def _run(cases: Sequence[Case], part: PartFile, results: Iterator[SweepRun], out
                 f"{len(part.runs)} of {len(cases)}: {one_line(_run_line(run))}; "
                 f"{_clock(elapsed_s)} elapsed, {_clock(remaining_s)} remaining\n"
             )
+        by_key = {run.key: run for run in part.runs}
+        runs = [by_key[case.key] for case in cases]
+        result = {
+            "command": command,
+            "runs": [asdict(run) for run in runs],
+            "groups": summarise_groups(runs),
+        }
+        with naming(out), written_whole(out) as fresh:
+            fresh.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", "ascii")
     except StopRequestedError as stopped:
-        raise StopRequestedError(stopped.received, left()) from None
+        raise StopRequestedError(stopped.received, kept()) from None
     except BrokenExecutor:
-        raise AppError(f"a worker process died; did memory run out?{left()}") from None
+        raise AppError(f"a worker process died; did memory run out?{kept()}") from None
     except ClusterLostError as lost:
-        raise AppError(f"{lost}{left()}") from None
+        raise AppError(f"{lost}{kept()}") from None
+    except AppError as error:
+        raise type(error)(f"{error}{kept()}") from None
     finally:
         if not part.runs:
-            part.path.unlink()
-    by_key = {run.key: run for run in part.runs}
-    runs = [by_key[case.key] for case in cases]
-    groups = summarise_groups(runs)
-    result = {"runs": [asdict(run) for run in runs], "groups": groups}
-    with naming(part.path):
-        text = json.dumps(result, indent=2, allow_nan=False) + "\n"
-        part.path.write_text(text, encoding="ascii")
-        part.path.replace(out)
-    for group in groups:
-        sys.stdout.write(f"{one_line(group_line(group))}\n")
-    for clean, rows in stress_tables(groups):
-        print_table(*stress_table(clean, rows))
+            part.path.unlink(missing_ok=True)
+    return runs
+
+
+def _remove_empty(path: Path) -> None:
+    with suppress(OSError):
+        if not path.stat().st_size:
+            path.unlink()
 
 
 def _run_line(run: SweepRun) -> str:

@@ -2,9 +2,11 @@
 
 import json
 import math
+import resource
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -140,27 +142,167 @@ def part_with(path: Path, count: int) -> PartFile:
     return part
 
 
-def test_the_file_is_whole_after_every_run_and_reads_back_the_same(tmp_path: Path) -> None:
+def test_the_file_has_a_line_for_the_command_and_one_per_run(tmp_path: Path) -> None:
     path = tmp_path / "o.part"
-    path.touch()
-    part = PartFile(path, COMMAND)
-    assert json.loads(path.read_text()) == {"command": COMMAND, "runs": []}
+    part = part_with(path, 0)
     for count, run in enumerate(runs(), start=1):
         part.add(run)
-        assert len(json.loads(path.read_text())["runs"]) == count
+        command, *lines = path.read_text().splitlines()
+        assert json.loads(command) == {"command": COMMAND}
+        assert [json.loads(line)["seed"] for line in lines] == list(range(count))
         assert PartFile(path, COMMAND).runs == part.runs == runs()[:count]
+
+
+def test_cut_at_any_byte_it_loses_the_last_line_only_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep.os, "fsync", lambda _: None)  # thousands of them take seconds
+    part_with(path := tmp_path / "o.part", 2)
+    expected, whole = runs()[:2], path.read_bytes()
+    for size in range(len(whole) + 1):
+        path.write_bytes(whole[:size])
+        part = PartFile(path, COMMAND)
+        n_lines = whole[:size].count(b"\n")
+        assert part.runs == expected[: max(n_lines - 1, 0)], size
+        for run in expected[len(part.runs) :]:
+            part.add(run)
+        assert path.read_bytes() == whole, size
+
+
+@contextmanager
+def largest_file(n_bytes: int) -> Iterator[None]:
+    """Let no file of this process grow beyond that: a write that would is cut short there."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("room", [0, 1, 400])
+def test_what_a_full_disk_takes_of_a_run_is_taken_away_again(room: int, tmp_path: Path) -> None:
+    part = part_with(path := tmp_path / "o.part", 1)
+    before = path.read_bytes()
+    with largest_file(len(before) + room), pytest.raises(AppError, match="cannot be written"):
+        part.add(runs()[1])
+    assert path.read_bytes() == before
+    part.add(runs()[1])
+    assert PartFile(path, COMMAND).runs == runs()[:2]
+
+
+@pytest.mark.parametrize("room", [0, 5])
+def test_a_disk_that_is_full_from_the_first_leaves_nothing(
+    room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep, "run_case", interrupted_after(99, []))
+    with largest_file(room), StopFlag() as stop, pytest.raises(AppError):
+        run_sweep(stop, **options_of(tmp_path / "out"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_result_that_does_not_fit_costs_no_run_and_not_the_result_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, part = tmp_path / "out", tmp_path / "out.part"
+    with StopFlag() as stop:
+        monkeypatch.setattr(sweep, "run_case", interrupted_after(99, []))
+        run_sweep(stop, **options_of(out, n_seeds=1))
+        before = out.read_bytes()
+        monkeypatch.setattr(sweep, "run_case", interrupted_after(11, []))
+        with pytest.raises(StopRequestedError):
+            run_sweep(stop, **options_of(out))
+        monkeypatch.setattr(sweep, "run_case", interrupted_after(1, []))
+        # room for the last run, and not for the result, which is longer by its line ends
+        with largest_file(part.stat().st_size * 12 // 10), pytest.raises(AppError) as failed:
+            run_sweep(stop, **options_of(out))
+        assert f"12 of 12 runs are in {part}" in str(failed.value)
+        assert out.read_bytes() == before
+        assert sorted(tmp_path.iterdir()) == [out, part]
+        monkeypatch.setattr(sweep, "run_case", interrupted_after(0, []))
+        run_sweep(stop, **options_of(out))
+    assert len(json.loads(out.read_text())["runs"]) == 12
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("is_part_left", [False, True])
+def test_a_command_whose_result_is_there_shows_it_and_runs_nothing(
+    is_part_left: bool,  # by a kill after the result had its name
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out, part = tmp_path / "out", tmp_path / "out.part"
+    with StopFlag() as stop:
+        monkeypatch.setattr(sweep, "run_case", interrupted_after(3, []))
+        with pytest.raises(StopRequestedError):
+            run_sweep(stop, **options_of(out))
+        kept = part.read_bytes()
+        monkeypatch.setattr(sweep, "run_case", interrupted_after(9, []))
+        run_sweep(stop, **options_of(out))
+        result, shown = out.read_bytes(), capsys.readouterr().out
+        if is_part_left:
+            part.write_bytes(kept)
+        monkeypatch.setattr(sweep, "run_case", interrupted_after(0, []))
+        run_sweep(stop, **options_of(out))
+    assert list(tmp_path.iterdir()) == [out]
+    assert out.read_bytes() == result
+    again = capsys.readouterr()
+    assert again.out == shown
+    assert again.err.startswith(f"uwb-slam: {out}: holds the result of this command")
+
+
+def test_another_sweeps_result_is_replaced_and_a_line_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    monkeypatch.setattr(sweep, "run_case", interrupted_after(99, []))
+    with StopFlag() as stop:
+        run_sweep(stop, **options_of(out))
+        capsys.readouterr()
+        run_sweep(stop, **options_of(out, n_seeds=1))
+    assert capsys.readouterr().err.startswith(f"uwb-slam: {out}: the result of another sweep")
+    assert len(json.loads(out.read_text())["runs"]) == 4
+
+
+@pytest.mark.parametrize("content", ["1.0 0 0 0 0 0 0 1\n", "[]", '{"runs": []}', "\x00"])
+def test_a_file_that_is_no_sweeps_result_is_not_replaced(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "drive.tum"
+    out.write_text(content)
+    monkeypatch.setattr(sweep, "run_case", interrupted_after(0, []))
+    with StopFlag() as stop, pytest.raises(AppError, match="would be lost"):
+        run_sweep(stop, **options_of(out))
+    assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(out, content)]
+
+
+BEFORE_LINES = b"""{"command": {
+ "seeds": "3",
+ "scene file lab": "12ab"
+},
+"runs": [
+]}
+"""
 
 
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda whole: whole[:-40],
+        lambda _: BEFORE_LINES,
+        lambda whole: whole.replace(b"{", b"", 1),
+        lambda whole: whole.replace(b"0.04", b"0,04", 1),
         lambda whole: b"\0" * len(whole),
-        lambda whole: whole + b"x",
-        lambda whole: whole + b" ",
+        lambda whole: whole + b"x\n",
+        lambda whole: whole + b"\n",
         lambda whole: whole.replace(b'"ate_rmse_m"', b'"ate"'),
-        lambda whole: b"[]",
-        lambda whole: b"\xff\xfe",
+        lambda _: b"[]",
+        lambda _: b"[]\n",
+        lambda _: b"\n",
+        lambda _: b"\xff\xfe",
+        lambda _: b'{"command": []}\n',
+        lambda _: b'{"command": "seeds"}\n',
+        lambda _: b"[" * 100_000 + b"\n",
     ],
 )
 def test_a_damaged_file_is_one_line_and_stays_as_it_is(
@@ -169,7 +311,7 @@ def test_a_damaged_file_is_one_line_and_stays_as_it_is(
     part_with(path := tmp_path / "o.part", 2)
     path.write_bytes(damage(path.read_bytes()))
     before = path.read_bytes()
-    with pytest.raises(AppError):
+    with pytest.raises(AppError, match="move this file away to begin anew"):
         PartFile(path, COMMAND)
     assert path.read_bytes() == before
 
