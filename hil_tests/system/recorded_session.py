@@ -24,6 +24,7 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.run.runner import RunRecord, make_slam, run_slam
+from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from xethru_protocol.system import StopFlag
@@ -61,6 +62,7 @@ def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = 
             true_landmarks_m=true_landmarks_m(scene)[: None if has_truth else 0],
             versions=versions(),
             config_json=settings_text(config),
+            constants=slam_constants(),
             wheels=asdict(wheels_of(scene)),
             outlines_m=outlines_m(scene),
             simulated=has_truth,

@@ -77,6 +77,9 @@ class SessionInfo:
         meaning.
     odometry_clock
         Text of the option --odometry-clock of a live run, "" of any other.
+    constants
+        Every number SLAM ran with beyond its settings, by dotted name, as JSON has them; empty
+        where they were not recorded.
     """
 
     scene: str
@@ -93,6 +96,7 @@ class SessionInfo:
     started_unix_ns: int | None = None
     has_detections: bool = False
     odometry_clock: str = ""
+    constants: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

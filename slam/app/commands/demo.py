@@ -29,6 +29,7 @@ from slam.app.rig.sources import RigSource
 from slam.app.run.output import Progress
 from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
+from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
@@ -84,6 +85,7 @@ def run_demo(
                 true_landmarks_m=true_landmarks_m(loaded),
                 versions=versions(),
                 config_json=settings_text(config),
+                constants=slam_constants(),
                 wheels=asdict(wheels),
                 outlines_m=outlines_m(loaded),
             )

@@ -24,6 +24,7 @@ from slam.app.run.live_source import Inbox, LiveLog, LiveSource, drift_text, rea
 from slam.app.run.output import Progress, Row, note
 from slam.app.run.results import RESULTS, finish, prepare_folder
 from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
+from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
@@ -99,6 +100,7 @@ def run_rig(
             true_landmarks_m=np.empty((0, 2)),
             versions=versions(),
             config_json=settings_text(config),
+            constants=slam_constants(),
             wheels=asdict(wheels),
             simulated=are_emulated(links),
             time_base="arrival",

@@ -31,6 +31,7 @@ from rosbags.typesys import Stores, get_typestore
 from slam.app.errors import AppError
 from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import RadarInfo, SessionInfo, Snapshot
+from slam.app.session.constants import slam_constants
 from slam.config import SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount
 
@@ -305,6 +306,7 @@ def session_table(info: SessionInfo) -> dict[str, str]:
         "config": info.config_json,
         "wheels": json.dumps(dict(info.wheels)),
         "versions": json.dumps(dict(info.versions)),
+        "constants": json.dumps(dict(info.constants)),
     }
 
 
@@ -352,6 +354,7 @@ def read_session_table(
                 json.loads(table["true_landmarks_m"]), dtype=np.float64
             ).reshape(-1, 2),
             versions=json.loads(table["versions"]),
+            constants=json.loads(table.get("constants", "{}")),
             config_json=table.get("config", ""),
             wheels=json.loads(table.get("wheels", "{}")),
             outlines_m=tuple(
@@ -413,6 +416,7 @@ def imported_info(
         true_landmarks_m=np.zeros((0, 2)),
         versions={},
         config_json=settings_text(load_preset(preset)),
+        constants=slam_constants(),
         wheels=asdict(WheelNoise()),
         simulated=False,
         time_base=time_base,

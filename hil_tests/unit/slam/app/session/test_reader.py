@@ -173,6 +173,7 @@ def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:
         session_info(),
         config_json='{"a": 0.1}',
         wheels={"scale_sigma": 1 / 3},
+        constants={"slam.a.B": 1 / 3, "slam.a.C": [1, 2.5], "slam.a.D": {"x": 1e-200}},
         outlines_m=(np.array([[0.1, 1 / 3], [2.0, 3.0]]), np.zeros((3, 2))),
         started_unix_ns=1_790_000_000_123_456_789,
         odometry_clock="unix",
@@ -183,6 +184,7 @@ def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:
     assert (found.config_json, found.wheels) == (sent.config_json, sent.wheels)
     assert found.started_unix_ns == sent.started_unix_ns
     assert found.odometry_clock == "unix"
+    assert found.constants == sent.constants
     assert [line.tolist() for line in found.outlines_m] == [
         line.tolist() for line in sent.outlines_m
     ]
