@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import resource
 import signal
 from collections.abc import Callable, Iterator
@@ -156,7 +157,7 @@ def test_the_file_has_a_line_for_the_command_and_one_per_run(tmp_path: Path) -> 
 def test_cut_at_any_byte_it_loses_the_last_line_only_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweep.os, "fsync", lambda _: None)  # thousands of them take seconds
+    monkeypatch.setattr(os, "fsync", lambda _: None)  # thousands of them take seconds
     part_with(path := tmp_path / "o.part", 2)
     expected, whole = runs()[:2], path.read_bytes()
     for size in range(len(whole) + 1):
