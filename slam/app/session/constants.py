@@ -84,8 +84,8 @@ def _entry(name: str, value: object) -> Iterator[tuple[str, Json]]:
 def _as_json(value: object) -> Json | None:
     """Return what JSON can hold of a value that is made of numbers only; None for any other."""
     if isinstance(value, np.ndarray):  # complex ones as pairs
-        whole = np.ascontiguousarray(value)
-        value = (whole.view(np.float64) if np.iscomplexobj(whole) else whole).tolist()
+        array = np.ascontiguousarray(value)
+        value = (array.view(np.float64) if np.iscomplexobj(array) else array).tolist()
     if isinstance(value, slice):
         value = [bound for bound in (value.start, value.stop, value.step) if bound is not None]
     if is_dataclass(value) and not isinstance(value, type):
