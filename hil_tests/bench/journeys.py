@@ -129,8 +129,8 @@ def scans_to_belief_and_log() -> list[str]:
             run_slam(earlier, *inputs, [log])
             with Trace() as trace:
                 record = run_slam(counted, *inputs, [log])
-    if len(record.results) != len(counted):
-        raise RuntimeError(f"{len(counted)} scans led to {len(record.results)} states")
+    if len(record.states) != len(counted):
+        raise RuntimeError(f"{len(counted)} scans led to {len(record.states)} states")
     return trace.files()
 
 

@@ -133,8 +133,8 @@ def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -
     source = source_of(make_case(str(demo.scene), "robust", SEED))
     record = execute(source)
     estimate = read_tum(demo.out / "estimate.tum")
-    np.testing.assert_array_equal(estimate.stamps_ns, [row.t_ns for row in record.results])
-    positions = np.array([row.belief.pose[:2] for row in record.results])
+    np.testing.assert_array_equal(estimate.stamps_ns, record.states.t_ns)
+    positions = record.states.estimate[:, :2]
     assert estimate.poses[:, :2].tobytes() == positions.tobytes()
     summary = json.loads((demo.out / "summary.json").read_text())
     in_process = summarise(record, source.info, source.rig)

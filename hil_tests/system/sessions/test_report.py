@@ -45,11 +45,12 @@ class Addresses(HTMLParser):
 def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
     session = tmp_path_factory.mktemp("report") / "session.mcap"
     record = record_session(session, "paper")
+    assert record.last is not None
     assert main(["report", str(session.parent)]) == 0
     return Reported(
         session=session,
         page=session.with_name("report.html"),
-        n_landmarks=len(record.results[-1].belief.landmark_ids),
+        n_landmarks=len(record.last.landmark_ids),
     )
 
 

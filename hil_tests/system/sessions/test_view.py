@@ -54,7 +54,7 @@ def viewed(tmp_path_factory: pytest.TempPathFactory) -> Viewed:
     record = record_session(session, "paper")
     rrd = session.with_name("made.rrd")
     assert main(["view", str(session), "--out", str(rrd)]) == 0
-    return Viewed(session=session, rrd=rrd, n_states=len(record.results))
+    return Viewed(session=session, rrd=rrd, n_states=len(record.states))
 
 
 def texts(path: Path, entity: str, component: str) -> list[str]:

@@ -117,7 +117,7 @@ def run_demo(
                 record = execute(source, sinks)
         with saying_what_is_left(kept):
             stop.check()
-            if not record.results:
+            if record.last is None:
                 raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
             finish(out, source, record, stop)
         if live is not None:

@@ -48,6 +48,7 @@ from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord, Ru
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
+from slam.packed import PackedRows
 from xethru_protocol.system import StopFlag, one_line
 
 _KEPT_WARNINGS = 200
@@ -89,7 +90,7 @@ class _ReportData(SessionObserver):
         self.n_warnings = 0
         self.start_ns: int | None = None
         self.end_ns = 0
-        self._rows: list[tuple[float, ...]] = []
+        self._rows = PackedRows(np.float64, len(_Series._fields))
         self._odom: NDArray[np.float64] | None = None
 
     @property
@@ -132,7 +133,7 @@ class _ReportData(SessionObserver):
         self._note(self.links.end(self.end_ns))
 
     def series(self) -> _Series:
-        return _Series(*np.array(self._rows, dtype=np.float64).reshape(-1, 7).T)
+        return _Series(*self._rows.rows.T)
 
     def _note(self, changes: Iterable[LinkChange]) -> None:
         self.changes += [(self.seconds(change.t_ns), change) for change in changes]
@@ -333,7 +334,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     source = recorded_source(session, stop)
     data = _ReportData(session.info)
     record = execute(source, [Progress(session.info, None, source.lost_frames), data])
-    if not record.results:
+    if record.last is None:
         raise AppError(f"{session.path}: no state was estimated, the robot did not move")
     info = session.info
     summary = summarise(record, info, source.rig)
@@ -347,7 +348,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     page.picture(
         svg_of(draw_map, info, record, summary, height_in=6.6), "map with paths and landmarks"
     )
-    page.heading("Errors over time" if record.has_truth else "Over time")
+    page.heading("Errors over time" if record.states.has_truth else "Over time")
     page.picture(
         svg_of(_draw_errors, series, height_in=4.4),
         "position errors and number of landmarks over time",
@@ -360,7 +361,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     page.picture(
         svg_of(_draw_consistency, series, height_in=4.4), "NIS and NEES over time with their bands"
     )
-    _write_landmarks(page, info, record)
+    _write_landmarks(page, info, record.last)
     _write_links(page, info, data)
     _write_parameters(page, info)
     return page.text()
@@ -388,16 +389,17 @@ def _write_numbers(
     )
 
 
-def _write_landmarks(page: _Page, info: SessionInfo, record: RunRecord) -> None:
-    belief = record.results[-1].belief
+def _write_landmarks(page: _Page, info: SessionInfo, last: Snapshot) -> None:
     page.heading("Landmarks")
-    if not belief.landmark_ids:
+    if not len(last.landmark_ids):
         page.note("None was found.")
         return
-    points = transform(record.world_from_map, belief.landmarks)
+    points = transform(last.world_from_map, last.landmarks_m)
     rows = []
-    for row, (number, point) in enumerate(zip(belief.landmark_ids, points, strict=True)):
-        variances = np.linalg.eigvalsh(belief.landmark_covariance(row))
+    for number, point, covariance in zip(
+        last.landmark_ids, points, last.landmark_covariances_m2, strict=True
+    ):
+        variances = np.linalg.eigvalsh(covariance)
         sigma_m = math.sqrt(max(float(variances[-1]), 0.0))
         cells = [str(number), f"{point[0]:.4f}", f"{point[1]:.4f}", f"{1e3 * sigma_m:.1f}"]
         if len(info.true_landmarks_m):

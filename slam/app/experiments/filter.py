@@ -25,7 +25,7 @@ from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.app.run.runner import execute
-from slam.app.sweep.run import first_laps, loopback_source
+from slam.app.sweep.run import Steps, first_laps, loopback_source
 from slam.config import load_preset, override
 from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
@@ -119,7 +119,10 @@ def drive(scene: str, *, seed: int, stop: StopFlag) -> Seen:
     rig = rig_of(lap)
     # With a window of one state each comes out as it is collected.
     alone = override(config, {"window.size": 1})
-    record = execute(loopback_source(lap, "paper", UwbRadarSlam(alone, rig), seed, stop=stop))
+    kept = Steps()
+    slam = UwbRadarSlam(alone, rig)
+    record = execute(loopback_source(lap, "paper", slam, seed, stop=stop), [kept])
+    truth = record.states.truth
     return Seen(
         scene=lap.name,
         states=tuple(
@@ -129,12 +132,12 @@ def drive(scene: str, *, seed: int, stop: StopFlag) -> Seen:
                 detections=result.detections,
                 fixes=result.fixes,
             )
-            for result in record.results
+            for result in kept.steps
         ),
-        truth=record.truth,
+        truth=truth,
         origins=tuple(
             _origins(result.fixes, pose, rig, lap)
-            for result, pose in zip(record.results, record.truth, strict=True)
+            for result, pose in zip(kept.steps, truth, strict=True)
         ),
         landmarks_m=true_landmarks_m(lap),
     )

@@ -30,7 +30,7 @@ from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import mm_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.run.runner import RunRecord, execute
-from slam.app.sweep.run import first_laps, loopback_source
+from slam.app.sweep.run import Steps, first_laps, loopback_source
 from slam.geometry import transform
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Fix, Observation, StepResult
@@ -96,12 +96,14 @@ def drive_in_clear_air_and_smoke(seed: int, stop: StopFlag) -> list[ObservedRun]
         ("lab, clear air", lab, lab_config, seed),
     ):
         slam = UwbRadarSlam(settings, rig_of(scene))
+        kept = Steps()
         record = execute(
-            loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed, stop=stop)
+            loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed, stop=stop), [kept]
         )
         if not runs:
-            reference = record
-        runs.append(_observed(name, scene, record, reference if scene is not lab else None))
+            reference = kept.steps
+        same_as = reference if scene is not lab else None
+        runs.append(_observed(name, scene, record, kept.steps, same_as))
     return runs
 
 
@@ -116,24 +118,28 @@ def in_smoke(scene: Scene) -> Scene:
 
 
 def _observed(
-    name: str, scene: Scene, record: RunRecord, reference: RunRecord | None
+    name: str,
+    scene: Scene,
+    record: RunRecord,
+    results: Sequence[StepResult],
+    reference: Sequence[StepResult] | None,
 ) -> ObservedRun:
     landmarks_m = true_landmarks_m(scene)
-    results = record.results
+    states = record.states
     start = record.world_from_map
     raw = [result.fixes for result in results]
     filtered = [result.observations for result in results]
-    on_odometry = np.array([result.odometry_pose for result in results])
+    on_odometry = states.odometry
     return ObservedRun(
         name=name,
         n_detections=sum(len(result.detections) for result in results),
-        same_detections=None if reference is None else _same(results, reference.results),
+        same_detections=None if reference is None else _same(results, reference),
         raw_m=transform(start, _placed(on_odometry, raw)),
         filtered_m=transform(start, _placed(on_odometry, filtered)),
-        raw_rms_m=_rms_m(_placed(record.truth, raw), landmarks_m),
-        filtered_rms_m=_rms_m(_placed(record.truth, filtered), landmarks_m),
+        raw_rms_m=_rms_m(_placed(states.truth, raw), landmarks_m),
+        filtered_rms_m=_rms_m(_placed(states.truth, filtered), landmarks_m),
         odometry_m=transform(start, on_odometry[:, :2]),
-        truth_m=record.truth[:, :2],
+        truth_m=states.truth[:, :2],
         landmarks_m=landmarks_m,
     )
 

@@ -18,13 +18,11 @@ from slam.app.records import SessionInfo, Snapshot
 from slam.app.run.runner import RunRecord
 from slam.evaluation import (
     LandmarkScore,
-    TrueAssociationNis,
     ate_rmse_m,
     icp_ate_rmse_m,
     landmark_metrics,
     nees_pose,
     observable_landmarks,
-    true_range_nis,
 )
 from slam.geometry import Rig, align_se2, between, compose, transform
 
@@ -146,27 +144,22 @@ def pose_nees(snapshot: Snapshot) -> float:
 NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)
 """Parts of the run at which consistency is evaluated; the quarters are the ends of four laps."""
 
-Nis = tuple[float, int]
-"""Summed NIS of one state's true associations, and its degrees of freedom."""
-
 
 def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     """Compute summary.json's numbers; None if no state was estimated or the truth is unknown.
 
     `rig` holds the mounts that SLAM uses; it decides which true landmarks count.
     """
-    if not record.has_truth:
+    states, last = record.states, record.last
+    if last is None or not states.has_truth:
         return None
     true_landmarks_m = info.true_landmarks_m
-    truth_xy = record.truth[:, :2]
-    truth_in_map = np.array([between(record.world_from_map, pose) for pose in record.truth])
-    estimate = np.array([result.belief.pose for result in record.results])
-    odometry = np.array([result.odometry_pose for result in record.results])
-    last = record.results[-1]
+    truth_xy = states.truth[:, :2]
+    truth_in_map = np.array([between(record.world_from_map, pose) for pose in states.truth])
+    estimate, odometry = states.estimate, states.odometry
     alignment = align_se2(estimate[:, :2], truth_xy)
-    counting = observable_landmarks(rig, record.truth, true_landmarks_m)
-    nis = _true_nis(record, true_landmarks_m)
-    landmarks = landmark_metrics(last.belief.landmarks, true_landmarks_m[counting], alignment)
+    counting = observable_landmarks(rig, states.truth, true_landmarks_m)
+    landmarks = landmark_metrics(last.landmarks_m, true_landmarks_m[counting], alignment)
     if not info.simulated and not len(true_landmarks_m):
         landmarks = replace(landmarks, true=None, precision=None, recall=None)
     return Summary(
@@ -182,47 +175,35 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
         final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
         landmarks=landmarks,
         nees_pose=_nees(record, truth_in_map),
-        nis_mean=sum(value for value, _ in nis) / dof if (dof := sum(n for _, n in nis)) else None,
-        nis_times=_nis_times(record, nis),
+        nis_mean=sum(states.nis.tolist()) / dof if (dof := int(states.nis_dof.sum())) else None,
+        nis_times=_nis_times(record),
     )
 
 
 def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
     """Return (time [s], NEES) of the last state at or before each of the ten times."""
+    states = record.states
     values = []
-    for row in _rows_at(record, range(len(record.results))):
-        result = record.results[row]
-        belief = result.belief
-        nees = nees_pose(belief.pose, belief.pose_covariance, truth_in_map[row])
-        values.append((result.t_ns / NS_PER_S, nees))
+    for row in _rows_at(record, range(len(states))):
+        nees = nees_pose(states.estimate[row], states.pose_covariances[row], truth_in_map[row])
+        values.append((int(states.t_ns[row]) / NS_PER_S, nees))
     return tuple(values)
 
 
 def _rows_at(record: RunRecord, rows: Sequence[int]) -> list[int]:
     """Return of each of the ten times the last of these rows at or before it, or the first."""
-    stamps_ns = [record.results[row].t_ns for row in rows]
+    stamps_ns = record.states.t_ns[rows].tolist()
     times_ns = [record.start_ns + round(part * record.duration_ns) for part in NEES_AT]
     return [rows[max(bisect_right(stamps_ns, t_ns) - 1, 0)] for t_ns in times_ns]
 
 
-def _true_nis(record: RunRecord, true_landmarks_m: NDArray[np.float64]) -> list[Nis]:
-    """Return the NIS of each state's measurements of what they are truly of, before gates."""
-    collector = TrueAssociationNis(true_landmarks_m)
-    nis = []
-    for result, truth in zip(record.results, record.truth, strict=True):
-        if result.report is None:
-            fixes = [value for value in collector.add(result, truth) if math.isfinite(value)]
-            nis.append((sum(fixes), _FIX_DOF * len(fixes)))
-        else:
-            ranges = true_range_nis(result, truth, true_landmarks_m)
-            nis.append((sum(ranges), len(ranges)))
-    return nis
-
-
-def _nis_times(record: RunRecord, nis: list[Nis]) -> tuple[tuple[float, float, int], ...]:
+def _nis_times(record: RunRecord) -> tuple[tuple[float, float, int], ...]:
     """Return (time [s], NIS, dof) of the last state at or before each time that has any."""
-    judged = [row for row, (_, dof) in enumerate(nis) if dof]
+    states = record.states
+    judged = np.flatnonzero(states.nis_dof).tolist()
     if not judged:
         return ()
-    rows = _rows_at(record, judged)
-    return tuple((record.results[row].t_ns / NS_PER_S, *nis[row]) for row in rows)
+    return tuple(
+        (int(states.t_ns[row]) / NS_PER_S, float(states.nis[row]), int(states.nis_dof[row]))
+        for row in _rows_at(record, judged)
+    )

@@ -229,17 +229,15 @@ def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Row
     duration_s = record.duration_ns / NS_PER_S
     speed = f"{record.n_frames} frames used, {lost_frames} lost between counters"
     rows = [("time", f"{duration_s:.1f} s", f"{speed}, {len(info.radars)} radars")]
-    if not record.results:
+    states, last = record.states, record.last
+    if last is None:
         return [*rows, ("states", "0", "the robot did not move, or no scan could be used")]
-    estimate = np.array([result.belief.pose[:2] for result in record.results])
-    odometry = np.array([result.odometry_pose[:2] for result in record.results])
     lengths_m = [
-        float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in (estimate, odometry)
+        float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
+        for path in (states.estimate, states.odometry)
     ]
-    belief = record.results[-1].belief
-    sigma_m = float(np.sqrt(np.trace(belief.pose_covariance[:2, :2])))
-    ids = belief.landmark_ids
-    spread = [float(np.sqrt(np.trace(belief.landmark_covariance(row)))) for row in range(len(ids))]
+    sigma_m = float(np.sqrt(np.trace(last.pose_covariance[:2, :2])))
+    spread = [float(np.sqrt(np.trace(each))) for each in last.landmark_covariances_m2]
     rows += [
         ("driven", f"{lengths_m[0]:.2f} m", f"{lengths_m[1]:.2f} m by the wheels alone"),
         (
@@ -249,7 +247,7 @@ def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Row
         ),
         (
             "landmarks",
-            f"{len(ids)}",
+            f"{len(spread)}",
             f"standard deviation {1e3 * min(spread):.1f} .. {1e3 * max(spread):.1f} mm"
             if spread
             else "none was seen often enough",

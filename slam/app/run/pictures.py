@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from slam.app.errors import naming
-from slam.app.records import SessionInfo
+from slam.app.records import SessionInfo, Snapshot
 from slam.app.run.evaluation import Summary
 from slam.app.run.runner import RunRecord
 from slam.geometry import between, compose, transform
-from slam.results import Belief
 
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
 INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"
@@ -143,11 +142,12 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     Estimate and odometry are drawn where they began, at the robot's first pose, without the
     alignment that the ATE uses: drift is shown unaligned.
     """
-    place = record.world_from_map
-    truth = record.truth
-    estimate = transform(place, _xy_m([row.belief.pose for row in record.results]))
+    states, last = record.states, record.last
+    assert last is not None  # whoever draws a map has a state
+    place, truth = last.world_from_map, states.truth
+    estimate = transform(place, states.estimate[:, :2])
     odom_place = place if summary is not None else _world_from_odom(record)
-    odometry = transform(odom_place, _xy_m([row.odometry_pose for row in record.results]))
+    odometry = transform(odom_place, states.odometry[:, :2])
     axes = figure.add_subplot()
     axes.set_aspect("equal", adjustable="datalim")
     for number, line in enumerate(info.outlines_m):
@@ -169,10 +169,10 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
             label="true landmark",
             zorder=4,
         )
-    for number, ends_m in enumerate(record.wall_spans_m):
+    for number, ends_m in enumerate(last.wall_spans_m):
         name = "estimated wall" if number == 0 else None
         axes.plot(*transform(place, ends_m).T, color=LANDMARK, linewidth=2.0, label=name)
-    _draw_landmarks(axes, record.results[-1].belief, place)
+    _draw_landmarks(axes, last)
     axes.margins(0.06)
     if summary is None:
         length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
@@ -209,14 +209,12 @@ def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
     )
 
 
-def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> None:
-    if not belief.landmark_ids:
+def _draw_landmarks(axes: Axes, last: Snapshot) -> None:
+    if not len(last.landmark_ids):
         return
-    points = transform(place, belief.landmarks)
-    covariances = rotate_covariances(
-        place[2],
-        np.array([belief.landmark_covariance(row) for row in range(len(points))]),
-    )
+    place = last.world_from_map
+    points = transform(place, last.landmarks_m)
+    covariances = rotate_covariances(place[2], last.landmark_covariances_m2)
     outlines = [ellipse_95(*pair) for pair in zip(points, covariances, strict=True)]
     axes.add_collection(
         PolyCollection(
@@ -239,19 +237,13 @@ def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> N
     )
 
 
-def _xy_m(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    return np.array([pose[:2] for pose in poses])
-
-
 def _world_from_odom(record: RunRecord) -> NDArray[np.float64]:
     """Return the place of odometry's frame such that it begins where SLAM does, shape (3,).
 
     A robot's odometry begins anywhere, as it runs before we listen; that of a demo at its start.
     """
-    odom_from_body = record.results[0].odometry_pose
-    return compose(_first_pose(record), between(odom_from_body, np.zeros(3)))
+    return compose(_first_pose(record), between(record.states.odometry[0], np.zeros(3)))
 
 
 def _first_pose(record: RunRecord) -> NDArray[np.float64]:
-    pose: NDArray[np.float64] = record.results[0].belief.pose
-    return compose(record.world_from_map, pose)
+    return compose(record.world_from_map, record.states.estimate[0])

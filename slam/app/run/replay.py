@@ -22,7 +22,7 @@ from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress, note
 from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
-from slam.app.run.runner import LinkLog, RunSource, execute, frames_between, make_slam
+from slam.app.run.runner import LinkLog, LostFrames, RunSource, execute, make_slam
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
@@ -128,25 +128,18 @@ def recorded_source(
         scans=scans,
         odometry=odometry,
         truth_at=scans.truth_at,
-        lost_frames=lambda: scans.n_lost,
+        lost_frames=lambda: scans.lost.n_lost,
         link_log=scans.link_log,
     )
 
 
 class _RecordedScans:
-    """The scans of a session, with the truth and the log lines between them.
-
-    Attributes
-    ----------
-    n_lost
-        Frames missing so far between counters of one stream.
-    """
+    """The scans of a session, with the truth and the log lines between them."""
 
     def __init__(self, session: RecordedSession, lines: Sequence[LogLine], stop: StopFlag) -> None:
         self._session, self._lines, self._stop = session, lines, stop
         self._truth: dict[int, NDArray[np.float64]] = {}
-        self._last: list[RadarFrame | None] = [None] * len(session.info.radars)
-        self.n_lost = 0
+        self.lost = LostFrames()
         self.link_log = LinkLog()
 
     def truth_at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -161,17 +154,11 @@ class _RecordedScans:
                 self.link_log.pass_on(line)
                 line = next(waiting, None)
             self._truth[scan.t_ns] = np.full(3, np.nan) if pose is None else pose
-            self._count_lost(scan)
+            self.lost.on_scan(scan)
             yield scan
         while line is not None:
             self.link_log.pass_on(line)
             line = next(waiting, None)
-
-    def _count_lost(self, scan: Scan) -> None:
-        for frame in scan.frames:
-            last = self._last[frame.radar]
-            self.n_lost += 0 if last is None else frames_between(last, frame)
-            self._last[frame.radar] = frame
 
 
 class Comparison(SessionObserver):

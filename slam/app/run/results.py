@@ -51,7 +51,7 @@ def _write(
         path.write_text(text + "\n", encoding="ascii")
     write_trajectories(out, record)
     stop.check()
-    if record.results:
+    if record.last is not None:
         # loads matplotlib, half a second
         from slam.app.run.pictures import draw_map, picture
 
@@ -62,22 +62,19 @@ def _write(
 
 def write_trajectories(out: Path, record: RunRecord) -> None:
     """Write estimate, odometry and, if known, truth at the stamps of SLAM's states."""
-    stamps_ns = np.array([result.t_ns for result in record.results], dtype=np.int64)
-    paths = {
-        "estimate": np.array([result.belief.pose for result in record.results]),
-        "odometry": np.array([result.odometry_pose for result in record.results]),
-    }
-    if record.has_truth:
-        paths["truth"] = record.truth
+    states = record.states
+    paths = {"estimate": states.estimate, "odometry": states.odometry}
+    if states.has_truth:
+        paths["truth"] = states.truth
     for name, poses in paths.items():
         with naming(path := out / f"{name}.tum"):
-            write_tum(path, Trajectory(stamps_ns=stamps_ns, poses=poses.reshape(-1, 3)))
+            write_tum(path, Trajectory(stamps_ns=states.t_ns, poses=poses))
 
 
 def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
     """Return the text of summary.json with null for everything that needs the truth."""
     duration_s = record.duration_ns / NS_PER_S
-    n_landmarks = len(record.results[-1].belief.landmark_ids) if record.results else 0
+    n_landmarks = 0 if record.last is None else len(record.last.landmark_ids)
     unknown: dict[str, object] = {row.name: None for row in fields(Summary)}
     del unknown["nis_times"]
     known = {

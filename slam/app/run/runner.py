@@ -5,6 +5,7 @@ Also what happens on the radars' links: log lines stamped with session time, and
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -26,12 +27,16 @@ from slam.app.records import (
     TruthAt,
 )
 from slam.config import BackEnd, SlamConfig, WheelNoise
+from slam.evaluation import TrueAssociationNis, true_range_nis
 from slam.frames import Detector, RadarFrame
 from slam.geometry import Rig
+from slam.packed import PackedRows
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, StepResult
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.conversation import ProtocolRecord
+
+_NO_LANDMARKS_M = np.empty((0, 2))
 
 
 def make_slam(
@@ -125,39 +130,136 @@ class RunSource:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class States:
+    """The states of a run in time order, as packed arrays.
+
+    Attributes
+    ----------
+    t_ns
+        Shape (n,), int64.
+    truth, odometry, estimate
+        Shape (n, 3), [x m, y m, heading rad]; world (NaN if unknown), odom and map frame.
+    pose_covariances
+        Shape (n, 3, 3), of the estimates.
+    nis, nis_dof
+        Shape (n,): summed NIS of the measurements of what they are truly of, before gates, and its
+        degrees of freedom; 0 of a state without truth or without such measurements.
+    """
+
+    t_ns: NDArray[np.int64]
+    truth: NDArray[np.float64]
+    odometry: NDArray[np.float64]
+    estimate: NDArray[np.float64]
+    pose_covariances: NDArray[np.float64]
+    nis: NDArray[np.float64]
+    nis_dof: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the true pose is known at every state, and there is a state."""
+        return len(self) > 0 and bool(np.isfinite(self.truth).all())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunRecord:
     """The outcome of a run.
 
     Attributes
     ----------
-    results, truth
-        States of SLAM in time order, and the true pose at each, shape (n_states, 3), world frame;
-        NaN if unknown.
-    world_from_map
-        Shape (3,): where the map frame lies in the world; zeros if unknown.
+    states
+        Numbers of every state.
+    last
+        The last state with its map; None if there is none.
     n_frames
         Radar frames used, over all radars.
     start_ns
         Session time of the first scan.
     duration_ns, wall_s
         Session time covered and the time it took.
-    wall_spans_m
-        Ends of the stretches of wall that answered, shape (k, 2, 2), map frame.
     """
 
-    results: tuple[StepResult, ...]
-    truth: NDArray[np.float64]
-    world_from_map: NDArray[np.float64]
+    states: States
+    last: Snapshot | None
     n_frames: int
     duration_ns: int
     wall_s: float
     start_ns: int = 0
-    wall_spans_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2, 2)))
 
     @property
-    def has_truth(self) -> bool:
-        """Whether the true pose is known at every state, and there is a state."""
-        return len(self.truth) > 0 and bool(np.isfinite(self.truth).all())
+    def world_from_map(self) -> NDArray[np.float64]:
+        """Return where the map frame lies in the world, shape (3,); zeros if unknown."""
+        return np.zeros(3) if self.last is None else self.last.world_from_map
+
+
+_FIX_DOF = 2
+
+
+class RunRecorder(SessionObserver):
+    """Packs what a run's record needs, state by state; the states may be recorded ones.
+
+    `true_landmarks_m` has shape (m, 2), world frame.
+    """
+
+    def __init__(self, true_landmarks_m: NDArray[np.float64]) -> None:
+        self._true_landmarks_m = true_landmarks_m
+        self._fixes_nis = TrueAssociationNis(true_landmarks_m)
+        self._t_ns = PackedRows(np.int64)
+        self._truth, self._odometry, self._estimate = (PackedRows(np.float64, 3) for _ in range(3))
+        self._covariances = PackedRows(np.float64, 3, 3)
+        self._nis, self._nis_dof = PackedRows(np.float64), PackedRows(np.int32)
+        self._last: Snapshot | None = None
+        self._start_ns: int | None = None
+        self._n_frames = self._duration_ns = 0
+        self._started = time.monotonic()
+
+    def on_scan(self, scan: Scan) -> None:
+        self._start_ns = scan.t_ns if self._start_ns is None else self._start_ns
+        self._duration_ns = scan.t_ns - self._start_ns
+        if scan.used:
+            self._n_frames += len(scan.frames)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        self._t_ns.append(snapshot.t_ns)
+        self._truth.append(snapshot.truth)
+        self._odometry.append(snapshot.odometry)
+        self._estimate.append(snapshot.estimate)
+        self._covariances.append(snapshot.pose_covariance)
+        nis, dof = self._true_nis(snapshot)
+        self._nis.append(nis)
+        self._nis_dof.append(dof)
+        self._last = snapshot
+
+    def record(self) -> RunRecord:
+        """Return the record of the run until now."""
+        return RunRecord(
+            states=States(
+                t_ns=self._t_ns.rows,
+                truth=self._truth.rows,
+                odometry=self._odometry.rows,
+                estimate=self._estimate.rows,
+                pose_covariances=self._covariances.rows,
+                nis=self._nis.rows,
+                nis_dof=self._nis_dof.rows,
+            ),
+            last=self._last,
+            n_frames=self._n_frames,
+            duration_ns=self._duration_ns,
+            start_ns=self._start_ns or 0,
+            wall_s=time.monotonic() - self._started,
+        )
+
+    def _true_nis(self, snapshot: Snapshot) -> tuple[float, int]:
+        step, truth = snapshot.step, snapshot.truth
+        if step is None or not np.isfinite(truth).all():
+            return 0.0, 0
+        if step.report is None:
+            fixes = [nis for nis in self._fixes_nis.add(step, truth) if math.isfinite(nis)]
+            return sum(fixes), _FIX_DOF * len(fixes)
+        ranges = true_range_nis(step, truth, self._true_landmarks_m)
+        return sum(ranges), len(ranges)
 
 
 def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunRecord:
@@ -181,6 +283,7 @@ def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunReco
             source.truth_at,
             [source.link_log, *sinks],
             gains_db=[radar.gain_db for radar in source.info.radars],
+            true_landmarks_m=source.info.true_landmarks_m,
         )
 
 
@@ -192,33 +295,35 @@ def run_slam(
     observers: Sequence[SessionObserver] = (),
     *,
     gains_db: Sequence[float] = (),
+    true_landmarks_m: NDArray[np.float64] = _NO_LANDMARKS_M,
 ) -> RunRecord:
     """Feed scans to SLAM as they come, and scans and states to the observers.
 
     A scan that is not `used` goes to the observers only, and so does the truth. BLAS runs on one
     thread, as everywhere else, so that results are the same bits. Observers get frames as received,
-    SLAM gets them without each radar's gain, if `gains_db` has any.
+    SLAM gets them without each radar's gain, if `gains_db` has any. `true_landmarks_m`, shape
+    (m, 2), world frame, is for the record only.
 
     Raises
     ------
     OdometryError
         Odometry does not cover the time of a scan.
     """
-    results: list[StepResult] = []
-    truths: list[NDArray[np.float64]] = []
+    recorder = RunRecorder(true_landmarks_m)
+    observers = [recorder, *observers]
     counter_at: dict[int, int] = {}
     world_from_map: NDArray[np.float64] | None = None
-    start_ns: int | None = None
-    n_frames = duration_ns = 0
-    started = time.monotonic()
 
     def take(new: Iterable[StepResult]) -> None:
         for result in new:
-            truth = truth_at(np.array([result.t_ns]))[0]
-            results.append(result)
-            truths.append(truth)
             assert world_from_map is not None
-            snapshot = _snapshot(result, counter_at.pop(result.t_ns), truth, world_from_map)
+            snapshot = snapshot_of_step(
+                result,
+                counter=counter_at.pop(result.t_ns),
+                truth=truth_at(np.array([result.t_ns]))[0],
+                world_from_map=world_from_map,
+                wall_spans_m=slam.wall_spans_m(),
+            )
             for observer in observers:
                 observer.on_snapshot(snapshot)
 
@@ -226,27 +331,15 @@ def run_slam(
         for scan in scans:
             for observer in observers:
                 observer.on_scan(scan)
-            start_ns = scan.t_ns if start_ns is None else start_ns
-            duration_ns = scan.t_ns - start_ns
             if not scan.used:
                 continue
             if world_from_map is None:
                 world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
             counter_at[scan.t_ns] = scan.counter
-            n_frames += len(scan.frames)
             frames = [_less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames]
             take(slam.step(frames, odometry.pose_at, scan.t_ns))
         take(slam.flush())
-    return RunRecord(
-        results=tuple(results),
-        truth=np.array(truths).reshape(-1, 3),
-        world_from_map=np.zeros(3) if world_from_map is None else world_from_map,
-        n_frames=n_frames,
-        duration_ns=duration_ns,
-        start_ns=start_ns or 0,
-        wall_spans_m=slam.wall_spans_m(),
-        wall_s=time.monotonic() - started,
-    )
+    return recorder.record()
 
 
 def _less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
@@ -261,12 +354,15 @@ def _less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
     return replace(frame, samples=frame.samples * scale, limits=limits)
 
 
-def _snapshot(
+def snapshot_of_step(
     result: StepResult,
+    *,
     counter: int,
     truth: NDArray[np.float64],
     world_from_map: NDArray[np.float64],
+    wall_spans_m: NDArray[np.float64],
 ) -> Snapshot:
+    """Return the state that a step of SLAM led to; see `Snapshot`."""
     belief = result.belief
     rows = range(len(belief.landmark_ids))
     return Snapshot(
@@ -283,6 +379,7 @@ def _snapshot(
             -1, 2, 2
         ),
         nis_per_dof=result.nis_per_dof,
+        wall_spans_m=wall_spans_m,
         step=result,
     )
 
@@ -293,6 +390,26 @@ def frames_between(last: RadarFrame, frame: RadarFrame) -> int:
     Sessions of older versions hold no numbers of streams: a counter that falls is a new stream.
     """
     return max(frame.counter - last.counter - 1, 0) if frame.stream == last.stream else 0
+
+
+class LostFrames(SessionObserver):
+    """Counts the frames missing between counters of one stream.
+
+    Attributes
+    ----------
+    n_lost
+        So far, over all radars.
+    """
+
+    def __init__(self) -> None:
+        self.n_lost = 0
+        self._last: dict[int, RadarFrame] = {}
+
+    def on_scan(self, scan: Scan) -> None:
+        for frame in scan.frames:
+            last = self._last.get(frame.radar)
+            self.n_lost += 0 if last is None else frames_between(last, frame)
+            self._last[frame.radar] = frame
 
 
 class LinkState(StrEnum):

@@ -163,6 +163,14 @@ class ScanEnd:
     truth: NDArray[np.float64] | None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordedScan:
+    """A scan as the run took it, and the true pose at it, shape (3,), world frame, if known."""
+
+    scan: Scan
+    truth: NDArray[np.float64] | None
+
+
 SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot
 """What `RecordedSession.records` yields; a TumSample is odometry."""
 
@@ -292,6 +300,12 @@ class RecordedSession:
 
         A scan that damage or the end of a cut file left incomplete is not among them.
         """
+        for record in self.played():
+            if isinstance(record, RecordedScan):
+                yield record.scan, record.truth
+
+    def played(self) -> Iterator[RecordedScan | TumSample | LogLine | Snapshot]:
+        """Yield what `records` does, with the frames put together into scans as in `scans`."""
         held: list[tuple[RadarFrame, int]] = []
         for message, record in self._records():
             if isinstance(record, RadarFrame):
@@ -311,7 +325,9 @@ class RecordedSession:
                         host_ns=arrivals if len(arrivals) == len(frames) else (),
                         used=record.used,
                     )
-                    yield scan, record.truth
+                    yield RecordedScan(scan=scan, truth=record.truth)
+            else:
+                yield record
 
     def detections(self) -> dict[int, tuple[Detection, ...]]:
         """Return the recorded ranges by the time of their scan [ns]; amplitudes are unknown."""

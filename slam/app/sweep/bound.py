@@ -38,9 +38,10 @@ from scipy.optimize import least_squares, linear_sum_assignment
 from emulator.scene.scene import Scene
 from slam.app.errors import AppError
 from slam.app.odometry.track import NS_PER_S
+from slam.app.records import SessionObserver, Snapshot
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
 from slam.app.run.evaluation import NEES_AT
-from slam.app.run.runner import RunRecord
+from slam.app.run.runner import RunRecord, States
 from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import ate_rmse_m, nees_pose
 from slam.frames import Detection
@@ -168,8 +169,21 @@ class KnownRun:
     ranges: tuple[tuple[KnownRange, ...], ...]
 
 
+class StateRanges(SessionObserver):
+    """Keeps the ranges of every state, each with its standard deviation, or () if there is none."""
+
+    def __init__(self) -> None:
+        self.of_states: list[tuple[tuple[Detection, ...], tuple[float, ...]]] = []
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        step = snapshot.step
+        assert step is not None  # a run in this process
+        self.of_states.append((step.detections, step.range_sigmas_m))
+
+
 def known_run(
-    record: RunRecord,
+    states: States,
+    ranges_of_states: StateRanges,
     rig: Rig,
     true_landmarks_m: Array,
     *,
@@ -178,21 +192,20 @@ def known_run(
 ) -> KnownRun:
     """Return the data that SLAM had, with the ids of the true landmarks, shape (n, 2), world frame.
 
-    ``range_sigma_m`` is the standard deviation of a range in results without ``range_sigmas_m``;
+    ``range_sigma_m`` is the standard deviation of a range in states without their own;
     ``offset_sigma_m``, that of each radar's unknown range offset, widens the gate.
     """
-    stamps_ns = np.array([result.t_ns for result in record.results], dtype=np.float64)
-    odometry = _Track(stamps_ns, np.array([result.odometry_pose for result in record.results]))
-    truth = _Track(stamps_ns, record.truth)
+    stamps_ns = states.t_ns.astype(np.float64)
+    odometry, truth = _Track(stamps_ns, states.odometry), _Track(stamps_ns, states.truth)
     increments, ranges = [], []
     last = np.zeros(3)
-    for row, result in enumerate(record.results):
-        pose = result.odometry_pose
+    for row, (detections, sigmas_m) in enumerate(ranges_of_states.of_states):
+        pose = states.odometry[row]
         increments.append(between(last, pose))
         last = pose
-        used = result.range_sigmas_m or (range_sigma_m,) * len(result.detections)
+        used = sigmas_m or (range_sigma_m,) * len(detections)
         by_frame: dict[tuple[int, int], list[tuple[Detection, float]]] = {}
-        for detection, sigma in zip(result.detections, used, strict=True):
+        for detection, sigma in zip(detections, used, strict=True):
             if sigma < math.inf:  # else SLAM was not given it
                 frame = by_frame.setdefault((detection.radar, detection.t_ns), [])
                 frame.append((detection, sigma))
@@ -500,7 +513,9 @@ class BoundSummary:
     nees_pose: tuple[tuple[float, float], ...]
 
 
-def bound_of(record: RunRecord, scene: Scene, config: SlamConfig) -> BoundSummary:
+def bound_of(
+    record: RunRecord, ranges: StateRanges, scene: Scene, config: SlamConfig
+) -> BoundSummary:
     """Return the bound of a run that has a state.
 
     Rig, wheels and offsets are those that SLAM knew; the truth only gives each range its landmark.
@@ -509,23 +524,25 @@ def bound_of(record: RunRecord, scene: Scene, config: SlamConfig) -> BoundSummar
     is_robust = config.back_end is BackEnd.ROBUST
     rig = rig_of(scene)
     offset_sigma_m = config.robust.offset_sigma_m if is_robust else 0.0
+    states = record.states
     run = known_run(
-        record,
+        states,
+        ranges,
         rig,
         true_landmarks_m(scene),
         range_sigma_m=config.robust.range_sigma_m if is_robust else _PAPER_RANGE_SIGMA_M,
         offset_sigma_m=offset_sigma_m,
     )
     paths = solve_known(run, rig, wheels_of(scene), offset_sigma_m=offset_sigma_m)
-    stamps_ns = np.array([result.t_ns for result in record.results])
+    stamps_ns = states.t_ns
     values = []
     for part in NEES_AT:
         t_ns = round(part * record.duration_ns)
         row = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
-        truth = between(record.world_from_map, record.truth[row])
+        truth = between(record.world_from_map, states.truth[row])
         nees = nees_pose(paths.filtered[row], paths.filtered_covariance[row], truth)
         values.append((int(stamps_ns[row]) / NS_PER_S, nees))
-    truth_xy = record.truth[:, :2]
+    truth_xy = states.truth[:, :2]
     return BoundSummary(
         filtered_ate_rmse_m=ate_rmse_m(paths.filtered[:, :2], truth_xy),
         smoothed_ate_rmse_m=ate_rmse_m(paths.smoothed[:, :2], truth_xy),

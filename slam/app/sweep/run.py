@@ -23,7 +23,7 @@ from emulator.scene.scene import CarriedSpec, Scene
 from emulator.scene.wheels import scene_odometry
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import NS_PER_S, OdometryTrack
-from slam.app.records import Scan, SessionInfo
+from slam.app.records import Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -37,15 +37,15 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
+from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.sweep import CLEAN, STRESSES, Stress
-from slam.app.sweep.bound import BoundSummary, bound_of
+from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.config import ConfigError, SlamConfig, override
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import transform
-from slam.results import Slam
+from slam.results import Slam, StepResult
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.x4 import FIRST_COUNTER
 
@@ -181,19 +181,18 @@ def _uniforms(seed: int, stream: int, block: int, count: int) -> NDArray[np.floa
     return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
-def false_landmarks(record: RunRecord, scene: Scene) -> tuple[int, int]:
-    """Count the landmarks of the last map that have nothing within 15 cm; in all, and confident.
+def false_landmarks(last: Snapshot, scene: Scene) -> tuple[int, int]:
+    """Count the landmarks of the last state that have nothing within 15 cm; in all, and confident.
 
     Judged in the start frame and not aligned, since that is the frame of the claim: a map turned
     by an error of heading that it does not know of is false, too. Something is a target's surface,
     a wall, or the side of a box.
     """
-    belief = record.results[-1].belief
     false = confident = 0
-    for row, place in enumerate(belief.landmarks):
-        if distance_m(scene, transform(record.world_from_map, place)) > LANDMARK_MATCH_M:
+    for place, covariance in zip(last.landmarks_m, last.landmark_covariances_m2, strict=True):
+        if distance_m(scene, transform(last.world_from_map, place)) > LANDMARK_MATCH_M:
             false += 1
-            variance = float(np.linalg.eigvalsh(belief.landmark_covariance(row))[-1])
+            variance = float(np.linalg.eigvalsh(covariance)[-1])
             confident += variance < CONFIDENT_M**2
     return false, confident
 
@@ -325,6 +324,17 @@ def loopback_source(
     )
 
 
+class Steps(SessionObserver):
+    """Keeps all that led to every state of a run, for short ones."""
+
+    def __init__(self) -> None:
+        self.steps: list[StepResult] = []
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        assert snapshot.step is not None  # a run in this process
+        self.steps.append(snapshot.step)
+
+
 def source_of(case: Case, stop: StopFlag = NO_STOP) -> RunSource:
     """Return the source of a case; SLAM gets the scene's own rig and wheels, no stress."""
     stress, front_end = STRESSES[case.stress], None
@@ -355,18 +365,19 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
             "install the same on both"
         )
     source = source_of(case, stop)
-    record = execute(source)
+    ranges = StateRanges()
+    record = execute(source, [ranges] if case.bound else [])
     summary = summarise(record, source.info, source.rig)
-    if summary is None:
+    if summary is None or record.last is None:
         raise AppError(f"{case.scene.name}: too short for SLAM, no state was estimated")
-    false, confident = false_landmarks(record, case.scene)
+    false, confident = false_landmarks(record.last, case.scene)
     run = SweepRun(
         **{row.name: getattr(summary, row.name) for row in fields(summary)},
         settings=dict(case.settings),
         stress=case.stress,
         false=false,
         confident_false=confident,
-        bound=bound_of(record, case.scene, case.config) if case.bound else None,
+        bound=bound_of(record, ranges, case.scene, case.config) if case.bound else None,
     )
     return finite(run)
 

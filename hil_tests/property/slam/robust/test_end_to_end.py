@@ -196,11 +196,10 @@ def test_through_echoes_the_floor_is_that_of_the_front_end(
     """Bounds: a fix of ranges that are 7.4 mm rms off is 59 mm off; a fifth of a bin is 1.3 mm."""
     case = make_case(str(silent_scene(tmp_path)), preset, 0, settings=TOLD_NOISE)
     record = execute(source_of(case))
-    estimate = np.array([result.belief.pose[:2] for result in record.results])
-    ate_m = ate_rmse_m(estimate, record.truth[:, :2])
-    landmarks = transform(
-        align_se2(estimate, record.truth[:, :2]), record.results[-1].belief.landmarks
-    )
+    estimate, truth = record.states.estimate[:, :2], record.states.truth[:, :2]
+    ate_m = ate_rmse_m(estimate, truth)
+    assert record.last is not None
+    landmarks = transform(align_se2(estimate, truth), record.last.landmarks_m)
     off_m = [float(np.hypot(*(RODS - landmark).T).min()) for landmark in landmarks]
     record_property("ate_floor_m", ate_m)
     record_property("landmark_floor_m", off_m)

@@ -11,8 +11,10 @@ from mcap.reader import NonSeekingReader
 from slam.app.cli import main
 from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.run.runner import RunRecord, RunRecorder, snapshot_of_step
 from slam.app.session.log import SessionLog
 from slam.frames import RadarFrame
+from slam.results import StepResult
 
 FRAME_NS = 199_261_498
 N_BINS = 1431
@@ -77,6 +79,28 @@ def snapshot(counter: int) -> Snapshot:
         landmark_covariances_m2=np.array([np.diag([4e-4, 1e-4]), [[2e-4, 1e-4], [1e-4, 2e-4]]]),
         nis_per_dof=(0.5, 1.5) if counter % 2 else (),
     )
+
+
+def record_of_steps(
+    results: Iterable[StepResult],
+    truth: np.ndarray,
+    world_from_map: np.ndarray,
+    true_landmarks_m: np.ndarray,
+    *observers: SessionObserver,
+) -> RunRecord:
+    """Return the record of states without scans, and give them to observers; truth (n, 3)."""
+    recorder = RunRecorder(true_landmarks_m)
+    for counter, (result, pose) in enumerate(zip(results, truth, strict=True)):
+        state = snapshot_of_step(
+            result,
+            counter=counter,
+            truth=pose,
+            world_from_map=world_from_map,
+            wall_spans_m=np.empty((0, 2, 2)),
+        )
+        for observer in (recorder, *observers):
+            observer.on_snapshot(state)
+    return recorder.record()
 
 
 class Listener(SessionObserver):

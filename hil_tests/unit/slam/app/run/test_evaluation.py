@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.unit.slam.app.sessions import session_info
+from hil_tests.unit.slam.app.sessions import record_of_steps, session_info
 from slam.app.cli import main
 from slam.app.odometry.track import Trajectory, write_tum
 from slam.app.run.evaluation import NEES_AT, Summary, summarise
@@ -34,12 +34,14 @@ RIG = Rig(
 
 
 def record_of(
-    results: Sequence[StepResult], truth: np.ndarray, world_from_map: np.ndarray, more_ns: int = 0
+    results: Sequence[StepResult],
+    truth: np.ndarray,
+    world_from_map: np.ndarray,
+    more_ns: int = 0,
+    landmarks: np.ndarray = LANDMARKS,
 ) -> RunRecord:
-    return RunRecord(
-        results=tuple(results),
-        truth=truth,
-        world_from_map=world_from_map,
+    return dataclasses.replace(
+        record_of_steps(results, truth, world_from_map, landmarks),
         n_frames=2 * N,
         duration_ns=(N - 1) * PERIOD_NS + more_ns,
         wall_s=0.5,
@@ -158,8 +160,8 @@ def turned() -> Summary:
                 associations=tuple(association for _, association in observed),
             )
         )
-    record = record_of(results, truth, PLACE, PERIOD_NS // 10)
     true_m = np.array([(w.real, w.imag) for w in map(in_world, (first, second))])
+    record = record_of(results, truth, PLACE, PERIOD_NS // 10, true_m)
     summary = summarise(record, dataclasses.replace(INFO, true_landmarks_m=true_m), RIG)
     assert summary is not None
     return summary

@@ -429,11 +429,10 @@ def test_through_drift_and_jitter_the_map_is_as_good_as_with_perfect_clocks(driv
         assert abs(arrivals.drift_ppm - ppm) < 3.0 * arrivals.drift_sigma_ppm
         assert arrivals.drift_sigma_ppm < 30.0
 
-    estimate = np.array([result.belief.pose[:2] for result in record.results])
-    odometry_xy = np.array([result.odometry_pose[:2] for result in record.results])
-    ate_m = ate_rmse_m(estimate, record.truth[:, :2])
+    states = record.states
+    ate_m = ate_rmse_m(states.estimate[:, :2], states.truth[:, :2])
     assert ate_m < 1.5e-3
-    assert ate_m < 0.5 * ate_rmse_m(odometry_xy, record.truth[:, :2])
+    assert ate_m < 0.5 * ate_rmse_m(states.odometry[:, :2], states.truth[:, :2])
 
 
 def test_a_dead_radar_is_told_and_the_others_go_on(drive: Drive) -> None:
@@ -478,7 +477,7 @@ def test_odometry_that_stops_for_a_while_costs_only_that_while(drive: Drive) -> 
     assert all(gap[0] - NS_PER_S // 2 < scan.t_ns < gap[1] for scan in unused)
     assert len(unused) in range(16, 24)  # of 20 in the gap
     assert all(len(scan.frames) == len(PPM) for scan in unused)  # they are recorded
-    stamps = [result.t_ns for result in record.results]
+    stamps = record.states.t_ns.tolist()
     assert not [t for t in stamps if gap[0] < t < gap[1] - NS_PER_S]
     assert [t for t in stamps if t > gap[1]]
 
@@ -497,7 +496,7 @@ def test_odometry_that_falls_silent_ends_the_run_with_all_its_states(drive: Driv
     assert str(source.ended) == (
         "odometry from the test: no more line for 10 s; is its sender running?"
     )
-    assert record.results[-1].t_ns > silent_ns - NS_PER_S
+    assert record.states.t_ns[-1] > silent_ns - NS_PER_S
 
 
 @pytest.mark.parametrize(

@@ -70,9 +70,11 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
     )
     assert tuple(scan.counter for scan in listener.scans) == COUNTERS
     assert tuple(snapshot.counter for snapshot in listener.snapshots) == COUNTERS
-    assert len(record.results) == len(COUNTERS)
+    states = record.states
+    assert len(states) == len(COUNTERS)
+    assert states.t_ns.tolist() == [counter * FRAME_NS for counter in COUNTERS]
     np.testing.assert_allclose(record.world_from_map, [5.0, 95.0, 0.5])
-    for counter, taken, truth in zip(COUNTERS, listener.snapshots, record.truth, strict=True):
+    for counter, taken, truth in zip(COUNTERS, listener.snapshots, states.truth, strict=True):
         assert taken.t_ns == counter * FRAME_NS
         np.testing.assert_allclose(taken.truth, [counter, 100 - counter, 0.1 * counter])
         np.testing.assert_allclose(taken.estimate, [2.0 * counter, 0.0, 0.0])
@@ -81,7 +83,9 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
     assert record.n_frames == 2 * len(COUNTERS)
     assert record.start_ns == COUNTERS[0] * FRAME_NS
     assert record.start_ns + record.duration_ns == COUNTERS[-1] * FRAME_NS
-    np.testing.assert_array_equal(record.wall_spans_m, [[[0.0, 1.0], [2.0, 1.0]]])
+    assert record.last is listener.snapshots[-1]
+    for taken in listener.snapshots:
+        np.testing.assert_array_equal(taken.wall_spans_m, [[[0.0, 1.0], [2.0, 1.0]]])
 
 
 def test_an_unused_scan_is_told_and_not_stepped() -> None:
@@ -94,7 +98,7 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
     assert record.n_frames == 2 * 3
     np.testing.assert_array_equal(record.world_from_map, np.zeros(3))
-    assert np.isnan(record.truth).all()
+    assert np.isnan(record.states.truth).all()
 
 
 def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from hil_tests.unit.slam.app.sessions import record_of_steps
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
     Run,
@@ -20,7 +21,6 @@ from hil_tests.unit.slam.robust.range_world import (
     true_path,
 )
 from slam.app.errors import AppError
-from slam.app.run.runner import RunRecord
 from slam.app.sweep.bound import (
     ALONE_RANGES,
     KnownAssociation,
@@ -28,6 +28,7 @@ from slam.app.sweep.bound import (
     KnownRun,
     Pose,
     SeenFrom,
+    StateRanges,
     first_position,
     known_run,
     solve_known,
@@ -266,19 +267,13 @@ def test_a_record_becomes_increments_and_ranges_at_their_own_times() -> None:
         StepResult(t_ns=100 * k, odometry_pose=pose, belief=start(), detections=found)
         for k, (pose, found) in enumerate(zip(odometry, [(late, clutter), (), ()], strict=True))
     )
-    record = RunRecord(
-        results=results,
-        truth=truth,
-        world_from_map=np.zeros(3),
-        n_frames=1,
-        duration_ns=200,
-        wall_s=1.0,
-    )
 
-    def known(record: RunRecord, **sigmas: float) -> KnownRun:
-        return known_run(record, Rig(mounts=(MOUNT,)), landmark, **sigmas)
+    def known(results: Sequence[StepResult], **sigmas: float) -> KnownRun:
+        ranges = StateRanges()
+        record = record_of_steps(results, truth, np.zeros(3), landmark, ranges)
+        return known_run(record.states, ranges, Rig(mounts=(MOUNT,)), landmark, **sigmas)
 
-    run = known(record, range_sigma_m=2e-3)
+    run = known(results, range_sigma_m=2e-3)
     np.testing.assert_allclose(
         run.increments, [[0.1, 0, 0], [0.2, 0, 0], [0.1, 0.1, math.pi / 2]], atol=1e-15
     )
@@ -287,13 +282,13 @@ def test_a_record_becomes_increments_and_ranges_at_their_own_times() -> None:
     assert (only.radar, only.landmark, only.range_m, only.sigma_m) == (0, 0, range_m, 2e-3)
     np.testing.assert_allclose(only.motion, [0.1, 0.0, 0.0], atol=1e-15)
     # the range is 4 mm off, and the gate four standard deviations
-    assert known(record, range_sigma_m=0.95e-3).ranges[0] == ()
-    assert len(known(record, range_sigma_m=5e-4, offset_sigma_m=2e-2).ranges[0]) == 1
+    assert known(results, range_sigma_m=0.95e-3).ranges[0] == ()
+    assert len(known(results, range_sigma_m=5e-4, offset_sigma_m=2e-2).ranges[0]) == 1
     told = tuple(replace(r, range_sigmas_m=(3e-3, math.inf)[: len(r.detections)]) for r in results)
-    by_detection = known(replace(record, results=told), range_sigma_m=2e-3)
+    by_detection = known(told, range_sigma_m=2e-3)
     assert [item.sigma_m for item in by_detection.ranges[0]] == [3e-3]
     left_out = (replace(results[0], range_sigmas_m=(math.inf, 3e-3)), *results[1:])
-    assert known(replace(record, results=left_out), range_sigma_m=2e-3).ranges == ((), (), ())
+    assert known(left_out, range_sigma_m=2e-3).ranges == ((), (), ())
 
 
 def test_ranges_of_one_radar_place_a_landmark_once_they_tell_it() -> None:

@@ -2,15 +2,13 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
 
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
-from slam.app.run.runner import RunRecord
+from slam.app.records import Snapshot
 from slam.app.sweep.bound import BoundSummary
 from slam.app.sweep.run import SweepRun, distance_m, false_landmarks, make_case
 from slam.app.sweep.statistics import (
@@ -22,7 +20,6 @@ from slam.app.sweep.statistics import (
     times_clean,
 )
 from slam.evaluation import LandmarkScore
-from slam.results import Belief, StepResult
 
 RUN = replace(
     run_of(make_case("lab", "paper", 0)),
@@ -191,18 +188,19 @@ def test_nothing_is_infinitely_far_in_an_empty_room() -> None:
     assert distance_m(empty_room(), np.zeros(2)) == math.inf
 
 
-def record(places: list[tuple[float, float]], sigmas: list[tuple[float, float]]) -> RunRecord:
-    mean = np.concatenate([np.zeros(3), np.ravel(places)])
-    variances = np.concatenate([np.zeros(3), np.ravel(sigmas)]) ** 2
-    ids = tuple(range(len(places)))
-    belief = Belief(mean=mean, covariance=np.diag(variances), landmark_ids=ids)
-    return RunRecord(
-        results=(cast(StepResult, SimpleNamespace(belief=belief)),),
-        truth=np.zeros((1, 3)),
+def state(places: list[tuple[float, float]], sigmas: list[tuple[float, float]]) -> Snapshot:
+    return Snapshot(
+        counter=0,
+        t_ns=0,
+        truth=np.zeros(3),
+        odometry=np.zeros(3),
+        estimate=np.zeros(3),
         world_from_map=np.array([1.0, 0.0, math.pi / 2]),
-        n_frames=1,
-        duration_ns=1,
-        wall_s=1.0,
+        pose_covariance=np.zeros((3, 3)),
+        landmark_ids=np.arange(len(places)),
+        landmarks_m=np.array(places),
+        landmark_covariances_m2=np.array([np.diag(pair) ** 2 for pair in sigmas]),
+        nis_per_dof=(),
     )
 
 
@@ -210,4 +208,4 @@ def test_false_ones_are_counted_in_the_world_and_by_their_worst_direction() -> N
     # map (2, 0) is world (1, 2), where the rod stands
     places = [(2.1, 0.0), (2.2, 0.0), (2.2, 0.0), (-9.0, 9.0)]
     sigmas = [(0.01, 0.01), (0.01, 0.04), (0.01, 0.06), (0.2, 0.2)]
-    assert false_landmarks(record(places, sigmas), ROOM) == (3, 1)
+    assert false_landmarks(state(places, sigmas), ROOM) == (3, 1)
