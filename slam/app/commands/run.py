@@ -8,7 +8,6 @@ import time
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from queue import SimpleQueue
 
 import numpy as np
 
@@ -20,7 +19,14 @@ from slam.app.records import SessionInfo, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.files import are_emulated, load_rig, open_rig
 from slam.app.rig.sources import RigSource, sampler_limits
-from slam.app.run.live_source import Inbox, LiveLog, LiveSource, drift_text, reading
+from slam.app.run.live_source import (
+    MOST_WAIT_NS,
+    Inbox,
+    LiveLog,
+    LiveSource,
+    drift_text,
+    reading,
+)
 from slam.app.run.output import Progress, Row, note
 from slam.app.run.results import RESULTS, finish, prepare_folder
 from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
@@ -68,7 +74,7 @@ def run_rig(
         raise UsageError(str(error)) from None
     line_source = parse_source(odometry)
     live_odometry = LiveOdometry(line_source.name, parse_clock(clock, line_source))
-    inbox: Inbox = SimpleQueue()
+    inbox = Inbox()
     with ExitStack() as held:
         if (out / _SESSION).exists():
             raise AppError(
@@ -81,30 +87,18 @@ def run_rig(
             rig_file,
             rig,
             None if ports is None else tuple(ports),
-            lambda radar, record: inbox.put(("link", radar, record)),
+            lambda radar, record: inbox.offer(("link", radar, record)),
             note,
         )
         rig_source = held.enter_context(RigSource(links))
         if wire:
             rig_source.listen(
-                lambda radar, way, data, host_ns: inbox.put(("wire", radar, way, data, host_ns))
+                lambda radar, way, data, host_ns: inbox.offer(("wire", radar, way, data, host_ns))
             )
         stop.check()
         rig_source.start(RAW_CONFIG, fps)
         wheels = rig_file.wheels.noise
-        info = SessionInfo(
-            scene=rig.stem,
-            preset=preset,
-            seed=None,
-            radars=rig_source.radars,
-            true_landmarks_m=np.empty((0, 2)),
-            versions=versions(),
-            config_json=settings_text(config),
-            constants=slam_constants(),
-            wheels=asdict(wheels),
-            simulated=are_emulated(links),
-            time_base="arrival",
-        )
+        slam = make_slam(config, rig_file.rig, wheels)
         log = LiveLog()
         live = LiveSource(
             rig_source.radars,
@@ -115,22 +109,37 @@ def run_rig(
             stop,
             duration_s=duration_s,
         )
-        source = RunSource(
-            info=info,
-            rig=rig_file.rig,
-            slam=make_slam(config, rig_file.rig, wheels),
-            scans=live.scans(),
-            odometry=live_odometry,
-            lost_frames=lambda: live.lost_frames,
-            link_log=log,
-        )
         with reading(links, line_source, inbox):
             start_ns = live.settle()
+            info = SessionInfo(
+                scene=rig.stem,
+                preset=preset,
+                seed=None,
+                radars=rig_source.radars,
+                true_landmarks_m=np.empty((0, 2)),
+                versions=versions(),
+                config_json=settings_text(config),
+                constants=slam_constants(),
+                wheels=asdict(wheels),
+                simulated=are_emulated(links),
+                time_base="arrival",
+                started_unix_ns=0 if clock == "unix" else live.started_unix_ns(),
+                odometry_clock=clock,
+            )
+            source = RunSource(
+                info=info,
+                rig=rig_file.rig,
+                slam=slam,
+                scans=live.scans(),
+                odometry=live_odometry,
+                lost_frames=lambda: live.lost_frames,
+                link_log=log,
+            )
             session_log = SessionLog(out / _SESSION, info, start_ns=start_ns)
             held.callback(session_log.close)
-            log.begin(session_log)
+            log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [
-                Progress(info, None, source.lost_frames, also=lambda: _lag_text(live))
+                Progress(info, None, source.lost_frames, also=lambda: _dropped_text(live))
             ]
             if view is not None:
                 sinks.append(view.observer(info))
@@ -193,12 +202,18 @@ def _rows(record: RunRecord, live: LiveSource, odometry: LiveOdometry) -> list[R
         (
             "load",
             f"{100 * load:.0f} %",
-            f"of real time spent in SLAM and logs; at worst {live.worst_lag_s:.2f} s behind",
+            f"of real time spent in SLAM and logs; a scan waited {live.worst_wait_s:.2f} s at most",
+        ),
+        (
+            "dropped",
+            f"{live.ticks.n_dropped}",
+            f"scans that waited longer than {MOST_WAIT_NS / NS_PER_S:g} s for SLAM: recorded, "
+            "not used",
         ),
         (
             "left out",
-            f"{live.ticks.n_unused}",
-            f"scans recorded without SLAM; {live.ticks.n_left_out} frames came too late",
+            f"{live.ticks.n_unused - live.ticks.n_dropped}",
+            f"more scans recorded without SLAM; {live.ticks.n_left_out} frames came too late",
         ),
     ]
     if (drift_ppm := odometry.drift_ppm) is not None:
@@ -209,6 +224,5 @@ def _rows(record: RunRecord, live: LiveSource, odometry: LiveOdometry) -> list[R
     return rows
 
 
-def _lag_text(live: LiveSource) -> str:
-    lag_s = live.ticks.lag_ns / NS_PER_S
-    return f"  {lag_s:.1f} s behind" if lag_s >= 1.0 else ""
+def _dropped_text(live: LiveSource) -> str:
+    return f"  {live.ticks.n_dropped} scans dropped" if live.ticks.n_dropped else ""

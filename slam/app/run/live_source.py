@@ -3,6 +3,12 @@
 Threads put events into one queue; the main loop reads that queue only. A radar that falls silent
 or vanishes is looked for until it is back or the run ends.
 
+A run never falls behind by much. A scan that waited for SLAM longer than `MOST_WAIT_NS` since its
+last frame came is recorded and not used; in the session it is marked so, and a replay leaves out
+the same scans. Before each step signals, duration and odometry are looked at: when one of them ends
+the run, scans that still wait are recorded and not used. The queue holds `MOST_EVENTS`; when it is
+full, the threads wait, and what sources and modules cannot hold meanwhile is lost and counted.
+
 Ticks are frame periods of session time. A tick is complete when every radar that is not lost has
 sent a frame of it or a later one, and odometry has come past it; or when waiting longer would not
 make it more complete. `TickAssembler` reads no clock: time is an argument, so tests run it in
@@ -19,12 +25,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from queue import Empty, SimpleQueue
-from typing import Literal, TypeAlias
+from dataclasses import replace
+from queue import Empty, Full, Queue
+from typing import Literal, NamedTuple, TypeAlias
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.arrival import ArrivalClock
-from slam.app.odometry.live import LineSource, LiveOdometry, read_lines
+from slam.app.odometry.live import MOST_STAMP_NS, LineSource, LiveOdometry, read_lines
 from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, Snapshot
 from slam.app.rig.sources import RadarLink, radar_frame
@@ -54,7 +61,38 @@ Event: TypeAlias = (
 - "odometry end": why no more lines will come, "" if the source just ended.
 """
 
-Inbox: TypeAlias = SimpleQueue[Event]
+MOST_EVENTS = 20_000
+"""At 5 frames/s of four radars half an hour of frames, 0.1 GB: no step of SLAM takes so long."""
+
+
+class Inbox(Queue[Event]):
+    """What waits for the main loop, `MOST_EVENTS` at most.
+
+    Attributes
+    ----------
+    n_refused
+        Events of `offer` that found no room.
+    """
+
+    def __init__(self, most: int = MOST_EVENTS) -> None:
+        super().__init__(most)
+        self.n_refused = 0
+
+    def hand_over(self, event: Event, stopped: threading.Event) -> None:
+        """Put an event, waiting for room; drop it if the reading is stopped meanwhile."""
+        while not stopped.is_set():
+            try:
+                self.put(event, timeout=_POLL_S)
+            except Full:
+                continue
+            return
+
+    def offer(self, event: Event) -> None:
+        """Put an event if there is room; from a driver's callback, which must not wait."""
+        try:
+            self.put_nowait(event)
+        except Full:
+            self.n_refused += 1
 
 
 SILENCE_S = 3.0
@@ -104,7 +142,7 @@ def _read_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Ev
         while not stopped.is_set():
             trouble = ""
             try:
-                inbox.put(("frame", radar, link.driver.read_frame(_POLL_S)))
+                inbox.hand_over(("frame", radar, link.driver.read_frame(_POLL_S)), stopped)
                 received_s = time.monotonic()
             except ResponseTimeout:
                 if time.monotonic() - received_s > SILENCE_S:
@@ -112,12 +150,12 @@ def _read_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Ev
             except XeThruError as error:
                 trouble = str(error)
             if trouble:
-                inbox.put(("lost", radar, trouble))
+                inbox.hand_over(("lost", radar, trouble), stopped)
                 if _found_again(link, stopped):
-                    inbox.put(("back", radar, link.driver.port))
+                    inbox.hand_over(("back", radar, link.driver.port), stopped)
                 received_s = time.monotonic()
     except Exception as error:  # a bug: reported, so that no radar is lost silently
-        inbox.put(("lost", radar, f"its reader failed: {error!r}"))
+        inbox.hand_over(("lost", radar, f"its reader failed: {error!r}"), stopped)
         raise
 
 
@@ -136,22 +174,32 @@ def _read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) -
     trouble = ""
     try:
         for text, arrival_ns in read_lines(source, stopped.is_set):
-            inbox.put(("odometry line", text, arrival_ns))
+            inbox.hand_over(("odometry line", text, arrival_ns), stopped)
     except OdometryError as error:
         trouble = str(error)
     except Exception as error:  # a bug, as above
-        inbox.put(("odometry end", f"its reader failed: {error!r}"))
+        inbox.hand_over(("odometry end", f"its reader failed: {error!r}"), stopped)
         raise
-    inbox.put(("odometry end", trouble))
+    inbox.hand_over(("odometry end", trouble), stopped)
 
 
 GRACE_NS = NS_PER_S // 2
 """How long a tick waits for a radar that has not sent its frame yet."""
 ODOMETRY_WAIT_NS = NS_PER_S
 """How long a tick waits for odometry; then its frames are recorded and not used."""
-MOST_LAG_NS = 10 * NS_PER_S
-"""When SLAM is later than that, scans are recorded and not used until it has caught up."""
-CAUGHT_UP_NS = NS_PER_S
+MOST_WAIT_NS = 2 * NS_PER_S
+"""A scan that waited for SLAM longer, since its period was over and its last frame had come, is
+recorded and not used. A second of it may be the wait for odometry."""
+EARLY_NS = NS_PER_S
+"""So much of the newest frames is kept before the first tick."""
+
+
+class _Waiting(NamedTuple):
+    """A frame that waits; it came at `host_ns` since 1970, and `came_ns` by session time."""
+
+    frame: RadarFrame
+    host_ns: int
+    came_ns: int
 
 
 class TickAssembler:
@@ -172,10 +220,12 @@ class TickAssembler:
         Indices of the radars that are not lost.
     start_ns
         Session time of tick 0; None before `begin`.
-    lag_ns
-        How long ago the newest tick given out was over.
+    wait_ns
+        How long the newest scan given out had waited for SLAM.
     n_unused
         Scans given out that SLAM must not use.
+    n_dropped
+        Those of them that waited too long for SLAM.
     n_left_out
         Frames that came too late for SLAM, given out in scans that it must not use.
     ended
@@ -185,29 +235,39 @@ class TickAssembler:
     def __init__(self, n_radars: int, period_ns: int, odometry: LiveOdometry) -> None:
         self._odometry = odometry
         self._period_ns = period_ns
-        # frames in session time, each with its arrival, nanoseconds since 1970
-        self._waiting: list[deque[tuple[RadarFrame, int]]] = [deque() for _ in range(n_radars)]
+        self._waiting: list[deque[_Waiting]] = [deque() for _ in range(n_radars)]
         self._tick = 0
-        self._is_late = False
         self.alive = set(range(n_radars))
         self.start_ns: int | None = None
-        self.lag_ns = 0
-        self.n_unused = self.n_left_out = 0
+        self.wait_ns = 0
+        self.n_unused = self.n_dropped = self.n_left_out = 0
         self.ended = False
 
     def begin(self, start_ns: int) -> None:
         """Let tick 0 begin at a session time; frames before it are dropped."""
         self.start_ns = start_ns
+        self._forget_before(start_ns)
+
+    def take(self, frame: RadarFrame, host_ns: int, came_ns: int) -> None:
+        """Take a frame; the frames of one radar come in the order of time.
+
+        It came at `host_ns` since 1970, and `came_ns` by session time.
+        """
+        self._waiting[frame.radar].append(_Waiting(frame, host_ns, came_ns))
+        if self.start_ns is None:
+            self._forget_before(frame.t_ns - EARLY_NS)
+
+    def _forget_before(self, t_ns: int) -> None:
         for queue in self._waiting:
-            while queue and queue[0][0].t_ns < start_ns:
+            while queue and queue[0].frame.t_ns < t_ns:
                 queue.popleft()
 
-    def take(self, frame: RadarFrame, host_ns: int) -> None:
-        """Take a frame; the frames of one radar come in the order of time."""
-        self._waiting[frame.radar].append((frame, host_ns))
+    def next_scan(self, now_ns: int, *, is_over: bool = False) -> Scan | None:
+        """Return the next scan if it is complete at a session time, else None.
 
-    def next_scan(self, now_ns: int) -> Scan | None:
-        """Return the next scan if it is complete at a session time, else None."""
+        When the run `is_over`, nothing more comes: what waits of the ticks before `now_ns` is given
+        out, and SLAM must not use it.
+        """
         if self.start_ns is None:
             return None
         while True:
@@ -217,23 +277,29 @@ class TickAssembler:
             if late:
                 self.n_left_out += len(late)
                 return self._scan(late, begin_ns, used=False)
-            self.ended = self._odometry.ended and not self._odometry.covers(begin_ns)
-            received = [q[0] for q in self._waiting if q and q[0][0].t_ns < end_ns]
-            stamps_ns = [begin_ns, *(frame.t_ns for frame, _ in received)]
-            if self.ended or self._may_get_more(bool(received), max(stamps_ns), end_ns, now_ns):
-                return None
+            received = [q[0] for q in self._waiting if q and q[0].frame.t_ns < end_ns]
+            stamps_ns = [begin_ns, *(one.frame.t_ns for one in received)]
+            if is_over:
+                if end_ns > now_ns or not any(self._waiting):
+                    return None
+            else:
+                self.ended = self._odometry.ended and not self._odometry.covers(begin_ns)
+                if self.ended or self._may_get_more(bool(received), max(stamps_ns), end_ns, now_ns):
+                    return None
             if received:
                 break
             # to the oldest frame, or the first tick that may still get some: there are billions of
             # empty ones if odometry's clock is set from 1970
-            heads_ns = [queue[0][0].t_ns for queue in self._waiting if queue]
+            heads_ns = [queue[0].frame.t_ns for queue in self._waiting if queue]
             next_ns = min([now_ns - GRACE_NS, *heads_ns])
             self._tick = max(self._tick + 1, (next_ns - self.start_ns) // self._period_ns)
-        for frame, _ in received:
-            self._waiting[frame.radar].popleft()
-        self.lag_ns = now_ns - end_ns
-        self._is_late = self.lag_ns > (CAUGHT_UP_NS if self._is_late else MOST_LAG_NS)
-        used = not self._is_late and all(map(self._odometry.is_known, stamps_ns))
+        for one in received:
+            self._waiting[one.frame.radar].popleft()
+        self.wait_ns = now_ns - max([end_ns, *(one.came_ns for one in received)])
+        used = not is_over and all(map(self._odometry.is_known, stamps_ns))
+        if used and self.wait_ns > MOST_WAIT_NS:
+            self.n_dropped += 1
+            used = False
         scan = self._scan(received, begin_ns, used=used)
         self._tick += 1
         return scan
@@ -249,17 +315,17 @@ class TickAssembler:
             return False
         return now_ns < needed_ns + ODOMETRY_WAIT_NS
 
-    def _scan(self, received: Sequence[tuple[RadarFrame, int]], t_ns: int, *, used: bool) -> Scan:
+    def _scan(self, received: Sequence[_Waiting], t_ns: int, *, used: bool) -> Scan:
         self.n_unused += not used
         return Scan(
             counter=self._tick,
             t_ns=t_ns,
-            frames=tuple(frame for frame, _ in received),
-            host_ns=tuple(host_ns for _, host_ns in received),
+            frames=tuple(one.frame for one in received),
+            host_ns=tuple(one.host_ns for one in received),
             used=used,
         )
 
-    def _late(self, begin_ns: int, end_ns: int) -> Sequence[tuple[RadarFrame, int]]:
+    def _late(self, begin_ns: int, end_ns: int) -> Sequence[_Waiting]:
         """Take the oldest frame of every radar that is too old for a tick.
 
         Too old is by more than a whole period, or by a quarter of one if a newer frame of the tick
@@ -268,8 +334,8 @@ class TickAssembler:
         """
         late = []
         for queue in self._waiting:
-            age_ns = begin_ns - queue[0][0].t_ns if queue else 0
-            has_newer = len(queue) > 1 and queue[1][0].t_ns < end_ns
+            age_ns = begin_ns - queue[0].frame.t_ns if queue else 0
+            has_newer = len(queue) > 1 and queue[1].frame.t_ns < end_ns
             if age_ns > (self._period_ns // 4 if has_newer else self._period_ns):
                 late.append(queue.popleft())
         return late
@@ -279,8 +345,9 @@ SETTLE_S = 2.0
 """How long frames and odometry are read before the first scan, so that clocks are known."""
 START_LIMIT_S = 15.0
 SILENT_RIG_S = 10.0
-WARN_LAG_S = 2.0
 UNUSED_S = 5.0
+END_NS = 3 * NS_PER_S // 4
+"""How long a run that is over waits for its last scans, and SLAM for them; see GRACE_NS."""
 _SOURCE_POLL_S = 0.05
 _DRIFT_EVERY_S = 60.0
 
@@ -302,9 +369,14 @@ class LiveLog(LinkLog):
         self._log: SessionLog | None = None
         self._early: list[TumSample] | None = []
 
-    def begin(self, log: SessionLog) -> None:
-        """Write to a log, first the odometry so far."""
-        self._log = log
+    def begin(self, log: SessionLog, start_ns: int) -> None:
+        """Write to a log, first the odometry so far.
+
+        The lines so far, and those until the first scan, get its session time: they are of another
+        clock, and 0 may be decades ago.
+        """
+        self._log, self._t_ns = log, start_ns
+        self._waiting = [replace(line, t_ns=start_ns) for line in self._waiting]
         early, self._early = self._early or [], None
         for sample in early:
             self.on_odometry(sample)
@@ -377,8 +449,8 @@ class LiveSource:
         Of every radar, in the order of the rig.
     ended
         Why `scans` ended: a text if that was to be expected, else the error.
-    worst_lag_s
-        How long ago a tick was over when SLAM got it, at worst.
+    worst_wait_s
+        How long a scan waited for SLAM before it was given out, at worst.
     busy_s
         Time spent in SLAM, logs and views.
     lost_frames
@@ -405,13 +477,13 @@ class LiveSource:
         self._all_lost_ns: int | None = None
         self._last_frames: list[Frame | None] = [None] * len(radars)
         self._drift_logged_ns = self._began_ns
-        self._lag_warned_s = WARN_LAG_S
+        self._warned_dropped = self._warned_refused = 0
         self._unused_since_ns: int | None = None
         self._unused_warned = False
         self.ticks = TickAssembler(len(radars), round(NS_PER_S / radars[0].rate_hz), odometry)
         self.clocks = tuple(ArrivalClock(radar.rate_hz) for radar in radars)
         self.ended: str | AppError | StopRequestedError | None = None
-        self.worst_lag_s = self.busy_s = 0.0
+        self.worst_wait_s = self.busy_s = 0.0
         self.lost_frames = 0
 
     def settle(self) -> int:
@@ -460,43 +532,70 @@ class LiveSource:
             self.ticks.begin(start_ns)
             return start_ns
 
+    def started_unix_ns(self) -> int:
+        """Return the time of day at session time 0, were both clocks equally fast until now."""
+        now_ns = self._clock_ns()
+        return now_ns + self._unix_ns - self._odometry.session_ns(now_ns)
+
     def scans(self) -> Iterator[Scan]:
-        """Yield scans until the run ends; `ended` is the reason then."""
+        """Yield scans until the run ends; `ended` is the reason then.
+
+        Whatever waits when it ends is yielded, too, and SLAM must not use it.
+        """
         while self.ended is None:
-            try:
-                self._stop.check()
-            except StopRequestedError as stopped:
-                self.ended = stopped
-                break
             self._drain(_SOURCE_POLL_S)
-            while (scan := self._next_scan()) is not None:
+            while self._goes_on() and (scan := self._next_scan()) is not None:
                 started_ns = self._clock_ns()
                 yield scan
                 self.busy_s += (self._clock_ns() - started_ns) / NS_PER_S
                 self._drain(0.0)
-            self._end_if_over()
+        now_ns = self._odometry.session_ns(self._clock_ns())
+        over_ns = min(now_ns, self._duration_end_ns, self._odometry_end_ns)
+        while (scan := self.ticks.next_scan(over_ns, is_over=True)) is not None:
+            yield scan
         self._log_drifts()
 
+    def _goes_on(self) -> bool:
+        """Return whether nothing ends the run: no signal, not its duration or odometry."""
+        try:
+            self._stop.check()
+        except StopRequestedError as stopped:
+            self.ended = stopped
+        else:
+            self._end_if_over()
+        return self.ended is None
+
     def _next_scan(self) -> Scan | None:
-        if self.ended is not None:
-            return None
+        n_dropped = self.ticks.n_dropped
         scan = self.ticks.next_scan(self._odometry.session_ns(self._clock_ns()))
         if scan is None:
             return None
-        assert self.ticks.start_ns is not None
-        elapsed_s = (scan.t_ns - self.ticks.start_ns) / NS_PER_S
-        if self._duration_s is not None and elapsed_s >= self._duration_s:
+        if scan.t_ns >= self._duration_end_ns:
             self.ended = f"the {self._duration_s:g} s asked for are over"
             return None
-        self._warn_of_lag()
-        self._warn_of_unused(scan)
+        self.worst_wait_s = max(self.worst_wait_s, self.ticks.wait_ns / NS_PER_S)
+        if self.ticks.n_dropped > n_dropped:
+            self._warn_of_dropped()
+        else:
+            self._warn_of_unused(scan)
         return scan
 
+    @property
+    def _duration_end_ns(self) -> int:
+        if self._duration_s is None:
+            return MOST_STAMP_NS
+        assert self.ticks.start_ns is not None
+        return self.ticks.start_ns + round(self._duration_s * NS_PER_S)
+
+    @property
+    def _odometry_end_ns(self) -> int:
+        return self._odometry.last_ns if self._odometry.ended else MOST_STAMP_NS
+
     def _drain(self, wait_s: float) -> None:
-        """Take all events that wait; wait for the first one if there is none."""
+        """Take the events that wait, no more than those; wait for the first if there is none."""
         try:
             self._take(self._inbox.get(timeout=wait_s) if wait_s else self._inbox.get_nowait())
-            while True:
+            for _ in range(MOST_EVENTS):
                 self._take(self._inbox.get_nowait())
         except Empty:
             return
@@ -536,19 +635,21 @@ class LiveSource:
         if not self._odometry.has_pose:
             return  # session time is unknown until then
         made = radar_frame(radar, frame, self._odometry.session_ns(taken_ns), limits=self._limits)
-        self.ticks.take(made, frame.arrival_ns + self._unix_ns)
+        came_ns = self._odometry.session_ns(frame.arrival_ns)
+        self.ticks.take(made, frame.arrival_ns + self._unix_ns, came_ns)
 
-    def _warn_of_lag(self) -> None:
-        lag_s = self.ticks.lag_ns / NS_PER_S
-        self.worst_lag_s = max(self.worst_lag_s, lag_s)
-        if lag_s > self._lag_warned_s:
-            self._lag_warned_s = 2.0 * lag_s
-            self._log.log(
-                "run",
-                f"SLAM is {lag_s:.1f} s behind the radars: this machine is too slow, or busy with "
-                "something else; all frames are recorded",
-                warning=True,
-            )
+    def _warn_of_dropped(self) -> None:
+        """Warn at the first scan that SLAM was too slow for, and whenever they have doubled."""
+        if self.ticks.n_dropped < 2 * self._warned_dropped:
+            return
+        self._warned_dropped = self.ticks.n_dropped
+        scans = "1 scan" if self.ticks.n_dropped == 1 else f"{self.ticks.n_dropped} scans"
+        self._log.log(
+            "run",
+            "SLAM cannot keep up with the radars: this machine is too slow, or busy with something "
+            f"else; {scans} waited longer than {MOST_WAIT_NS / NS_PER_S:g} s: recorded, not used",
+            warning=True,
+        )
 
     def _warn_of_unused(self, scan: Scan) -> None:
         """Warn if SLAM has got no scan for long: a clock may have been set."""
@@ -566,14 +667,15 @@ class LiveSource:
             )
 
     def _end_if_over(self) -> None:
-        """Log how clocks drift, and end a run that cannot go on."""
+        """Log how clocks drift, and end a run that is over, or cannot go on."""
         now_ns = self._clock_ns()
         if now_ns - self._drift_logged_ns > _DRIFT_EVERY_S * NS_PER_S:
             self._drift_logged_ns = now_ns
             self._log_drifts()
-        if self.ended is not None:
-            return
-        if self.ticks.ended:
+        over_ns = self._odometry.session_ns(now_ns) - END_NS
+        if over_ns >= self._duration_end_ns:
+            self.ended = f"the {self._duration_s:g} s asked for are over"
+        elif self.ticks.ended or over_ns >= self._odometry_end_ns:
             trouble = self._odometry.trouble
             self.ended = AppError(trouble) if trouble else "odometry ended"
         elif text := self._odometry.silence(now_ns, self._began_ns):
@@ -588,6 +690,14 @@ class LiveSource:
     def _log_drifts(self) -> None:
         for info, clock in zip(self.radars, self.clocks, strict=True):
             self._log.log(info.name, drift_text(clock), warning=False)
+        if self._inbox.n_refused > self._warned_refused:
+            self._warned_refused = self._inbox.n_refused
+            self._log.log(
+                "run",
+                f"{self._warned_refused} lines about links, or pieces of raw bytes, found no room "
+                "in the queue and are not recorded: this machine is too slow",
+                warning=True,
+            )
 
 
 def drift_text(clock: ArrivalClock) -> str:

@@ -33,7 +33,7 @@ def test_odometry_from_before_the_log_is_in_it_once_and_in_order(tmp_path: Path)
     listener = LiveLog()
     listener.on_odometry(pose(1))
     listener.on_odometry(pose(2))
-    listener.begin(SessionLog(tmp_path / "session.mcap", session_info()))
+    listener.begin(SessionLog(tmp_path / "session.mcap", session_info()), 0)
     listener.on_odometry(pose(3))
     listener.close()
     recorded = open_session(tmp_path / "session.mcap").records()
@@ -51,7 +51,7 @@ def test_a_disk_that_fills_up_is_said_once_and_the_run_goes_on(
     listener.on_odometry(pose(2))
     log = SessionLog(tmp_path / "session.mcap", session_info())
     monkeypatch.setattr(log, refused, refuse)
-    listener.begin(log)
+    listener.begin(log, 0)
     listener.attach(heard)
     for number in range(3):
         listener.on_odometry(pose(3 + number))
@@ -69,7 +69,7 @@ def test_a_last_chunk_that_does_not_fit_is_told_and_nothing_raised(
 ) -> None:
     listener = LiveLog()
     log = SessionLog(tmp_path / "session.mcap", session_info())
-    listener.begin(log)
+    listener.begin(log, 0)
     with monkeypatch.context() as full:
         full.setattr(log, "close", refuse)
         listener.close()

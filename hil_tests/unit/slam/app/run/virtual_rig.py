@@ -4,7 +4,7 @@ import heapq
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from queue import Empty, SimpleQueue
+from queue import Empty
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from emulator.scene.wheels import scene_odometry
 from slam.app.records import RadarInfo
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
 from slam.app.rig.sources import RadarLink, RigSource
-from slam.app.run.live_source import Event, LiveLog
+from slam.app.run.live_source import Event, Inbox, LiveLog
 from xethru_protocol.driver.radar import X4M300
 
 NS_PER_S = 1_000_000_000
@@ -33,10 +33,11 @@ class Timed:
     event: Event
 
 
-class VirtualInbox(SimpleQueue[Event]):
+class VirtualInbox(Inbox):
     """An inbox whose events come when virtual time reaches them; waiting takes none."""
 
     def __init__(self, events: list[Timed]) -> None:
+        super().__init__()
         self._heap = [(row.t_ns, number, row.event) for number, row in enumerate(events)]
         heapq.heapify(self._heap)
         self.now_ns = 0
