@@ -17,7 +17,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.chip import Pace
-from xethru_protocol.system import StopFlag, each_line, flush_streams, json_text, one_line
+from xethru_protocol.system import (
+    STDERR,
+    STDOUT,
+    StopFlag,
+    StopRequestedError,
+    each_line,
+    flush_streams,
+    json_text,
+    one_line,
+)
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -264,14 +273,11 @@ def ask(path: Path, request: dict[str, Any]) -> bytes:
 
 
 def _print(text: str) -> None:
-    if sys.stdout is not None:
-        sys.stdout.write(f"{each_line(text)}\n")
-        sys.stdout.flush()  # what fails shall fail here, not when the interpreter ends
+    STDOUT.write(f"{each_line(text)}\n")
 
 
 def _failed(text: str, *, exit_code: int = 1) -> int:
-    if sys.stderr is not None:  # started with stderr closed
-        sys.stderr.write(f"xethru-emulator: {one_line(' '.join(text.split()))}\n")
+    STDERR.write_soon(f"xethru-emulator: {one_line(' '.join(text.split()))}\n")
     return exit_code
 
 
@@ -300,28 +306,29 @@ _AT_ONCE: dict[str, Callable[[argparse.Namespace], int]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    with StopFlag("same") as stop:  # the imports take most of a second: a signal may come in them
-        arguments = _parse(argv)
-        if arguments.command not in _AT_ONCE:
-            return _run(arguments, stop)
-    # a signal ends these at once: there is nothing to clean up
     try:
-        return _AT_ONCE[arguments.command](arguments)
+        with StopFlag("same") as stop:
+            arguments = _parse(argv)
+            if arguments.command not in _AT_ONCE:
+                return _run(arguments, stop)
+        # a signal ends these at once: there is nothing to clean up
+        exit_code = _AT_ONCE[arguments.command](arguments)
+        failure = STDOUT.failure
+        if failure is None or isinstance(failure, BrokenPipeError):  # its reader has seen enough
+            return exit_code
+        return _failed(f"stdout: cannot write: {failure.strerror}")
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except BrokenPipeError:  # the reader of our output has closed it
-        flush_streams()
-        return 0
-    except OSError as error:
-        flush_streams()
-        return _failed(f"stdout: cannot write: {error.strerror}")
+    finally:
+        flush_streams(wait=False)
 
 
 def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
-    # heavy imports only now: --help and usage errors answer at once
-    from emulator import serving
-
-    if stop.requested:
+    try:
+        with stop.at_once():  # the imports take most of a second
+            # heavy, and only now: --help and usage errors answer at once
+            from emulator import serving
+    except StopRequestedError:
         return 0
     start = {"serve": serving.serve, "play": serving.play, "proxy": serving.proxy}
     try:

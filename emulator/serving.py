@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 import time
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +36,7 @@ from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
-from xethru_protocol.system import StopFlag, flush_streams, json_text
+from xethru_protocol.system import STDOUT, StopFlag, json_text
 from xethru_protocol.transport import open_line
 from xethru_protocol.wire.errors import PortUnavailable
 
@@ -332,13 +331,7 @@ def _run(
     announcement = Announcement(ready)
     cleanup.callback(announcement.close)
     ports.moved = lambda: announcement.update({**ready, "devices": ports.entries()})
-    if sys.stdout is not None:  # else it was started with stdout closed
-        try:
-            sys.stdout.write(json_text(ready, separators=(",", ":")) + "\n")
-            sys.stdout.flush()
-        except OSError as error:  # ports that were not announced are of no use
-            flush_streams()
-            raise CannotServeError(
-                f"stdout: cannot write the ready line: {error.strerror}"
-            ) from error
+    STDOUT.write(json_text(ready, separators=(",", ":")) + "\n")
+    if STDOUT.failure is not None:  # ports that were not announced are of no use
+        raise CannotServeError(f"stdout: cannot write the ready line: {STDOUT.failure.strerror}")
     server.run()

@@ -9,13 +9,14 @@ import errno
 import fcntl
 import json
 import os
+import select
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TextIO
 
 MOST_BYTES = 1 << 20
 
@@ -197,21 +198,122 @@ def open_closed_streams(*, replace: bool = True) -> None:
                 setattr(sys, name, file)
 
 
-def flush_streams() -> bool:
-    """Flush both outputs; one that takes no more is sent to the null device.
+_PIECE = 64
+"""Letters that a stream takes whole when it takes anything: of a terminal's buffer 256 bytes are
+free then, of a pipe's 4096."""
+_MOST_LATE = 100_000
+"""Letters that wait for a stream that blocks; a run's session log has its warnings, too."""
 
-    What is left in a buffer would otherwise make the interpreter complain, and end with an exit
-    code of its own, when it flushes at its end. Returns whether standard output took all.
+
+class Outlet:
+    """Standard output or standard error for as long as it takes text; its methods never raise.
+
+    A terminal goes away with its connection, the reader of a pipe ends, a disk gets full: nothing
+    more is written then, and `failure` is the reason. A stream may also block, as a terminal does
+    after Ctrl-S or a pipe that nobody reads. Only `write` waits for it.
     """
-    taken = True
-    for descriptor, stream in enumerate((sys.stdout, sys.stderr), start=1):
+
+    def __init__(self, name: Literal["stdout", "stderr"], descriptor: int) -> None:
+        self._name, self._descriptor = name, descriptor
+        self._failed: tuple[TextIO, OSError] | None = None
+        self._late = ""
+
+    @property
+    def stream(self) -> TextIO | None:
+        """The stream itself, for what it is connected to; None if it was closed at the start."""
+        stream: TextIO | None = getattr(sys, self._name)
+        return stream
+
+    @property
+    def is_terminal(self) -> bool:
+        return self.stream is not None and self.stream.isatty()
+
+    @property
+    def failure(self) -> OSError | None:
+        """Why the stream takes no more; BrokenPipeError if its reader has ended."""
+        if self._failed is None or self._failed[0] is not self.stream:
+            return None
+        return self._failed[1]
+
+    def write(self, text: str) -> None:
+        """Write a text behind those that wait, however long the stream blocks."""
+        text, self._late = self._late + text, ""
+        self._put(text)
+
+    def write_soon(self, text: str) -> None:
+        """Write a text if the stream does not block, else keep it until it takes text again."""
+        self._late = (self._late + text)[:_MOST_LATE]
+        while self._late and not self._blocks():
+            piece, self._late = self._late[:_PIECE], self._late[_PIECE:]
+            self._put(piece)
+
+    def offer(self, text: str) -> None:
+        """Write a text if the stream does not block, else leave it out."""
+        self.write_soon("")
+        if not self._late and not self._blocks():
+            self.write_soon(text)
+
+    def _blocks(self) -> bool:
+        if self.stream is None or self.failure is not None:
+            return False
         try:
-            if stream is not None:
-                stream.flush()
-        except (OSError, ValueError):
-            _null_at(descriptor)
-            taken &= descriptor != 1
-    return taken
+            descriptor = self.stream.fileno()
+        except (OSError, ValueError):  # a stream of text in memory, in tests
+            return False
+        poll = select.poll()
+        poll.register(descriptor, select.POLLOUT)
+        return not poll.poll(0)
+
+    def _put(self, text: str) -> None:
+        stream = self.stream
+        if stream is None or self.failure is not None:
+            return
+        try:
+            try:
+                stream.write(text)
+            except UnicodeEncodeError:  # a file name that is no text, or a terminal without UTF-8
+                encoding = stream.encoding or "ascii"
+                stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+            stream.flush()
+        except OSError as error:
+            self._give_up(error.errno or errno.EIO)
+        except ValueError:  # somebody closed it
+            self._give_up(errno.EBADF)
+        except BaseException:  # a signal ended the waiting
+            if self._blocks():
+                self._give_up(errno.EINTR)
+            raise
+
+    def _give_up(self, number: int) -> None:
+        """Write nothing more.
+
+        What is left in the stream's buffer would make the interpreter wait, or complain and end
+        with an exit code of its own, when it flushes at its end: the null device takes it.
+        """
+        stream = self.stream
+        assert stream is not None
+        self._late = ""
+        # of the errno's own class, such as BrokenPipeError
+        self._failed = stream, OSError(number, os.strerror(number))
+        with suppress(OSError, ValueError):
+            if stream.fileno() == self._descriptor:
+                _null_at(self._descriptor)
+
+
+STDOUT, STDERR = Outlet("stdout", 1), Outlet("stderr", 2)
+
+
+def flush_streams(*, wait: bool = True) -> bool:
+    """Write what was kept for both outputs; return whether standard output took all there was.
+
+    Without ``wait``, what they do not take at once is dropped.
+    """
+    for outlet in (STDOUT, STDERR):
+        if wait:
+            outlet.write("")
+        else:
+            outlet.write_soon("")
+    return STDOUT.failure is None
 
 
 def one_line(text: str) -> str:

@@ -6,7 +6,6 @@ Nothing heavy is imported before a command runs, so `--help` answers at once.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -19,12 +18,17 @@ from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep import STRESSES
 from xethru_protocol.system import (
+    STDERR,
+    STDOUT,
     StopFlag,
     StopRequestedError,
     flush_streams,
     one_line,
     open_closed_streams,
 )
+
+_BY_A_SIGNAL = 128
+"""Exit codes from here on are of signals."""
 
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
@@ -59,41 +63,37 @@ With an emulator in another terminal, which has both radars and odometry:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; return 0, 1 (failed), 2 (wrong usage), or 128 + n (stopped by signal n)."""
     open_closed_streams()
+    exit_code = 0
     try:
-        return _run(_parser().parse_args(argv))
+        exit_code = _run(_parser().parse_args(argv))
     except KeyboardInterrupt:  # before a command took note of signals
-        return _end("stopped by SIGINT", 128 + signal.SIGINT)
-    finally:
-        flush_streams()
+        exit_code = _end("stopped by SIGINT", 128 + signal.SIGINT)
+    finally:  # also of --help; who sent a signal does not wait for a stream that blocks
+        flush_streams(wait=exit_code < _BY_A_SIGNAL)
+    return exit_code
 
 
 def _run(arguments: argparse.Namespace) -> int:
     stop = StopFlag()
     try:
-        try:
-            with stop:
-                arguments.command(arguments, stop)
-                sys.stdout.flush()
-        except OSError:
-            stop.check()  # a terminal that closes sends SIGHUP and takes no more output
-            raise
+        with stop:
+            arguments.command(arguments, stop)
         stop.check()  # a signal that came after the command's own last check
     except AppError as error:
         return _end(str(error), error.exit_code)
     except StopRequestedError as stopped:
         return _end(str(stopped), stopped.exit_code)
-    except BrokenPipeError:
-        return EXIT_FAILED  # the reader of the output has ended
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _end(f"{where}{error.strerror or error}", EXIT_FAILED)
-    return 0
+    failure = STDOUT.failure
+    if failure is None or isinstance(failure, BrokenPipeError):  # its reader has seen enough
+        return 0
+    return _end(f"standard output cannot be written: {failure.strerror}", EXIT_FAILED)
 
 
 def _end(message: str, exit_code: int) -> int:
-    line = one_line(" ".join(message.split()))
-    with contextlib.suppress(OSError):  # the terminal may be gone, and be the reason of the end
-        print(f"uwb-slam: {line}", file=sys.stderr)  # noqa: T201 - a command line prints
+    STDERR.write_soon(f"uwb-slam: {one_line(' '.join(message.split()))}\n")
     return exit_code
 
 
@@ -114,7 +114,9 @@ class _Command(NamedTuple):
     def start(self, arguments: argparse.Namespace, stop: StopFlag) -> None:
         module, _, name = self.function.partition(":")
         options: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k != "command"}
-        getattr(import_module(module), name)(stop, **options)
+        with stop.at_once():  # imports take seconds, and nothing was begun
+            function = getattr(import_module(module), name)
+        function(stop, **options)
 
 
 def _add_demo(demo: argparse.ArgumentParser) -> None:

@@ -9,6 +9,9 @@ from importlib import import_module
 
 from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
 
+_BY_A_SIGNAL = 128
+"""Exit codes from here on are of signals."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``xethru``; returns the exit code."""
@@ -29,20 +32,21 @@ def _run(argv: Sequence[str] | None) -> int:
     from xethru_protocol.cli.output import warn
     from xethru_protocol.wire.errors import XeThruError
 
+    code = _BY_A_SIGNAL
     try:
         arguments = parse(argv)
         try:
             file, _, function = arguments.run.partition(":")
             run = getattr(import_module(f"xethru_protocol.cli.{file}"), function)
-            code: int = run(arguments)
+            code = run(arguments)
         except XeThruError as error:
             warn(f"xethru {arguments.command}: {error}")
-            return 1
+            code = 1
     except SystemExit:  # after --help or wrong usage
         if flush_streams():
             raise
         warn("xethru: standard output cannot be written")
-        return 1
-    finally:
-        flush_streams()  # a failure here was reported already, or nobody reads
+        code = 1
+    finally:  # who sent a signal does not wait for a stream that blocks
+        flush_streams(wait=code < _BY_A_SIGNAL)
     return code

@@ -1,6 +1,5 @@
 """``xethru list``, ``ping``, ``info``, ``reset``, ``flash`` and ``stream``."""
 
-import sys
 import time
 from argparse import Namespace
 from dataclasses import asdict
@@ -14,7 +13,6 @@ from xethru_protocol.cli.output import (
     bytes_text,
     counted,
     frame_rate,
-    is_terminal,
     module_at,
     print_json,
     print_line,
@@ -26,6 +24,7 @@ from xethru_protocol.cli.output import (
 from xethru_protocol.driver.firmware import UNFINISHED, FirmwareImage
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.system import STDOUT
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import XeThruError
@@ -153,7 +152,7 @@ def stream(arguments: Namespace) -> int:
         radar.configure_raw(config)
         rate = radar.start(frame_rate(radar, arguments.fps))
         print_warnings(radar)
-        as_json = arguments.json or arguments.samples or not is_terminal(sys.stdout)
+        as_json = arguments.json or arguments.samples or not STDOUT.is_terminal
         live = None if as_json else _Live(radar)
         try:
             for frame in radar.frames(arguments.count, timeout_s=max(2.0, 3.0 / rate)):
@@ -214,4 +213,4 @@ class _Live:
             f"strongest at {frame.ranges_m[strongest]:.3f} m, "
             f"{self._radar.frames_lost} lost"
         )
-        print_text(rewriting(line, sys.stdout))
+        print_text(rewriting(line, STDOUT.stream))

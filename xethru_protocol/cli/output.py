@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, TextIO
 
-from xethru_protocol.system import flush_streams, json_text, one_line
+from xethru_protocol.system import STDERR, STDOUT, json_text, one_line
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 
@@ -55,40 +54,22 @@ def print_line(text: str) -> None:
 
 def print_text(text: str) -> None:
     """Write a part of a result as it is, at once; raises like `print_line`."""
-    if sys.stdout is None:  # started with it closed
+    if STDOUT.stream is None:  # started with it closed
         raise CommandFailed("standard output is closed; nothing can be printed")
-    try:
-        try:
-            sys.stdout.write(text)
-        except UnicodeEncodeError:  # a file name that is no text, or a terminal without UTF-8
-            encoding = sys.stdout.encoding or "ascii"
-            sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise CommandFailed(f"standard output cannot be written: {error.strerror}") from None
+    STDOUT.write(text)
+    failure = STDOUT.failure
+    if isinstance(failure, BrokenPipeError):
+        raise failure
+    if failure is not None:
+        raise CommandFailed(f"standard output cannot be written: {failure.strerror}")
 
 
 def warn(text: str) -> None:
-    """Write a line to standard error; what is not printable is written out."""
-    show(one_line(text) + "\n")
+    """Write a line to standard error; what is not printable is written out.
 
-
-def show(text: str) -> None:
-    """Write a text as it is to standard error; a closed one is no failure."""
-    if sys.stderr is None:
-        return
-    try:
-        sys.stderr.write(text)
-        sys.stderr.flush()
-    except OSError:
-        flush_streams()
-
-
-def is_terminal(stream: TextIO | None) -> bool:
-    """Whether a stream is a terminal; a closed one is not."""
-    return stream is not None and stream.isatty()
+    While standard error blocks the line is kept, and the command goes on.
+    """
+    STDERR.write_soon(one_line(text) + "\n")
 
 
 def _without_nan(value: Any) -> Any:  # noqa: ANN401 - any JSON value
@@ -106,12 +87,15 @@ _LINE_S = 10.0
 
 
 class Progress:
-    """Shows the newest of many states, not too often; ``name`` begins the lines of a log."""
+    """Shows the newest of many states, not too often; ``name`` begins the lines of a log.
+
+    Nothing waits for a terminal that blocks, as after Ctrl-S: states are left out meanwhile.
+    """
 
     def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
         self._clock = clock
-        self._rewrites = is_terminal(sys.stderr)
+        self._rewrites = STDERR.is_terminal
         self._shown_s = clock()
         self._is_open = False  # a line is there that ends in no line end
 
@@ -121,7 +105,7 @@ class Progress:
             return
         self._shown_s = now_s
         if self._rewrites:
-            show(rewriting(one_line(state()), sys.stderr))
+            STDERR.offer(rewriting(one_line(state()), STDERR.stream))
             self._is_open = True
         else:
             warn(f"{self._name}: {state()}")
@@ -129,16 +113,16 @@ class Progress:
     def finish(self, state: Callable[[], str]) -> None:
         """Bring a rewritten line up to date and end it."""
         if self._is_open:
-            show(rewriting(one_line(state()), sys.stderr) + "\n")
+            STDERR.write_soon(rewriting(one_line(state()), STDERR.stream) + "\n")
             self._is_open = False
 
 
-def rewriting(line: str, terminal: TextIO) -> str:
+def rewriting(line: str, terminal: TextIO | None) -> str:
     """Text that replaces the line of a terminal, cut to fit: a longer one would scroll."""
-    try:
-        columns = os.get_terminal_size(terminal.fileno()).columns
-    except (OSError, ValueError):  # unknown
-        columns = 0
+    columns = 0
+    if terminal is not None:
+        with suppress(OSError, ValueError):  # unknown
+            columns = os.get_terminal_size(terminal.fileno()).columns
     return f"\r{line[: columns - 1] if columns else line}\x1b[K"
 
 

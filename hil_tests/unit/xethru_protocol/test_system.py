@@ -1,11 +1,16 @@
 """Signals, locks and files that never end."""
 
+import contextlib
 import errno
 import os
+import select
 import signal
 import subprocess
 import sys
+import termios
 import threading
+import tty
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +20,7 @@ from emulator.scene.scene import SceneError, load_scene
 from hil_tests.patience import seconds
 from slam.app.cli import main
 from xethru_protocol.system import (
+    Outlet,
     PathInUseError,
     StopFlag,
     StopRequestedError,
@@ -268,3 +274,94 @@ def test_links_stay_links_and_what_is_no_file_is_written_to_itself(tmp_path: Pat
     finally:
         os.close(reader)
     assert pipe.is_fifo()
+
+
+@contextlib.contextmanager
+def terminal_as_stderr() -> Iterator[tuple[int, Outlet]]:
+    """Put a real terminal in place of standard error; give its other end and the outlet."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    with os.fdopen(slave, "w") as stream, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stderr", stream)
+        yield master, Outlet("stderr", slave)
+    with contextlib.suppress(OSError):  # closed by the test
+        os.close(master)
+
+
+def test_a_terminal_that_is_gone_takes_nothing_and_raises_nothing() -> None:
+    with terminal_as_stderr() as (master, outlet):
+        outlet.write("before")
+        assert os.read(master, 100) == b"before"
+        assert outlet.failure is None
+        os.close(master)
+        for write in (outlet.write, outlet.write_soon, outlet.offer):
+            write("after")
+            assert outlet.failure is not None
+            assert outlet.failure.errno == errno.EIO
+
+
+@pytest.mark.parametrize("line_length", [7, 79, 1000])
+def test_a_terminal_that_blocks_is_not_waited_for(line_length: int) -> None:
+    """Nobody reads it until all is written, so this would hang. What is kept comes in order."""
+    n = 200_000 // line_length
+    with terminal_as_stderr() as (master, outlet):
+        for number in range(n):
+            outlet.offer(f"{number:>{line_length}}")
+        for number in range(50):
+            outlet.write_soon(f"warning {number}\n")
+        outlet.offer("left out")
+        received = b""
+        while b"warning 49\n" not in received:
+            if select.select([master], [], [], 0.0)[0]:
+                received += os.read(master, 65536)
+            outlet.write_soon("")
+    shown, first, warnings = received.partition(b"warning 0\n")
+    assert shown.split() == [b"%d" % number for number in range(len(shown.split()))]
+    assert 1000 < len(shown) < n * line_length
+    assert (first + warnings).decode() == "".join(f"warning {n}\n" for n in range(50))
+
+
+def test_a_stopped_terminal_gets_no_progress_and_then_its_warnings() -> None:
+    """As after Ctrl-S and Ctrl-Q."""
+    with terminal_as_stderr() as (master, outlet):
+        assert sys.stderr is not None
+        termios.tcflow(sys.stderr, termios.TCOOFF)
+        outlet.offer("progress")
+        outlet.write_soon("warning\n")
+        termios.tcflow(sys.stderr, termios.TCOON)
+        outlet.offer("progress again")
+        expected = b"warning\nprogress again"
+        received = b""
+        while len(received) < len(expected):
+            received += os.read(master, 100)
+    assert received == expected
+
+
+def test_a_pipe_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    read_end, write_end = os.pipe()
+    with os.fdopen(read_end, "rb") as reader:
+        with os.fdopen(write_end, "w") as stream:
+            monkeypatch.setattr(sys, "stderr", stream)
+            outlet = Outlet("stderr", write_end)
+            for _ in range(3000):
+                outlet.offer("x" * 99 + "\n")
+            outlet.write_soon("warning\n")
+            shown = os.read(read_end, 1 << 20)
+            outlet.write("")
+            monkeypatch.undo()
+        assert set(shown.decode().splitlines()) == {"x" * 99}
+        assert reader.read().splitlines()[-1] == b"warning"
+
+
+def test_a_reader_that_has_ended_is_told_from_other_failures(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    with os.fdopen(write_end, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        outlet = Outlet("stdout", write_end)
+        outlet.write("a result")
+        assert isinstance(outlet.failure, BrokenPipeError)
+        monkeypatch.undo()
+    assert outlet.failure is None  # of the stream that is standard output now

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import SessionInfo
 from slam.app.rig.files import RigFile, RigRadar, write_rig
+from slam.app.run.output import print_progress, print_text
 from slam.app.session.reader import RecordedSession, open_session
 from slam.calibration.calibration import Calibration, Drive, calibrate, make_drive
 from slam.calibration.observability import (
@@ -82,12 +82,12 @@ def run_calibrate(
     report = _report_of(_drive_of(recorded, stop), known)
     if recorded.cut_at_byte is not None:
         cut = f"{session}: cut at byte {recorded.cut_at_byte}; read up to there"
-        sys.stderr.write(f"{one_line(cut)}\n")
+        print_progress(cut)
     planted = _planted(report.drive.rig, scene)
     if as_json:
-        sys.stdout.write(json_text(_facts(report, planted), indent=2, allow_nan=False) + "\n")
+        print_text(json_text(_facts(report, planted), indent=2, allow_nan=False))
     else:
-        sys.stdout.write("".join(f"{one_line(line)}\n" for line in _lines(report, planted)))
+        print_text("\n".join(one_line(line) for line in _lines(report, planted)))
     if rig is not None:
         write_rig(rig, _rig_file(recorded.info, report))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -121,7 +120,6 @@ def run_demo(
                 raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
             finish(out, source, record, stop)
         if live is not None:
-            sys.stdout.flush()
             live.keep_serving()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -33,7 +32,7 @@ from slam.app.run.evaluation import (
     summarise,
     world_from_odom,
 )
-from slam.app.run.output import Progress, run_rows, summary_rows
+from slam.app.run.output import Progress, print_text, run_rows, summary_rows
 from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
@@ -49,7 +48,7 @@ from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
 from slam.packed import PackedRows
-from xethru_protocol.system import StopFlag, one_line
+from xethru_protocol.system import StopFlag, one_line, written_whole
 
 _KEPT_WARNINGS = 200
 
@@ -318,9 +317,9 @@ def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
     page = out or recorded.path.with_name("report.html")
     refuse_overwriting(recorded.path, page)
     text = _report_text(recorded, stop)
-    with naming(page):
-        page.write_text(text, encoding="utf-8")
-    sys.stdout.write(f"{one_line(str(page))}\n")
+    with naming(page), written_whole(page) as fresh:
+        fresh.write_text(text, encoding="utf-8")
+    print_text(one_line(str(page)))
 
 
 def _report_text(session: RecordedSession, stop: StopFlag) -> str:

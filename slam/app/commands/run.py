@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import time
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -149,7 +148,6 @@ def run_rig(
         finish(out, source, record, StopFlag(), _rows(record, live, live_odometry))
         _report_end(live, log, out)
         if view is not None:
-            sys.stdout.flush()
             view.keep_serving()
 
 

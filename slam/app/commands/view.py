@@ -8,7 +8,6 @@ experimental: it is used in this file only.
 from __future__ import annotations
 
 import io
-import sys
 import tempfile
 import time
 from importlib.metadata import version
@@ -18,7 +17,7 @@ from PIL import Image
 
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.records import SessionObserver
-from slam.app.run.output import Progress, note
+from slam.app.run.output import Progress, note, print_text
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import RunSource, execute
 from slam.app.session.reader import RecordedSession, open_session
@@ -26,7 +25,7 @@ from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
 from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
 from xethru_protocol.recordings.mcap import MAGIC
-from xethru_protocol.system import StopFlag, one_line
+from xethru_protocol.system import StopFlag, one_line, written_whole
 
 _MAGIC = b"RRF"
 _END = b"FOOT"
@@ -97,9 +96,9 @@ def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -
         shown = full.convert("RGB").crop((0, _MENU_PIXELS, full.width, full.height))
         # An octree keeps colours that few points have, like landmarks; a median cut does not.
         few = shown.quantize(_PALETTE, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    with naming(out):
-        few.save(out, format="png", optimize=True)
-    sys.stdout.write(f"{one_line(str(out))}\n")
+    with naming(out), written_whole(out) as fresh:
+        few.save(fresh, format="png", optimize=True)
+    print_text(one_line(str(out)))
 
 
 def _settled(process: ViewerProcess, rrd: Path, at_s: float | None, stop: StopFlag) -> bytes:
@@ -162,7 +161,7 @@ def run_view(
     recorded = open_session(path)
     if out is not None:
         _write_view(recorded, out, stop)
-        sys.stdout.write(f"{one_line(str(out))}\n")
+        print_text(one_line(str(out)))
     elif screenshot is not None:
         with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
             made = Path(folder) / _VIEW_NAME

@@ -11,12 +11,12 @@ from slam.app.convert.matlab import convert_mat, write_detections
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import AppError, UsageError
 from slam.app.rig.files import load_rig
-from slam.app.run.output import note
+from slam.app.run.output import note, print_text
 from slam.app.run.replay import recorded_config
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
-from xethru_protocol.system import StopFlag, each_line
+from xethru_protocol.system import StopFlag
 
 
 def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
@@ -107,7 +107,7 @@ def run_convert(
                 )
     for line in warnings:
         note(f"{source}: {line}")
-    print(each_line(str(result)))  # noqa: T201 - the result
+    print_text(str(result))
 
 
 def _is_session(path: Path) -> bool:

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -44,6 +43,7 @@ from emulator.echo.reflections import sum_of_pulses
 from emulator.scene.scene import NoiseSpec, RadarSpec, empty_room
 from slam.app.experiments import Result, Table, table
 from slam.app.rig.sources import sampler_limits
+from slam.app.run.output import print_progress
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.config import FrontEnd, MatchedFilterConfig, SlamConfig, override
 from slam.frames import Detector, RadarFrame
@@ -705,8 +705,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     trials, seed = arguments.trials, arguments.seed
     tables: dict[str, Sequence[_Row]] = {}
     for number, (name, measure) in enumerate(cells.items(), start=1):
-        sys.stderr.write(f"{number}/{len(cells)} {name}\n")
-        sys.stderr.flush()
+        print_progress(f"{number}/{len(cells)} {name}")
         tables[name] = list(measure(trials, seed, stop))
     return Result(
         numbers={

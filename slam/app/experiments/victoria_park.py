@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -29,7 +28,7 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError
 from slam.app.experiments import Result, table
-from slam.app.run.output import share_text
+from slam.app.run.output import print_progress, share_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.sweep.bound import load_gtsam
 from slam.config import WheelNoise
@@ -400,7 +399,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     drive = read_drive(shipped_file())
     if arguments.steps is not None:
         drive = drive.first(arguments.steps)
-    sys.stderr.write("GTSAM: every step with ISAM2, then all of it in a batch\n")
+    print_progress("GTSAM: every step with ISAM2, then all of it in a batch")
     reference = batch_reference(drive, stop)
     odometry = odometry_path(drive)
     rows = [
@@ -413,7 +412,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
         ("true ids", True, UNKNOWN_WHEELS),
         ("unknown ids", False, UNKNOWN_WHEELS),
     ):
-        sys.stderr.write(f"robust back end, {name}\n")
+        print_progress(f"robust back end, {name}")
         run = drive_back_end(drive, wheels, stop, with_ids=with_ids)
         rows.append(score(f"robust, {name}", run.poses, reference, run, has_ids=with_ids))
         runs[name] = run

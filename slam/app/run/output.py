@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from slam.app.run.evaluation import Summary, ratio
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import LandmarkScore
 from slam.geometry import transform
-from xethru_protocol.system import one_line
+from xethru_protocol.system import STDERR, STDOUT, each_line, one_line, written_whole
 
 _LIVE_PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 10.0
@@ -30,14 +28,15 @@ _NO_RADARS = frozenset({"odometry", "run"})
 class Progress(SessionObserver):
     """Shows session time, frames/s per radar, pose error against truth, landmarks, lost frames.
 
+    One line is rewritten on a terminal. A run never waits for standard error: a line is left out
+    while it blocks, and warnings are written once it takes text again.
+
     Parameters
     ----------
     duration_ns
         Session time the run will cover; None if unknown.
     lost_frames, also
         Called when a line is shown; `also` returns text to add.
-    stream
-        A terminal gets one line that is rewritten.
     """
 
     def __init__(
@@ -47,13 +46,13 @@ class Progress(SessionObserver):
         lost_frames: Callable[[], int],
         *,
         also: Callable[[], str] = str,
-        stream: TextIO | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._stream = sys.stderr if stream is None else stream
         self._n_radars, self._duration_ns = max(len(info.radars), 1), duration_ns
         self._lost_frames, self._also, self._clock = lost_frames, also, clock
-        self._is_terminal = self._stream.isatty()
+        self._is_terminal = STDERR.is_terminal
+        # carriage return and erase: the live line stays one line
+        self._erased = "\r\x1b[K" if self._is_terminal else ""
         self._period_s = _LIVE_PERIOD_S if self._is_terminal else _PLAIN_PERIOD_S
         self._started = self._shown = clock()
         self._n_frames = self._t_ns = 0
@@ -74,14 +73,13 @@ class Progress(SessionObserver):
     def on_log(self, line: LogLine) -> None:
         if line.warning:
             who = line.radar if line.radar in _NO_RADARS else f"radar {line.radar}"
-            self._write(one_line(f"warning: {who}: {line.text}") + "\n")
+            STDERR.write_soon(self._erased + one_line(f"warning: {who}: {line.text}") + "\n")
 
     def close(self) -> None:
         """Show the last line and leave it standing."""
         self._show()
         if self._is_terminal:
-            self._stream.write("\n")
-            self._stream.flush()
+            STDERR.write_soon("\n")
 
     def line(self) -> str:
         wall_s = max(self._clock() - self._started, 1e-9)
@@ -101,27 +99,35 @@ class Progress(SessionObserver):
     def _show(self) -> None:
         self._shown = self._clock()
         if self._is_terminal:  # erasing reaches one row only, so the line must not wrap
-            self._write(self.line()[: shutil.get_terminal_size().columns - 1])
+            line = self.line()[: shutil.get_terminal_size().columns - 1]
+            STDERR.offer(self._erased + line)
         else:
-            self._write(f"{self.line()}\n")
-
-    def _write(self, text: str) -> None:
-        # Carriage return and erase: the live line stays one line.
-        self._stream.write(f"\r\x1b[K{text}" if self._is_terminal else text)
-        self._stream.flush()
+            STDERR.offer(f"{self.line()}\n")
 
 
 def note(text: str) -> None:
-    """Print a line about the program itself."""
-    sys.stderr.write(f"uwb-slam: {one_line(text)}\n")
-    sys.stderr.flush()
+    """Print a line about the program itself; like all that prints here, it never raises."""
+    print_progress(f"uwb-slam: {text}")
+
+
+def print_progress(line: str) -> None:
+    """Print a line on standard error; while that blocks, it is kept and the program goes on."""
+    STDERR.write_soon(f"{one_line(line)}\n")
+
+
+def print_text(lines: str) -> None:
+    """Print lines of a result on standard output, after its files are written.
+
+    What cannot be printed is no error here: the exit code says so.
+    """
+    STDOUT.write(each_line(lines) + "\n")
 
 
 def write_json(path: Path, numbers: Mapping[str, object]) -> None:
     """Write numbers without NaN; raise AppError if the file cannot be written."""
     text = json.dumps(numbers, indent=2, allow_nan=False)
-    with naming(path):
-        path.write_text(text + "\n", encoding="ascii")
+    with naming(path), written_whole(path) as fresh:
+        fresh.write_text(text + "\n", encoding="ascii")
 
 
 Row = tuple[str, str, str]
@@ -129,8 +135,7 @@ Row = tuple[str, str, str]
 
 
 def print_table(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
-    sys.stdout.write(table_text(title, header, rows))
-    sys.stdout.flush()
+    print_text(table_text(title, header, rows).rstrip("\n"))
 
 
 def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
@@ -17,7 +16,7 @@ from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.output import Row, print_result
+from slam.app.run.output import Row, print_result, print_text
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
 from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
@@ -152,11 +151,11 @@ def _finite_ate_m(
 def run_evaluate(stop: StopFlag, *, estimate: Path, reference: Path, as_json: bool) -> None:
     result = evaluate(estimate, reference)
     if as_json:
-        sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
+        print_text(json.dumps(result, allow_nan=False))
         return
     ate_m = result["ate_rmse_m"]
     size = "beyond floating point" if ate_m is None else f"{1e3 * float(ate_m):.1f} mm"
-    sys.stdout.write(
+    print_text(
         f"ATE {size} (RMS, {result['alignment']}, "
-        f"{result['pairs']} of {result['estimate_poses']} poses)\n"
+        f"{result['pairs']} of {result['estimate_poses']} poses)"
     )

@@ -17,7 +17,7 @@ from pathlib import Path
 from slam.app.errors import AppError
 from slam.app.session.reader import open_mcap
 from xethru_protocol.recordings import mcap
-from xethru_protocol.system import PathInUseError, StopFlag, each_line, locked
+from xethru_protocol.system import STDOUT, PathInUseError, StopFlag, each_line, locked
 
 KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""
@@ -90,7 +90,7 @@ class Repair:
 
 
 def run_repair(stop: StopFlag, *, session: Path, out: Path | None) -> None:
-    print(each_line(str(repair(session, out, stop))))  # noqa: T201 - the result
+    STDOUT.write(each_line(str(repair(session, out, stop))) + "\n")
 
 
 def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:

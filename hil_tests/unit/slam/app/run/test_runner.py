@@ -2,11 +2,13 @@
 
 import io
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from hil_tests.unit.slam.app.sessions import FRAME_NS, Listener, scan, session_info, snapshot
@@ -207,9 +209,7 @@ class Terminal(io.StringIO):
 
 def test_the_line_has_time_rate_error_landmarks_and_losses() -> None:
     now = [0.0]
-    progress = Progress(
-        session_info(), 100 * FRAME_NS, lambda: 3, stream=io.StringIO(), clock=lambda: now[0]
-    )
+    progress = Progress(session_info(), 100 * FRAME_NS, lambda: 3, clock=lambda: now[0])
     for counter in range(51):
         progress.on_scan(scan(counter))
     progress.on_snapshot(snapshot(50))
@@ -221,9 +221,10 @@ def test_the_line_has_time_rate_error_landmarks_and_losses() -> None:
     )
 
 
-def test_plain_lines_come_every_ten_seconds() -> None:
+def test_plain_lines_come_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     now, stream = [0.0], io.StringIO()
-    progress = Progress(session_info(), FRAME_NS, lambda: 0, stream=stream, clock=lambda: now[0])
+    monkeypatch.setattr(sys, "stderr", stream)
+    progress = Progress(session_info(), FRAME_NS, lambda: 0, clock=lambda: now[0])
     for counter in range(31):
         now[0] = float(counter)
         progress.on_scan(scan(counter))
@@ -233,9 +234,10 @@ def test_plain_lines_come_every_ten_seconds() -> None:
     assert "\r" not in stream.getvalue()
 
 
-def test_a_terminal_gets_one_line_rewritten() -> None:
+def test_a_terminal_gets_one_line_rewritten(monkeypatch: pytest.MonkeyPatch) -> None:
     now, stream = [0.0], Terminal()
-    progress = Progress(session_info(), FRAME_NS, lambda: 0, stream=stream, clock=lambda: now[0])
+    monkeypatch.setattr(sys, "stderr", stream)
+    progress = Progress(session_info(), FRAME_NS, lambda: 0, clock=lambda: now[0])
     for counter in range(20):
         now[0] = counter / 8
         progress.on_scan(scan(counter))
@@ -245,9 +247,10 @@ def test_a_terminal_gets_one_line_rewritten() -> None:
     assert stream.getvalue().count("\r\x1b[K") == 10
 
 
-def test_a_warning_about_a_link_is_shown_at_once() -> None:
+def test_a_warning_about_a_link_is_shown_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
-    progress = Progress(session_info(), FRAME_NS, lambda: 0, stream=stream)
+    monkeypatch.setattr(sys, "stderr", stream)
+    progress = Progress(session_info(), FRAME_NS, lambda: 0)
     progress.on_log(LogLine(t_ns=0, radar="left", warning=False, text="Ping"))
     progress.on_log(LogLine(t_ns=0, radar="left", warning=True, text="checksum"))
     assert stream.getvalue() == "warning: radar left: checksum\n"
