@@ -36,6 +36,7 @@ from slam.app.run.output import Progress, print_text, run_rows, summary_rows
 from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
+    LINK_COLOURS,
     ODOMETRY,
     PALE_INK,
     draw_map,
@@ -222,13 +223,6 @@ def _lines_of(values: Mapping[str, object], prefix: str = "") -> list[str]:
 
 
 _BAND = "#dfe3e8"
-_STATE_COLOURS = {
-    LinkState.SETTING_UP: "#8a9bb8",
-    LinkState.STREAMING: "#3d9a5f",
-    LinkState.FRAMES_LOST: "#e0a030",
-    LinkState.SILENT: "#8c5a2b",
-    LinkState.FAULT: "#d03a3a",
-}
 _BAR = 0.7
 """Height of a link's bar; 1 is the distance of two."""
 _TIME = "time since the first scan [s]"
@@ -282,19 +276,19 @@ def _draw_links(
         own = [(at_s, change.state) for at_s, change in changes if change.radar == name]
         ends = [*(at_s for at_s, _ in own[1:]), end_s]
         for (start_s, state), stop_s in zip(own, ends, strict=True):
-            if state in _STATE_COLOURS:
+            if state is not LinkState.ENDED:
                 # The shortest state, one lost frame, must stay visible.
                 width_s = max(stop_s - start_s, 0.002 * end_s)
                 place, height = [(start_s, width_s)], (row - _BAR / 2, _BAR)
-                axes.broken_barh(place, height, facecolors=_STATE_COLOURS[state])
+                axes.broken_barh(place, height, facecolors=LINK_COLOURS[state])
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(0.0, max(end_s, 1e-3))
     label(axes, "State of each link", _TIME, "")
     axes.grid(visible=False)
     shown = {change.state for _, change in changes}
-    for state, colour in _STATE_COLOURS.items():
-        if state in shown:
+    for state, colour in LINK_COLOURS.items():
+        if state in shown and state is not LinkState.ENDED:
             axes.plot([], [], linewidth=6, color=colour, label=str(state))
     figure.legend(loc="outside right upper", frameon=False, handlelength=1.0)
 

@@ -23,10 +23,19 @@ from PIL import Image
 from slam.app.errors import naming
 from slam.app.records import SessionInfo, Snapshot
 from slam.app.run.evaluation import Summary
-from slam.app.run.runner import RunRecord
+from slam.app.run.runner import LinkState, RunRecord
 from slam.geometry import between, compose, transform
 
-TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
+# What is drawn alike differs also for those who see two colours only.
+TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#9aa0a8", "#e08a2c", "#1f6fd0", "#c2255c"
+LINK_COLOURS = {
+    LinkState.SETTING_UP: "#9fc9e8",
+    LinkState.STREAMING: "#0072b2",
+    LinkState.FRAMES_LOST: "#f0c000",
+    LinkState.SILENT: "#cc79a7",
+    LinkState.FAULT: "#d04500",
+    LinkState.ENDED: "#444a52",
+}
 INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"
 _PALETTE = 256
 
@@ -109,12 +118,16 @@ CHI2_95_TWO_DOF = -2.0 * math.log(1.0 - 0.95)
 
 
 def ellipse_95(
-    center_m: NDArray[np.float64], covariance_m2: NDArray[np.float64], n_points: int = 33
+    center_m: NDArray[np.float64],
+    covariance_m2: NDArray[np.float64],
+    n_points: int = 33,
+    *,
+    enlarged: float = 1.0,
 ) -> NDArray[np.float64]:
     """Return the closed 95 % contour of a planar Gaussian, shape (n_points, 2).
 
     The first point is repeated at the end. The root of the covariance comes from the eigenvectors,
-    so a singular one gives a line.
+    so a singular one gives a line. `enlarged` is a factor of both axes.
 
     >>> outline = ellipse_95(np.zeros(2), np.diag([4.0, 1.0]), n_points=5)
     >>> np.abs(outline).max(axis=0).round(3)
@@ -123,8 +136,61 @@ def ellipse_95(
     variances, axes = np.linalg.eigh(covariance_m2)
     angle_rad = np.linspace(0.0, 2.0 * np.pi, n_points)
     circle = np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=-1)
-    half_axes_m = np.sqrt(CHI2_95_TWO_DOF * np.maximum(variances, 0.0))
+    half_axes_m = enlarged * np.sqrt(CHI2_95_TWO_DOF * np.maximum(variances, 0.0))
     return np.asarray(center_m + (circle * half_axes_m) @ axes.T)
+
+
+def half_axes_95_m(covariances_m2: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the half axes of the 95 % ellipses of covariances (n, 2, 2): (n, 2), short and long.
+
+    >>> half_axes_95_m(np.diag([4.0, 1.0])[None]).round(3)
+    array([[2.448, 4.895]])
+    """
+    variances = np.linalg.eigvalsh(covariances_m2)
+    return np.asarray(np.sqrt(CHI2_95_TWO_DOF * np.maximum(variances, 0.0)))
+
+
+_TYPICAL_PART, _LARGEST_PART = 0.03, 0.1
+"""Of the size of a map: how long an ellipse's half axis may be drawn."""
+_MOST_ENLARGED = 1000
+
+
+def enlargement(covariances_m2: NDArray[np.float64], extent_m: float) -> int:
+    """Return by how much ellipses are enlarged so that they can be seen: 1, 2, 5, 10 .. 1000.
+
+    It is the largest of these at which the half axes of the covariances, shape (n, 2, 2), have a
+    median below 3 % of the map's size, and none is longer than 10 % of it.
+
+    >>> enlargement(np.diag([1e-6, 1e-6])[None], extent_m=4.0)
+    20
+    """
+    if not len(covariances_m2):
+        return 1
+    half_axes_m = half_axes_95_m(covariances_m2)[:, 1]
+    fits = min(
+        part * extent_m / max(float(half_axis_m), 1e-9)
+        for part, half_axis_m in (
+            (_TYPICAL_PART, np.median(half_axes_m)),
+            (_LARGEST_PART, half_axes_m.max()),
+        )
+    )
+    steps = [digit * 10**power for power in range(3) for digit in (1, 2, 5)] + [_MOST_ENLARGED]
+    return max([step for step in steps if step <= fits], default=1)
+
+
+def ellipse_text(enlarged: int) -> str:
+    """Return what a legend calls ellipses that are enlarged so many times.
+
+    >>> ellipse_text(1), ellipse_text(20)
+    ('95 % ellipse', '95 % ellipse, 20 x')
+    """
+    return "95 % ellipse" if enlarged == 1 else f"95 % ellipse, {enlarged} x"
+
+
+def extent_m(*points_m: NDArray[np.float64]) -> float:
+    """Return the longer side of the box around points, shape (n, 2) each; 0 if there are none."""
+    known = np.concatenate([np.reshape(some, (-1, 2)) for some in points_m])
+    return float(np.ptp(known, axis=0).max()) if len(known) else 0.0
 
 
 def rotate_covariances(

@@ -14,17 +14,25 @@ from numpy.typing import NDArray
 
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import RadarInfo, Scan, SessionInfo, Snapshot
-from slam.app.run.pictures import ellipse_95, rotate_covariances
+from slam.app.run.pictures import (
+    ellipse_95,
+    ellipse_text,
+    enlargement,
+    extent_m,
+    rotate_covariances,
+)
 from slam.app.view.rerun_recording import (
-    ARROW_M,
     ESTIMATE_RGB,
     FAULT_RGB,
     FIX_RGB,
+    GRID_RGB,
     KEPT_RGB,
     LANDMARK_RGB,
     ODOMETRY_RGB,
     RADAR_RGB,
     REJECTED_RGB,
+    ROBOT_RGB,
+    TICK_RGB,
     TRUTH_RGB,
     UNUSED_RGB,
     USED_RGB,
@@ -155,15 +163,22 @@ class FrameLayer:
             self._recording.static(f"{block.entity}/frame", style)
         charts = _tensors("BarChart:values", samples.ravel(), np.full(n_frames, n_bins))
         self._recording.rows(f"{block.entity}/frame", block.stamps, [charts])
-        block.shown.extend(frame.samples for frame in block.frames)
+        block.shown.extend(block.frames)
         # Stamped with its first frame, so that the cursor is inside the picture it shows; where
         # blocks come early, because someone watches, the picture is of the newest frames.
-        shown = samples if n_frames == BLOCK_FRAMES else np.stack(block.shown)
+        shown = samples
+        if n_frames < BLOCK_FRAMES:
+            shown = np.stack([frame.samples for frame in block.shown])
         picture = bscan_picture(shown, newest.range_start_m, newest.bin_length_m)
+        # A tensor's view has no scale: the names of its axes say where they begin and end. The
+        # envelope lacks the first bin and the last.
+        ends_m = newest.range_start_m + newest.bin_length_m * np.array([1, picture.shape[1]])
+        lasted_s = (newest.t_ns - block.shown[-len(shown)].t_ns) / NS_PER_S
+        names = (f"time {lasted_s:.1f} s", f"range {ends_m[0]:.2f} .. {ends_m[1]:.2f} m")
         self._recording.row(
             f"{block.entity}/bscan",
             block.stamps,
-            rr.Tensor(picture, dim_names=("frame", "range_bin"), value_range=(0.0, 255.0)),
+            rr.Tensor(picture, dim_names=names, value_range=(0.0, 255.0)),
         )
         block.stamps, block.frames = Stamps(), []
 
@@ -174,7 +189,7 @@ class _FrameBlock:
     def __init__(self, name: str) -> None:
         self.entity = f"radar/{part(name)}"
         self.axis: tuple[float, float, int] | None = None
-        self.shown: deque[NDArray[np.float32]] = deque(maxlen=BLOCK_FRAMES)
+        self.shown: deque[RadarFrame] = deque(maxlen=BLOCK_FRAMES)
         self.stamps = Stamps()
         self.frames: list[RadarFrame] = []
 
@@ -315,8 +330,18 @@ Array = NDArray[np.float64]
 
 _MAP_PERIOD_NS = NS_PER_S
 _PATH_PERIOD_NS = 2 * NS_PER_S
+_ROBOT_PART, _ROBOT_M = 0.025, 0.08
+"""Radius of the robot on the map: the larger one of a part of the map's size, and of metres."""
+_LINE_POINTS = rr.Radius.ui_points(0.8)
+
 _PATH_STEP = 5
 """One point per five states is 5 cm of path: no corner is lost."""
+
+MAP_MARGIN_M = 0.6
+"""Free border of the map, in which the numbers of its axes are."""
+
+_TICKS = 6
+"""About so many lines of the grid cross the longer side of the map."""
 
 TRAIL_STATES = 40
 """Of so many states trilaterated points stay on the map: the clouds that clusters are made of."""
@@ -324,8 +349,8 @@ TRAIL_STATES = 40
 # Name, colour, half line width, draw order: the truth lies below, wide enough to be seen.
 _PATHS: tuple[tuple[str, Rgb, float, float], ...] = (
     ("truth", TRUTH_RGB, 0.02, 10.0),
-    ("odometry", ODOMETRY_RGB, 0.006, 20.0),
-    ("estimate", ESTIMATE_RGB, 0.006, 30.0),
+    ("odometry", ODOMETRY_RGB, 0.008, 20.0),
+    ("estimate", ESTIMATE_RGB, 0.01, 30.0),
 )
 
 # Name, colour, radius [m], draw order.
@@ -334,6 +359,55 @@ _POINTS: tuple[tuple[str, Rgb, float, float], ...] = (
     ("fixes/found", FIX_RGB, 0.012, 42.0),
     ("fixes/rejected", REJECTED_RGB, 0.015, 43.0),
 )
+
+
+def known_world_m(info: SessionInfo) -> Array:
+    """Return the points known before a run, shape (n, 2), world frame: landmarks and outlines."""
+    return np.concatenate([info.true_landmarks_m.reshape(-1, 2), *info.outlines_m])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ground:
+    """What the map is drawn on, world frame: `low_m` and `high_m`, shape (2,), are its corners."""
+
+    low_m: Array
+    high_m: Array
+
+    @classmethod
+    def around(cls, points_m: Array) -> Ground:
+        """Return the ground that holds points, shape (n, 2), n > 0, with a border."""
+        low_m, high_m = points_m.min(axis=0), points_m.max(axis=0)
+        return cls(low_m=low_m - MAP_MARGIN_M, high_m=high_m + MAP_MARGIN_M)
+
+    @property
+    def size_m(self) -> float:
+        """The longer side, without the border."""
+        return max(extent_m(np.array([self.low_m, self.high_m])) - 2 * MAP_MARGIN_M, 1.0)
+
+    def holds(self, points_m: Array) -> bool:
+        """Return whether points, shape (n, 2), lie on it, at most half in its border."""
+        border = MAP_MARGIN_M / 2
+        return bool(
+            np.all(points_m >= self.low_m + border) and np.all(points_m <= self.high_m - border)
+        )
+
+    def grid(self) -> tuple[list[Array], Array, list[str]]:
+        """Return lines, shape (2, 2) each, and the places (n, 2) and texts of their numbers."""
+        steps = (digit * 10.0**power for power in range(-1, 5) for digit in (1, 2, 5))
+        step_m = next(step for step in steps if self.size_m <= _TICKS * step)
+        lines, places, texts = [], [], []
+        for axis, name in enumerate("xy"):
+            first, last = np.ceil(self.low_m[axis] / step_m), np.floor(self.high_m[axis] / step_m)
+            for tick in np.arange(first, last + 1) * step_m + 0.0:  # no -0
+                ends = np.array([self.low_m, self.high_m])
+                ends[:, axis] = tick
+                lines.append(ends)
+                # a number lies in the border, outside of what is drawn
+                place = self.low_m + MAP_MARGIN_M * np.array([0.25, 0.45])
+                place[axis] = tick
+                places.append(place)
+                texts.append(f"{name} {tick:g} m")
+        return lines, np.array(places), texts
 
 
 class MapLayer:
@@ -351,6 +425,9 @@ class MapLayer:
         self._first_ns: int | None = None
         self._next_map_ns = self._next_path_ns = 0
         self._last: tuple[Snapshot, int | None] | None = None
+        world_m = known_world_m(info)
+        self._grows = not len(world_m)  # the layout shows all of a known world and no more
+        self._ground = Ground.around(np.zeros((1, 2)) if self._grows else world_m)
         self._send_statics(info)
 
     def on_snapshot(self, snapshot: Snapshot, host_ns: int | None, odom: Array) -> None:
@@ -363,7 +440,7 @@ class MapLayer:
         self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
         if np.isfinite(snapshot.truth).all():
             if not self._paths["truth"]:  # no robot is shown where there is no truth
-                self._recording.static("map/truth/robot", _arrow(TRUTH_RGB, 45.0))
+                self._send_robot("map/truth/robot", TRUTH_RGB, 45.0)
             self._paths["truth"].append(snapshot.truth[:2])
         if snapshot.t_ns >= self._next_map_ns:
             self._next_map_ns = snapshot.t_ns + _MAP_PERIOD_NS
@@ -382,7 +459,7 @@ class MapLayer:
         truth = np.array([rows[k].truth for k in known]).reshape(-1, 3)
         self._send_poses("map/truth/robot", stamps.at(known), truth)
         spread = [
-            ellipse_95(pose[:2], rotated)
+            ellipse_95(pose[:2], rotated, enlarged=self._enlargement(row))
             for row, pose in zip(rows, world, strict=True)
             for rotated in rotate_covariances(
                 row.world_from_map[2], row.pose_covariance[None, :2, :2]
@@ -408,8 +485,8 @@ class MapLayer:
             static("map/walls", rr.LineStrips2D(walls, colors=WALL_RGB, radii=0.015))
         if len(info.true_landmarks_m):
             static("map/landmarks/true", _crosses(info.true_landmarks_m))
-        static("map/robot", _arrow(ESTIMATE_RGB, 50.0))
-        style = rr.LineStrips2D.from_fields(colors=ESTIMATE_RGB, radii=0.004, draw_order=50.0)
+        self._send_ground()
+        style = rr.LineStrips2D.from_fields(colors=ROBOT_RGB, radii=_LINE_POINTS, draw_order=65.0)
         static("map/estimate/ellipse", style)
         for index, radar in enumerate(info.radars):
             wedge = [screen(self._beams.wedge(radar))]
@@ -428,6 +505,45 @@ class MapLayer:
         for name, colour, radius_m, order in _POINTS:
             points = rr.Points2D.from_fields(colors=colour, radii=radius_m, draw_order=order)
             static(f"map/{name}", points)
+
+    def _send_ground(self) -> None:
+        """Send the grid, and the robot, which is as large as the map needs it to be seen."""
+        lines, places, texts = self._ground.grid()
+        grid = rr.LineStrips2D(
+            [screen(line) for line in lines], colors=GRID_RGB, radii=_LINE_POINTS, draw_order=1.0
+        )
+        self._recording.static("map/grid", grid)
+        numbers = rr.Points2D(
+            screen(places), labels=texts, show_labels=True, colors=TICK_RGB, radii=0.0
+        )
+        self._recording.static("map/grid/numbers", numbers)
+        self._send_robot("map/robot", ESTIMATE_RGB, 60.0)
+        if self._paths["truth"]:
+            self._send_robot("map/truth/robot", TRUTH_RGB, 45.0)
+
+    def _send_robot(self, entity: str, colour: Rgb, order: float) -> None:
+        """Send a disk with an arrow forwards, in the body's frame."""
+        radius_m = max(_ROBOT_PART * self._ground.size_m, _ROBOT_M)
+        centre = np.zeros((1, 2), dtype=np.float32)
+        for name, size_m, rgb, depth in (
+            ("rim", radius_m, ROBOT_RGB, 0.0),
+            ("body", 0.8 * radius_m, colour, 1.0),
+        ):
+            disk = rr.Points2D(centre, colors=rgb, radii=size_m, draw_order=order + depth)
+            self._recording.static(f"{entity}/{name}", disk)
+        arrow = rr.Arrows2D(
+            origins=centre,
+            vectors=[[2.2 * radius_m, 0.0]],
+            colors=ROBOT_RGB,
+            radii=0.2 * radius_m,
+            draw_order=order + 2.0,
+        )
+        self._recording.static(entity, arrow)
+
+    def _enlargement(self, snapshot: Snapshot) -> int:
+        pose = snapshot.pose_covariance[None, :2, :2]
+        every = np.concatenate([snapshot.landmark_covariances_m2, pose])
+        return enlargement(every, self._ground.size_m)
 
     def _send_poses(self, entity: str, stamps: Stamps, poses: Array) -> None:
         """Send poses (n, 3) of the world as the transform of an entity drawn in the body frame."""
@@ -492,7 +608,17 @@ class MapLayer:
         covariances = rotate_covariances(
             snapshot.world_from_map[2], snapshot.landmark_covariances_m2
         )
-        outlines = [screen(ellipse_95(*pair)) for pair in zip(points, covariances, strict=True)]
+        here = transform(snapshot.world_from_map, snapshot.estimate[:2])[None]
+        seen = np.concatenate([points, here])
+        if self._grows and not self._ground.holds(seen):
+            corners = [self._ground.low_m + MAP_MARGIN_M, self._ground.high_m - MAP_MARGIN_M]
+            self._ground = Ground.around(np.concatenate([seen, corners]))
+            self._send_ground()
+        enlarged = self._enlargement(snapshot)
+        outlines = [
+            screen(ellipse_95(*pair, enlarged=enlarged))
+            for pair in zip(points, covariances, strict=True)
+        ]
         dots = rr.Points2D(
             screen(points),
             colors=LANDMARK_RGB,
@@ -500,9 +626,20 @@ class MapLayer:
             labels=[str(number) for number in snapshot.landmark_ids],
             show_labels=False,
         )
-        ellipses = rr.LineStrips2D(outlines, colors=LANDMARK_RGB)
+        ellipses = rr.LineStrips2D(
+            outlines, colors=LANDMARK_RGB, radii=_LINE_POINTS, draw_order=35.0
+        )
         self._recording.row("map/landmarks/estimated", stamps, dots)
         self._recording.row("map/landmarks/ellipses", stamps, ellipses)
+        corner = np.array([[self._ground.low_m[0], self._ground.high_m[1]]])
+        legend = rr.Points2D(
+            screen(corner + np.array([1.0, 0.0]) * MAP_MARGIN_M),
+            labels=[ellipse_text(enlarged)],
+            show_labels=True,
+            colors=LANDMARK_RGB,
+            radii=0.0,
+        )
+        self._recording.row("map/landmarks/legend", stamps, legend)
 
     def _send_paths(self, snapshot: Snapshot, host_ns: int | None) -> None:
         stamps = Stamps()
@@ -516,17 +653,6 @@ class MapLayer:
             self._recording.row(f"map/{name}/path", stamps, line)
 
 
-def _arrow(colour: Rgb, order: float) -> rr.Arrows2D:
-    """Draw the robot in its own frame: from its base footprint forwards."""
-    return rr.Arrows2D(
-        origins=[[0.0, 0.0]],
-        vectors=[[ARROW_M, 0.0]],
-        colors=colour,
-        radii=0.02,
-        draw_order=order,
-    )
-
-
 def _crosses(points: Array, arm_m: float = 0.04) -> rr.LineStrips2D:
     """Draw a cross at each point, shape (n, 2)."""
     strips = [
@@ -534,4 +660,4 @@ def _crosses(points: Array, arm_m: float = 0.04) -> rr.LineStrips2D:
         for point in points
         for arm in (np.array([arm_m, arm_m]), np.array([arm_m, -arm_m]))
     ]
-    return rr.LineStrips2D(strips, colors=TRUTH_RGB, radii=0.008)
+    return rr.LineStrips2D(strips, colors=TRUTH_RGB, radii=0.008, draw_order=32.0)

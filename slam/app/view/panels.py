@@ -28,8 +28,17 @@ from slam.app.run.evaluation import (
     position_errors_m,
     world_from_odom,
 )
-from slam.app.run.runner import LinkChange, LinkState, LinkStates
-from slam.app.view.layers import BLOCK_FRAMES, TRAIL_STATES, FrameLayer, MapLayer, beams_of
+from slam.app.run.pictures import LINK_COLOURS, half_axes_95_m
+from slam.app.run.runner import LinkChange, LinkStates
+from slam.app.view.layers import (
+    BLOCK_FRAMES,
+    TRAIL_STATES,
+    FrameLayer,
+    Ground,
+    MapLayer,
+    beams_of,
+    known_world_m,
+)
 from slam.app.view.rerun_recording import (
     BAND_RGB,
     DEVICE_TIME,
@@ -54,17 +63,17 @@ A robot drives through a room and maps it with {n_radars} short-range radars, wh
 only. {data}
 
 * **Map** (left, metres, y up). {truth}Orange: where its *wheels* alone say it went. Blue: where
-  *radar SLAM* says, with the robot as an arrow. Red dots: *landmarks* it found, each with the
-  ellipse that should hold the truth in 95 % of cases.
+  *radar SLAM* says, with the robot as a disk and an arrow forwards. Red: *landmarks* it found, with
+  95 % ellipses, enlarged as the corner says so that they can be seen.
 * **Around the robot**: a grey wedge is what one radar can see. An echo has a distance but no
   direction, so it is an arc: **green** if it moved the estimate, **dim** if not. {points}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, time downwards, range to
   the right, constant part removed. A landmark that the robot passes is a curved line.
-* **Frame**: the newest raw frame, amplitude over range in metres; red bars are detections.
-* **Position error** (below the map): distance to the truth, which SLAM never sees. **NIS**,
-  **NEES**: errors of predicted echoes, and of the pose, over their own covariance; a consistent
-  filter stays inside the grey 95 % band most of the time. Below, its covariance is too large,
-  above too small.
+* **Frame**: the newest raw frame; red bars are detections.
+* **Error** (below the map): distance to the truth, which SLAM never sees. **SLAM**: the same, with
+  the grey band that should hold it in 95 % of cases. **NEES**, **NIS**: errors of the pose over 3,
+  and of predicted echoes over their number, by their own covariance; inside the grey 95 % band
+  most of the time if consistent, below if the covariance is too large.
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
   every command and answer under *Log*.
 
@@ -94,9 +103,6 @@ def about(info: SessionInfo) -> str:
         truth=_TRUTH if is_world_known(info) else "",
         points="" if settings.get("back_end") == "robust" else _POINTS.format(states=TRAIL_STATES),
     )
-
-
-_MAP_MARGIN_M = 0.6
 
 
 def blueprint(info: SessionInfo) -> rrb.Blueprint:
@@ -135,15 +141,15 @@ def blueprint(info: SessionInfo) -> rrb.Blueprint:
 
 
 def _map_view(info: SessionInfo) -> rrb.Spatial2DView:
-    known = [line for line in (info.true_landmarks_m, *info.outlines_m) if len(line)]
+    known = known_world_m(info)
     bounds = None
-    if known:
-        corners = screen(np.concatenate(known))
-        low, high = corners.min(axis=0) - _MAP_MARGIN_M, corners.max(axis=0) + _MAP_MARGIN_M
+    if len(known):
+        ground = Ground.around(known)
+        low, high = np.sort(screen(np.array([ground.low_m, ground.high_m])), axis=0)
         bounds = rrb.VisualBounds2D(
             x_range=[float(low[0]), float(high[0])], y_range=[float(low[1]), float(high[1])]
         )
-    return rrb.Spatial2DView(name="Map", origin="/map", visual_bounds=bounds)
+    return rrb.Spatial2DView(name="Map [m]", origin="/map", visual_bounds=bounds)
 
 
 def _echoes(names: Sequence[str]) -> rrb.Tabs:
@@ -158,7 +164,7 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
                     scalar_mapping=mapping,
                 ),
                 rrb.BarChartView(
-                    name=f"Frame {name}",
+                    name=f"Frame {name}: amplitude over range [m]",
                     origin=f"/radar/{part(name)}",
                     contents=["$origin/frame", "$origin/detections"],
                 ),
@@ -170,18 +176,19 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
 
 
 def _numbers(info: SessionInfo) -> rrb.Tabs:
-    """Lay out the curves; without truth the first two stay empty."""
-    origins = {
-        "Position error": "/error",
-        "NEES": "/consistency/nees",
-        "NIS": "/consistency/nis",
-        "Landmarks": "/landmarks",
+    """Lay out the curves; without truth, errors and NEES stay empty."""
+    contents = {
+        "Error [m]": ("/error", ["$origin/slam", "$origin/odometry"]),
+        "SLAM [m]": ("/error", ["$origin/slam", "$origin/believed"]),
+        "NEES": ("/consistency/nees", ["$origin/**"]),
+        "NIS": ("/consistency/nis", ["$origin/**"]),
+        "Landmarks": ("/landmarks", ["$origin/**"]),
     }
     views = [
-        rrb.TimeSeriesView(name=name, origin=origin, axis_x=_whole_run())
-        for name, origin in origins.items()
+        rrb.TimeSeriesView(name=name, origin=origin, contents=shown, axis_x=_whole_run())
+        for name, (origin, shown) in contents.items()
     ]
-    return rrb.Tabs(*views, active_tab=0 if is_world_known(info) else len(views) - 1)
+    return rrb.Tabs(*views, active_tab=0 if is_world_known(info) else 1)
 
 
 def _whole_run() -> rrb.TimeAxis:
@@ -190,16 +197,6 @@ def _whole_run() -> rrb.TimeAxis:
         start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
     )
     return rrb.TimeAxis(view_range=everything)
-
-
-_STATE_COLOURS = {
-    LinkState.SETTING_UP: 0x5B6B8CFF,
-    LinkState.STREAMING: 0x2E8B57FF,
-    LinkState.FRAMES_LOST: 0xE0A030FF,
-    LinkState.SILENT: 0x8C5A2BFF,
-    LinkState.FAULT: 0xD03A3AFF,
-    LinkState.ENDED: 0x444A52FF,
-}
 
 
 class LinkLayer:
@@ -220,8 +217,8 @@ class LinkLayer:
         self._host_ns: int | None = None
         for index, radar in enumerate(radars):
             states = rr.StateConfiguration(
-                values=[str(state) for state in _STATE_COLOURS],
-                colors=list(_STATE_COLOURS.values()),
+                values=[str(state) for state in LINK_COLOURS],
+                colors=[int(f"{colour[1:]}ff", 16) for colour in LINK_COLOURS.values()],
             )
             recording.static(f"link/state/{part(radar.name)}", states)
             line = rr.SeriesLines(
@@ -320,12 +317,15 @@ _SERIES: tuple[tuple[str, str, Rgb, float], ...] = (
     ("error/slam", "SLAM [m]", ESTIMATE_RGB, 2.0),
     ("error/odometry", "wheels [m]", ODOMETRY_RGB, 1.5),
     ("consistency/nis/value", "NIS / dof", ESTIMATE_RGB, 1.5),
-    ("consistency/nis/low", "95 % band", BAND_RGB, 1.0),
-    ("consistency/nis/high", "95 % band", BAND_RGB, 1.0),
     ("consistency/nees/value", "NEES / 3", ESTIMATE_RGB, 1.5),
-    ("consistency/nees/low", "95 % band", BAND_RGB, 1.0),
-    ("consistency/nees/high", "95 % band", BAND_RGB, 1.0),
     ("landmarks/count", "landmarks", LANDMARK_RGB, 2.0),
+)
+
+# Entity, name in the legend, unit.
+_BANDS: tuple[tuple[str, str, str], ...] = (
+    ("error/believed", "95 % by SLAM's own covariance", "m"),
+    ("consistency/nis/band", "95 % band", "1"),
+    ("consistency/nees/band", "95 % band", "1"),
 )
 
 
@@ -341,6 +341,9 @@ def style_numbers(recording: Recording) -> None:
             else None,
         )
         recording.static(entity, line)
+    for entity, name, unit in _BANDS:
+        band = rr.Measurements.from_fields(colors=BAND_RGB, names=name, units=unit, widths=0.5)
+        recording.static(entity, band)
 
 
 def send_numbers(
@@ -348,10 +351,7 @@ def send_numbers(
 ) -> None:
     """Send the curves of some states, finite values only; `odom` is the first `world_from_odom`."""
     errors_m = [position_errors_m(row, odom) for row in rows]
-    nis_bands = [_band(nis_dof(row)) for row in rows]
     nees = [pose_nees(row) / POSE_DOF for row in rows]
-    low, high = _band(POSE_DOF)
-    known = [math.isfinite(value) for value in nees]
     curves: dict[str, Sequence[float]] = {
         "error/slam": [slam_m for slam_m, _ in errors_m],
         "error/odometry": [wheels_m for _, wheels_m in errors_m],
@@ -359,17 +359,29 @@ def send_numbers(
         "consistency/nis/value": [
             float(np.mean(row.nis_per_dof)) if row.nis_per_dof else math.nan for row in rows
         ],
-        "consistency/nis/low": [low for low, _ in nis_bands],
-        "consistency/nis/high": [high for _, high in nis_bands],
         "consistency/nees/value": nees,
-        "consistency/nees/low": [low if has_nees else math.nan for has_nees in known],
-        "consistency/nees/high": [high if has_nees else math.nan for has_nees in known],
     }
     for entity, values in curves.items():
         finite = [row for row, value in enumerate(values) if math.isfinite(value)]
         if finite:
             columns = rr.Scalars.columns(scalars=np.array([values[row] for row in finite]))
             recording.rows(entity, stamps.at(finite), columns)
+    believed_m = half_axes_95_m(np.array([row.pose_covariance[:2, :2] for row in rows]))[:, 1]
+    bands: dict[str, Sequence[tuple[float, float]]] = {
+        "error/believed": [(0.0, float(radius_m)) for radius_m in believed_m],
+        "consistency/nis/band": [_band(nis_dof(row)) for row in rows],
+        "consistency/nees/band": [
+            _band(POSE_DOF) if math.isfinite(value) else (math.nan, math.nan) for value in nees
+        ],
+    }
+    for entity, bounds in bands.items():
+        low, high = np.array(bounds).T
+        (finite_rows,) = np.nonzero(np.isfinite(high))
+        if len(finite_rows):
+            # Rerun shades one standard deviation on either side of a value
+            middle, half = (high + low)[finite_rows] / 2, (high - low)[finite_rows] / 2
+            columns = rr.Measurements.columns(values=middle, variances=half**2)
+            recording.rows(entity, stamps.at(finite_rows.tolist()), columns)
 
 
 def _band(dof: int | None) -> tuple[float, float]:

@@ -33,26 +33,26 @@ os.environ.setdefault("RUST_LOG", "off")
 
 Rgb = tuple[int, int, int]
 
-TRUTH_RGB: Rgb = (150, 150, 150)
-ODOMETRY_RGB: Rgb = (230, 130, 30)
-ESTIMATE_RGB: Rgb = (60, 140, 240)
-LANDMARK_RGB: Rgb = (230, 60, 110)
+# On a dark ground; what is drawn alike differs also for those who see two colours only.
+TRUTH_RGB: Rgb = (165, 165, 165)
+ODOMETRY_RGB: Rgb = (240, 150, 40)
+ESTIMATE_RGB: Rgb = (70, 140, 255)
+LANDMARK_RGB: Rgb = (225, 50, 120)
 WALL_RGB: Rgb = (95, 95, 95)
+GRID_RGB: Rgb = (38, 40, 44)
+TICK_RGB: Rgb = (150, 155, 165)
 WEDGE_RGB: Rgb = (70, 80, 95)
-USED_RGB: Rgb = (90, 220, 130)
+USED_RGB: Rgb = (60, 220, 180)
 UNUSED_RGB: Rgb = (120, 110, 70)
 FIX_RGB: Rgb = (240, 220, 70)
-KEPT_RGB: Rgb = (90, 220, 130)
-REJECTED_RGB: Rgb = (240, 80, 60)
+KEPT_RGB: Rgb = (60, 220, 180)
+REJECTED_RGB: Rgb = (200, 70, 20)
 BAND_RGB: Rgb = (130, 130, 130)
 FAULT_RGB: Rgb = (240, 60, 60)
+ROBOT_RGB: Rgb = (255, 255, 255)
 
 RADAR_RGB: tuple[Rgb, ...] = ((76, 175, 200), (240, 170, 60), (150, 120, 230), (120, 200, 100))
 """One per radar, in the order of the rig; used again from the first beyond the fourth."""
-
-ARROW_M = 0.25
-"""Length of the arrow that stands for the robot."""
-
 
 DEVICE_TIME, HOST_TIME, FRAME = "device_time", "host_time", "frame"
 """The timelines: session time of the radars, time of day of arrival, tick."""

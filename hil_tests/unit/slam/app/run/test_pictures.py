@@ -1,13 +1,25 @@
-"""The 95 % contour against its closed form."""
+"""The 95 % contour against its closed form; colours as those who see two of them see them."""
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam.app.run.pictures import ellipse_95, rotate_covariances
+from slam.app.run.pictures import (
+    ESTIMATE,
+    LANDMARK,
+    LINK_COLOURS,
+    ODOMETRY,
+    TRUTH,
+    ellipse_95,
+    enlargement,
+    rotate_covariances,
+)
+from slam.app.view import rerun_recording as view
 
 
 @given(st.floats(0.01, 2), st.floats(0.01, 2), st.floats(-3, 3))
@@ -35,3 +47,83 @@ def test_a_singular_covariance_is_a_line() -> None:
 def test_a_quarter_turn_swaps_the_axes() -> None:
     turned = rotate_covariances(math.pi / 2, np.array([np.diag([4.0, 1.0])]))
     np.testing.assert_allclose(turned[0], np.diag([1.0, 4.0]), atol=1e-12)
+
+
+def test_enlarged_ellipses_have_enlarged_half_axes() -> None:
+    outline = ellipse_95(np.array([3.0, -1.0]), np.diag([4e-6, 1e-6]), enlarged=20)
+    half_axes = np.ptp(outline, axis=0) / 2
+    np.testing.assert_allclose(half_axes, 20 * 2.4477468 * np.array([2e-3, 1e-3]), rtol=1e-6)
+
+
+@given(st.lists(st.floats(1e-4, 1.0), min_size=1, max_size=20), st.floats(1.0, 100.0))
+def test_ellipses_are_as_large_as_the_map_allows(sigmas_m: list[float], size_m: float) -> None:
+    half_axes_m = 2.4477468 * np.array(sigmas_m)
+    covariances = np.array([np.diag([sigma**2, (sigma / 3) ** 2]) for sigma in sigmas_m])
+    times = enlargement(covariances, size_m)
+    steps = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000]
+    assert times in steps
+
+    def fits(factor: float) -> bool:
+        middle, largest = np.median(half_axes_m), half_axes_m.max()
+        return bool(factor * middle <= 0.03 * size_m and factor * largest <= 0.1 * size_m)
+
+    assert times == 1 or fits(times * (1 - 1e-6))
+    assert times == 1000 or not fits(steps[steps.index(times) + 1] * (1 + 1e-6))
+
+
+# Machado, Oliveira, Fernandes: A physiologically-based model for simulation of color vision
+# deficiency, 2009: linear RGB, severity 1.
+_VISION = {
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "tritanopia": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
+}
+_XYZ = [
+    [0.4124564, 0.3575761, 0.1804375],
+    [0.2126729, 0.7151522, 0.0721750],
+    [0.0193339, 0.1191920, 0.9503041],
+]
+_WHITE = [0.95047, 1.0, 1.08883]
+
+
+def lab(rgb: Sequence[int], vision: str) -> np.ndarray:
+    """Return CIE L*a*b* of an sRGB colour as somebody sees it."""
+    srgb = np.array(rgb) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(np.array(_VISION[vision]) @ linear, 0.0, 1.0)
+    x, y, z = np.cbrt(np.array(_XYZ) @ seen / _WHITE)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def numbers(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour.removeprefix("#")))
+
+
+@pytest.mark.parametrize("vision", list(_VISION))
+@pytest.mark.parametrize(
+    "colours",
+    [
+        [numbers(colour) for colour in (TRUTH, ODOMETRY, ESTIMATE, LANDMARK)],
+        [numbers(colour) for colour in LINK_COLOURS.values()],
+        [view.TRUTH_RGB, view.ODOMETRY_RGB, view.ESTIMATE_RGB, view.LANDMARK_RGB],
+        [view.USED_RGB, view.UNUSED_RGB, view.ESTIMATE_RGB],
+        [view.FIX_RGB, view.KEPT_RGB, view.REJECTED_RGB],
+    ],
+    ids=["map", "links", "paths of the view", "arcs of the view", "points of the view"],
+)
+def test_colours_differ_for_those_who_see_two(colours: list[tuple[int, ...]], vision: str) -> None:
+    for one, other in itertools.combinations(colours, 2):
+        # 2.3 can just be seen; lines of a pixel need much more
+        assert np.linalg.norm(lab(one, vision) - lab(other, vision)) > 15, (one, other)

@@ -111,6 +111,22 @@ def test_ellipses_are_rotated_polygons(finished: Path) -> None:
     assert longest[0] * longest[1] < 0
 
 
+def test_ellipses_are_enlarged_as_the_map_says(tmp_path: Path) -> None:
+    small = np.array([np.diag([4e-6, 1e-6])] * 2)
+    state = replace(snapshot(0), landmark_covariances_m2=small, pose_covariance=1e-6 * np.eye(3))
+    path = drawn(tmp_path, state)
+    (text,) = next(rows(path, "/map/landmarks/legend", "Points2D:labels"))[1]
+    times = float(text.removeprefix("95 % ellipse, ").removesuffix(" x"))
+    assert times > 1
+    _, strips = next(rows(path, "/map/landmarks/ellipses", "LineStrips2D:strips"))
+    half_axes = np.ptp(np.array(strips[0]), axis=0) / 2
+    # deviations of 2 and 1 mm, and the quantile of chi2(2) in closed form
+    expected = times * np.sqrt(-2.0 * np.log(0.05)) * np.array([0.002, 0.001])
+    np.testing.assert_allclose(half_axes, expected, rtol=1e-4)
+    _, ((pose),) = next(rows(path, "/map/estimate/ellipse", "LineStrips2D:strips"))
+    np.testing.assert_allclose(np.ptp(np.array(pose), axis=0) / 2, expected[1], rtol=1e-4)
+
+
 def test_scalars_and_log(finished: Path) -> None:
     counted = count_rows(finished)
     assert counted["/error/slam"] == counted["/landmarks/count"] == N_SCANS
@@ -122,15 +138,35 @@ def test_scalars_and_log(finished: Path) -> None:
     assert odometry[0] == [pytest.approx(0.01)]  # it begins elsewhere, so is placed at SLAM's start
 
 
-def test_nees_is_told_with_its_band(finished: Path) -> None:
+def band(path: Path, entity: str) -> np.ndarray:
+    """Return the edges of the first band that Rerun shades: one deviation around the value."""
+    ((value,),) = [v for _, v in rows(path, entity, "Measurements:values") if v][:1]
+    ((variance,),) = [v for _, v in rows(path, entity, "Measurements:variances") if v][:1]
+    return np.array([value - np.sqrt(variance), value + np.sqrt(variance)])
+
+
+def test_nees_has_its_band(finished: Path) -> None:
     values = dict(rows(finished, "/consistency/nees/value", "Scalars:scalars"))
     # 0.01 m in y with a deviation of 0.01 m, 0.3 rad with one of sqrt(1e-5): 1 + 9000 over 3
     assert values[0] == [pytest.approx((1.0 + 0.3**2 / 1e-5) / 3.0)]
-    bounds = [
-        dict(rows(finished, f"/consistency/nees/{name}", "Scalars:scalars"))[0]
-        for name in ("low", "high")
-    ]
-    np.testing.assert_allclose(np.ravel(bounds), [0.0719, 3.1161], atol=1e-4)  # tables of chi2(3)
+    # tables of chi2(3)
+    np.testing.assert_allclose(
+        band(finished, "/consistency/nees/band"), [0.0719, 3.1161], atol=1e-4
+    )
+    counted = count_rows(finished)
+    assert counted["/consistency/nees/band"] == counted["/consistency/nees/value"] == N_SCANS
+
+
+def test_nis_has_the_band_of_its_degrees_of_freedom(tmp_path: Path) -> None:
+    path = drawn(tmp_path, replace(snapshot(1), step=step(robust=True)))
+    # tables of chi2(1)
+    np.testing.assert_allclose(band(path, "/consistency/nis/band"), [0.00098, 5.0239], atol=1e-4)
+
+
+def test_the_error_is_shown_with_what_slam_believes_of_it(finished: Path) -> None:
+    # both deviations are 0.01 m: 95 % of a planar Gaussian are within sqrt(-2 ln 0.05) of them
+    expected = [0.0, 0.01 * np.sqrt(-2.0 * np.log(0.05))]
+    np.testing.assert_allclose(band(finished, "/error/believed"), expected, atol=1e-9)
 
 
 def test_a_fault_is_a_marker_and_a_state_of_its_lane(finished: Path) -> None:
@@ -151,10 +187,71 @@ def test_the_guide_speaks_of_truth_only_where_there_is_one(tmp_path: Path, is_kn
     assert "2 short-range radars" in text
 
 
+def blueprint_values(path: Path, component: str) -> list[Any]:
+    reader = RrdReader(path)
+    (blueprint,) = reader.blueprints()
+    return [
+        value
+        for chunk in reader.stream(store=blueprint)
+        for batch in [chunk.to_record_batch()]
+        if component in batch.schema.names
+        for row in batch[component].to_pylist()
+        for value in row or ()
+    ]
+
+
 def test_a_blueprint_is_embedded(finished: Path) -> None:
-    assert len(RrdReader(finished).blueprints()) == 1
+    names = blueprint_values(finished, "ViewBlueprint:display_name")
+    assert {"Map [m]", "Error [m]", "SLAM [m]", "NEES", "NIS", "Landmarks"} <= set(names)
+    assert "Frame radar1: amplitude over range [m]" in names
     (recording,) = RrdReader(finished).recordings()
     assert recording.recording_id == "made_up-paper-7"
+
+
+def test_the_map_has_a_grid_with_metres_inside_of_what_is_visible(tmp_path: Path) -> None:
+    path = drawn(tmp_path, snapshot(0))
+    (texts,) = [t for _, t in rows(path, "/map/grid/numbers", "Points2D:labels") if t]
+    (places,) = [p for _, p in rows(path, "/map/grid/numbers", "Points2D:positions") if p]
+    (bounds,) = blueprint_values(path, "VisualBounds2D:range")
+    (left, right), (top, bottom) = bounds["x_range"], bounds["y_range"]
+    # the true landmarks are at (1.0, 0.5) and (-0.5, 2.0); up is negative on the screen
+    np.testing.assert_allclose([left, right, top, bottom], [-1.1, 1.6, -2.6, 0.1], atol=1e-6)
+    at = dict(zip(texts, places, strict=True))
+    assert {"x -0.5 m", "x 0 m", "x 1.5 m", "y 0 m", "y 0.5 m", "y 2.5 m"} <= set(at)
+    for text, (x, y) in at.items():
+        axis, value, unit = text.split()
+        assert unit == "m"
+        assert float(value) == pytest.approx(x if axis == "x" else -y)
+        assert left < x < right
+        assert top < y < bottom
+
+
+def test_a_map_of_an_unknown_world_grows_with_what_is_found(tmp_path: Path) -> None:
+    unknown = replace(session_info(), true_landmarks_m=np.empty((0, 2)))
+    far = replace(snapshot(9), landmarks_m=np.array([[7.0, 0.5], [-0.5, 2.02]]))
+    path = drawn(tmp_path, snapshot(0), far, info=unknown)
+    texts = [t for _, t in rows(path, "/map/grid/numbers", "Points2D:labels") if t]
+    assert len(texts) > 1
+    assert "x 6 m" in texts[-1]
+
+
+def test_the_robot_lies_above_its_path_and_is_larger(finished: Path) -> None:
+    orders = {
+        name: next(v for _, v in rows(finished, entity, f"{kind}:draw_order") if v)[0]
+        for name, entity, kind in (
+            ("path", "/map/estimate/path", "LineStrips2D"),
+            ("rim", "/map/robot/rim", "Points2D"),
+            ("body", "/map/robot/body", "Points2D"),
+            ("arrow", "/map/robot", "Arrows2D"),
+        )
+    }
+    assert orders["path"] < orders["rim"] < orders["body"] < orders["arrow"]
+    radius = next(v for _, v in rows(finished, "/map/robot/rim", "Points2D:radii") if v)[0]
+    line = next(v for _, v in rows(finished, "/map/estimate/path", "LineStrips2D:radii") if v)[0]
+    assert radius > 5 * line
+    (forwards,) = next(v for _, v in rows(finished, "/map/robot", "Arrows2D:vectors") if v)
+    assert forwards[0] > radius
+    assert forwards[1] == 0.0
 
 
 def test_wall_clock_is_nowhere_in_the_data(finished: Path) -> None:
