@@ -346,8 +346,8 @@ SETTLE_S = 2.0
 START_LIMIT_S = 15.0
 SILENT_RIG_S = 10.0
 UNUSED_S = 5.0
-END_NS = 3 * NS_PER_S // 4
-"""How long a run that is over waits for its last scans, and SLAM for them; see GRACE_NS."""
+END_NS = GRACE_NS
+"""How long SLAM gets the last scans of a run whose duration or odometry is over."""
 _SOURCE_POLL_S = 0.05
 _DRIFT_EVERY_S = 60.0
 

@@ -41,6 +41,7 @@ class VirtualInbox(Inbox):
         self._heap = [(row.t_ns, number, row.event) for number, row in enumerate(events)]
         heapq.heapify(self._heap)
         self.now_ns = 0
+        self.n_frames = 0  # that were taken out
 
     def clock_ns(self) -> int:
         return self.now_ns
@@ -48,7 +49,9 @@ class VirtualInbox(Inbox):
     def get_nowait(self) -> Event:
         if not self._heap or self._heap[0][0] > self.now_ns:
             raise Empty
-        return heapq.heappop(self._heap)[2]
+        event = heapq.heappop(self._heap)[2]
+        self.n_frames += event[0] == "frame"
+        return event
 
     def get(self, block: bool = True, timeout: float | None = None) -> Event:
         assert timeout is not None
