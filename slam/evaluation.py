@@ -3,8 +3,8 @@
 Every trajectory error states its alignment. ``ate_rmse_m`` is the one to quote; the ICP numbers
 of the paper answer a different question.
 
-Which landmarks are observable is part of the metric, not of the design under test, so the numbers
-of that rule are constants here.
+How many looks make a landmark observable is part of the metric, not of the design under test, so
+these numbers are constants here; how far a radar looks is the preset's.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from slam.geometry import (
-    Mount,
+    FieldOfView,
     Rig,
     align_se2,
+    between,
     compose,
     has_moved,
     transform,
     wrap_angle,
-    wrap_angles,
 )
 from slam.results import Association, StepResult
 
@@ -40,11 +40,6 @@ _ROUNDING_VARIANCE = 1e-12
 _ROUNDING_ERROR = 1e-9
 # Half of a pulse's width at half height: what lies farther from a target is no echo of it.
 ECHO_LENGTH_M = 0.06
-# Joint field of view and range limits of one radar: theta and L of the paper, and the start of
-# the module's detection zone.
-VIEW_DEG = 65.0
-MIN_RANGE_M = 0.2
-MAX_RANGE_M = 1.5
 # As many poses as the paper wants observations of a landmark (min_opc) ...
 MIN_POSES = 9
 # ... and two poses are distinct if the paper would collect both (min_disp).
@@ -131,21 +126,27 @@ class LandmarkScore:
     Field names are those of summary.json.
     """
 
-    # Numbers of true landmarks, None if unknown, and of estimates
+    # Numbers of true landmarks, and of those that the radars could range often enough; None if
+    # unknown
     true: int | None
+    observable: int | None
     estimated: int
-    # One-to-one matches within 0.15 m / estimated and / true; None where the denominator is 0
+    # Share of the estimates that match a true landmark one to one within 0.15 m, and share of the
+    # observable landmarks that are matched; None where the denominator is 0
     precision: float | None
     recall: float | None
     duplicates: int  # further estimates within 0.15 m of a matched true landmark
     rmse_m: float | None  # RMS distance of the matches; None without any
 
 
-def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> LandmarkScore:
+def landmark_metrics(
+    estimated_xy: Array, true_xy: Array, alignment: Array, observable: NDArray[np.bool_]
+) -> LandmarkScore:
     """Return how well estimated landmarks (n, 2), map frame, match true ones (m, 2), world frame.
 
     ``alignment`` (3,) is the *trajectory's* (``align_se2`` of its positions): the map is not fitted
-    to the landmarks it is judged by.
+    to the landmarks it is judged by. Every true landmark may be matched; ``observable`` (m,) marks
+    those that must be (``observable_landmarks``): only they count in recall.
     """
     n, m = len(estimated_xy), len(true_xy)
     if n and m:
@@ -159,13 +160,14 @@ def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> L
     kept = close[rows, columns]
     rows, columns = rows[kept], columns[kept]
     others = np.setdiff1d(np.arange(n), rows)
-    matched = len(rows)
+    matched, expected = len(rows), int(observable.sum())
     squared = distances[rows, columns] ** 2
     return LandmarkScore(
         true=m,
+        observable=expected,
         estimated=n,
         precision=matched / n if n else None,
-        recall=matched / m if m else None,
+        recall=int(observable[columns].sum()) / expected if expected else None,
         duplicates=int(close[others][:, columns].any(axis=1).sum()),
         rmse_m=math.sqrt(float(np.mean(squared))) if matched else None,
     )
@@ -311,34 +313,21 @@ class TrueAssociationNis:
         return best
 
 
-def observable_landmarks(rig: Rig, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
-    """Return which landmarks both radars of a pair could see at nine or more poses, shape (m,).
+def observable_landmarks(
+    rig: Rig, poses: Array, landmarks_xy: Array, field: FieldOfView
+) -> NDArray[np.bool_]:
+    """Return which landmarks some radar could range at nine or more poses, shape (m,).
 
-    In view means within the 65 degree field of view and between 0.2 and 1.5 m. Poses less than 5 mm
-    and 0.1 rad from the last distinct one count with it, so standing still adds nothing. ``poses``
-    (n, 3) are true poses in time order, frame of the landmarks, (m, 2) [m].
+    It need not be the same radar at all of them. Poses less than 5 mm and 0.1 rad from the last
+    distinct one count with it, so standing still adds nothing. ``poses`` (n, 3) are true poses in
+    time order, frame of the landmarks, (m, 2) [m]; ``field`` is that of every radar.
     """
     kept: list[Array] = []
     for pose in poses:
         if not kept or has_moved(kept[-1], pose, DISTINCT_M, DISTINCT_RAD):
             kept.append(pose)
-    distinct = np.array(kept).reshape(-1, 3)
-    observable = np.zeros(len(landmarks_xy), dtype=bool)
-    for pair in rig.pairs():
-        seen = _in_view(rig.mounts[pair.first], distinct, landmarks_xy) & _in_view(
-            rig.mounts[pair.second], distinct, landmarks_xy
-        )
-        observable |= seen.sum(axis=0) >= MIN_POSES
-    return observable
-
-
-def _in_view(mount: Mount, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
-    """Return whether one radar has each landmark in view from each pose, shape (n, m)."""
-    antenna = np.array([mount.x_m, mount.y_m])
-    antennas = np.array([transform(pose, antenna) for pose in poses]).reshape(-1, 2)
-    offsets = landmarks_xy[None, :, :] - antennas[:, None, :]
-    ranges_m = np.hypot(offsets[..., 0], offsets[..., 1])
-    directions = np.arctan2(offsets[..., 1], offsets[..., 0])
-    off_boresight = wrap_angles(directions - poses[:, 2, None] - mount.yaw_rad)
-    inside = (ranges_m >= MIN_RANGE_M) & (ranges_m <= MAX_RANGE_M)
-    return np.asarray(inside & (np.abs(off_boresight) <= math.radians(VIEW_DEG) / 2))
+    looks = np.zeros(len(landmarks_xy), dtype=np.intp)
+    for pose in kept:
+        body_xy = transform(between(pose, np.zeros(3)), landmarks_xy)
+        looks += np.any([field.contains(mount, body_xy) for mount in rig.mounts], axis=0)
+    return np.asarray(looks >= MIN_POSES)

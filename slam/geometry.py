@@ -7,8 +7,8 @@ x forward, y left and its origin at the base footprint.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -16,8 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-# Mounts closer in yaw than this look the same way; mounting tolerances are coarser by far.
-_SAME_BORESIGHT_RAD = 1e-6
+# Where two range circles cross at a smaller angle, an error of range moves their intersection by
+# more than 80 times as much.
+_MIN_CROSSING_RAD = math.radians(1.0)
+# Least part of their fields of view in which two radars must be able to place a point ...
+_PAIR_SHARE = 0.05
+# ... and part from which on they look at the same things. Less, and most of what one of them ranges
+# is out of the other's view.
+_SAME_SIDE_SHARE = 0.3
+# Cells of a field of view by range and by angle; a share is counted in cells of equal area.
+_CELLS = 48
 
 
 def wrap_angle(angle_rad: float) -> float:
@@ -87,6 +95,35 @@ def align_se2(points: Array, targets: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FieldOfView:
+    """Where a radar can range what is there; the defaults are the paper's."""
+
+    opening_rad: float = math.radians(65.0)  # full angle about the boresight, theta
+    min_range_m: float = 0.2  # start of the module's detection zone
+    max_range_m: float = 1.5  # L
+
+    def points(self, mount: Mount) -> Array:
+        """Return the middles of cells of equal area of one radar's field, (n, 2), body frame."""
+        middles = (np.arange(_CELLS) + 0.5) / _CELLS
+        squares = self.min_range_m**2 + middles * (self.max_range_m**2 - self.min_range_m**2)
+        ranges_m = np.sqrt(squares)[:, None]
+        directions = mount.yaw_rad + self.opening_rad * (middles - 0.5)
+        x, y = mount.x_m + ranges_m * np.cos(directions), mount.y_m + ranges_m * np.sin(directions)
+        return np.column_stack([x.ravel(), y.ravel()])
+
+    def contains(self, mount: Mount, points: Array) -> NDArray[np.bool_]:
+        """Return which points (n, 2), body frame, one radar can range, shape (n,)."""
+        x, y = points[:, 0] - mount.x_m, points[:, 1] - mount.y_m
+        ranges_m = np.hypot(x, y)
+        off_boresight = np.abs(wrap_angles(np.arctan2(y, x) - mount.yaw_rad))
+        inside = (ranges_m >= self.min_range_m) & (ranges_m <= self.max_range_m)
+        return np.asarray(inside & (off_boresight <= self.opening_rad / 2))
+
+
+PAPERS_FIELD = FieldOfView()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
     """Where one radar sits on the robot and how its range zero is off."""
 
@@ -119,10 +156,10 @@ def mount_at(mount: Mount, motion: Array) -> Mount:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarPair:
-    """Two radars that look the same way, and the triangle base between them.
+    """Two radars whose fields of view overlap, and the triangle base between them.
 
     ``first`` and ``second`` are mount indices; in the pairs of a rig they are ordered so that the
-    boresight lies to the left of the base from first to second.
+    boresights look to the left of the base from first to second.
     """
 
     first: int
@@ -134,8 +171,7 @@ class RadarPair:
     along: Array
     ahead: Array
     # Angle of each boresight, of the first and of the second radar, from ``along`` towards
-    # ``ahead``, in [-pi/2, 3 pi/2). They differ only where the two sampled at different times while
-    # the robot turned.
+    # ``ahead``, in [-pi/2, 3 pi/2)
     boresights_rad: tuple[float, float]
 
 
@@ -145,13 +181,59 @@ class Rig:
 
     mounts: tuple[Mount, ...]
 
-    def pairs(self) -> tuple[RadarPair, ...]:
+    def pairs(self, field: FieldOfView = PAPERS_FIELD) -> tuple[RadarPair, ...]:
+        """Return the radars that can trilaterate, two by two: ``common_share`` is at least 0.05.
+
+        ``field`` is that of every radar.
+        """
+        return self._pairs(field, _PAIR_SHARE)
+
+    def sides(self, field: FieldOfView = PAPERS_FIELD) -> tuple[tuple[int, ...], ...]:
+        """Return the groups of radars that look at the same things; others are alone in theirs.
+
+        Those of a group are linked by pairs whose ``common_share`` is at least 0.3.
+        """
+        group = list(range(len(self.mounts)))
+        for pair in self._pairs(field, _SAME_SIDE_SHARE):
+            old, new = group[pair.second], group[pair.first]
+            group = [new if g == old else g for g in group]
+        return tuple(
+            tuple(i for i, g in enumerate(group) if g == leader) for leader in dict.fromkeys(group)
+        )
+
+    def _pairs(self, field: FieldOfView, least_share: float) -> tuple[RadarPair, ...]:
         pairs = []
         for first, second in combinations(range(len(self.mounts)), 2):
-            pair = _side_by_side(self.mounts, first, second)
-            if pair is not None:
-                pairs.append(pair)
-        return tuple(pairs)
+            mounts = self.mounts[first], self.mounts[second]
+            if common_share(mounts, field) >= least_share:
+                pairs.append(_ordered(first, second, mounts))
+        return tuple(pair for pair in pairs if pair is not None)
+
+
+@lru_cache(maxsize=256)
+def common_share(mounts: tuple[Mount, Mount], field: FieldOfView) -> float:
+    """Return the part of their fields of view in which two radars can place a point, 0 to 1.
+
+    Both must have the point in view, and not its mirror image across the line through both
+    antennas, which has the same two ranges; and the range circles must cross there at a degree or
+    more. Counted in 2304 cells of equal area of each field, whose mean is returned.
+    """
+    a, b = mounts
+    base = np.array([b.x_m - a.x_m, b.y_m - a.y_m])
+    baseline_m = math.hypot(base[0], base[1])
+    if baseline_m == 0.0:
+        return 0.0
+    across = np.array([-base[1], base[0]]) / baseline_m
+    points = np.vstack([field.points(a), field.points(b)])
+    heights = (points - np.array([a.x_m, a.y_m])) @ across
+    mirrored = points - 2.0 * heights[:, None] * across
+    to_a = points - np.array([a.x_m, a.y_m])
+    to_b = points - np.array([b.x_m, b.y_m])
+    crossing = np.arctan2(baseline_m * np.abs(heights), np.sum(to_a * to_b, axis=1))
+    common = field.contains(a, points) & field.contains(b, points)
+    image = field.contains(a, mirrored) & field.contains(b, mirrored)
+    crossing = np.minimum(crossing, math.pi - crossing)
+    return float(np.mean(common & ~image & (crossing >= _MIN_CROSSING_RAD)))
 
 
 def paper_rig() -> Rig:
@@ -196,13 +278,12 @@ def _from_base(angle_rad: float) -> float:
     return angle_rad if angle_rad >= -math.pi / 2 else angle_rad + math.tau
 
 
-def _side_by_side(mounts: Sequence[Mount], first: int, second: int) -> RadarPair | None:
-    """Return the ordered pair, or None where the two do not look the same way across a base."""
-    a, b = mounts[first], mounts[second]
-    if abs(wrap_angle(a.yaw_rad - b.yaw_rad)) > _SAME_BORESIGHT_RAD:
-        return None
-    base_rad = math.atan2(b.y_m - a.y_m, b.x_m - a.x_m)
-    boresight_rad = wrap_angle(a.yaw_rad - base_rad)
-    if abs(math.sin(boresight_rad)) < _SAME_BORESIGHT_RAD:
-        return None  # one looks at the other's back: no base across the view
-    return pair_of(first, second, (a, b)) if boresight_rad > 0 else pair_of(second, first, (b, a))
+def _ordered(first: int, second: int, mounts: tuple[Mount, Mount]) -> RadarPair | None:
+    """Return the pair of two mounts, ordered so that the boresights look to the left of its base.
+
+    None where they are at the same place.
+    """
+    pair = pair_of(first, second, mounts)
+    if pair is None or pair.along[0] * pair.ahead[1] - pair.along[1] * pair.ahead[0] > 0:
+        return pair
+    return pair_of(second, first, mounts[::-1])

@@ -27,7 +27,7 @@ PoseAt = Callable[[int], Array]
 class Fix:
     """One trilaterated point, seen once."""
 
-    pair: int  # index into ``Rig.pairs()``
+    pair: int  # index into the pairs of the rig
     # Session time of the pose in whose body frame the position is given; the two detections keep
     # their own times
     t_ns: int

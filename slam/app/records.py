@@ -6,6 +6,8 @@ robot's first pose; `odom` is the wheel odometry's own.
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -15,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
+from slam.geometry import PAPERS_FIELD, FieldOfView
 from slam.results import StepResult
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
@@ -96,6 +99,23 @@ class SessionInfo:
     started_unix_ns: int | None = None
     has_detections: bool = False
     odometry_clock: str = ""
+
+    @property
+    def field_of_view(self) -> FieldOfView:
+        """Where SLAM takes every radar to see; the paper's, where its settings are not recorded.
+
+        Read key by key: those of another version may have keys that this one does not have.
+        """
+        settings = json.loads(self.config_json) if self.config_json else {}
+        angle = settings.get("robust" if settings.get("back_end") == "robust" else "trilateration")
+        limits = settings.get("detection", {})
+        opening_deg = (angle or {}).get("field_of_view_deg", math.degrees(PAPERS_FIELD.opening_rad))
+        return FieldOfView(
+            opening_rad=math.radians(opening_deg),
+            min_range_m=limits.get("min_range_m", PAPERS_FIELD.min_range_m),
+            max_range_m=limits.get("max_range_m", PAPERS_FIELD.max_range_m),
+        )
+
     constants: Mapping[str, object] = field(default_factory=dict)
 
 

@@ -32,7 +32,10 @@ class UwbRadarSlam:
         sensor = config.observation
         self._Q = np.diag([sensor.sigma_range_m**2, sensor.sigma_bearing_rad**2])
         self._detector = detector or make_detector(config)
-        self._trilaterator = Trilaterator(config.trilateration, rig)
+        limits = config.detection
+        self._trilaterator = Trilaterator(
+            config.trilateration, rig, (limits.min_range_m, limits.max_range_m)
+        )
         self._window: deque[CollectedState] = deque()
         self._collected_pose: Array | None = None  # odometry where the last state was collected
         self._estimated_pose: Array = np.zeros(3)  # Odom[s - 1]

@@ -1,7 +1,7 @@
 """Two ranges from two radars of one side become a point in the body frame (paper eq. 1 to 4).
 
-The paper calls it trilateration; it is the intersection of two circles, of which the one in front
-of the radars is kept.
+The paper calls it trilateration; it is the intersection of two circles, of which the one that both
+radars have in view is kept.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from slam.config import Pairing, TrilaterationConfig
 from slam.frames import Detection
-from slam.geometry import RadarPair, Rig, mount_at, pair_of
+from slam.geometry import FieldOfView, RadarPair, Rig, mount_at, pair_of, wrap_angles
 from slam.results import Fix
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ NO_MOTIONS: Mapping[int, Array] = MappingProxyType({})
 def bilaterate(
     first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Intersect range circles around two antennas and tell which intersections both radars see.
+    """Intersect range circles around two antennas and find the intersection that both radars see.
 
     With l1, l2 the ranges (``first_m``, ``second_m``), d the baseline and u, v the coordinates
     along the base from its middle and square to it towards the boresight::
@@ -45,11 +45,13 @@ def bilaterate(
     alpha and beta are the paper's inner angles, whose cosines its eq. 2 gives; atan2 loses no
     digits near 0. Seen by both means that each antenna's direction to the point is less than
     theta / 2 off its boresight; for a boresight square to the base that is exactly alpha > gamma
-    and beta > gamma, with gamma = (pi - theta) / 2 of eq. 1.
+    and beta > gamma, with gamma = (pi - theta) / 2 of eq. 1. The circles meet a second time at
+    (u, -v), which only radars see that look across or along their base.
 
-    Returns positions (n, 2) [m], body frame, NaN where the circles do not meet; and whether they
-    meet inside both fields of view (n,), never for ranges that are negative, zero, not finite or
-    beyond 1e150 m.
+    Returns positions (n, 2) [m], body frame, NaN where the circles do not meet; and whether both
+    radars see one of the two intersections and not the other (n,), never for ranges that are
+    negative, zero, not finite or beyond 1e150 m. The position is (u, v) unless only (u, -v) is
+    seen.
     """
     l1, l2 = np.asarray(first_m, dtype=np.float64), np.asarray(second_m, dtype=np.float64)
     d = pair.baseline_m
@@ -61,12 +63,15 @@ def bilaterate(
     v = np.sqrt(np.maximum((l1**2 + l2**2) / 2 - d**2 / 4 - u**2, 0.0))
     alpha = np.arctan2(v, u + d / 2)
     beta = np.arctan2(v, d / 2 - u)
-    half_view = field_of_view_rad / 2
-    accepted = (
-        meets
-        & (np.abs(alpha - pair.boresights_rad[0]) < half_view)
-        & (np.abs(math.pi - beta - pair.boresights_rad[1]) < half_view)
+    half_view, (first_rad, second_rad) = field_of_view_rad / 2, pair.boresights_rad
+    seen = (np.abs(alpha - first_rad) < half_view) & (
+        np.abs(math.pi - beta - second_rad) < half_view
     )
+    mirror_seen = (np.abs(wrap_angles(-alpha - first_rad)) < half_view) & (
+        np.abs(wrap_angles(beta - math.pi - second_rad)) < half_view
+    )
+    accepted = meets & (seen != mirror_seen)
+    v = np.where(accepted & mirror_seen, -v, v)
     xy = pair.midpoint + u[:, None] * pair.along + v[:, None] * pair.ahead
     return xy, accepted
 
@@ -79,10 +84,22 @@ class Trilaterator:
     detection takes part in at most one fix of a pair of radars, see ``one_to_one``.
     """
 
-    def __init__(self, config: TrilaterationConfig, rig: Rig) -> None:
+    def __init__(
+        self,
+        config: TrilaterationConfig,
+        rig: Rig,
+        range_limits_m: tuple[float, float] = (0.2, 1.5),
+    ) -> None:
         self.config = config
         self.rig = rig
-        self.pairs = rig.pairs()
+        nearest_m, farthest_m = range_limits_m
+        self.pairs = rig.pairs(
+            FieldOfView(
+                opening_rad=config.field_of_view_rad,
+                min_range_m=nearest_m,
+                max_range_m=farthest_m,
+            )
+        )
 
     def locate(
         self,

@@ -208,17 +208,6 @@ def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Ro
     )
 
 
-def sides_of(rig: Rig) -> tuple[tuple[int, ...], ...]:
-    """Return the groups of radars that look the same way; a radar without partner is its own."""
-    group = list(range(len(rig.mounts)))
-    for pair in rig.pairs():
-        old, new = group[pair.second], group[pair.first]
-        group = [new if g == old else g for g in group]
-    return tuple(
-        tuple(i for i, g in enumerate(group) if g == leader) for leader in dict.fromkeys(group)
-    )
-
-
 def fix_of_pair(
     first_m: Array, second_m: Array, range_first_m: float, range_second_m: float, ahead: Array
 ) -> Array | None:

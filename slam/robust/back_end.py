@@ -21,7 +21,6 @@ from slam.robust.association import (
     landmarks_in_view,
     predicted_ranges,
     rows_of,
-    sides_of,
     view,
 )
 from slam.robust.initialisation import (
@@ -89,7 +88,7 @@ class RobustBackEnd:
         self.parameters = parameters
         offsets = (parameters.ranges.offset_sigma_m,) * len(rig.mounts)
         self.state = State(parameters.wheels.calibration_sigmas, offsets)
-        self._sides = sides_of(rig)
+        self._sides = rig.sides(parameters.ranges.field_of_view)
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
         window = max(rule.window, rule.single_window)

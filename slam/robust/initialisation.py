@@ -358,11 +358,12 @@ def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) 
         for a, b in product(first.unused, second.unused):
             if a.label != b.label:
                 continue
-            point = fix_of_pair(here, there, a.range_m, b.range_m, ahead)
-            if point is None:
-                continue
-            if _in_view(point, first, noise) and _in_view(point, second, noise):
-                guesses.append(Guess(target=point, covariance=spread, label=a.label))
+            for side in (ahead, -ahead):
+                point = fix_of_pair(here, there, a.range_m, b.range_m, side)
+                if point is None:
+                    break
+                if _in_view(point, first, noise) and _in_view(point, second, noise):
+                    guesses.append(Guess(target=point, covariance=spread, label=a.label))
     return guesses
 
 

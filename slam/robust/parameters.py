@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 
 from slam.config import WheelNoise
+from slam.geometry import FieldOfView
 
 
 def chi_square_limit(dof: int, excess_sigmas: float) -> float:
@@ -35,6 +36,14 @@ class RangeNoise:
     # Where targets are detected
     min_range_m: float = 0.2
     max_range_m: float = 1.5
+
+    @property
+    def field_of_view(self) -> FieldOfView:
+        return FieldOfView(
+            opening_rad=self.field_of_view_rad,
+            min_range_m=self.min_range_m,
+            max_range_m=self.max_range_m,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,8 @@
 """Laws of the metrics, and their values against evo and closed forms."""
 
 import math
+from itertools import combinations, permutations
+from random import Random
 
 import numpy as np
 import pytest
@@ -163,13 +165,14 @@ def test_associated_stamps_are_close_distinct_and_in_order(a: set[int], b: set[i
 # --- landmarks ----------------------------------------------------------------------------------
 
 TRUE = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]])
+ALL = np.ones(len(TRUE), dtype=bool)
 HERE = np.zeros(3)
 
 
 def test_map_is_scored_after_the_trajectory_alignment() -> None:
     moved = np.array([0.5, -0.25, 1.0])
     score = landmark_metrics(
-        transform(moved, TRUE + np.array([0.03, 0.04])), TRUE, between(moved, np.zeros(3))
+        transform(moved, TRUE + np.array([0.03, 0.04])), TRUE, between(moved, np.zeros(3)), ALL
     )
     assert (score.true, score.estimated, score.duplicates) == (3, 3, 0)
     assert (score.precision, score.recall) == (1.0, 1.0)
@@ -178,7 +181,7 @@ def test_map_is_scored_after_the_trajectory_alignment() -> None:
 
 def test_second_estimate_beside_a_match_is_a_duplicate_and_a_far_one_is_false() -> None:
     estimated = np.array([[0.01, 0.0], [0.1, 0.0], [1.0, 0.02], [5.0, 5.0]])
-    score = landmark_metrics(estimated, TRUE, HERE)
+    score = landmark_metrics(estimated, TRUE, HERE, ALL)
     assert score.duplicates == 1
     assert score.precision == 0.5
     assert score.recall == pytest.approx(2 / 3)
@@ -189,24 +192,89 @@ def test_matching_is_joint_not_greedy() -> None:
     # The nearest estimate of the second truth is the only one in reach of the first.
     true = np.array([[0.0, 0.0], [0.2, 0.0]])
     estimated = np.array([[0.12, 0.0], [0.32, 0.0]])
-    assert landmark_metrics(estimated, true, HERE).recall == 1.0
+    assert landmark_metrics(estimated, true, HERE, np.ones(2, dtype=bool)).recall == 1.0
 
 
 @pytest.mark.parametrize(("off_m", "matched"), [(0.149, 1), (0.151, 0)])
 def test_fifteen_centimetres_are_a_match(off_m: float, matched: int) -> None:
     estimated = TRUE[:1] + np.array([0.6, 0.8]) * off_m
-    assert landmark_metrics(estimated, TRUE, HERE).precision == matched
+    assert landmark_metrics(estimated, TRUE, HERE, ALL).precision == matched
     # A second estimate at that distance from a matched truth is a duplicate, or false.
     both = np.vstack([TRUE[:1], estimated])
-    assert landmark_metrics(both, TRUE, HERE).duplicates == matched
+    assert landmark_metrics(both, TRUE, HERE, ALL).duplicates == matched
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 3), (2, 0), (0, 0)])
 def test_empty_maps_have_no_ratio(n: int, m: int) -> None:
-    score = landmark_metrics(np.zeros((n, 2)), np.zeros((m, 2)) + 9, HERE)
+    score = landmark_metrics(np.zeros((n, 2)), np.zeros((m, 2)) + 9, HERE, np.ones(m, dtype=bool))
     assert (score.duplicates, score.rmse_m) == (0, None)
     assert score.precision == (0.0 if n else None)
     assert score.recall == (0.0 if m else None)
+
+
+def test_a_true_landmark_that_need_not_be_found_is_no_false_one_and_not_in_recall() -> None:
+    observable = np.array([True, False, True])
+    score = landmark_metrics(TRUE[1:], TRUE, HERE, observable)
+    assert (score.true, score.observable, score.estimated) == (3, 2, 2)
+    assert (score.precision, score.recall) == (1.0, 0.5)
+
+
+apart = st.sets(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=6).map(
+    lambda cells: np.array(sorted(cells), dtype=np.float64).reshape(-1, 2)
+)
+
+
+@given(apart, st.lists(st.booleans(), min_size=6, max_size=6))
+def test_the_whole_truth_is_precise_whatever_is_observable(
+    true: NDArray[np.float64], flags: list[bool]
+) -> None:
+    observable = np.array(flags[: len(true)], dtype=bool)
+    score = landmark_metrics(true, true, HERE, observable)
+    assert score.precision == (1.0 if len(true) else None)
+    assert score.recall == (1.0 if observable.any() else None)
+    assert score.duplicates == 0
+    # Recall does not depend on the estimates of what is not observable.
+    assert landmark_metrics(true[observable], true, HERE, observable).recall == score.recall
+
+
+grids = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 3)), max_size=4)
+
+
+@given(grids, st.lists(st.tuples(st.integers(0, 6), st.integers(0, 3)), max_size=4), st.randoms())
+def test_scores_are_those_of_the_best_of_all_one_to_one_matches(
+    estimated: list[tuple[int, int]], true: list[tuple[int, int]], random: Random
+) -> None:
+    # Points 7 cm apart, moved a little so that no two matches tie.
+    est, tru = (
+        np.array(
+            [
+                (0.07 * x + random.uniform(0, 0.02), 0.07 * y + random.uniform(0, 0.02))
+                for x, y in points
+            ]
+        ).reshape(-1, 2)
+        for points in (estimated, true)
+    )
+    observable = np.array([random.random() < 0.5 for _ in true], dtype=bool)
+    possible: list[tuple[int, float, list[tuple[int, int]]]] = []
+    for k in range(min(len(est), len(tru)) + 1):
+        for rows in combinations(range(len(est)), k):
+            for columns in permutations(range(len(tru)), k):
+                match = list(zip(rows, columns, strict=True))
+                distances = [math.dist(est[row], tru[column]) for row, column in match]
+                if all(distance <= 0.15 for distance in distances):
+                    possible.append((k, -sum(distances), match))
+    _, _, best = max(possible, key=lambda found: found[:2])
+    score = landmark_metrics(est, tru, HERE, observable)
+    found = [j for _, j in best]
+    used = [i for i, _ in best]
+    assert score.precision == (len(best) / len(est) if len(est) else None)
+    expected = int(observable.sum())
+    assert score.recall == (int(observable[found].sum()) / expected if expected else None)
+    assert score.duplicates == sum(
+        any(math.dist(est[i], tru[j]) <= 0.15 for j in found)
+        for i in range(len(est))
+        if i not in used
+    )
 
 
 # --- consistency --------------------------------------------------------------------------------

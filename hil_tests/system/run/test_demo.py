@@ -56,6 +56,7 @@ def test_stdout_is_one_table_of_simulated_numbers_and_stderr_is_progress(demo: F
         "SLAM ATE, ICP",
         "final error",
         "landmarks",
+        "observable",
         "speed",
     ]
     assert "0 lost" in lines[-2]

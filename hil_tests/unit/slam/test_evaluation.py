@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slam.evaluation import ECHO_LENGTH_M, TrueAssociationNis, observable_landmarks, true_range_nis
 from slam.frames import Detection
-from slam.geometry import paper_rig
+from slam.geometry import PAPERS_FIELD, Mount, Rig, paper_rig
 from slam.paper.ekf import start
 from slam.results import Association, Observation, PredictedRange, StepResult, UpdateReport
 
@@ -219,20 +219,21 @@ def creeping(n: int) -> NDArray[np.float64]:
         ((1.0, 0.0), False),  # ahead, where no radar looks
         ((0.0, 1.8), False),  # beyond L
         ((0.0, 0.3), False),  # too near: outside both fields of view
-        ((0.5, 0.9), False),  # in view of the front radar only
+        ((0.5, 0.9), True),  # in view of the front radar only
         ((0.0, 1.69), True),  # within 1.5 m of both antennas
+        ((0.16, 1.69), True),  # within 1.5 m of the front one only
     ],
 )
-def test_joint_view_and_range_limits(landmark: tuple[float, float], findable: bool) -> None:
+def test_view_and_range_limits_of_any_radar(landmark: tuple[float, float], findable: bool) -> None:
     poses = creeping(10) - np.array([0.05, 0.0, 0.0])
-    found = observable_landmarks(paper_rig(), poses, np.array([landmark]))
+    found = observable_landmarks(paper_rig(), poses, np.array([landmark]), PAPERS_FIELD)
     assert found.tolist() == [findable]
 
 
 @pytest.mark.parametrize(("n", "findable"), [(8, False), (9, True)])
 def test_nine_distinct_poses_are_needed(n: int, findable: bool) -> None:
     landmark = np.array([[0.04, 1.0]])
-    found = observable_landmarks(paper_rig(), creeping(n), landmark)
+    found = observable_landmarks(paper_rig(), creeping(n), landmark, PAPERS_FIELD)
     assert found.tolist() == [findable]
 
 
@@ -250,25 +251,58 @@ def test_distinct_is_five_millimetres_or_a_tenth_of_a_radian(
 ) -> None:
     # Nine poses to and fro, so that the way back does not add up to more than one step.
     poses = np.array([np.array(step) * (k % 2) for k in range(9)])
-    found = observable_landmarks(paper_rig(), poses, np.array([[0.0, 1.0]]))
+    found = observable_landmarks(paper_rig(), poses, np.array([[0.0, 1.0]]), PAPERS_FIELD)
     assert found.tolist() == [distinct]
 
 
 def test_standing_still_adds_no_pose() -> None:
-    found = observable_landmarks(paper_rig(), standing(100), np.array([[0.0, 1.0]]))
+    found = observable_landmarks(paper_rig(), standing(100), np.array([[0.0, 1.0]]), PAPERS_FIELD)
     assert found.tolist() == [False]
 
 
-def test_poses_of_two_pairs_do_not_add_up() -> None:
+def test_looks_of_different_radars_add_up() -> None:
     # Five looks with the left pair, then five with the right one after a half turn.
     poses = creeping(10)
     poses[5:, 2] = math.pi
-    found = observable_landmarks(paper_rig(), poses, np.array([[0.04, 1.0]]))
-    assert found.tolist() == [False]
+    found = observable_landmarks(paper_rig(), poses, np.array([[0.04, 1.0]]), PAPERS_FIELD)
+    assert found.tolist() == [True]
+
+
+FOUR_YAWS = Rig(
+    mounts=tuple(
+        Mount(name=str(yaw), x_m=0.0, y_m=0.0, yaw_rad=math.radians(yaw))
+        for yaw in (0, 75, 170, 260)
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("bearing_deg", "range_m", "max_range_m", "found"),
+    [
+        (0.0, 1.0, 1.5, True),
+        (75.0, 1.0, 1.5, True),
+        (170.0, 1.4, 1.5, True),
+        (260.0, 4.9, 5.2, True),
+        (260.0, 4.9, 1.5, False),
+        (0.0, 5.3, 5.2, False),
+        (37.5, 1.0, 1.5, False),  # between two radars: 37.5 degrees off both boresights
+        (215.0, 1.0, 1.5, False),
+    ],
+)
+def test_radars_need_no_partner(
+    bearing_deg: float, range_m: float, max_range_m: float, found: bool
+) -> None:
+    bearing_rad = math.radians(bearing_deg)
+    landmark = range_m * np.array([[math.cos(bearing_rad), math.sin(bearing_rad)]])
+    field = replace(PAPERS_FIELD, max_range_m=max_range_m)
+    poses = creeping(9) - np.array([0.04, 0.0, 0.0])
+    assert observable_landmarks(FOUR_YAWS, poses, landmark, field).tolist() == [found]
 
 
 def test_no_landmarks_and_no_poses() -> None:
     none = np.empty((0, 2))
-    assert observable_landmarks(paper_rig(), creeping(9), none).shape == (0,)
+    assert observable_landmarks(paper_rig(), creeping(9), none, PAPERS_FIELD).shape == (0,)
     one = np.array([[0.0, 1.0]])
-    assert observable_landmarks(paper_rig(), np.empty((0, 3)), one).tolist() == [False]
+    assert observable_landmarks(paper_rig(), np.empty((0, 3)), one, PAPERS_FIELD).tolist() == [
+        False
+    ]

@@ -275,7 +275,8 @@ def write_detections(
     """
     rig = session.rig
     sides = _sides(session.path, rig)
-    detector, trilaterator = make_detector(config), Trilaterator(config.trilateration, rig)
+    detector, limits = make_detector(config), config.detection
+    trilaterator = Trilaterator(config.trilateration, rig, (limits.min_range_m, limits.max_range_m))
     side_of = {
         index: side
         for index, pair in enumerate(trilaterator.pairs)

@@ -25,7 +25,7 @@ from slam.app.experiments import Result, table
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, note
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.association import antennas_of, landmarks_in_view, rows_of, sides_of, view
+from slam.robust.association import antennas_of, landmarks_in_view, rows_of, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
@@ -85,7 +85,7 @@ def stepper(state: State) -> Callable[[], None]:
     The robot goes to and fro, so that what it sees stays the same.
     """
     rig, wheels, noise, rule = paper_rig(), WheelNoise(), RangeNoise(), ContinuationRule()
-    sides = sides_of(rig)
+    sides = rig.sides()
     radars = np.array([radar for side in sides for radar in side], dtype=np.intp)
     R = np.full(N_UPDATES, noise.sigma_m**2)
     mounts = antennas_of(rig, (), np.zeros(3))

@@ -148,7 +148,8 @@ NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)
 def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     """Compute summary.json's numbers; None if no state was estimated or the truth is unknown.
 
-    `rig` holds the mounts that SLAM uses; it decides which true landmarks count.
+    `rig` holds the mounts that SLAM uses; they and the settings in `info` decide which true
+    landmarks count in recall.
     """
     states, last = record.states, record.last
     if last is None or not states.has_truth:
@@ -158,10 +159,10 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     truth_in_map = np.array([between(record.world_from_map, pose) for pose in states.truth])
     estimate, odometry = states.estimate, states.odometry
     alignment = align_se2(estimate[:, :2], truth_xy)
-    counting = observable_landmarks(rig, states.truth, true_landmarks_m)
-    landmarks = landmark_metrics(last.landmarks_m, true_landmarks_m[counting], alignment)
+    observable = observable_landmarks(rig, states.truth, true_landmarks_m, info.field_of_view)
+    landmarks = landmark_metrics(last.landmarks_m, true_landmarks_m, alignment, observable)
     if not info.simulated and not len(true_landmarks_m):
-        landmarks = replace(landmarks, true=None, precision=None, recall=None)
+        landmarks = replace(landmarks, true=None, observable=None, precision=None, recall=None)
     return Summary(
         scene=info.scene,
         preset=info.preset,

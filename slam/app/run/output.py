@@ -15,7 +15,7 @@ from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import Summary, ratio
 from slam.app.run.runner import RunRecord, RunSource
-from slam.evaluation import LandmarkScore
+from slam.evaluation import MIN_POSES, LandmarkScore
 from slam.geometry import transform
 from xethru_protocol.system import STDERR, STDOUT, each_line, one_line, written_whole
 
@@ -201,7 +201,7 @@ def summary_rows(
             f"{icp_ratio:.2f} of odometry's ATE; paper's metric: nearest point, no time",
         ),
         ("final error", mm_text(summary.final_error_m), "at the last state, not aligned"),
-        _landmark_row(summary.landmarks),
+        *_landmark_rows(summary.landmarks),
         (
             "speed",
             f"{summary.realtime_factor:.0f} x real time",
@@ -210,15 +210,23 @@ def summary_rows(
     ]
 
 
-def _landmark_row(landmarks: LandmarkScore) -> Row:
+def _landmark_rows(landmarks: LandmarkScore) -> list[Row]:
     if landmarks.true is None:
-        return ("landmarks", str(landmarks.estimated), "the true ones are unknown")
-    return (
-        "landmarks",
-        f"{landmarks.estimated} for {landmarks.true} true",
-        f"precision {share_text(landmarks.precision)}, recall {share_text(landmarks.recall)}, "
-        f"{landmarks.duplicates} duplicates, rmse {mm_text(landmarks.rmse_m)}",
-    )
+        return [("landmarks", str(landmarks.estimated), "the true ones are unknown")]
+    return [
+        (
+            "landmarks",
+            f"{landmarks.estimated} for {landmarks.true} true",
+            f"precision {share_text(landmarks.precision)}, {landmarks.duplicates} duplicates, "
+            f"rmse {mm_text(landmarks.rmse_m)}",
+        ),
+        (
+            "observable",
+            f"{landmarks.observable} of {landmarks.true} true",
+            f"recall {share_text(landmarks.recall)} of those in view of a radar from "
+            f"{MIN_POSES} poses or more",
+        ),
+    ]
 
 
 def mm_text(length_m: float | None) -> str:

@@ -38,6 +38,7 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.runner import RunSource, execute, make_slam
+from slam.app.session.messages import settings_text
 from slam.app.sweep import CLEAN, STRESSES, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.config import ConfigError, SlamConfig, override
@@ -314,6 +315,7 @@ def loopback_source(
             radars=radars.radars,
             true_landmarks_m=true_landmarks_m(scene),
             versions={},
+            config_json=settings_text(slam.config),
         ),
         rig=rig_of(scene),
         slam=slam,

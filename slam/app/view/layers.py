@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import defaultdict, deque
 from collections.abc import Sequence
@@ -263,8 +262,6 @@ def _tensors(
     return arrow_column(template.component_descriptor(), column)
 
 
-_PAPERS_FIELD_OF_VIEW_DEG = 65.0
-_PAPERS_REACH_M = 1.5
 _ARC_POINTS = 17
 
 
@@ -291,13 +288,10 @@ class Beams:
         return np.concatenate([antenna, rim, antenna])
 
 
-def beams_of(config_json: str) -> Beams:
-    """Return the beams that SLAM assumes; those of the paper if they are not recorded."""
-    settings = json.loads(config_json) if config_json else {}
-    table = settings.get("robust" if settings.get("back_end") == "robust" else "trilateration", {})
-    opening_deg = float(table.get("field_of_view_deg", _PAPERS_FIELD_OF_VIEW_DEG))
-    reach_m = float(settings.get("detection", {}).get("max_range_m", _PAPERS_REACH_M))
-    return Beams(field_of_view_rad=math.radians(opening_deg), reach_m=reach_m)
+def beams_of(info: SessionInfo) -> Beams:
+    """Return the beams that SLAM assumes."""
+    field = info.field_of_view
+    return Beams(field_of_view_rad=field.opening_rad, reach_m=field.max_range_m)
 
 
 def used_detections(step: StepResult) -> tuple[bool, ...]:

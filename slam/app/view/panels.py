@@ -443,7 +443,7 @@ class RerunView(SessionObserver):
         settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
         self._recording.static("radars", rr.TextDocument(settings))
         self._frames = FrameLayer(self._recording, info.radars)
-        self._map = MapLayer(self._recording, info, beams_of(info.config_json))
+        self._map = MapLayer(self._recording, info, beams_of(info))
         style_numbers(self._recording)
         self._link = LinkLayer(self._recording, info.radars)
 

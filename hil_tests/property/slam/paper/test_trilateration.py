@@ -7,7 +7,7 @@ from random import Random
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, assume, given, settings
+from hypothesis import HealthCheck, Phase, assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -20,7 +20,7 @@ from hil_tests.property.trilateration_oracles import (
 )
 from slam.config import Pairing, TrilaterationConfig
 from slam.frames import Detection
-from slam.geometry import Mount, RadarPair, Rig, paper_rig
+from slam.geometry import FieldOfView, Mount, RadarPair, Rig, pair_of, paper_rig
 from slam.paper.trilateration import Trilaterator, bilaterate
 from slam.results import Fix
 
@@ -35,7 +35,7 @@ thorough = settings(
     report_multiple_bugs=False,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )
-condemning = settings(thorough, phases=(Phase.generate,))
+condemning = settings(thorough, phases=(Phase.explicit, Phase.generate))
 
 
 @st.composite
@@ -238,8 +238,79 @@ def check_paper_equations(implementation: Bilaterate, law: settings = thorough) 
     equations()
 
 
+@st.composite
+def odd_looks(draw: st.DrawFn) -> tuple[tuple[Mount, Mount], RadarPair, float, Array]:
+    """Draw two mounts with any yaws, an opening angle and a target that may be anywhere near."""
+    yaws = st.floats(-math.pi, math.pi)
+    first_rad = draw(yaws)
+    second_rad = first_rad + draw(st.one_of(st.floats(-1.0, 1.0), yaws))
+    # A base along the view has points that are seen on the side that the boresights look from.
+    base_rad = first_rad + draw(st.one_of(st.floats(-0.5, 0.5), yaws))
+    half_m = draw(st.floats(0.05, 0.5))
+    x_m, y_m = half_m * math.cos(base_rad), half_m * math.sin(base_rad)
+    mounts = (
+        Mount(name="a", x_m=-x_m, y_m=-y_m, yaw_rad=first_rad),
+        Mount(name="b", x_m=x_m, y_m=y_m, yaw_rad=second_rad),
+    )
+    pair = pair_of(0, 1, mounts)
+    assert pair is not None
+    direction = first_rad + draw(st.floats(-1.2, 1.2))
+    range_m = draw(st.floats(0.2, 5.0))
+    target = range_m * np.array([math.cos(direction), math.sin(direction)]) - [x_m, y_m]
+    return mounts, pair, draw(st.floats(0.3, 2.8)), target
+
+
+def look_from_behind() -> tuple[tuple[Mount, Mount], RadarPair, float, Array]:
+    """Return a target that both see on the side of the base that their boresights point from.
+
+    It lies 10 and 30 degrees off the base, whose two boresights are 20 degrees off it on the other
+    side and 10 on this: the second radar does not have the mirror image in view.
+    """
+    mounts = (
+        Mount(name="a", x_m=-0.1, y_m=0.0, yaw_rad=math.radians(20.0)),
+        Mount(name="b", x_m=0.1, y_m=0.0, yaw_rad=math.radians(-10.0)),
+    )
+    pair = pair_of(0, 1, mounts)
+    assert pair is not None
+    range_m = 0.2 * math.sin(math.radians(30.0)) / math.sin(math.radians(20.0))
+    away_rad = math.radians(-10.0)
+    target = range_m * np.array([math.cos(away_rad), math.sin(away_rad)]) - [0.1, 0.0]
+    return mounts, pair, FIELD_OF_VIEW_RAD, target
+
+
+def check_any_yaws(implementation: Bilaterate, law: settings = thorough) -> None:
+    """Of the two points that the law of cosines gives, the one that both radars see, if one."""
+
+    @law
+    @given(odd_looks())
+    @example(look_from_behind())
+    def any_yaws(look: tuple[tuple[Mount, Mount], RadarPair, float, Array]) -> None:
+        (a, b), pair, opening_rad, target = look
+        l1, l2 = distance(a, target), distance(b, target)
+        d, base_rad = math.hypot(b.x_m - a.x_m, b.y_m - a.y_m), math.atan2(b.y_m, b.x_m)
+        cosine = (l1**2 + d**2 - l2**2) / (2 * l1 * d)
+        assume(l2 > 1e-3 and abs(cosine) < 1 - 1e-6)
+        seen = []
+        for side in (1, -1):
+            away_rad = base_rad + side * math.acos(cosine)
+            point = np.array([a.x_m, a.y_m]) + l1 * np.array(
+                [math.cos(away_rad), math.sin(away_rad)]
+            )
+            margins = [opening_rad / 2 - abs(off_boresight(mount, point)) for mount in (a, b)]
+            assume(all(abs(margin) > 1e-6 for margin in margins))
+            if min(margins) > 0:
+                seen.append(point)
+        xy, accepted = implementation(np.array([l1]), np.array([l2]), pair, opening_rad)
+        assert accepted.tolist() == [len(seen) == 1]
+        if len(seen) == 1:
+            assert math.dist(xy[0], seen[0]) <= 1e-6
+
+    any_yaws()
+
+
 LAWS = (
     check_round_trip,
+    check_any_yaws,
     check_gate,
     check_gate_by_heron,
     check_triangle,
@@ -304,9 +375,19 @@ def circles_that_almost_meet(
     return bilaterate(l1, l2, pair, math.pi)
 
 
+def always_ahead(
+    first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Take the intersection on the boresights' side of the base, whatever the yaws."""
+    xy, accepted = bilaterate(first_m, second_m, pair, field_of_view_rad)
+    heights = (xy - pair.midpoint) @ pair.ahead
+    return xy + 2 * np.maximum(-heights, 0)[:, None] * pair.ahead, accepted
+
+
 @pytest.mark.parametrize(
     ("mutant", "check"),
     [
+        (always_ahead, check_any_yaws),
         (literal_cosine, check_round_trip),
         (literal_cosine, check_gate),
         (literal_cosine, check_paper_equations),
@@ -358,9 +439,12 @@ def test_scaling_all_lengths_scales_range_and_keeps_bearing(
             Mount(name=m.name, x_m=k * m.x_m, y_m=k * m.y_m, yaw_rad=m.yaw_rad) for m in rig.mounts
         )
     )
+    (scaled_pair,) = scaled.pairs(
+        FieldOfView(min_range_m=k * MIN_RANGE_M, max_range_m=k * MAX_RANGE_M)
+    )
     l1, l2 = ranges_to(rig, pair, target)
     (xy,), _ = bilaterate(l1, l2, pair, FIELD_OF_VIEW_RAD)
-    (xy_scaled,), accepted = bilaterate(k * l1, k * l2, scaled.pairs()[0], FIELD_OF_VIEW_RAD)
+    (xy_scaled,), accepted = bilaterate(k * l1, k * l2, scaled_pair, FIELD_OF_VIEW_RAD)
     assert accepted[0]
     assert math.dist(xy_scaled, k * xy) <= 1e-12 * k
 

@@ -30,7 +30,7 @@ from slam.app.run.pictures import picture
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
-from slam.robust.association import antennas_of, landmarks_in_view, sides_of, view
+from slam.robust.association import antennas_of, landmarks_in_view, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
 from xethru_protocol.system import StopFlag
 
@@ -133,7 +133,7 @@ def test_a_step_predicts_and_learns_from_a_landmark_on_each_side() -> None:
 def test_the_gate_of_a_step_has_something_to_weigh() -> None:
     state, rig = mapped_state(40), paper_rig()
     seen = view(state, antennas_of(rig, (), np.zeros(3)))
-    for side in sides_of(rig):
+    for side in rig.sides():
         near = landmarks_in_view(state, seen, side, RangeNoise(), ContinuationRule())
         assert near is not None
         sure = near.surer_than(RangeNoise().sigma_m)

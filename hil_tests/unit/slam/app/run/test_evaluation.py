@@ -88,10 +88,11 @@ def test_a_constant_offset_is_aligned_away_in_the_ate_and_counts_in_nees_and_fin
     assert summary.nis_mean is None
 
 
-def test_landmarks_are_judged_after_the_trajectorys_alignment_and_only_if_seen() -> None:
+def test_landmarks_are_judged_after_the_trajectorys_alignment_and_expected_only_if_seen() -> None:
     # the map is 30 mm off in y, the path 30 mm too: aligned, nothing is left
     score = run(offset_m=0.03, drift=0.0, variance=0.01).landmarks
-    assert (score.true, score.estimated, score.precision, score.recall) == (2, 2, 1.0, 1.0)
+    assert (score.true, score.observable, score.estimated) == (3, 2, 2)
+    assert (score.precision, score.recall) == (1.0, 1.0)
     assert score.rmse_m == pytest.approx(0.0, abs=1e-9)
     # the path is right, the map is 30 mm off
     assert run(offset_m=0.0, drift=0.0, variance=0.01).landmarks.rmse_m == pytest.approx(0.03)
@@ -266,7 +267,13 @@ SUMMARY = Summary(
     odometry_ate_rmse_m=0.0564,
     final_error_m=0.02,
     landmarks=LandmarkScore(
-        true=14, estimated=15, precision=14 / 15, recall=1.0, duplicates=1, rmse_m=0.012
+        true=14,
+        observable=14,
+        estimated=15,
+        precision=14 / 15,
+        recall=1.0,
+        duplicates=1,
+        rmse_m=0.012,
     ),
     nees_pose=((69.12, 2.5), (691.2, 3.25)),
     nis_mean=1.1,
@@ -279,7 +286,10 @@ def test_the_fields_are_those_of_the_contract() -> None:
         "scene preset seed frames duration_s realtime_factor ate_rmse_m ate_icp_rmse_m "
         "odometry_ate_rmse_m final_error_m landmarks nees_pose nis_mean"
     )
-    assert " ".join(data["landmarks"]) == "true estimated precision recall duplicates rmse_m"
+    assert (
+        " ".join(data["landmarks"])
+        == "true observable estimated precision recall duplicates rmse_m"
+    )
     assert data["nees_pose"] == [[69.12, 2.5], [691.2, 3.25]]
 
 
@@ -302,11 +312,12 @@ def test_the_table_gives_the_ratio() -> None:
 
 def test_a_map_without_a_match_has_dashes() -> None:
     nothing = LandmarkScore(
-        true=14, estimated=0, precision=None, recall=0.0, duplicates=0, rmse_m=None
+        true=14, observable=13, estimated=0, precision=None, recall=0.0, duplicates=0, rmse_m=None
     )
     rows = summary_rows(
         dataclasses.replace(SUMMARY, landmarks=nothing), lag_states=0, wall_s=1.0, lost_frames=2
     )
     text = table_text("title", None, rows)
     assert "SE(2)-aligned, causal" in text
-    assert "precision -, recall 0.00, 0 duplicates, rmse -" in text
+    assert "0 for 14 true  precision -, 0 duplicates, rmse -" in text
+    assert "13 of 14 true  recall 0.00 of those in view" in text

@@ -21,7 +21,13 @@ def run_of(case: Case) -> SweepRun:
         odometry_ate_rmse_m=0.04,
         final_error_m=0.02,
         landmarks=LandmarkScore(
-            true=4, estimated=4, precision=None, recall=1.0, duplicates=case.seed % 2, rmse_m=0.01
+            true=4,
+            observable=4,
+            estimated=4,
+            precision=None,
+            recall=1.0,
+            duplicates=case.seed % 2,
+            rmse_m=0.01,
         ),
         nees_pose=((1.0, 2.0), (9.9, 1.0)),
         nis_mean=None,

@@ -26,7 +26,7 @@ RUN = replace(
     scene="a",
     ate_rmse_m=0.01,
     landmarks=LandmarkScore(
-        true=4, estimated=4, precision=1.0, recall=1.0, duplicates=0, rmse_m=0.01
+        true=4, observable=4, estimated=4, precision=1.0, recall=1.0, duplicates=0, rmse_m=0.01
     ),
     nis_mean=0.5,
     nis_times=(),
