@@ -16,15 +16,19 @@ _BY_A_SIGNAL = 128
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``xethru``; returns the exit code."""
     open_closed_streams(replace=False)  # a port opened in their place would get our messages
+    code = 0
+    stop = StopFlag("same")
     try:
-        with StopFlag("same") as stop, stop.at_once():
-            return _run(argv)
+        with stop, stop.at_once():
+            code = _run(argv)
+        stop.check()  # a terminal that closes also takes no more output, which is a failure
     except KeyboardInterrupt:  # before the handlers were installed
         return 130
     except StopRequestedError as stopped:
         return stopped.exit_code
     except BrokenPipeError:  # the reader of our output has ended
         return 0
+    return code
 
 
 def _run(argv: Sequence[str] | None) -> int:

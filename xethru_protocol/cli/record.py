@@ -459,6 +459,16 @@ def record(arguments: Namespace) -> int:
                     _record_from(radar, recorder, mode, arguments.duration, stop)
         except XeThruError as error:
             recorder.fail(error)
+    if stop.received is None:
+        _print_end(recorder, stop, arguments)
+        return 0
+    with suppress(CommandFailed, BrokenPipeError):  # the terminal may have closed
+        _print_end(recorder, stop, arguments)
+    return 128 + stop.received
+
+
+def _print_end(recorder: RecordingFiles, stop: StopFlag, arguments: Namespace) -> None:
+    """Print what was recorded; CommandFailed if not all could be, and no signal was the reason."""
     targets = " and ".join(str(path) for path in recorder.paths)
     if arguments.json:
         print_json(recorder.summary() | {"ended_by": _end(recorder, stop)})
@@ -473,7 +483,6 @@ def record(arguments: Namespace) -> int:
         if stop.received is None:
             raise CommandFailed(text)
         warn(f"xethru record: {text}")
-    return 0 if stop.received is None else 128 + stop.received
 
 
 def _record_from(

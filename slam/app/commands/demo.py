@@ -26,13 +26,13 @@ from slam.app.rig.emulated import (
 )
 from slam.app.rig.sources import RigSource
 from slam.app.run.output import Progress
-from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
+from slam.app.run.results import RESULTS, finish, hold_folder, remove_earlier
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, StopRequestedError
 
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
 
@@ -49,19 +49,20 @@ def run_demo(
 ) -> None:
     """Run the emulated robot through its scene and write everything into one folder.
 
-    The folder is locked until the run ends. After an error or a signal, what was recorded until
-    then is complete and readable.
+    The folder is locked until the run ends. After a signal, or the end of the emulator, what was
+    driven until then is recorded, mapped and summed up.
     """
     loaded, config = scene_and_config(scene, preset)
     with ExitStack() as held:
         live = None
         if rerun is not None:  # before an earlier run's files are removed
             live = held.enter_context(LiveView(rerun, stop))
-        prepare_folder(out, _OUTPUTS, held)
+        hold_folder(out, held)
         kept = f"; what was recorded is in {out}"
         with ExitStack() as stack:
             emulator = stack.enter_context(EmulatorProcess(scene, seed))
-            from slam.app.view.panels import RerunView  # a second, while the emulator starts
+            with stop.at_once():
+                from slam.app.view.panels import RerunView  # a second, while the emulator starts
 
             emulator.wait_until_ready(stop)
             odometry = read_odometry_socket(emulator.odometry_socket)
@@ -75,6 +76,7 @@ def run_demo(
                 rig_source.listen(lambda *row: early_bytes.append(row))
             rig_source.start(RAW_CONFIG, FRAME_RATE_HZ)
             trajectory = loaded.trajectory()
+            scans = _Scans(rig_source, end_tick(trajectory.duration_ns), emulator, stop)
             wheels = wheels_of(loaded)
             info = SessionInfo(
                 scene=loaded.name,
@@ -92,13 +94,15 @@ def run_demo(
                 info=info,
                 rig=rig,
                 slam=make_slam(config, rig, wheels),
-                scans=_scans(rig_source, end_tick(trajectory.duration_ns), emulator, stop, kept),
+                scans=scans,
                 odometry=odometry,
                 truth_at=trajectory.poses,
                 lost_frames=lambda: rig_source.lost_frames,
                 link_log=link_log,
                 close=rig_source.close,
             )
+            stop.check()
+            remove_earlier(out, _OUTPUTS)
             log = SessionLog(out / "session.mcap", info, odometry, truth_at=trajectory.poses)
             stack.callback(log.close)
             view = RerunView(out / "session.rrd", info)
@@ -112,23 +116,41 @@ def run_demo(
                 log.on_wire(*row)
             if wire:
                 rig_source.listen(log.on_wire)
-            with saying_what_is_left(kept):
-                record = execute(source, sinks)
-        with saying_what_is_left(kept):
-            stop.check()
-            if record.last is None:
-                raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
-            finish(out, source, record, stop)
+            record = execute(source, sinks)
+        if record.last is not None:
+            # without the flag: the signal that ended the drive does not end the writing
+            finish(out, source, record, StopFlag())
+        if stop.received is not None:
+            raise StopRequestedError(stop.received, kept)
+        if scans.failure is not None:
+            raise EmulatorError(f"{scans.failure}{kept}")
+        if record.last is None:
+            raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
         if live is not None:
             live.keep_serving()
 
 
-def _scans(
-    rig_source: RigSource, end: int, emulator: EmulatorProcess, stop: StopFlag, kept: str
-) -> Iterator[Scan]:
-    try:
-        yield from rig_source.scans(end, stop)
-    except RadarSilentError as silent:
-        cause = emulator.ended() or str(silent)
-        emulator.end()  # before the drivers close, which then wait for no answers
-        raise EmulatorError(f"{cause}{kept}") from None
+class _Scans:
+    """The scans of the emulated rig, until the scene or the emulator ends, or a signal comes.
+
+    Attributes
+    ----------
+    failure
+        Why the emulator sends no more; None if it does.
+    """
+
+    def __init__(
+        self, rig_source: RigSource, end: int, emulator: EmulatorProcess, stop: StopFlag
+    ) -> None:
+        self._rig_source, self._end = rig_source, end
+        self._emulator, self._stop = emulator, stop
+        self.failure: str | None = None
+
+    def __iter__(self) -> Iterator[Scan]:
+        try:
+            yield from self._rig_source.scans(self._end, self._stop)
+        except StopRequestedError:
+            return
+        except RadarSilentError as silent:
+            self.failure = self._emulator.ended() or str(silent)
+            self._emulator.end()  # before the drivers close, which then wait for no answers

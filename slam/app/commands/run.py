@@ -27,7 +27,7 @@ from slam.app.run.live_source import (
     reading,
 )
 from slam.app.run.output import Progress, Row, note
-from slam.app.run.results import RESULTS, finish, prepare_folder
+from slam.app.run.results import RESULTS, finish, hold_folder, remove_earlier
 from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
@@ -80,7 +80,7 @@ def run_rig(
                 f"{out}: holds the session of an earlier drive, which cannot be repeated; "
                 "choose another --out, or move it away"
             )
-        prepare_folder(out, (*RESULTS, *_STALE), held)
+        hold_folder(out, held)
         view = held.enter_context(LiveView(rerun, stop)) if rerun is not None else None
         links = open_rig(
             rig_file,
@@ -134,6 +134,7 @@ def run_rig(
                 lost_frames=lambda: live.lost_frames,
                 link_log=log,
             )
+            remove_earlier(out, (*RESULTS, *_STALE))
             session_log = SessionLog(out / _SESSION, info, start_ns=start_ns)
             held.callback(session_log.close)
             log.begin(session_log, start_ns)

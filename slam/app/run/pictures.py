@@ -25,6 +25,7 @@ from slam.app.records import SessionInfo, Snapshot
 from slam.app.run.evaluation import Summary
 from slam.app.run.runner import LinkState, RunRecord
 from slam.geometry import between, compose, transform
+from xethru_protocol.system import written_whole
 
 # What is drawn alike differs also for those who see two colours only.
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#9aa0a8", "#e08a2c", "#1f6fd0", "#c2255c"
@@ -67,8 +68,8 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
         figure.savefig(drawn, format="png")
         with Image.open(drawn) as colours:
             few = colours.convert("RGB").quantize(_PALETTE, dither=Image.Dither.NONE)
-        with naming(path):
-            few.save(path, format="png", optimize=True)
+        with naming(path), written_whole(path) as fresh:
+            few.save(fresh, format="png", optimize=True)
 
 
 def svg_of(draw: Callable[..., None], *arguments: object, height_in: float) -> str:

@@ -21,7 +21,7 @@ from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress, note
-from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
+from slam.app.run.results import finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import LinkLog, LostFrames, RunSource, execute, make_slam
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
@@ -55,7 +55,7 @@ def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
     comparison = Comparison()
     source = recorded_source(recorded, stop, comparison)
     with ExitStack() as held:
-        prepare_folder(out, RESULTS, held)
+        hold_folder(out, held)
         record = execute(source, [comparison, Progress(source.info, None, source.lost_frames)])
         if recorded.cut_at_byte is not None:
             note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")

@@ -19,7 +19,13 @@ from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.output import Row, print_result, print_text
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
-from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
+from xethru_protocol.system import (
+    PathInUseError,
+    StopFlag,
+    StopRequestedError,
+    locked,
+    written_whole,
+)
 
 RESULTS = ("map.png", "summary.json", "estimate.tum", "truth.tum", "odometry.tum")
 
@@ -27,18 +33,21 @@ RESULTS = ("map.png", "summary.json", "estimate.tum", "truth.tum", "odometry.tum
 def finish(
     out: Path, source: RunSource, record: RunRecord, stop: StopFlag, also: Sequence[Row] = ()
 ) -> None:
-    """Write a run's results into an existing folder and print its table; `also` are more rows.
+    """Write a run's results into an existing folder, then print its table; `also` are more rows.
 
-    If a file cannot be written, the table is printed nevertheless.
+    They replace those of an earlier run, each once it is whole. If a file cannot be written, the
+    table is printed nevertheless.
     """
     stop.check()
     summary = summarise(record, source.info, source.rig)
     try:
+        remove_earlier(out, RESULTS)
         _write(out, source.info, record, summary, stop)
     except AppError:
         print_result(source, record, summary, also)
         raise
-    print_result(source, record, summary, also)
+    with stop.at_once():  # a stream may block
+        print_result(source, record, summary, also)
 
 
 def _write(
@@ -46,8 +55,8 @@ def _write(
 ) -> None:
     stop.check()
     text = summary.to_json() if summary else _summary_without_truth(info, record)
-    with naming(path := out / "summary.json"):
-        path.write_text(text + "\n", encoding="ascii")
+    with naming(path := out / "summary.json"), written_whole(path) as fresh:
+        fresh.write_text(text + "\n", encoding="ascii")
     write_trajectories(out, record)
     stop.check()
     if record.last is not None:
@@ -66,8 +75,8 @@ def write_trajectories(out: Path, record: RunRecord) -> None:
     if states.has_truth:
         paths["truth"] = states.truth
     for name, poses in paths.items():
-        with naming(path := out / f"{name}.tum"):
-            write_tum(path, Trajectory(stamps_ns=states.t_ns, poses=poses))
+        with naming(path := out / f"{name}.tum"), written_whole(path) as fresh:
+            write_tum(fresh, Trajectory(stamps_ns=states.t_ns, poses=poses))
 
 
 def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
@@ -88,8 +97,8 @@ def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
     return json.dumps(unknown | known, indent=2, allow_nan=False)
 
 
-def prepare_folder(out: Path, names: tuple[str, ...], held: ExitStack) -> None:
-    """Make a folder, lock it, and remove an earlier run's files so that no two runs mix."""
+def hold_folder(out: Path, held: ExitStack) -> None:
+    """Make a folder and lock it; the results of an earlier run stay until there are others."""
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
         try:
@@ -98,8 +107,13 @@ def prepare_folder(out: Path, names: tuple[str, ...], held: ExitStack) -> None:
             raise AppError(
                 f"{out}: another run is writing there; wait for its end or choose another --out"
             ) from None
-        for name in names:
-            (out / name).unlink(missing_ok=True)
+
+
+def remove_earlier(out: Path, names: Sequence[str]) -> None:
+    """Remove an earlier run's files from a folder so that no two runs mix."""
+    for name in names:
+        with naming(path := out / name):
+            path.unlink(missing_ok=True)
 
 
 @contextmanager

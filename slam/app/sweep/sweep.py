@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
@@ -23,7 +22,7 @@ from joblib import cpu_count
 from pydantic import TypeAdapter, ValidationError
 
 from slam.app.errors import AppError, UsageError, naming
-from slam.app.run.output import note, print_table
+from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.sweep import CLEAN
 from slam.app.sweep.bound import PURPOSE, load_gtsam
 from slam.app.sweep.run import Case, SweepRun, make_case, program_version, run_case
@@ -226,7 +225,7 @@ def run_sweep(
         part.path.unlink(missing_ok=True)
         groups = summarise_groups(runs)
     for group in groups:
-        sys.stdout.write(f"{one_line(group_line(group))}\n")
+        print_text(one_line(group_line(group)))
     for clean, rows in stress_tables(groups):
         print_table(*stress_table(clean, rows))
 
@@ -310,9 +309,9 @@ def _run(
             elapsed_s = time.monotonic() - started
             to_do = len(cases) - len(part.runs)
             remaining_s = elapsed_s / (len(part.runs) - n_done) * to_do
-            sys.stderr.write(
-                f"{len(part.runs)} of {len(cases)}: {one_line(_run_line(run))}; "
-                f"{_clock(elapsed_s)} elapsed, {_clock(remaining_s)} remaining\n"
+            print_progress(
+                f"{len(part.runs)} of {len(cases)}: {_run_line(run)}; "
+                f"{_clock(elapsed_s)} elapsed, {_clock(remaining_s)} remaining"
             )
         by_key = {run.key: run for run in part.runs}
         runs = [by_key[case.key] for case in cases]

@@ -11,7 +11,10 @@ import pytest
 
 from hil_tests.unit.slam.app.sessions import session_info, write_session
 from slam.app.cli import main
+from slam.app.errors import EmulatorError
 from slam.app.records import LogLine
+from slam.app.rig.emulated import EmulatorProcess
+from slam.app.rig.files import RigFile, RigRadar, write_rig
 from slam.app.run.output import Progress, note, print_table
 from xethru_protocol.system import locked
 
@@ -123,3 +126,29 @@ def test_a_signal_before_a_command_takes_note_of_signals_is_one_line(
     monkeypatch.setattr("slam.app.cli._parser", interrupted)
     assert main(["run"]) == 130
     assert capsys.readouterr().err == "uwb-slam: stopped by SIGINT\n"
+
+
+def test_a_run_that_cannot_begin_leaves_an_earlier_runs_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def not_started(self: EmulatorProcess) -> EmulatorProcess:
+        raise EmulatorError("the emulator ended at once")
+
+    monkeypatch.setattr(EmulatorProcess, "__enter__", not_started)
+    rig = tmp_path / "robot.toml"
+    radar = RigRadar(name="nose", serial="000000000001", x_m=0.1, y_m=0.0, yaw_deg=0.0)
+    write_rig(rig, RigFile(radars=(radar,)))
+    earlier = ("summary.json", "estimate.tum", "map.png", "report.html")
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in earlier:
+        (out / name).write_text("of an earlier run")
+    (lines := tmp_path / "lines.tum").write_text("0 0 0 0 0 0 0 1\n")
+    drive = ["--odometry", str(lines), "--odometry-clock", "unix"]
+    for command in (
+        ["demo"],
+        ["run", "--rig", str(rig), *drive, "--ports", str(tmp_path / "no port")],
+    ):
+        assert main([*command, "--out", str(out)]) == 1
+        assert sorted(path.name for path in out.iterdir()) == sorted(earlier)
+    assert "no port" in capsys.readouterr().err
