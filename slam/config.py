@@ -27,6 +27,8 @@ from pydantic import (
     model_validator,
 )
 
+from xethru_protocol.validation import problem_text, shown
+
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -432,7 +434,7 @@ def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
     """
     known = sorted(file.stem for file in _SHIPPED_PRESETS.glob("*.toml"))
     if name not in known:
-        raise ConfigError(f"unknown preset {name!r}; known: {', '.join(known)}")
+        raise ConfigError(f"unknown preset {name}; known: {', '.join(known)}")
     file = _SHIPPED_PRESETS / f"{name}.toml"
     source = f"preset {name}.toml"
     try:
@@ -458,7 +460,7 @@ def config_from_tables(
         return _validated(base, source)
     if environment != BASE_ENVIRONMENT and environment not in overrides:
         allowed = ", ".join([BASE_ENVIRONMENT, *sorted(overrides)])
-        raise ConfigError(f"{source}: no environment {environment!r}; known: {allowed}")
+        raise ConfigError(f"{source}: no environment {environment}; known: {allowed}")
     configs = {BASE_ENVIRONMENT: _validated(base, source)}
     for name, values in overrides.items():
         key = f"environment.{name}"
@@ -485,7 +487,7 @@ def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
         tables.setdefault(part, {})
         if not isinstance(tables[part], dict) or not field:
             parts = ", ".join(SlamConfig.model_fields)
-            raise ConfigError(f"setting {key!r}: write it as part.key; parts: {parts}")
+            raise ConfigError(f"setting {key}: write it as part.key; parts: {parts}")
         tables[part] = {**tables[part], field: value}
     return _validated(tables, "setting", context=TEXT_ALLOWED)
 
@@ -510,7 +512,7 @@ def without_removed_keys(tables: Mapping[str, Any], source: str) -> dict[str, An
         if not _is_same(table.get(field, default), default):
             raise ConfigError(
                 f"{source}: {removed}: version {_LAST_VERSION_WITH_THEM} was the last with this "
-                f"key; only its default {default!r} is still read (given: {table[field]!r})"
+                f"key; only its default {shown(default)} is still read, not {shown(table[field])}"
             )
         kept[part] = {key: value for key, value in table.items() if key != field}
         if not kept[part] and part not in SlamConfig.model_fields:
@@ -531,7 +533,7 @@ def _is_same(value: object, default: str | float) -> bool:
 
 def _table(value: object, key: str, source: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ConfigError(f"{source}: {key}: must be a table (given: {value!r})")
+        raise ConfigError(f"{source}: {key}: must be a table, not {shown(value)}")
     return value
 
 
@@ -540,18 +542,4 @@ def _validated(tables: Mapping[str, Any], source: str, context: str | None = Non
     try:
         return SlamConfig.model_validate(tables, context=context)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise ConfigError(f"{source}: unknown key {key}; allowed: {_siblings(key)}") from error
-        message = first["msg"].removeprefix("Value error, ")
-        given = f" (given: {first['input']!r})" if not isinstance(first["input"], dict) else ""
-        raise ConfigError(f"{source}: {key}: {message}{given}") from error
-
-
-def _siblings(key: str) -> str:
-    part, _, field = key.partition(".")
-    model = SlamConfig.model_fields[part].annotation if field else SlamConfig
-    assert isinstance(model, type)
-    assert issubclass(model, BaseModel)
-    return ", ".join(model.model_fields)
+        raise ConfigError(f"{source}: {problem_text(error.errors(), SlamConfig)}") from error

@@ -42,7 +42,8 @@ from pydantic import (
 
 from emulator.faults.kind import Kind, Parameters, Target
 from emulator.faults.kinds import KINDS
-from emulator.scene.tables import Table, finite, load_table, one_line
+from emulator.scene.tables import Table, finite, load_table
+from xethru_protocol.validation import problem_text, shown
 from xethru_protocol.wire.messages import Command
 from xethru_protocol.wire.rows import ROWS
 
@@ -138,7 +139,9 @@ class FaultSpec(Table):
     @classmethod
     def _known_kind(cls, kind: str) -> str:
         if kind not in KINDS:
-            raise ValueError(f"no kind of fault is called {kind!r}; known are {', '.join(KINDS)}")
+            raise ValueError(
+                f"no kind of fault is called {shown(kind)}; known are {', '.join(KINDS)}"
+            )
         return kind
 
     @field_validator("command")
@@ -146,7 +149,7 @@ class FaultSpec(Table):
     def _known_command(cls, command: str | int | None) -> str | int | None:
         if isinstance(command, str) and command not in _COMMANDS:
             known = ", ".join(sorted(_COMMANDS))
-            raise ValueError(f"no command is called {command!r}; known are {known}")
+            raise ValueError(f"no command is called {shown(command)}; known are {known}")
         if isinstance(command, int) and not 0 <= command <= 0xFF:
             raise ValueError(f"an opcode is 0 ... 255, not {command}")
         return command
@@ -162,7 +165,9 @@ class FaultSpec(Table):
         try:
             self.kind_parameters()
         except ValidationError as error:
-            raise ValueError(f"parameters.{one_line(error, self.row.parameters)}") from None
+            raise ValueError(
+                f"parameters.{problem_text(error.errors(), self.row.parameters)}"
+            ) from None
         if self.packet != "any" and self.row.target is not Target.PACKET:
             raise ValueError(f"packet: {self.kind} acts on {self.row.target.value} anyway")
         return self
@@ -204,7 +209,7 @@ def parse_fault(table: object, source: str = "fault") -> FaultSpec:
     try:
         return FaultSpec.model_validate(table)
     except ValidationError as error:
-        raise FaultPlanError(f"{source}: {one_line(error, FaultSpec)}") from None
+        raise FaultPlanError(f"{source}: {problem_text(error.errors(), FaultSpec)}") from None
 
 
 def load_plan(path: Path | str) -> FaultPlan:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from emulator.scene.tables import Number, Table
+from emulator.scene.tables import Number, Table, matching
 
 AMPLITUDE_OF_1_M2 = 0.06
 """Echo of 1 m**2 on boresight at 1 m, normalised units at TX power 2.
@@ -30,7 +30,11 @@ Assumed: a scene's rod of 0.015 is a cylinder of 1 cm radius seen over one Fresn
 2 pi a h**2 / wavelength = 0.06 m**2, and amplitude goes with the root of the cross section."""
 
 Metres = Annotated[Number, Field(ge=-1000, le=1000)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+Name = Annotated[
+    str,
+    Field(max_length=40),
+    matching("[a-z][a-z0-9_]*", "of small letters, digits and _, a letter first"),
+]
 _Seconds = Annotated[Number, Field(ge=0, le=86_400)]
 
 # A turn smaller than this is straight on; a U-turn within it of -180 deg is taken as +180 deg.

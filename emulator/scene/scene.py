@@ -26,7 +26,7 @@ from emulator.scene.motion import (
     carried,
     drive,
 )
-from emulator.scene.tables import Number, Table, load_table
+from emulator.scene.tables import Number, SerialNumber, Table, load_table
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
 """Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
@@ -54,7 +54,7 @@ class RadarSpec(Table):
     """
 
     name: Name
-    serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
+    serial: SerialNumber
     x_m: Metres
     y_m: Metres
     yaw_deg: Degrees

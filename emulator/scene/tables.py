@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, StrictFloat, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    StrictFloat,
+    ValidationError,
+)
 
 from xethru_protocol.system import read_bounded
+from xethru_protocol.validation import problem_text, shown
 
 # Beside this package, in the repository and in the wheel alike. Not importlib.resources on the
 # name "fixtures": a folder of that name in the user's own project would come first.
@@ -23,7 +32,19 @@ def finite(value: object) -> object:
     return value
 
 
+def matching(pattern: str, what: str) -> AfterValidator:
+    """Return what refuses text that does not match, calling what it must be by its name."""
+
+    def check(text: str) -> str:
+        if not re.fullmatch(pattern, text):
+            raise ValueError(f"must be {what}, not {shown(text)}")
+        return text
+
+    return AfterValidator(check)
+
+
 Number = Annotated[StrictFloat, BeforeValidator(finite)]
+SerialNumber = Annotated[str, matching("[0-9]{12}", "12 digits")]
 
 
 class Table(BaseModel):
@@ -78,57 +99,8 @@ def parse_table(model: type[TableT], text: str, *, source: str, error: type[Exce
     try:
         return model.model_validate(tomllib.loads(text))
     except ValidationError as problem:
-        raise error(f"{source}: {one_line(problem, model)}") from problem
+        raise error(f"{source}: {problem_text(problem.errors(), model)}") from problem
     except ValueError as problem:  # not TOML, or an integer of thousands of digits
         raise error(f"{source}: not valid TOML: {problem}") from problem
     except RecursionError as problem:
         raise error(f"{source}: brackets are nested too deep") from problem
-
-
-def one_line(error: ValidationError, model: type[BaseModel]) -> str:
-    """Describe the first problem in one line: key, what is allowed, and how many more there are."""
-    found = error.errors(include_url=False)
-    # A refused row makes its list too short as well: that is no problem of its own.
-    refused = {each["loc"][:depth] for each in found for depth in range(len(each["loc"]))}
-    problems = [e for e in found if e["type"] != "too_short" or e["loc"] not in refused]
-    first = problems[0]
-    location = first["loc"]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
-    match first["type"]:
-        case "extra_forbidden":
-            allowed = ", ".join(_allowed_keys(model, location[:-1])) or "none"
-            text = f"unknown key; allowed are {allowed}"
-        case "tuple_type" if isinstance(first["input"], dict):
-            name = location[-1]
-            text = f"must be a list of tables; begin each with [[{name}]], not [{name}]"
-        case "missing":
-            text = "missing; this key is required"
-        case "value_error":
-            text = str(first["ctx"]["error"])
-        case _:
-            text = f"{first['msg'].replace('tuple', 'list')}, got {_short(first['input'])}"
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{key.removeprefix('.')}: {text}{more}" if key else f"{text}{more}"
-
-
-def _short(value: object) -> str:
-    try:
-        text = repr(value)
-    except ValueError:  # an integer of thousands of digits
-        return "a number of thousands of digits"
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _allowed_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table at a location, by walking the models' fields."""
-    for part in location:
-        if isinstance(part, str):
-            model = _table_type(model.model_fields[part].annotation)
-    return list(model.model_fields)
-
-
-def _table_type(annotation: Any) -> type[BaseModel]:  # noqa: ANN401 - any type expression
-    """Return the table model inside ``Table`` or ``tuple[Table, ...]``."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return _table_type(annotation.__args__[0])

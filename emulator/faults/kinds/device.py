@@ -23,6 +23,7 @@ from emulator.faults.kind import (
     response_bytes,
 )
 from emulator.scene.philox import Rng
+from emulator.scene.tables import SerialNumber
 from xethru_protocol.wire.codes import DirCode, InfoItem, PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.messages import (
     GetProfileId,
@@ -61,9 +62,7 @@ class _Version(Parameters):
 
 
 class _Serial(Parameters):
-    serial: str = Field(
-        "000000000001", pattern=r"^[0-9]{12}$", description="serial number that it reports"
-    )
+    serial: SerialNumber = Field("000000000001", description="serial number that it reports")
 
 
 class _Profile(Parameters):

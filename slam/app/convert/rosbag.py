@@ -34,7 +34,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from slam.app.errors import AppError, OdometryError
-from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
+from slam.app.odometry.track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan, SessionInfo, TruthAt
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
 from slam.app.session import messages as ros
@@ -179,15 +179,17 @@ def convert_bag(
     unused = n_scans = 0
     try:
         for scan in _scans(_frames(bag, names, radars, stop), period_ns):
-            newest_ns = max(frame.t_ns for frame in scan.frames)
-            used = odometry.first_ns <= scan.t_ns and newest_ns <= odometry.last_ns
+            used = all(odometry.is_known(frame.t_ns) for frame in scan.frames)
             unused += not used
             n_scans += 1
             log.on_scan(replace(scan, used=used))
     finally:
         log.close()
     if unused:
-        warnings.append(f"{unused} scans lie outside the odometry and are marked as not to be used")
+        warnings.append(
+            f"{unused} scans lie outside the odometry, or in a hole of it longer than "
+            f"{MOST_GAP_NS // NS_PER_S} s, and are marked as not to be used"
+        )
     n_frames = sum(len(stream.stamps_ns) for stream in contents.streams.values())
     return (
         f"{out}: {n_frames} frames of {len(radars)} radars in {n_scans} scans, "

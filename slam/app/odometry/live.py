@@ -24,12 +24,17 @@ from numpy.typing import NDArray
 
 from slam.app.errors import OdometryError, UsageError
 from slam.app.odometry.arrival import ClockLine, LowerEnvelope
-from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumError, TumSample, parse_tum_line
+from slam.app.odometry.track import (
+    MOST_GAP_NS,
+    NS_PER_S,
+    OdometryTrack,
+    TumError,
+    TumSample,
+    parse_tum_line,
+)
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire.errors import XeThruError
 
-MOST_GAP_NS = NS_PER_S
-"""Between two samples farther apart the motion of the robot is unknown."""
 SILENCE_S = 10.0
 """A source without a new pose for so long has ended: wheels at rest send poses, too."""
 MOST_SPEED_MPS = 10.0
@@ -192,7 +197,7 @@ class LiveOdometry:
 
     def is_known(self, t_ns: int) -> bool:
         """Return whether the pose at this time lies between two samples close enough."""
-        return self._track is not None and self._track.gap_ns(t_ns) <= MOST_GAP_NS
+        return self._track is not None and self._track.is_known(t_ns)
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
         return self._whole().pose_at(t_ns)

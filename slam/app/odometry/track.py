@@ -25,6 +25,8 @@ from slam.geometry import wrap_angle
 from xethru_protocol.system import read_bounded
 
 NS_PER_S = 1_000_000_000
+MOST_GAP_NS = NS_PER_S
+"""Between two samples farther apart the motion of the robot is unknown."""
 _FIELDS = 8
 _MAX_BYTES = 1 << 28
 """Weeks of poses; a longer or endless file is not a trajectory."""
@@ -189,6 +191,10 @@ class OdometryTrack:
         if self._stamps_ns[after] == t_ns:
             return 0.0
         return self._stamps_ns[after] - self._stamps_ns[after - 1]
+
+    def is_known(self, t_ns: int) -> bool:
+        """Return whether the pose at this time lies between two samples close enough."""
+        return self.gap_ns(t_ns) <= MOST_GAP_NS
 
     def append(self, sample: TumSample) -> None:
         """Take a sample; OdometryError if it is not later than all before it."""

@@ -23,7 +23,7 @@ from typing import Annotated
 
 from pydantic import Field, StrictFloat
 
-from emulator.scene.tables import Table, load_table
+from emulator.scene.tables import SerialNumber, Table, load_table
 from slam.app.errors import AppError, naming
 from slam.app.rig.sources import RadarLink, RecordObserver
 from slam.config import WheelNoise
@@ -43,7 +43,7 @@ class RigRadar(Table):
     """One radar: who it is, where it sits, what is known of its errors."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
-    serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
+    serial: SerialNumber
     x_m: _Number
     y_m: _Number
     yaw_deg: _Number

@@ -29,6 +29,7 @@ from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_key
 from slam.frames import Detection, RadarFrame
 from slam.results import PoseAt, Slam, StepResult
 from xethru_protocol.system import StopFlag
+from xethru_protocol.validation import problem_text
 
 
 class _RecordedSlam:
@@ -76,10 +77,9 @@ def recorded_config(session: RecordedSession) -> SlamConfig:
     except ConfigError as error:
         raise AppError(str(error)) from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
+        text = problem_text(error.errors(), SlamConfig)
         raise AppError(
-            f"{session.path}: its setting {key} is not one of this version ({first['msg']}); "
+            f"{session.path}: its settings are not those of this version: {text}; "
             f"it was recorded with xethru-hil {session.info.versions.get('xethru-hil', '?')}"
         ) from None
 

@@ -53,7 +53,7 @@ def test_every_parameter_has_a_meaning_and_a_limit(kind: str) -> None:
         ),
         ("[[fault]]\nkind = 'stall'\nprobability = 2", "fault[0].probability: "),
         ("[[fault]]\nkind = 'stall'\nat_s = nan", "fault[0].at_s: "),
-        ("[[fault]]\nkind = 'nack'\ncommand = 'PIG'", "'PIG'"),
+        ("[[fault]]\nkind = 'nack'\ncommand = 'PIG'", '"PIG"'),
         ("[[fault]]\nkind = 'nack'\ncommand = 300", "0 ... 255"),
         ("[[fault]]\nkind = 'nack'\npacket = 'frame'", "packet: "),
         ("[[fault", "TOML"),

@@ -130,13 +130,13 @@ def test_a_value_out_of_bounds_is_refused_with_its_limit(
     table: str, key: str, value: str, limit: str, tmp_path: Path
 ) -> None:
     path = write(tmp_path, GOOD + f"[{table}]\n{key} = {value}\n")
-    with pytest.raises(SceneError, match=rf"{table}\.{key}.*than or equal to {limit}\b"):
+    with pytest.raises(SceneError, match=rf"{table}\.{key}: must be at (least|most) {limit}, not"):
         load_scene(path)
 
 
 def test_one_bad_value_is_one_problem(tmp_path: Path) -> None:
     """That the only radar is refused is no second problem of the list of radars."""
-    with pytest.raises(SceneError, match=r"got '1'$"):
+    with pytest.raises(SceneError, match=r'not "1"$'):
         load_scene(write(tmp_path, GOOD.replace("000000000001", "1")))
 
 

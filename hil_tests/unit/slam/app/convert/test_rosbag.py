@@ -188,6 +188,32 @@ def test_scans_that_odometry_does_not_reach_are_not_used(
     assert used == [False, False, True, True, True, False, False, False]
 
 
+def test_scans_in_a_hole_of_odometry_are_kept_and_not_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames every 200 ms, radar by radar 30 ms later; no pose between 4 s and 7 s."""
+    bag = AuthorsBag(tmp_path / "bag")
+    second = 1_000_000_000
+    for number in range(50):
+        for radar in range(4):
+            t_ns = START_NS + number * second // 5 + radar * 30_000_000
+            bag.add_frame(t_ns, radar + 1, samples(radar, number))
+    for k in range(260):
+        if not 100 < k < 175:
+            t_ns = START_NS + k * second // 25
+            bag.add_odometry(t_ns, t_ns, (0.01 * k, 0.0, 0.0))
+    bag.write()
+    out = tmp_path / "s.mcap"
+    code, _, err = run(capsys, "convert", bag.path, out)
+    assert code == 0
+    assert "15 scans lie outside the odometry, or in a hole of it longer than 1 s" in err
+    used = [one.used for one, _ in open_session(out).scans()]
+    # scan 20 begins at 4.0 s, where the last pose is, and ends at 4.09 s; scan 35 begins at 7.0 s
+    assert [number for number, is_used in enumerate(used) if not is_used] == list(range(20, 35))
+    assert len(used) == 50
+    assert run(capsys, "replay", out, "--out", tmp_path / "replay")[0] == 0
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_cut_bag_is_one_line(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -1,0 +1,153 @@
+"""What is wrong with a file that a person wrote, in one line of plain English.
+
+Problems are the plain dictionaries of pydantic's ``ValidationError.errors()``, and models are only
+asked for their fields: scenes and settings of SLAM share this, and nothing here needs pydantic.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+_MUST = {
+    "string_type": "be text in quotes",
+    "int_type": "be a whole number",
+    "int_from_float": "be a whole number",
+    "int_parsing": "be a whole number",
+    "int_parsing_size": "be a smaller number",
+    "float_type": "be a number",
+    "float_parsing": "be a number",
+    "finite_number": "be a finite number",
+    "bool_type": "be true or false",
+    "bool_parsing": "be true or false",
+    "list_type": "be a list",
+    "tuple_type": "be a list",
+    "dict_type": "be a table",
+    "model_type": "be a table",
+    "model_attributes_type": "be a table",
+    "literal_error": "be {expected}",
+    "enum": "be {expected}",
+    "greater_than": "be greater than {gt}",
+    "greater_than_equal": "be at least {ge}",
+    "less_than": "be less than {lt}",
+    "less_than_equal": "be at most {le}",
+    "string_too_short": "have at least {min_length} characters",
+    "string_too_long": "have at most {max_length} characters",
+    "too_short": "have at least {min_length} entries",
+    "too_long": "have at most {max_length} entries",
+}
+"""By pydantic's type of a problem."""
+
+Problem = Mapping[str, Any]
+Location = tuple[int | str, ...]
+_LONGEST = 60
+
+
+def problem_text(problems: Sequence[Problem], model: Any) -> str:  # noqa: ANN401 - see the module
+    """Describe the first problem: key, what is allowed, what is there, and how many more there are.
+
+    ``model`` is the class of the table, whose ``model_fields`` name what is allowed.
+    """
+    # A refused row makes its list too short as well: that is no problem of its own.
+    refused = {each["loc"][:depth] for each in problems for depth in range(len(each["loc"]))}
+    texts: dict[str, list[str]] = {}
+    for each in problems:
+        if each["type"] != "too_short" or each["loc"] not in refused:
+            location, keys, table = _place(each["loc"], model)
+            of_key = texts.setdefault(_key(location), [])
+            of_key += [text] if (text := _text(each, keys, table)) not in of_key else []
+    key, first = next(iter(texts.items()))
+    more = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
+    # several texts of one key: the value may be of several kinds, and is of none
+    kinds = [each.partition(", not ")[0] for each in first[:-1]]
+    text = " or ".join([*kinds, first[-1].removeprefix("must be ")]) if kinds else first[0]
+    return f"{key}: {text}{more}" if key else f"{text}{more}"
+
+
+def shown(value: object) -> str:
+    """Write a value as a person would in TOML; lists and tables only by what they are.
+
+    >>> print(shown("lab"), shown(True), shown([1.5]), shown(-0.5))
+    "lab" true a list -0.5
+    """
+    if isinstance(value, bool | str):
+        text = json.dumps(value, ensure_ascii=False)
+    elif isinstance(value, dict):
+        return "a table"
+    elif isinstance(value, list | tuple):
+        return "a list"
+    elif value is None:
+        return "nothing"
+    elif isinstance(value, int) and value.bit_length() > math.log2(10) * _LONGEST:
+        return "a number that long"
+    else:
+        text = str(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def _text(problem: Problem, keys: Sequence[str], table: Any) -> str:  # noqa: ANN401
+    """Describe a value in a table of these keys that should be a ``table``, None if no table."""
+    kind, value, limits = problem["type"], problem.get("input"), problem.get("ctx", {})
+    match kind:
+        case "extra_forbidden":
+            text = f"unknown key; allowed are {', '.join(keys) or 'none'}"
+        case "tuple_type" if isinstance(value, dict) and table is not None:
+            name = problem["loc"][-1]
+            text = f"must be a list of tables; begin each with [[{name}]], not [{name}]"
+        case "missing":
+            is_entry = isinstance(problem["loc"][-1], int)
+            text = "missing; " + ("the list is too short" if is_entry else "this key is required")
+        case "value_error":
+            text = str(limits["error"])
+        case "too_short" | "string_too_short" if limits["min_length"] == 1:
+            text = "must not be empty"
+        case "too_short" | "too_long":
+            text = f"must {_must(problem)}, not {len(value or ())}"
+        case _:
+            text = f"must {_must(problem)}, not {shown(value)}"
+    return text
+
+
+def _must(problem: Problem) -> str:
+    if problem["type"] not in _MUST:
+        return str(problem["msg"]).removeprefix("Input should ")
+    limits = {name: _plain(limit) for name, limit in problem.get("ctx", {}).items()}
+    return _MUST[problem["type"]].format_map(limits).replace("'", '"')
+
+
+def _plain(limit: object) -> object:
+    return int(limit) if isinstance(limit, float) and limit.is_integer() else limit
+
+
+def _place(location: Location, model: Any) -> tuple[Location, list[str], Any]:  # noqa: ANN401
+    """Follow a location: without the kinds of value that were tried, and its table's keys.
+
+    Third comes the model of what is there, None if that is no table.
+    """
+    keys: list[str] = []
+    for depth, part in enumerate(location):
+        if isinstance(part, int):
+            continue
+        fields = getattr(model, "model_fields", None)
+        if fields is None:
+            return location[:depth], keys, None
+        keys = list(fields)
+        if part not in fields:
+            return location[: depth + 1], keys, None
+        model = _table_of(fields[part].annotation)
+    return location, keys, model
+
+
+def _table_of(annotation: Any) -> Any:  # noqa: ANN401 - any type expression
+    """Return the table in ``Table``, ``tuple[Table, ...]`` or ``Table | None``, else None."""
+    if hasattr(annotation, "model_fields"):
+        return annotation
+    inside = getattr(annotation, "__args__", ())
+    return next((table for each in inside if (table := _table_of(each)) is not None), None)
+
+
+def _key(location: Location) -> str:
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    return "".join(parts).removeprefix(".")
