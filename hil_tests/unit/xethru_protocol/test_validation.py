@@ -5,6 +5,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,20 @@ RIG = """
 radars = [{name = "a", serial = "000000000001", x_m = 1.0, y_m = 0.0, yaw_deg = 90.0}]
 wheels = {scale_sigma = 0.1}
 """
-NONSENSE = ("nonsense", "", 1.5, -1, 10**30, math.nan, math.inf, True, [], {}, [1, 2], {"zz": 1})
+NONSENSE: tuple[object, ...] = (
+    "nonsense",
+    "",
+    1.5,
+    -1,
+    10**30,
+    math.nan,
+    math.inf,
+    True,
+    [],
+    {},
+    [1, 2],
+    {"zz": 1},
+)
 # what pydantic and Python would write
 THEIRS = re.compile(
     r"Input should|pydantic|instance of|dictionary|\^\[|tuple|validation|\bstr\b|parse|<class|"
@@ -105,7 +119,7 @@ def test_nonsense_of_set_is_one_plain_line() -> None:
     keys = [f"{part}.{key}" for part in tables if part != "back_end" for key in tables[part]]
     for key in (*keys, "back_end", "detection", "zz", "detection.zz", ".", "back_end.zz"):
         for new in ("", "nonsense", "-1", "1e400", "nan", "[1]", "1.5", "9" * 30, "x" * 200):
-            line = refusal(lambda key=key, new=new: override(SlamConfig(), {key: new}))
+            line = refusal(partial(override, SlamConfig(), {key: new}))
             assert not THEIRS.search(line), line
             assert len(line) < 600
 
