@@ -188,6 +188,46 @@ class LogLine:
     text: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gap:
+    """What damage took out of a session at one place of it, as far as it is known.
+
+    Attributes
+    ----------
+    from_ns, to_ns
+        Session times of the last message before it and the first one behind it; None: there is
+        none.
+    n_messages
+        How many are lost; None if unknown.
+    scans
+        Counters of the first and the last scan that is lost, None if there is none in between.
+    frames
+        How many counters are missing, by the names of radars.
+    """
+
+    from_ns: int
+    to_ns: int | None
+    n_messages: int | None
+    scans: tuple[int, int] | None
+    frames: Mapping[str, int]
+
+    def __str__(self) -> str:
+        if self.to_ns is None:
+            text = f"from {self.from_ns / 1e9:.2f} s on"
+        else:
+            span_s = max(self.to_ns - self.from_ns, 0) / 1e9
+            text = f"{self.from_ns / 1e9:.2f} to {self.to_ns / 1e9:.2f} s ({span_s:.2f} s)"
+        parts = []
+        if self.scans is not None:
+            first, last = self.scans
+            which = f"scan {first}" if first == last else f"scans {first} to {last}"
+            parts.append(which)
+        parts += [f"{n} frame{'s' * (n > 1)} of {radar}" for radar, n in self.frames.items()]
+        if self.n_messages is not None:
+            parts.append(f"{self.n_messages} message{'s' * (self.n_messages > 1)} in all")
+        return ": ".join([text, ", ".join(parts)] if parts else [text])
+
+
 class SessionObserver:
     """Gets everything a run produces, in order: a log, a viewer, a progress line.
 

@@ -171,6 +171,7 @@ _NAME_AT = _HEAD.size + _CHUNK.size
 _PIECE_BYTES = 1 << 20
 _FOOTER_BYTES, _DATA_END_BYTES = 20, 4
 _TAIL_BYTES = _HEAD.size + _FOOTER_BYTES + len(MAGIC)
+_MOST_ADDED_BYTES = 255
 _END_TIME_AT = 34  # in statistics, behind six counts and the time of the first message
 _MOST_INDEX_BYTES = 1 << 26
 
@@ -185,6 +186,7 @@ class Record:
     at: int
     code: int
     body: bytes
+    is_in_chunk: bool = False  # whose checksum is right, if it has one
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +217,7 @@ class RecordReader:
     def __init__(self, stream: BinaryIO, size: int) -> None:
         self._stream, self._size = stream, size
         self._is_data_over = False
+        self._last_chunk_before = size
 
     def _read(self, n_bytes: int | None = None) -> bytes:
         left = max(self._size - self._stream.tell(), 0)
@@ -223,6 +226,9 @@ class RecordReader:
     def read(self) -> Iterator[Found]:
         """Yield the records, those in chunks one by one, to the footer or as far as it goes."""
         at: int | None = len(MAGIC)
+        self._stream.seek(0)
+        if self._read(len(MAGIC)) != MAGIC:
+            yield self._damage(0, at, "the first bytes of an MCAP file do not stand there")
         while at is not None:
             self._stream.seek(at)
             head = self._read(_HEAD.size)
@@ -253,7 +259,7 @@ class RecordReader:
                     self._check(at, code, body)
                     yield Record(at, code, body)
             except DAMAGES as error:
-                following = end if self._is_head(end) else self._next_chunk(at + 1)
+                following = self._behind_damage(at, code, body)
                 yield self._damage(at, following, str(error))
                 at = following
                 continue
@@ -270,7 +276,9 @@ class RecordReader:
         """
         end = at + _HEAD.size + len(body)
         if code == HEADER:
-            fits = at == len(MAGIC)
+            fits = at == len(MAGIC) and _is_filled(body, text_at(body, text_at(body, 0)[1])[1])
+        elif code == METADATA:
+            fits = _is_filled(body, table_at(body, text_at(body, 0)[1])[1])
         elif code == FOOTER:
             fits = len(body) == _FOOTER_BYTES and end + len(MAGIC) >= self._size
         elif code == DATA_END:
@@ -288,6 +296,21 @@ class RecordReader:
             fits = True
         if not fits:
             raise ValueError("the record there is not what it says")
+
+    def _behind_damage(self, at: int, code: int, body: bytes) -> int | None:
+        """Return where reading goes on behind a damaged record.
+
+        The length of a chunk stands in it twice; where these fit, the length is right. Any other
+        length is trusted only where no chunk follows, as in a file without chunks.
+        """
+        end = at + _HEAD.size + len(body)
+        if code == CHUNK and _is_length_right(body) and self._is_head(end):
+            return end
+        following = None if at >= self._last_chunk_before else self._next_chunk(at + 1)
+        if following is not None:
+            return following
+        self._last_chunk_before = min(self._last_chunk_before, at)
+        return end if self._is_head(end) else None
 
     def _is_head(self, at: int) -> bool:
         """Whether a record of a known kind may begin at a place, or the file ends there."""
@@ -332,6 +355,11 @@ class RecordReader:
         return True
 
 
+def _is_filled(body: bytes, end: int) -> bool:
+    """Whether a record ends about where its content does: versions to come may add some."""
+    return len(body) - end <= _MOST_ADDED_BYTES
+
+
 def text_at(body: bytes, at: int) -> tuple[str, int]:
     """Return a text with its length before it, and the position after it."""
     data, end = bytes_at(body, at)
@@ -356,6 +384,14 @@ def table_at(body: bytes, at: int) -> tuple[dict[str, str], int]:
         key, at = text_at(body, at)
         table[key], at = text_at(body, at)
     return table, end
+
+
+def _is_length_right(body: bytes) -> bool:
+    try:
+        _, at = text_at(body, _CHUNK.size)
+        return int(struct.unpack_from("<Q", body, at)[0]) == len(body) - at - 8
+    except DAMAGES:
+        return False
 
 
 def _content(body: bytes) -> bytes:
@@ -407,7 +443,7 @@ def _records_in(at: int, content: bytes) -> Iterator[Record]:
             raise ValueError(f"a chunk cannot hold a record of kind {code}")
         if here + length > len(content):
             return  # the chunk was cut here
-        yield Record(at, code, content[here : here + length])
+        yield Record(at, code, content[here : here + length], is_in_chunk=True)
         here += length
 
 
@@ -446,13 +482,16 @@ class Message:
 Entry: TypeAlias = Metadata | Channel | Message
 
 
-def read_entries(stream: BinaryIO, size: int) -> Iterator[Entry | Cut | Damage]:
+def read_entries(
+    stream: BinaryIO, size: int, channels: dict[int, Channel] | None = None
+) -> Iterator[Entry | Cut | Damage]:
     """Yield what a file holds, to the end of its data, and where it is cut or damaged.
 
-    One chunk at a time is in memory. ``stream`` and ``size`` are those of `RecordReader`.
+    One chunk at a time is in memory. ``stream`` and ``size`` are those of `RecordReader`;
+    ``channels`` by their numbers, if some are known already, get those that are found.
     """
     schemas: dict[int, str] = {}
-    channels: dict[int, Channel] = {}
+    channels = {} if channels is None else channels
     for found in RecordReader(stream, size).read():
         if not isinstance(found, Record):
             yield found
@@ -499,8 +538,25 @@ def _entry(record: Record, schemas: dict[int, str], channels: dict[int, Channel]
 CHUNK_BYTES = 256 * 1024
 
 
+_LATCHED = re.compile(r"^\s*-?\s*durability: 1$", re.MULTILINE)
+
+
+def is_latched(metadata: Mapping[str, str]) -> bool:
+    """Whether the last message of a channel is kept for whoever comes later, as ROS 2 marks it."""
+    return _LATCHED.search(metadata.get("offered_qos_profiles", "")) is not None
+
+
 class McapWriter(Writer):
-    """Writes chunks compressed by zstd, by default of messages of ROS 2; the file stays open."""
+    """Writes chunks compressed by zstd, by default of messages of ROS 2; the file stays open.
+
+    Attributes
+    ----------
+    has_copies
+        Whether `end_chunk` repeats all schemas and channels and the last message of each latched
+        channel, in a chunk of their own: behind the first chunk, the second, the fourth, and so
+        on. Whatever part of a file is lost, one of the few copies is left. Their sequence number
+        is how many messages of other channels come before them.
+    """
 
     def __init__(
         self,
@@ -510,8 +566,17 @@ class McapWriter(Writer):
         profile: str = "ros2",
         library: str = "xethru-hil",
     ) -> None:
-        super().__init__(stream, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+        super().__init__(
+            stream,
+            chunk_size=chunk_bytes,
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,
+        )
+        self.has_copies = False
         self._schema_ids: dict[str, int] = {}
+        self._latched: dict[int, _Latched | None] = {}
+        self._n_messages = 0  # of channels that are not latched
+        self._n_chunks = 0
         self.start(profile=profile, library=library)
 
     def add_channel(
@@ -522,15 +587,63 @@ class McapWriter(Writer):
             self._schema_ids[message_type] = self.register_schema(message_type, "ros2msg", schema)
         return self.register_channel(topic, "cdr", self._schema_ids[message_type], dict(metadata))
 
+    def register_channel(
+        self,
+        topic: str,
+        message_encoding: str,
+        schema_id: int,
+        metadata: dict[str, str] | None = None,
+    ) -> int:
+        number = super().register_channel(topic, message_encoding, schema_id, metadata or {})
+        if is_latched(metadata or {}):
+            self._latched[number] = None
+        return number
+
+    def add_message(
+        self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
+    ) -> None:
+        if channel_id in self._latched:
+            self._latched[channel_id] = _Latched(log_time, publish_time, data)
+        else:
+            self._n_messages += 1
+        super().add_message(channel_id, log_time, data, publish_time, sequence)
+
     def end_chunk(self) -> None:
         """End the chunk here, whatever its size."""
         # A private method: mcap's writer offers no public way to close a chunk by time. pyproject
         # pins the minor version of mcap for this line; the tests of chunks cut by time and of
         # files never finished fail if the method does not write the pending chunk any more.
         self._Writer__finalize_chunk()  # type: ignore[attr-defined]  # see above
+        self._n_chunks += 1
+        if self.has_copies and self._n_chunks.bit_count() == 1:
+            self.write_copy()
+
+    def write_copy(self) -> None:
+        """Write a copy of what a reader needs, between two chunks."""
+        # Private as well, and tested as above: registering a schema again would make a new one.
+        chunk = self._Writer__chunk_builder  # type: ignore[attr-defined]
+        for schema in self._Writer__schemas.values():  # type: ignore[attr-defined]
+            chunk.add_schema(schema)
+        for channel in self._Writer__channels.values():  # type: ignore[attr-defined]
+            chunk.add_channel(channel)
+        sequence = self._n_messages & 0xFFFFFFFF
+        for number, last in self._latched.items():
+            if last is not None:
+                super().add_message(number, last.t_ns, last.data, last.publish_ns, sequence)
+        self._Writer__finalize_chunk()  # type: ignore[attr-defined]
 
     def finish(self) -> None:
+        if self.has_copies:
+            self.end_chunk()
+            self.write_copy()
         super().finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+
+
+@dataclass(frozen=True, slots=True)
+class _Latched:
+    t_ns: int
+    publish_ns: int
+    data: bytes
 
 
 def end_time_of(stream: BinaryIO, size: int) -> int | None:
@@ -554,6 +667,18 @@ def end_time_of(stream: BinaryIO, size: int) -> int | None:
             return int(end_ns)
         at += _HEAD.size + length
     return None
+
+
+def message_counts(statistics: bytes) -> dict[int, int]:
+    """Return the messages by channel in the body of a statistics record."""
+    (length,) = struct.unpack_from("<I", statistics, _END_TIME_AT + 8)
+    table = statistics[_END_TIME_AT + 12 :][:length]
+    return dict(struct.iter_unpack("<HQ", table))
+
+
+def is_magic(head: bytes) -> bool:
+    """Whether a file begins as MCAP does, one damaged byte allowed."""
+    return len(head) == len(MAGIC) and sum(a != b for a, b in zip(head, MAGIC, strict=True)) <= 1
 
 
 def statistics_of(path: Path) -> Statistics:

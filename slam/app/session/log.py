@@ -10,6 +10,7 @@ process leaves a file without index that lacks its last chunk only.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -33,6 +34,7 @@ from slam.app.records import (
 from slam.app.session import messages as ros
 from slam.app.session.messages import (
     METADATA_NAME,
+    SESSION_TOPIC,
     radar_text,
     schema_text,
     session_table,
@@ -164,6 +166,15 @@ class _SessionFile:
         self._pending_bytes = 0
         self._chunk_started_ns = self._clock_ns()
 
+    def end_head(self) -> None:
+        """End the chunk that describes the run, and have it repeated, for the first time here."""
+        self.cut_chunk()
+        self._writer.has_copies = True
+        with self._giving_up():
+            self._writer.write_copy()
+            self._stream.flush()
+            self._whole_bytes = self._disk.tell()
+
     def close(self) -> None:
         """Write index and footer, and close the file; doing so again does nothing."""
         if self._stream.closed:
@@ -244,7 +255,11 @@ class SessionLog(SessionObserver):
         self._names = [radar.name for radar in info.radars]
         self._streams = [0] * len(self._names)
         self._frame_channels: list[int] = []
-        self._file.add_metadata(METADATA_NAME, session_table(info))
+        table = session_table(info)
+        self._file.add_metadata(METADATA_NAME, table)
+        # The same with a checksum, and repeated; metadata have neither, but other programs show it.
+        channel = self._file.channel(SESSION_TOPIC, STRING, latched=True)
+        self._file.write(channel, start_ns, pack_string(json.dumps(table)))
         for radar in info.radars:
             self._frame_channels.append(
                 self._file.channel(f"/radar/{radar.name}/frame", FLOAT_ARRAY)
@@ -269,7 +284,7 @@ class SessionLog(SessionObserver):
         }
         static = ros.transforms(start_ns, self._placements)
         self._write(self._static_transforms, start_ns, static)
-        self._file.cut_chunk()
+        self._file.end_head()
 
     def on_scan(self, scan: Scan) -> None:
         """Write the frames of one tick, and the odometry that their poses come from."""

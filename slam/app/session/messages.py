@@ -281,6 +281,11 @@ def _pose(x_m: float, y_m: float, qz: float, qw: float) -> Message:
 
 
 METADATA_NAME = "xethru-hil session"
+SESSION_TOPIC = "/session/info"
+"""Latched and repeated: the table of the run as JSON, with the names of its radars."""
+
+GAP_TOPIC = "/session/gap"
+"""Where `repair` left something out: a `Gap` as JSON, before what follows it."""
 
 LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
 """Of a radar's range_start_m and bin_length_m; its mount is in true metres."""
@@ -293,6 +298,7 @@ def session_table(info: SessionInfo) -> dict[str, str]:
     """Return the table of a run; floats in it are those of the run to the last bit."""
     return {
         "format": str(FORMAT),
+        "radars": json.dumps([radar.name for radar in info.radars]),
         "scene": info.scene,
         "preset": info.preset,
         "seed": "" if info.seed is None else str(info.seed),

@@ -6,13 +6,15 @@ saw. Only one chunk of the file is in memory.
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import re
 import stat
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import BinaryIO, Literal, TypeAlias
 
@@ -21,11 +23,14 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, Snapshot
+from slam.app.records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE, sampler_limits
 from slam.app.session import messages as ros
+from slam.app.session.gaps import read_gap
 from slam.app.session.messages import (
+    GAP_TOPIC,
     METADATA_NAME,
+    SESSION_TOPIC,
     check_format,
     read_radar_text,
     read_session_table,
@@ -46,6 +51,7 @@ from xethru_protocol.recordings.mcap import (
     Message,
     Metadata,
     end_time_of,
+    is_magic,
     unpack_array,
     unpack_string,
 )
@@ -105,7 +111,7 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
             if stat.S_ISFIFO(path.stat().st_mode):  # opening one waits for who writes into it
                 raise AppError(f"{path}: is a pipe; give a file, the session.mcap of a run")
             stream = stack.enter_context(path.open("rb"))
-            if stream.read(len(MAGIC)) != MAGIC:
+            if not is_magic(stream.read(len(MAGIC))):
                 raise AppError(f"{path}: is no MCAP file{describe_kind(path)}")
             whole = os.fstat(stream.fileno()).st_size
         except IsADirectoryError:
@@ -117,29 +123,50 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
         yield stream, whole if size is None else min(size, whole)
 
 
-def read_entries(path: Path, size: int | None = None) -> Iterator[Metadata | Message | Cut]:
+def read_entries(
+    path: Path, size: int | None = None, channels: dict[int, Channel] | None = None
+) -> Iterator[Metadata | Message | Cut]:
     """Yield metadata and messages in the order of the file, holding one chunk in memory.
 
     The last entry is a `Cut` if the file ends too early. `size` is how many bytes to read, so that
-    a file that grows reads the same again; None: all.
+    a file that grows reads the same again; None: all. `channels` by their numbers are known
+    already, as where the chunk that names them is damaged. Damage before a copy of the head that
+    no other message precedes is no loss.
 
     Raises
     ------
     AppError
         Missing, unreadable, not MCAP, or damaged other than by being cut.
     """
+    damage: Damage | None = None
+    for found in _found_in(path, size, channels):
+        if isinstance(found, Damage):
+            damage = damage or found
+            continue
+        if damage is not None and _is_first_copy(found):
+            damage = None
+        if damage is not None and not isinstance(found, Metadata):
+            break
+        yield found
+    if damage is not None:
+        raise AppError(
+            f"{path}: damaged at byte {damage.at}: {damage.reason}; "
+            f"`uwb-slam repair {path}` keeps what is whole"
+        )
+
+
+def _is_first_copy(found: Metadata | Message | Cut) -> bool:
+    return isinstance(found, Message) and (found.topic, found.sequence) == (SESSION_TOPIC, 0)
+
+
+def _found_in(
+    path: Path, size: int | None, channels: dict[int, Channel] | None
+) -> Iterator[Metadata | Message | Cut | Damage]:
     with open_mcap(path, size) as (stream, n_bytes):
         try:
-            for found in entries_of(stream, n_bytes):
-                if isinstance(found, Damage):
-                    raise AppError(
-                        f"{path}: damaged at byte {found.at}: {found.reason}; "
-                        f"`uwb-slam repair {path}` keeps what is whole"
-                    )
+            for found in entries_of(stream, n_bytes, channels):
                 if not isinstance(found, Channel):
                     yield found
-                if isinstance(found, Cut):
-                    return
         except OSError as error:
             raise _unreadable(path, error) from None
 
@@ -171,7 +198,7 @@ class RecordedScan:
     truth: NDArray[np.float64] | None
 
 
-SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot
+SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot | Gap
 """What `RecordedSession.records` yields; a TumSample is odometry."""
 
 
@@ -239,7 +266,12 @@ def _log_line(message: Message) -> LogLine:
     )
 
 
+def _gap(message: Message) -> Gap:
+    return read_gap(unpack_string(message.data))
+
+
 _READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
+    GAP_TOPIC: _gap,
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
     "/odom": _odometry,
@@ -260,9 +292,16 @@ class RecordedSession:
     """
 
     def __init__(
-        self, path: Path, info: SessionInfo, *, size: int | None = None, end_ns: int | None = None
+        self,
+        path: Path,
+        info: SessionInfo,
+        *,
+        size: int | None = None,
+        end_ns: int | None = None,
+        channels: Mapping[int, Channel] | None = None,
     ) -> None:
         self.path = path
+        self._channels = dict(channels or {})
         self._size = size  # when it was opened: a run may be writing it still
         self.info = info
         self.end_ns = end_ns
@@ -304,7 +343,7 @@ class RecordedSession:
             if isinstance(record, RecordedScan):
                 yield record.scan, record.truth
 
-    def played(self) -> Iterator[RecordedScan | TumSample | LogLine | Snapshot]:
+    def played(self) -> Iterator[RecordedScan | TumSample | LogLine | Snapshot | Gap]:
         """Yield what `records` does, with the frames put together into scans as in `scans`."""
         held: list[tuple[RadarFrame, int]] = []
         for message, record in self._records():
@@ -338,7 +377,7 @@ class RecordedSession:
         held: list[Detection] = []
         for entry in self._messages():
             if entry.topic in index_of:
-                with self._naming(entry):
+                with _naming(self.path, entry):
                     ranges_m = unpack_array(DOUBLE_ARRAY, entry.data).tolist()
                 radar, t_ns = index_of[entry.topic], entry.t_ns
                 held += [
@@ -362,7 +401,7 @@ class RecordedSession:
             ways[f"/radar/{radar.name}/tx"] = (radar.name, "tx")
         for entry in self._messages():
             if found := ways.get(entry.topic):
-                with self._naming(entry):
+                with _naming(self.path, entry):
                     data = unpack_array(BYTE_ARRAY, entry.data).tobytes()
                 yield *found, data, entry.publish_ns
 
@@ -386,7 +425,7 @@ class RecordedSession:
         step: Message | None = None
         for entry in self._messages():
             record: SessionRecord | None = None
-            with self._naming(entry):
+            with _naming(self.path, entry):
                 if entry.topic in radar_of:
                     index, radar, limits = radar_of[entry.topic]
                     record = _frame(entry, index, radar, limits, streams[index])
@@ -403,75 +442,126 @@ class RecordedSession:
                 yield entry, record
 
     def _messages(self) -> Iterator[Message]:
-        for entry in read_entries(self.path, self._size):
+        for entry in read_entries(self.path, self._size, dict(self._channels)):
             if isinstance(entry, Message):
                 yield entry
             elif isinstance(entry, Cut):
                 self.cut_at_byte = entry.at
 
-    @contextmanager
-    def _naming(self, entry: Message) -> Iterator[None]:
-        try:
-            yield
-        except (
-            ValueError,
-            TypeError,
-            AssertionError,
-            IndexError,
-            OverflowError,
-            struct.error,
-        ) as error:
-            raise AppError(
-                f"{self.path}: a message of {entry.topic} at "
-                f"{entry.t_ns / 1e9:.3f} s cannot be read: {error}"
-            ) from None
+
+@contextmanager
+def _naming(path: Path, message: Message) -> Iterator[None]:
+    try:
+        yield
+    except (
+        ValueError,
+        TypeError,
+        AssertionError,
+        IndexError,
+        KeyError,
+        OverflowError,
+        struct.error,
+    ) as error:
+        raise AppError(
+            f"{path}: a message of {message.topic} at "
+            f"{message.t_ns / 1e9:.3f} s cannot be read: {error}"
+        ) from None
+
+
+@dataclass(slots=True, kw_only=True)
+class _Head:
+    """What describes a session, as far as it has been read.
+
+    `table` is that of a message, whose chunk has a checksum, or else that of the metadata.
+    """
+
+    table: dict[str, str] | None = None
+    has_message: bool = False
+    radars: dict[str, RadarInfo] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    cut: Cut | None = None
+    is_damaged: bool = False
+
+    def names(self) -> list[str]:
+        """Return the radars in their order; of an old session those that are described."""
+        if self.table is not None and "radars" in self.table:
+            return [str(name) for name in json.loads(self.table["radars"])]
+        return list(self.radars)
+
+    def is_whole(self) -> bool:
+        return self.has_message and set(self.names()) <= set(self.radars)
+
+    def take(self, path: Path, found: Metadata | Message) -> bool:
+        """Whether it is part of a head."""
+        if isinstance(found, Metadata):
+            if found.name == METADATA_NAME and self.table is None:
+                self.table = found.values
+        elif found.topic == SESSION_TOPIC:
+            self.table, self.has_message = _session_table(path, found), True
+        elif name := RADAR_INFO.fullmatch(found.topic):
+            self.radars[name[1]] = _radar_info(path, found)
+        else:
+            return False
+        return True
+
+
+RADAR_INFO = re.compile(r"/radar/(.+)/info")
 
 
 def open_session(path: Path) -> RecordedSession:
-    """Read the head of a session file.
+    """Read what describes a session: at its head, or where that is damaged in a later copy.
 
     Raises
     ------
     AppError
-        Missing, foreign, damaged, or cut before the radars are named.
+        Missing, foreign, cut before the radars are named, or damaged beyond all copies.
     """
-    head: dict[str, str] | None = None
-    radars: list[RadarInfo] = []
-    cut: Cut | None = None
     try:
         size = path.stat().st_size
     except OSError:
         size = None  # reading it reports what is wrong
-    for entry in read_entries(path, size):
-        if isinstance(entry, Cut):
-            cut = entry
-        elif isinstance(entry, Metadata):
-            if entry.name == METADATA_NAME:
-                head = entry.values
-                check_format(path, head)
-        elif entry.topic.startswith("/radar/") and entry.topic.endswith("/info"):
-            radars.append(_radar_info(path, entry))
-        else:
-            break  # the infos come before everything else
-    if head is None:
-        if cut is not None:
-            raise AppError(f"{path}: ends at byte {cut.at}, before it says what run it is of")
+    head = _read_head(path, size)
+    if head.table is None:
+        if head.cut is not None:
+            raise AppError(f"{path}: ends at byte {head.cut.at}, before it says what run it is of")
         raise AppError(
             f"{path}: an MCAP file, but no session of `uwb-slam`: its metadata {METADATA_NAME!r} "
             "is missing; of a bag in the layout of the paper's data set `uwb-slam convert` makes a "
             "session"
         )
-    if not radars:
+    check_format(path, head.table)
+    names = head.names()
+    if not names or not head.radars:
         raise AppError(f"{path}: ends before any radar is named; record the session again")
+    if missing := [name for name in names if name not in head.radars]:
+        raise AppError(f"{path}: the description of radar {missing[0]} is lost")
+    info = read_session_table(path, head.table, tuple(head.radars[name] for name in names))
     with open_mcap(path, size) as opened:
         end_ns = end_time_of(*opened)
-    info = read_session_table(path, head, tuple(radars))
-    return RecordedSession(path, info, size=size, end_ns=end_ns)
+    return RecordedSession(path, info, size=size, end_ns=end_ns, channels=head.channels)
+
+
+def _read_head(path: Path, size: int | None) -> _Head:
+    head = _Head()
+    for found in _found_in(path, size, head.channels):
+        if isinstance(found, Cut):
+            head.cut = found
+        elif isinstance(found, Damage):
+            head.is_damaged = True
+        elif not head.take(path, found) and (head.is_whole() or not head.is_damaged):
+            break  # the head comes before everything else
+    return head
+
+
+def _session_table(path: Path, message: Message) -> dict[str, str]:
+    with _naming(path, message):
+        table = json.loads(unpack_string(message.data))
+        if not isinstance(table, dict):
+            raise ValueError("it is no table")
+        return {str(key): str(value) for key, value in table.items()}
 
 
 def _radar_info(path: Path, message: Message) -> RadarInfo:
-    try:
+    with _naming(path, message):
         text = unpack_string(message.data)
-    except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
-        raise AppError(f"{path}: {message.topic} cannot be read: {error!r}") from None
     return read_radar_text(path, message.topic, text)

@@ -6,6 +6,7 @@ before it takes the place of the old one. The old one is kept under another name
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 import zlib
@@ -13,17 +14,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO, TypeVar
 
 from slam.app.errors import AppError
-from slam.app.session.reader import open_mcap
+from slam.app.records import Gap
+from slam.app.session.gaps import GapFinder, gap_json
+from slam.app.session.messages import GAP_TOPIC, METADATA_NAME, SESSION_TOPIC
+from slam.app.session.reader import RADAR_INFO, open_mcap, open_session
 from xethru_protocol.recordings import mcap
 from xethru_protocol.system import STDOUT, PathInUseError, StopFlag, each_line, locked
+
+Row = TypeVar("Row")
 
 KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""
 
 _ATTACHMENT = struct.Struct("<QQ")
 _FOOTER = struct.Struct("<QQI")
+_PIECE_BYTES = 1 << 20
 _FOOTER_HEAD_BYTES = 9  # code and length
 _CHECKED_FOOTER_BYTES = 16  # of its body, that its checksum covers
 
@@ -42,8 +50,19 @@ class Repair:
         Places of the old file that were left out.
     has_index
         Whether the old file had an index, with the right checksum.
+    has_right_data
+        Whether the checksum over all of the old file's data is right, if it has one.
     schemas, channels
         By their numbers in the old file.
+    head
+        Of a session, the first whole message of each topic that describes it, in order.
+    metadata
+        Of a session, as the old file has it.
+    message_counts, data_end, checksum
+        Of the old file: messages by channel as its index has them, where its data end, and their
+        checksum.
+    gaps
+        Of a session, what is lost, by the byte at which the damage begins.
     n_messages, first_ns, last_ns
         Messages in the new file, and the session time they span [ns].
     kept
@@ -54,10 +73,17 @@ class Repair:
     cut_at: int | None = None
     damages: list[mcap.Damage] = field(default_factory=list)
     has_index: bool = False
+    has_right_data: bool = True
     profile: str = ""
     library: str = ""
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, tuple[int, str, str, dict[str, str]]] = field(default_factory=dict)
+    head: dict[str, bytes] = field(default_factory=dict)
+    metadata: dict[str, str] | None = None
+    gaps: dict[int, Gap] = field(default_factory=dict)
+    message_counts: dict[int, int] = field(default_factory=dict)
+    data_end: int = 0
+    checksum: int = 0
     n_messages: int = 0
     first_ns: int = 0
     last_ns: int = 0
@@ -70,7 +96,22 @@ class Repair:
 
     @property
     def was_whole(self) -> bool:
-        return self.cut_at is None and not self.damages and self.has_index
+        is_right = self.has_index and self.has_right_data
+        return self.cut_at is None and not self.damages and is_right
+
+    @property
+    def is_session(self) -> bool:
+        """Whether a run of `uwb-slam` wrote it, whatever is left of what describes it."""
+        topics = {topic for _, topic, *_ in self.channels.values()}
+        return "/scan" in topics or SESSION_TOPIC in topics or self.metadata is not None
+
+    def table(self) -> dict[str, str] | None:
+        """Return the table of the run: of a message, which has a checksum, or the metadata."""
+        if SESSION_TOPIC in self.head:
+            body = self.head[SESSION_TOPIC][mcap.MESSAGE_HEAD.size :]
+            table: dict[str, str] = json.loads(mcap.unpack_string(body))
+            return table
+        return self.metadata
 
     def __str__(self) -> str:
         span = f"{self.n_messages} messages, {(self.last_ns - self.first_ns) / 1e9:.1f} s"
@@ -83,7 +124,11 @@ class Repair:
             f"  bytes {row.at} to {row.until} are left out: {row.reason}" for row in self.damages
         ]
         if self.cut_at is None and not self.damages:
-            lines.append("  its index was missing or wrong")
+            wrong = "a byte outside of its chunks" if self.has_index else "its index"
+            lines.append(f"  {wrong} was missing or wrong")
+        lines += [f"  lost: {gap}" for gap in self.gaps.values()]
+        if self.is_session and not self.gaps and self.cut_at is None:
+            lines.append("  nothing that was recorded is lost")
         if self.kept is not None:
             lines.append(f"  as it was: {self.kept}")
         return "\n".join(lines)
@@ -109,7 +154,8 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
     Raises
     ------
     AppError
-        Not an MCAP file, nothing left of it, still being written, or no place to write.
+        Not an MCAP file, nothing left of it, still being written, or no place to write; or a
+        session that nothing describes any more, of which only `out` gets what is whole.
     """
     with _held(path):
         survey = _survey(path, stop)
@@ -131,11 +177,12 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
         try:
             _write(path, fresh, survey, stop)
             _read_back(fresh, survey)
-            if out is None:
+            lost = _lost_description(fresh) if survey.is_session else ""
+            if out is not None:
+                fresh.replace(out)
+            elif not lost:
                 survey.kept = kept
                 _swap(fresh, path, kept)
-            else:
-                fresh.replace(out)
         except OSError as error:
             raise AppError(
                 f"{error.filename or fresh}: cannot be written: {error.strerror or error}; "
@@ -143,7 +190,31 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
             ) from None
         finally:
             fresh.unlink(missing_ok=True)
+    if lost:
+        raise AppError(_not_a_session(path, out, survey, lost))
     return survey
+
+
+def _lost_description(fresh: Path) -> str:
+    """Return why nobody can read a session as one; "" if they can."""
+    try:
+        open_session(fresh)
+    except AppError as error:
+        return str(error).removeprefix(f"{fresh}: ")
+    return ""
+
+
+def _not_a_session(path: Path, out: Path | None, survey: Repair, lost: str) -> str:
+    text = f"{path}: was a session, and what describes it is lost ({lost}); "
+    if out is None:
+        return (
+            f"{text}it is as it was; with --out FILE the {survey.n_messages} messages that are "
+            "whole are written, for programs that read MCAP"
+        )
+    return (
+        f"{text}{out} holds the {survey.n_messages} messages that are whole, for programs that "
+        "read MCAP, but `uwb-slam` cannot replay them"
+    )
 
 
 def _swap(fresh: Path, path: Path, kept: Path) -> None:
@@ -171,23 +242,62 @@ def _held(path: Path) -> Iterator[None]:
 
 
 def _survey(path: Path, stop: StopFlag) -> Repair:
-    survey = Repair(path=path)
+    survey, finder = Repair(path=path), GapFinder()
     with open_mcap(path) as opened:
         for found in mcap.RecordReader(*opened).read():
             if isinstance(found, mcap.Cut):
                 survey.cut_at = found.at
             elif isinstance(found, mcap.Damage):
                 survey.damages.append(found)
+                finder.damage(found.at)
             else:
                 stop.check()
                 try:
-                    _note(survey, path, found)
+                    _note(survey, finder, path, found)
                 except mcap.DAMAGES as error:
                     survey.lose(found, error)
+        if not survey.damages and survey.checksum:
+            survey.has_right_data = _checksum(*opened, survey.data_end, stop) == survey.checksum
+    topics = {
+        number: topic
+        for number, (_, topic, _, table) in survey.channels.items()
+        if not mcap.is_latched(table)
+    }
+    if survey.is_session:
+        if survey.message_counts:
+            finder.count(sum(n for number, n in survey.message_counts.items() if number in topics))
+        survey.gaps = finder.gaps(topics)
+        _order_head(survey)
+    else:
+        survey.head, survey.metadata = {}, None
     return survey
 
 
-def _note(survey: Repair, path: Path, record: mcap.Record) -> None:
+def _order_head(survey: Repair) -> None:
+    """Put the table of the run first, then the radars in their order."""
+    try:
+        table = survey.table() or {}
+        names = json.loads(table.get("radars", "[]"))
+        first = [SESSION_TOPIC, *(f"/radar/{name}/info" for name in names)]
+    except (ValueError, TypeError, struct.error):
+        return  # reading it back will fail, too
+    topics = [topic for topic in dict.fromkeys([*first, *survey.head]) if topic in survey.head]
+    survey.head = {topic: survey.head[topic] for topic in topics}
+    if SESSION_TOPIC in survey.head and survey.metadata not in (None, table):
+        survey.has_right_data = False
+
+
+def _checksum(stream: BinaryIO, size: int, end: int, stop: StopFlag) -> int:
+    """Return the CRC-32 of a file's bytes before a place."""
+    stream.seek(0)
+    checksum = 0
+    for at in range(0, min(end, size), _PIECE_BYTES):
+        stop.check()
+        checksum = zlib.crc32(stream.read(min(_PIECE_BYTES, end - at)), checksum)
+    return checksum
+
+
+def _note(survey: Repair, finder: GapFinder, path: Path, record: mcap.Record) -> None:
     body = record.body
     if record.code == mcap.HEADER:
         survey.profile, at = mcap.text_at(body, 0)
@@ -196,16 +306,44 @@ def _note(survey: Repair, path: Path, record: mcap.Record) -> None:
         (number,) = struct.unpack_from("<H", body)
         name, at = mcap.text_at(body, 2)
         encoding, at = mcap.text_at(body, at)
-        survey.schemas[number] = (name, encoding, mcap.bytes_at(body, at)[0])
+        data, _ = mcap.bytes_at(body, at)
+        _define(survey.schemas, record, number, (name, encoding, data))
     elif record.code == mcap.CHANNEL:
         number, schema = struct.unpack_from("<HH", body)
         topic, at = mcap.text_at(body, 4)
         encoding, at = mcap.text_at(body, at)
-        survey.channels[number] = (schema, topic, encoding, mcap.table_at(body, at)[0])
+        table, _ = mcap.table_at(body, at)
+        _define(survey.channels, record, number, (schema, topic, encoding, table))
     elif record.code == mcap.MESSAGE:
-        survey.n_messages += 1
+        _note_message(survey, finder, body)
+    elif record.code == mcap.METADATA:
+        name, at = mcap.text_at(body, 0)
+        if name == METADATA_NAME:
+            survey.metadata = mcap.table_at(body, at)[0]
+    elif record.code == mcap.DATA_END:
+        survey.data_end = record.at
+        (survey.checksum,) = struct.unpack_from("<I", body)
+    elif record.code == mcap.STATISTICS:
+        survey.message_counts = mcap.message_counts(body)
     elif record.code == mcap.FOOTER:
         survey.has_index = _is_index_right(path, record)
+
+
+def _note_message(survey: Repair, finder: GapFinder, body: bytes) -> None:
+    survey.n_messages += 1
+    number, sequence, t_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
+    topic = survey.channels.get(number, (0, "", "", {}))[1]
+    if topic == SESSION_TOPIC:
+        finder.count(sequence)
+    if topic == SESSION_TOPIC or RADAR_INFO.fullmatch(topic):
+        survey.head.setdefault(topic, body)
+    finder.message(number, sequence, t_ns)
+
+
+def _define(table: dict[int, Row], record: mcap.Record, number: int, row: Row) -> None:
+    """Take a schema or channel; the last word has a chunk, for the index has no checksum each."""
+    if record.is_in_chunk or number not in table:
+        table[number] = row
 
 
 def _is_index_right(path: Path, footer: mcap.Record) -> bool:
@@ -221,21 +359,24 @@ def _is_index_right(path: Path, footer: mcap.Record) -> bool:
 
 
 def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
+    profile, library = survey.profile, survey.library
+    if survey.is_session:
+        profile, library = "ros2", "xethru-hil"
     with fresh.open("wb") as stream, open_mcap(path) as opened:
-        writer = mcap.McapWriter(stream, profile=survey.profile, library=survey.library)
-        schemas = {0: 0} | {
-            number: writer.register_schema(*row) for number, row in survey.schemas.items()
-        }
-        channels = {
-            number: writer.register_channel(topic, encoding, schemas.get(schema, 0), table)
-            for number, (schema, topic, encoding, table) in survey.channels.items()
-        }
+        # Chunks end below at half of that, so that a session's copies lie between them.
+        most = 2 * mcap.CHUNK_BYTES
+        writer = mcap.McapWriter(stream, chunk_bytes=most, profile=profile, library=library)
+        copy = _Copy(writer, survey)
+        if survey.is_session:
+            copy.write_head()
         for found in mcap.RecordReader(*opened).read():
             stop.check()
+            if isinstance(found, mcap.Damage) and found.at in survey.gaps:
+                copy.write_gap(survey.gaps[found.at])
             if not isinstance(found, mcap.Record):
                 continue
             try:
-                _copy(writer, channels, found)
+                copy.write(found)
             except mcap.DAMAGES as error:
                 survey.lose(found, error)
         writer.finish()
@@ -243,26 +384,78 @@ def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
         os.fsync(stream.fileno())
 
 
-def _copy(writer: mcap.McapWriter, channels: dict[int, int], record: mcap.Record) -> None:
-    body = record.body
-    if record.code == mcap.MESSAGE:
-        channel, sequence, t_ns, publish_ns = mcap.MESSAGE_HEAD.unpack_from(body)
-        writer.add_message(
-            channel_id=channels[channel],
+class _Copy:
+    """Writes what is whole of a file into another."""
+
+    def __init__(self, writer: mcap.McapWriter, survey: Repair) -> None:
+        self._writer, self._survey = writer, survey
+        schemas = {0: 0} | {
+            number: writer.register_schema(*row) for number, row in survey.schemas.items()
+        }
+        self._channels = {
+            number: writer.register_channel(topic, encoding, schemas.get(schema, 0), table)
+            for number, (schema, topic, encoding, table) in survey.channels.items()
+        }
+        self._gaps: int | None = None
+        self._pending_bytes = 0
+        self._latched: dict[int, tuple[int, bytes]] = {}
+
+    def write_head(self) -> None:
+        """Write what describes a session at its beginning, and have it repeated."""
+        if (table := self._survey.table()) is not None:
+            self._writer.add_metadata(METADATA_NAME, table)
+        for body in self._survey.head.values():
+            self._message(body, is_head=True)
+        self._writer.end_chunk()
+        self._writer.has_copies = True
+        self._writer.write_copy()
+
+    def write_gap(self, gap: Gap) -> None:
+        if self._gaps is None:
+            schema = mcap.SCHEMAS[mcap.STRING].encode()
+            self._gaps = self._writer.add_channel(GAP_TOPIC, mcap.STRING, schema, {})
+        self._writer.add_message(
+            channel_id=self._gaps,
+            log_time=gap.from_ns,
+            publish_time=gap.from_ns,
+            data=mcap.pack_string(gap_json(gap)),
+        )
+
+    def write(self, record: mcap.Record) -> None:
+        body = record.body
+        if record.code == mcap.MESSAGE:
+            self._message(body)
+        elif record.code == mcap.METADATA:
+            name, at = mcap.text_at(body, 0)
+            if not self._survey.is_session or name != METADATA_NAME:
+                self._writer.add_metadata(name, mcap.table_at(body, at)[0])
+        elif record.code == mcap.ATTACHMENT:
+            log_ns, created_ns = _ATTACHMENT.unpack_from(body)
+            name, at = mcap.text_at(body, _ATTACHMENT.size)
+            media_type, at = mcap.text_at(body, at)
+            (size,) = struct.unpack_from("<Q", body, at)
+            data = body[at + 8 : at + 8 + size]
+            self._writer.add_attachment(created_ns, log_ns, name, media_type, data)
+
+    def _message(self, body: bytes, *, is_head: bool = False) -> None:
+        number, sequence, t_ns, publish_ns = mcap.MESSAGE_HEAD.unpack_from(body)
+        data = body[mcap.MESSAGE_HEAD.size :]
+        if self._survey.is_session and mcap.is_latched(self._survey.channels[number][3]):
+            if self._latched.get(number) == (t_ns, data):
+                return  # a copy; the writer makes its own
+            self._latched[number] = t_ns, data
+            sequence = 0
+        if not is_head and self._pending_bytes + len(body) > mcap.CHUNK_BYTES:
+            self._writer.end_chunk()
+            self._pending_bytes = 0
+        self._pending_bytes += len(body)
+        self._writer.add_message(
+            channel_id=self._channels[number],
             log_time=t_ns,
             publish_time=publish_ns,
             sequence=sequence,
-            data=body[mcap.MESSAGE_HEAD.size :],
+            data=data,
         )
-    elif record.code == mcap.METADATA:
-        name, at = mcap.text_at(body, 0)
-        writer.add_metadata(name, mcap.table_at(body, at)[0])
-    elif record.code == mcap.ATTACHMENT:
-        log_ns, created_ns = _ATTACHMENT.unpack_from(body)
-        name, at = mcap.text_at(body, _ATTACHMENT.size)
-        media_type, at = mcap.text_at(body, at)
-        (size,) = struct.unpack_from("<Q", body, at)
-        writer.add_attachment(created_ns, log_ns, name, media_type, body[at + 8 : at + 8 + size])
 
 
 def _read_back(readable: Path, survey: Repair) -> None:

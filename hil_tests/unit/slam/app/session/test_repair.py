@@ -1,14 +1,21 @@
 """What `uwb-slam repair` says and refuses; what it keeps is tested in property/."""
 
 import errno
+import json
 import signal
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
-from hil_tests.unit.slam.app.sessions import run, write_session
-from slam.app.session.reader import open_session
+from hil_tests.unit.slam.app.sessions import FRAME_NS, run, write_session
+from slam.app.records import Gap
+from slam.app.session.reader import ScanEnd, open_session
 from slam.app.session.repair import repair
+from slam.frames import RadarFrame
 from xethru_protocol.system import StopFlag, StopRequestedError, locked
 
 
@@ -97,3 +104,119 @@ def test_a_file_that_cannot_take_its_place_leaves_everything_as_it_was(
     monkeypatch.setattr(Path, "replace", replace)
     assert run(capsys, "repair", cut)[0] == 0
     assert Path(f"{cut}.unrepaired").read_bytes() == before
+
+
+def chunks_of(content: bytes | bytearray) -> list[int]:
+    """Return where the chunks of an MCAP file begin."""
+    at, chunks = 8, []
+    while at + 9 <= len(content):
+        if content[at] == 6:
+            chunks.append(at)
+        at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
+    return chunks
+
+
+@pytest.fixture
+def holed(tmp_path: Path) -> Path:
+    """Return a session that lacks the chunk in its middle, some ten scans."""
+    path = write_session(tmp_path / "session.mcap", 60)
+    content = bytearray(path.read_bytes())
+    chunks = chunks_of(content)
+    content[chunks[len(chunks) // 2] + 2000] ^= 0xFF
+    path.write_bytes(content)
+    return path
+
+
+def test_it_says_what_is_lost_and_writes_it_into_the_file(
+    holed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = run(capsys, "repair", holed)
+    assert (code, err) == (0, "")
+    (line,) = [line for line in out.splitlines() if "lost:" in line]
+    left = {one.counter for one in open_session(holed).records() if isinstance(one, ScanEnd)}
+    gone = sorted(set(range(60)) - left)
+    assert gone == list(range(gone[0], gone[-1] + 1)) != []
+    assert f"scans {gone[0]} to {gone[-1]}" in line
+    with holed.open("rb") as stream:  # what mcap's own reader finds
+        texts = [m.data[8:] for _, c, m in make_reader(stream).iter_messages("/session/gap")]
+    (row,) = [json.loads(text.rstrip(b"\0")) for text in texts]
+    assert row["scans"] == [gone[0], gone[-1]]
+    frames = [f for f in open_session(holed).records() if isinstance(f, RadarFrame)]
+    n_left = {name: sum(f.radar == k for f in frames) for k, name in enumerate(row["frames"])}
+    assert row["frames"] == {name: 60 - n_left[name] for name in ("radar0", "radar1")}
+    assert row["from_ns"] <= gone[0] * FRAME_NS <= gone[-1] * FRAME_NS <= row["to_ns"]
+
+
+def gaps_in(path: Path) -> Iterator[Gap]:
+    return (record for record in open_session(path).records() if isinstance(record, Gap))
+
+
+def test_a_second_repair_keeps_the_gap_of_the_first(holed: Path, tmp_path: Path) -> None:
+    first = tmp_path / "first.mcap"
+    repair(holed, first, StopFlag())
+    content = first.read_bytes()
+    again = tmp_path / "again.mcap"
+    again.write_bytes(content[:-100])
+    out = tmp_path / "out.mcap"
+    repair(again, out, StopFlag())
+    assert list(gaps_in(out)) == list(gaps_in(first))
+    assert len(list(gaps_in(out))) == 1
+
+
+def without_description(path: Path, content: bytes) -> None:
+    """Write the file of a session without a word of what run it is of, by mcap's own writer."""
+    (source := path.with_suffix(".whole")).write_bytes(content)
+    with source.open("rb") as stream, path.open("wb") as target:
+        writer = Writer(target, chunk_size=50_000)
+        writer.start("ros2", "xethru-hil")
+        numbers: dict[str, int] = {}
+        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            if channel.topic.endswith("/info") or schema is None:
+                continue
+            if channel.topic not in numbers:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", schema_id)
+            writer.add_message(
+                numbers[channel.topic],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
+            )
+    source.unlink()
+
+
+def test_a_session_that_nothing_describes_is_a_failure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = write_session(tmp_path / "whole.mcap", 20)
+    path = tmp_path / "session.mcap"
+    without_description(path, whole.read_bytes())
+    whole.unlink()
+    before = path.read_bytes()
+    code, out, err = run(capsys, "repair", path)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "is lost" in err
+    assert "--out" in err
+    assert [path] == list(tmp_path.iterdir())
+    assert path.read_bytes() == before
+    saved = tmp_path / "saved.mcap"
+    code, out, err = run(capsys, "repair", path, "--out", saved)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    with saved.open("rb") as stream:
+        frames = sum(1 for _ in make_reader(stream).iter_messages("/radar/radar0/frame"))
+    assert frames > 10
+
+
+def test_damage_that_costs_nothing_is_said_to_cost_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_session(tmp_path / "session.mcap", 20)
+    content = bytearray(path.read_bytes())
+    copies = chunks_of(content)
+    content[copies[1] + 300] ^= 1
+    path.write_bytes(content)
+    code, out, _ = run(capsys, "repair", path)
+    assert code == 0
+    assert "nothing that was recorded is lost" in out
+    assert list(gaps_in(path)) == []
