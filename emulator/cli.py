@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.chip import Pace
+from xethru_protocol.cli.version import add_version
 from xethru_protocol.system import (
     STDERR,
     STDOUT,
@@ -346,8 +347,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="xethru-emulator",
         description="Emulated X4M300 radars on pseudo-terminals. To begin: `xethru-emulator "
-        "serve --bare` tells the path of a port; `xethru info --port PATH` asks what is there.",
+        "serve --bare` prints the path of a port; `xethru info --port PATH` asks what is there.",
     )
+    add_version(parser)
     commands = parser.add_subparsers(dest="command", required=True)
 
     serve = commands.add_parser(

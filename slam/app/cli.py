@@ -17,6 +17,7 @@ from slam.app.commands.options import add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep import STRESSES
+from xethru_protocol.cli.version import add_version
 from xethru_protocol.system import (
     STDERR,
     STDOUT,
@@ -434,6 +435,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uwb-slam", description="UWB-radar SLAM on X4M300 radars, emulated or real."
     )
+    add_version(parser)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for row in _COMMANDS:
         command = commands.add_parser(

@@ -7,6 +7,8 @@ from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from xethru_protocol.cli.version import add_version
+
 if TYPE_CHECKING:
     from xethru_protocol.driver.link import RawConfig
 
@@ -245,6 +247,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="xethru", description="Talk to XeThru X4M300 radar modules, real or emulated."
     )
+    add_version(parser)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     _add_json(
         _add_command(
