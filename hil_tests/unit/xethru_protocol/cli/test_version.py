@@ -1,6 +1,5 @@
 """``--version`` of the three programs."""
 
-import contextlib
 import errno
 import io
 import sys
@@ -18,14 +17,19 @@ PROJECT = Path(__file__).parents[4] / "pyproject.toml"
 PROGRAMS = (xethru, xethru_emulator, uwb_slam)
 
 
+def exit_code(program: Callable[[Sequence[str]], int]) -> object:
+    try:
+        return program(["--version"])
+    except SystemExit as end:
+        return end.code
+
+
 @pytest.mark.parametrize("program", PROGRAMS, ids=["xethru", "xethru-emulator", "uwb-slam"])
 def test_each_program_prints_the_version_of_the_package(
     program: Callable[[Sequence[str]], int],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with pytest.raises(SystemExit) as end:
-        program(["--version"])
-    assert not end.value.code
+    assert not exit_code(program)
     version = tomllib.loads(PROJECT.read_text())["project"]["version"]
     assert capsys.readouterr() == (f"xethru-hil {version}\n", "")
 
@@ -41,10 +45,7 @@ def test_a_full_disk_or_a_closed_output_is_no_traceback(
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(sys, "stdout", Full())
-    with pytest.raises(SystemExit) as end:
-        program(["--version"])
-    assert end.value.code == 1
+    assert exit_code(program) == 1
     assert "cannot write the version: No space left on device" in capsys.readouterr().err
     monkeypatch.setattr(sys, "stdout", None)
-    with contextlib.suppress(SystemExit):
-        program(["--version"])
+    exit_code(program)
