@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Annotated, Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
+from pydantic import BaseModel, Field, ValidationError
 
 from slam.app.errors import AppError
 from slam.app.experiments import Result, table
@@ -29,6 +31,7 @@ from slam.app.sweep.statistics import (
     times_clean,
 )
 from xethru_protocol.system import StopFlag, read_bounded
+from xethru_protocol.validation import problem_text
 
 Group = dict[str, Any]
 
@@ -43,16 +46,64 @@ TARGETS = {
 _MOST_NEES = 100.0
 """What is above is an arrow at the edge."""
 
+_LEAST_MM = 1e-3
+"""A smaller error is drawn here: a logarithmic axis has no place for zero."""
+
 _MOST_BYTES = 1 << 28
-_NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}
 _COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
+
+
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Error = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Nees = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Count = Annotated[int, Field(ge=0)]
+_NisRow = tuple[_Number, _Nees, _Nees, _Nees] | tuple[_Number, None, None, None]
+
+
+class _Spread(BaseModel):
+    median: _Error
+    p90: _Error
+
+
+class _Medians(BaseModel):
+    precision: _Number | None
+    recall: _Number | None
+
+
+class _Anees(BaseModel):
+    anees_pose: Annotated[tuple[tuple[_Number, _Nees], ...], Field(min_length=1)]
+    anees_band_95: tuple[_Nees, _Nees]
+
+
+class _Group(_Anees):
+    """What is shown of a group of `slam.app.sweep.statistics.summarise_groups`."""
+
+    scene: str
+    preset: str
+    settings: dict[str, str]
+    stress: str
+    runs: Annotated[int, Field(gt=0)]
+    runs_below_odometry: _Count
+    ate_rmse_m: _Spread
+    odometry_ate_rmse_m: _Spread
+    landmark_medians: _Medians
+    without_duplicates: _Error
+    false_per_run: _Error
+    confident_false: _Count
+    nis_mean: _Number | None
+    nis_times: tuple[_NisRow, ...]
+    bound: _Anees | None
+
+
+class _Sweep(BaseModel):
+    groups: Annotated[tuple[_Group, ...], Field(min_length=1)]
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     """Read the sweep and return the experiment of that name.
 
     Raises AppError if the file cannot be read, is not a sweep's, would be replaced by the result,
-    or has no stressed runs where they are what is shown.
+    or has no runs of those that are shown.
     """
     path: Path = arguments.sweep
     groups = _read_groups(path, arguments.out / f"{arguments.name}.json")
@@ -63,6 +114,8 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
             raise AppError(f"{path}: has no stressed runs; `uwb-slam sweep --stress` does")
         return _stress(tables)
     clean = [group for group in groups if group["stress"] == CLEAN]
+    if not clean:
+        raise AppError(f"{path}: has no clean runs, and `experiment {arguments.name}` shows those")
     return _consistency(clean) if arguments.name == "consistency" else _scenes(clean)
 
 
@@ -70,16 +123,20 @@ def _read_groups(path: Path, result: Path) -> list[Group]:
     if result.resolve() == path.resolve():
         raise AppError(f"{path}: the result would replace the sweep; choose another --out")
     try:
-        groups: list[Group] = json.loads(read_bounded(path, _MOST_BYTES))["groups"]
-        complete = all(group.keys() >= _NEEDED for group in groups)
+        content = json.loads(read_bounded(path, _MOST_BYTES))
+        _Sweep.model_validate(content)
     except OSError as error:
         raise AppError(
             f"{path}: cannot be read: {error.strerror or error}; `uwb-slam sweep --json` writes it"
         ) from None
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        complete, groups = False, []
-    if not groups or not complete:
-        raise AppError(f"{path}: is not a result of this version's `uwb-slam sweep --json`")
+    except ValidationError as error:
+        raise AppError(
+            f"{path}: is not a result of this version's `uwb-slam sweep --json`: "
+            f"{problem_text(error.errors(), _Sweep)}"
+        ) from None
+    except (ValueError, RecursionError):
+        raise AppError(f"{path}: is not a result of `uwb-slam sweep --json`, nor JSON") from None
+    groups: list[Group] = content["groups"]
     return groups
 
 
@@ -156,7 +213,7 @@ def _stress(tables: Sequence[tuple[Group, Sequence[Group]]]) -> Result:
             "name": group_name(group),
             "runs": group["runs"],
             "ate_rmse_m": group["ate_rmse_m"],
-            "times_clean": {of: times_clean(group, clean, of) for of in ("median", "p90")},
+            "times_clean": {of: _finite(times_clean(group, clean, of)) for of in ("median", "p90")},
             "anees_in_band": in_band(group),
             "without_duplicates": group["without_duplicates"],
             "false_per_run": group["false_per_run"],
@@ -220,7 +277,9 @@ def _scenes(groups: Sequence[Group]) -> Result:
             "runs_below_odometry": group["runs_below_odometry"],
             "odometry_ate_rmse_m": group["odometry_ate_rmse_m"],
             "ate_rmse_m": group["ate_rmse_m"],
-            "ratio": ratio(group["ate_rmse_m"]["median"], group["odometry_ate_rmse_m"]["median"]),
+            "ratio": _finite(
+                ratio(group["ate_rmse_m"]["median"], group["odometry_ate_rmse_m"]["median"])
+            ),
             "anees_mean": fmean(nees for _, nees in group["anees_pose"]),
             "anees_in_band": in_band(group),
             "times": len(group["anees_pose"]),
@@ -237,7 +296,7 @@ def _scenes(groups: Sequence[Group]) -> Result:
         "wheels": [mm_text(row["odometry_ate_rmse_m"]["median"]) for row in rows],
         "SLAM": [mm_text(row["ate_rmse_m"]["median"]) for row in rows],
         "SLAM p90": [mm_text(row["ate_rmse_m"]["p90"]) for row in rows],
-        "of wheels": [f"{row['ratio']:.3f}" for row in rows],
+        "of wheels": ["-" if row["ratio"] is None else f"{row['ratio']:.3f}" for row in rows],
         "beat wheels": [f"{row['runs_below_odometry']} of {row['runs']}" for row in rows],
         "ANEES": [f"{row['anees_mean']:.1f}" for row in rows],
         "in band": [f"{row['anees_in_band']} of {row['times']}" for row in rows],
@@ -269,10 +328,15 @@ def _scenes(groups: Sequence[Group]) -> Result:
     )
 
 
+def _finite(value: float) -> float | None:
+    """Return a ratio, None where there is nothing to compare with: JSON has no infinity."""
+    return value if math.isfinite(value) else None
+
+
 def _draw_errors(axes: Axes, groups: Sequence[Group]) -> None:
     places = range(len(groups))
     odometry_mm, median_mm, p90_mm = (
-        [1e3 * group[error][statistic] for group in groups]
+        [max(1e3 * group[error][statistic], _LEAST_MM) for group in groups]
         for error, statistic in (
             ("odometry_ate_rmse_m", "median"),
             ("ate_rmse_m", "median"),

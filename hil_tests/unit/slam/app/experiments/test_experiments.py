@@ -1,7 +1,9 @@
 """Experiments: what they measure, the pictures and tables they leave, and how the command ends."""
 
+import argparse
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,8 @@ from hil_tests.paths import real_recording
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.cli import main
+from slam.app.errors import AppError
+from slam.app.experiments import sweep_results
 from slam.app.experiments.figure7 import measure_steps, range_errors
 from slam.app.experiments.filter import Origin, Seen, Setting, drive, outcome
 from slam.app.experiments.recording import (
@@ -372,3 +376,55 @@ def test_a_sweep_without_stresses_has_no_stress_table(
     path = written(tmp_path, [run for run in runs() if run.stress == "clean"])
     assert main(["experiment", "stress", "--sweep", path, "--out", str(tmp_path / "out")]) == 1
     assert "has no stressed runs" in capsys.readouterr().err
+
+
+def damaged(value: Any) -> Iterator[Any]:  # noqa: ANN401 - JSON
+    """Yield copies of a document with one part of it gone or replaced."""
+    yield from (None, "x", -1, [], {}, math.nan, math.inf, 0)
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield {name: each for name, each in value.items() if name != key}
+            yield from ({**value, key: wrong} for wrong in damaged(part))
+    elif isinstance(value, list) and value:
+        yield value[:-1]
+        yield from ([*value[:-1], wrong] for wrong in damaged(value[-1]))
+
+
+@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
+def test_a_file_that_is_no_whole_sweep_is_refused_or_shown(name: str, tmp_path: Path) -> None:
+    """Whatever is missing or null in it; what is drawn goes by what `run` lets through."""
+    arguments = argparse.Namespace(name=name, out=tmp_path, sweep=Path(written(tmp_path, runs())))
+    whole = json.loads(arguments.sweep.read_text())
+    del whole["runs"]
+    whole["groups"] = whole["groups"][:2]
+    refused = shown = 0
+    for content in damaged(whole):
+        arguments.sweep.write_text(json.dumps(content))
+        try:
+            numbers = sweep_results.run(arguments, StopFlag()).numbers
+        except AppError:
+            refused += 1
+        else:
+            shown += 1
+            json.dumps(numbers, allow_nan=False)
+    assert refused > 100
+    assert shown > 10
+
+
+@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
+def test_a_sweep_without_any_error_is_drawn(name: str, tmp_path: Path) -> None:
+    """Ideal wheels give no ratio, and a logarithmic axis has no place for zero."""
+    perfect = [replace(run, ate_rmse_m=0.0, odometry_ate_rmse_m=0.0) for run in runs()]
+    command = ["experiment", name, "--sweep", written(tmp_path, perfect), "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("content", ["", '{"command": {}}\n{}\n', "[", "[" * 100_000, "\x00"])
+def test_an_unfinished_sweep_is_one_line(
+    content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "o.part").write_text(content)
+    command = ["experiment", "scenes", "--sweep", str(tmp_path / "o.part"), "--out", str(tmp_path)]
+    assert main(command) == 1
+    assert capsys.readouterr().err.count("\n") == 1
