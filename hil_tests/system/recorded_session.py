@@ -1,6 +1,6 @@
 """A short recorded session without ports: the emulated robot in this process, in two seconds."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
+from slam.robust.parameters import BackEndParameters
 from xethru_protocol.system import StopFlag
 
 STARTED_UNIX_NS = 1_790_000_000_000_000_000
@@ -44,7 +45,15 @@ def write_shorter_scene(folder: Path) -> Path:
     return file
 
 
-def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = True) -> RunRecord:
+def record_session(
+    path: Path,
+    preset: str,
+    seed: int = 5,
+    *,
+    has_truth: bool = True,
+    rules: BackEndParameters | None = None,
+    constants: Mapping[str, object] | None = None,
+) -> RunRecord:
     """Record 0.2 m there and back, with one frame lost and one fault on the links.
 
     Without truth it is as a drive in the real world.
@@ -62,7 +71,7 @@ def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = 
             true_landmarks_m=true_landmarks_m(scene)[: None if has_truth else 0],
             versions=versions(),
             config_json=settings_text(config),
-            constants=slam_constants(),
+            constants=slam_constants() if constants is None else constants,
             wheels=asdict(wheels_of(scene)),
             outlines_m=outlines_m(scene),
             simulated=has_truth,
@@ -71,7 +80,7 @@ def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = 
         truth = trajectory.poses if has_truth else _unknown
         log = SessionLog(path, info, odometry, truth_at=truth if has_truth else None)
         scans = source.scans(end_tick(trajectory.duration_ns), StopFlag())
-        slam = make_slam(config, rig_of(scene), wheels_of(scene))
+        slam = make_slam(config, rig_of(scene), wheels_of(scene), rules=rules)
         record = run_slam(_damaged(scans, log, info), odometry, slam, truth, [log])
         log.close()
     return record

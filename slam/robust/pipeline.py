@@ -31,11 +31,16 @@ class RobustSlam:
     """
 
     def __init__(
-        self, config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
+        self,
+        config: SlamConfig,
+        rig: Rig,
+        wheels: WheelNoise,
+        detector: Detector | None = None,
+        rules: BackEndParameters | None = None,
     ) -> None:
         self.config = config
         self.rig = rig
-        self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels))
+        self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels, rules))
         self._detector = detector or make_detector(config)
         self._pose: Array | None = None  # odometry at the last state
 
@@ -135,10 +140,14 @@ class RobustSlam:
         ]
 
 
-def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParameters:
+def back_end_parameters(
+    config: SlamConfig, wheels: WheelNoise, rules: BackEndParameters | None = None
+) -> BackEndParameters:
+    """Return the rules, by default those of this version, with the noise that is configured."""
     robust, limits = config.robust, config.detection
     reach_m = limits.max_range_m - limits.min_range_m
-    return BackEndParameters(
+    return replace(
+        rules or BackEndParameters(),
         wheels=replace(wheels, walk_per_sqrt_m=robust.wheel_walk_per_sqrt_m),
         ranges=RangeNoise(
             sigma_m=robust.range_sigma_m,

@@ -1,6 +1,7 @@
 """Replay of what a demo recorded: the same numbers, also of a file cut or killed half-way."""
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,14 +9,17 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hil_tests.system.recorded_session import write_shorter_scene
+from hil_tests.system.recorded_session import record_session, write_shorter_scene
 from hil_tests.unit.slam.app.session.test_steps import assert_same_step
 from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.cli import main
 from slam.app.records import Snapshot
+from slam.app.run import replay
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
+from slam.app.session.constants import slam_constants
 from slam.app.session.reader import open_session
+from slam.robust.parameters import BackEndParameters, TrackletRule
 from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
@@ -122,3 +126,44 @@ def test_what_led_to_every_state_is_recorded(recorded: Recorded) -> None:
     for found, live in zip(states, listener.snapshots, strict=True):
         assert found.wall_spans_m.tolist() == live.wall_spans_m.tolist()
         assert_same_step(found.step, live.step)
+
+
+def test_what_damage_took_is_named_and_not_held_against_the_processor(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = bytearray((recorded.folder / "session.mcap").read_bytes())
+    content[len(content) // 2] ^= 0x55
+    (path := tmp_path / "session.mcap").write_bytes(content)
+    assert main(["replay", str(path), "--out", str(tmp_path / "refused")]) == 1
+    assert "repair" in capsys.readouterr().err
+    assert main(["repair", str(path)]) == 0
+    assert "lost: " in capsys.readouterr().out
+    assert main(["replay", str(path), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    (n_before,) = map(int, re.findall(r"all (\d+) recorded states before the first gap", said))
+    lines = (tmp_path / "out" / "estimate.tum").read_text().splitlines()
+    expected = (recorded.folder / "estimate.tum").read_text().splitlines()
+    assert 10 < n_before < len(expected)
+    assert lines[:n_before] == expected[:n_before]
+    assert "frames of " in said
+    assert "processor" not in said
+
+
+@pytest.mark.thorough
+def test_a_run_with_other_rules_is_replayed_with_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a session of another version is, whose rules are not those of this one."""
+    name = "slam.robust.parameters.TrackletRule.min_frames"
+    constants = slam_constants() | {name: 13, "slam.robust.map._KNOTS": 9}
+    rules = BackEndParameters(tracklets=TrackletRule(min_frames=13))
+    session = tmp_path / "session.mcap"
+    record_session(session, "robust", rules=rules, constants=constants)
+    assert main(["replay", str(session), "--out", str(tmp_path / "out")]) == 0
+    assert "recorded states came again, to the last bit" in capsys.readouterr().err
+    monkeypatch.setattr(replay, "recorded_rules", lambda constants: BackEndParameters())
+    assert main(["replay", str(session), "--out", str(tmp_path / "again")]) == 0
+    said = capsys.readouterr().err
+    assert "only " in said
+    assert "slam.robust.map._KNOTS 9, here 8" in said
+    assert "processor" not in said

@@ -19,10 +19,11 @@ from pydantic import ValidationError
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
+from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress, note
 from slam.app.run.results import finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import LinkLog, LostFrames, RunSource, execute, make_slam
+from slam.app.session.constants import different_constants, recorded_rules
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
@@ -53,7 +54,7 @@ class _RecordedSlam:
 def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
     """Replay a session, write its results into a folder and print its table."""
     recorded = open_session(session)
-    comparison = Comparison()
+    comparison = Comparison(different_constants(recorded.info.constants))
     source = recorded_source(recorded, stop, comparison)
     with ExitStack() as held:
         hold_folder(out, held)
@@ -115,11 +116,14 @@ def recorded_source(
             lines.append(record)
         elif isinstance(record, Snapshot) and comparison is not None:
             comparison.expect(record)
+        elif isinstance(record, Gap) and comparison is not None:
+            comparison.expect_gap(record)
     try:
         odometry = OdometryTrack(samples)
     except OdometryError as error:
         raise AppError(f"{session.path}: {error}") from None
-    slam = make_slam(config, session.rig, wheels)
+    rules = recorded_rules(session.info.constants)
+    slam = make_slam(config, session.rig, wheels, rules=rules)
     scans = _RecordedScans(session, lines, stop)
     return RunSource(
         info=session.info,
@@ -162,37 +166,79 @@ class _RecordedScans:
 
 
 class Comparison(SessionObserver):
-    """Compares every state with the recorded one, to the last bit."""
+    """Compares every state with the recorded one, to the last bit.
 
-    def __init__(self) -> None:
+    `different` are the numbers in which the recorded run and this one differ, a text each.
+    """
+
+    def __init__(self, different: Sequence[str] = ()) -> None:
+        self._different = different
         self._expected: dict[int, bytes] = {}
-        self._n_same = 0
+        self._gaps: list[Gap] = []
+        self._n_before_gap: int | None = None
+        self._came_again: set[int] = set()
         self._first_other_ns: int | None = None
 
     def expect(self, snapshot: Snapshot) -> None:
         self._expected[snapshot.t_ns] = _digest(snapshot)
+
+    def expect_gap(self, gap: Gap) -> None:
+        """Take it that what is expected from now on was recorded behind a gap."""
+        self._gaps.append(gap)
+        if self._n_before_gap is None:
+            self._n_before_gap = len(self._expected)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         expected = self._expected.get(snapshot.t_ns)
         if expected is None:
             return
         if expected == _digest(snapshot):
-            self._n_same += 1
+            self._came_again.add(snapshot.t_ns)
         elif self._first_other_ns is None:
             self._first_other_ns = snapshot.t_ns
 
     def verdict(self) -> str:
-        if not self._expected:
+        """Return one line: how many states came again, and why others did not."""
+        n_expected = len(self._expected)
+        if not n_expected:
             return "no states are recorded, so there are none to compare with"
-        if self._n_same == len(self._expected):
-            return f"all {self._n_same} recorded states came again, to the last bit"
+        if len(self._came_again) == n_expected:
+            return f"all {n_expected} recorded states came again, to the last bit"
+        if self._n_before_gap is None:
+            return self._verdict_on(n_expected, "") + self._reason()
+        before = list(self._expected)[: self._n_before_gap]
+        n_same = sum(t_ns in self._came_again for t_ns in before)
+        gaps = "; ".join(map(str, self._gaps))
+        behind = (
+            f"the other {n_expected - len(before)} cannot be compared, as SLAM lacks what damage "
+            f"took: {gaps}"
+        )
+        if not before:
+            return f"none of the {n_expected} recorded states precedes the first gap; {behind}"
+        if n_same == len(before):
+            return (
+                f"all {n_same} recorded states before the first gap came again, to the last bit; "
+                f"{behind}"
+            )
+        return f"{self._verdict_on(len(before), ' before the first gap')}{self._reason()}; {behind}"
+
+    def _verdict_on(self, n_expected: int, which: str) -> str:
+        n_same = sum(t_ns in self._came_again for t_ns in list(self._expected)[:n_expected])
         where = ""
         if self._first_other_ns is not None:
             where = f", the first other one at {self._first_other_ns / 1e9:.3f} s"
-        return (
-            f"only {self._n_same} of {len(self._expected)} recorded states came again{where}; "
-            "another version, or another processor's arithmetic?"
-        )
+        return f"only {n_same} of {n_expected} recorded states{which} came again{where}; "
+
+    def _reason(self) -> str:
+        if not self._different:
+            return "another version, or another processor's arithmetic?"
+        shown = "; ".join(self._different[:_MOST_SHOWN])
+        more = len(self._different) - _MOST_SHOWN
+        rest = f"; and {more} more" if more > 0 else ""
+        return f"these numbers differ from the recorded ones: {shown}{rest}"
+
+
+_MOST_SHOWN = 10
 
 
 def _digest(snapshot: Snapshot) -> bytes:

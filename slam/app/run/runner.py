@@ -33,6 +33,7 @@ from slam.geometry import Rig
 from slam.packed import PackedRows
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, StepResult
+from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.conversation import ProtocolRecord
 
@@ -40,15 +41,19 @@ _NO_LANDMARKS_M = np.empty((0, 2))
 
 
 def make_slam(
-    config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
+    config: SlamConfig,
+    rig: Rig,
+    wheels: WheelNoise,
+    detector: Detector | None = None,
+    rules: BackEndParameters | None = None,
 ) -> Slam:
     """Return the pipeline that ``config.back_end`` names.
 
     ``wheels`` is the robot's odometry noise; preset ``paper`` has numbers of its own. ``detector``
-    replaces the front end that the configuration names.
+    replaces the front end that the configuration names, ``rules`` those of the robust back end.
     """
     if config.back_end is BackEnd.ROBUST:
-        return RobustSlam(config, rig, wheels, detector)
+        return RobustSlam(config, rig, wheels, detector, rules)
     return UwbRadarSlam(config, rig, detector)
 
 

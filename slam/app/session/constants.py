@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import math
 import pkgutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 from functools import cache
 from importlib import import_module
 from numbers import Real
 from types import ModuleType
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
+
+from slam.robust.parameters import BackEndParameters
 
 Json: TypeAlias = "float | list[Json] | dict[str, Json]"
 
@@ -103,3 +106,58 @@ def _as_json(value: object) -> Json | None:
     if isinstance(value, Real):  # NaN stands for none
         return None if math.isnan(value) else float(value)
     return None
+
+
+_RULES = [rule for rule in fields(BackEndParameters) if rule.name not in {"wheels", "ranges"}]
+"""Those that a run takes as they are; noise comes from its settings."""
+
+
+def recorded_rules(constants: Mapping[str, object]) -> BackEndParameters:
+    """Return the back end's rules with the recorded numbers, for those that are recorded."""
+    rules = BackEndParameters()
+    return replace(
+        rules, **{rule.name: _recorded(getattr(rules, rule.name), constants) for rule in _RULES}
+    )
+
+
+_Rule = TypeVar("_Rule")
+
+
+def _recorded(rule: _Rule, constants: Mapping[str, object]) -> _Rule:
+    changes = {}
+    for field in fields(rule):  # type: ignore[arg-type]  # every rule is a dataclass
+        default = getattr(rule, field.name)
+        value = constants.get(f"{type(rule).__module__}.{type(rule).__qualname__}.{field.name}")
+        if isinstance(value, list):
+            value = tuple(value)
+        if type(value) is type(default):
+            changes[field.name] = value
+    return replace(rule, **changes)  # type: ignore[type-var]  # as above
+
+
+def different_constants(recorded: Mapping[str, object]) -> list[str]:
+    """Return where a session's numbers differ from those that its replay has, a text each.
+
+    The rules that `recorded_rules` takes over are not among them; nor is any number of a session
+    that holds none.
+    """
+    if not recorded:
+        return []
+    present = slam_constants()
+    taken_over = recorded_rules(recorded)
+    for rule in _RULES:
+        values = getattr(taken_over, rule.name)
+        kind = type(values)
+        for field in fields(kind):
+            number = _as_json(getattr(values, field.name))
+            if number is not None:
+                present[f"{kind.__module__}.{kind.__qualname__}.{field.name}"] = number
+    return [
+        f"{name} {_text(recorded.get(name))}, here {_text(present.get(name))}"
+        for name in sorted({*recorded, *present})
+        if _text(recorded.get(name)) != _text(present.get(name))
+    ]
+
+
+def _text(value: object) -> str:
+    return "none" if value is None else json.dumps(value)
