@@ -76,6 +76,7 @@ def record_session(
             outlines_m=outlines_m(scene),
             simulated=has_truth,
             started_unix_ns=None if has_truth else STARTED_UNIX_NS,
+            odometry_clock="" if has_truth else "monotonic",
         )
         truth = trajectory.poses if has_truth else _unknown
         log = SessionLog(path, info, odometry, truth_at=truth if has_truth else None)

@@ -353,15 +353,15 @@ _COMMANDS = (
         "slam.app.commands.view:run_view",
         "show a session in Rerun: window, browser, file or picture",
         _add_view,
-        "Replays a session into a Rerun view. Without an option a window opens.",
+        "Shows a recorded session in Rerun, as its run saw it. Without an option a window opens.",
     ),
     _Command(
         "report",
         "slam.app.commands.report:run_report",
         "write a session's report as one HTML page",
         _add_report,
-        "Replays a session and writes map, trajectory, errors, consistency, link "
-        "statistics and parameters into one page that any browser opens without a network.",
+        "Writes map, trajectory, errors, consistency, link statistics and parameters of a "
+        "recorded session into one page that any browser opens without a network.",
     ),
     _Command(
         "run",

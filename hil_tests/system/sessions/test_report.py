@@ -119,6 +119,7 @@ def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
     assert "simulated" not in page
     assert "The truth of this drive is unknown" in page
     assert "begun 2026-09-21 14:13:20 UTC" in page
+    assert "odometry clock: monotonic" in page
     assert "ATE" not in page
     assert "nearest truth" not in page
     assert "Errors over time" not in page

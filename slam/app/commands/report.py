@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from slam.app.commands.view import refuse_overwriting, session_file
+from slam.app.commands.view import play, refuse_overwriting, session_file
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
@@ -32,7 +32,7 @@ from slam.app.run.evaluation import (
     summarise,
     world_from_odom,
 )
-from slam.app.run.output import Progress, print_text, run_rows, summary_rows
+from slam.app.run.output import print_text, run_rows, summary_rows
 from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
@@ -43,8 +43,7 @@ from slam.app.run.pictures import (
     label,
     svg_of,
 )
-from slam.app.run.replay import recorded_source
-from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord, RunSource, execute
+from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
@@ -324,18 +323,22 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     AppError
         The session cannot be replayed, or no state was estimated in it.
     """
-    source = recorded_source(session, stop)
     data = _ReportData(session.info)
-    record = execute(source, [Progress(session.info, None, source.lost_frames), data])
+    record = play(session, [data], stop)
     if record.last is None:
         raise AppError(f"{session.path}: no state was estimated, the robot did not move")
     info = session.info
-    summary = summarise(record, info, source.rig)
+    summary = summarise(record, info, session.rig)
     seed = "" if info.seed is None else f", seed {info.seed}"
     page = _Page(f"{info.scene}, preset {info.preset}{seed}")
     page.note("simulated data" if info.simulated else "measured data", kind="origin")
     page.note(_what_it_is(session, data))
-    _write_numbers(page, source, record, summary)
+    if record.last.step is None:
+        page.note(
+            "It was recorded by a version that did not keep what led to the states, so the report "
+            "has no NIS of true associations, no band of the NIS and no walls."
+        )
+    _write_numbers(page, info, data, record, summary)
     series = data.series()
     page.heading("Map and trajectory")
     page.picture(
@@ -361,16 +364,21 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
 
 
 def _write_numbers(
-    page: _Page, source: RunSource, record: RunRecord, summary: Summary | None
+    page: _Page,
+    info: SessionInfo,
+    data: _ReportData,
+    record: RunRecord,
+    summary: Summary | None,
 ) -> None:
     page.heading("Numbers")
-    lost_frames = source.lost_frames()
-    driven = run_rows(source.info, record, lost_frames)
+    lost_frames = sum(count.lost for count in data.links.counts.values())
+    driven = run_rows(info, record, lost_frames)
     if summary is None:
         page.note("The truth of this drive is unknown, so there are no errors.")
         page.numbers(driven)
         return
-    lag_states = source.slam.config.window.size - 1
+    window = json.loads(info.config_json or "{}").get("window", {})
+    lag_states = int(window.get("size", 1)) - 1
     rows = summary_rows(
         summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
     )
@@ -481,8 +489,11 @@ def _what_it_is(session: RecordedSession, data: _ReportData) -> str:
     info = session.info
     parts = [f"{session.path.name}: {data.duration_s:.1f} s of {len(info.radars)} radars"]
     if info.started_unix_ns is not None:
-        began = datetime.fromtimestamp(info.started_unix_ns / NS_PER_S, UTC)
+        first_ns = info.started_unix_ns + (data.start_ns or 0)
+        began = datetime.fromtimestamp(first_ns / NS_PER_S, UTC)
         parts.append(f"begun {began:%Y-%m-%d %H:%M:%S} UTC")
+    if info.odometry_clock:
+        parts.append(f"odometry clock: {info.odometry_clock}")
     if "xethru-hil" in info.versions:
         parts.append(f"xethru-hil {info.versions['xethru-hil']}")
     if session.cut_at_byte is not None:

@@ -1,7 +1,7 @@
 """`uwb-slam view`: a recorded session in Rerun, in a window, a browser, a file or a picture.
 
-A session is replayed into the view, so it shows what the run itself would have shown, whatever
-version of Rerun the run had. An .rrd is opened as it is. Rerun's API to control a viewer is
+What a session recorded is shown as the run itself would have shown it, whatever version of Rerun
+the run had; SLAM does not run again. An .rrd is opened as it is. Rerun's API to control a viewer is
 experimental: it is used in this file only.
 """
 
@@ -10,16 +10,18 @@ from __future__ import annotations
 import io
 import tempfile
 import time
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
 from PIL import Image
 
 from slam.app.errors import AppError, UsageError, naming
-from slam.app.records import SessionObserver
+from slam.app.records import SessionObserver, Snapshot
 from slam.app.run.output import Progress, note, print_text
+from slam.app.run.recorded import play_states
 from slam.app.run.replay import recorded_source
-from slam.app.run.runner import RunSource, execute
+from slam.app.run.runner import LostFrames, RunRecord, execute
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
@@ -69,6 +71,8 @@ def is_finished(path: Path) -> bool:
 
 _SETTLE_LIMIT_S = 30.0
 _PERIOD_S = 0.5
+_ENDING_S = 2.0
+"""A viewer without a graphics driver drops its connections before it has ended."""
 _PALETTE = 256
 _MENU_PIXELS = 36
 """The viewer's own bar on top, which names the machine that drew it."""
@@ -90,6 +94,7 @@ def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -
         try:
             picture = _settled(process, rrd, at_s, stop)
         except (ConnectionError, RuntimeError, TimeoutError) as error:
+            process.require_alive(_ENDING_S)  # or its end is the reason
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise AppError(f"{rrd}: the viewer gave no picture: {reason}") from None
     with Image.open(io.BytesIO(picture)) as full:
@@ -169,8 +174,7 @@ def run_view(
             _take_screenshot(made, screenshot, at_s, stop)
     else:
         with LiveView(where, stop, is_replay=True) as live:
-            source = recorded_source(recorded, stop)
-            _replay(recorded, source, live.observer(recorded.info))
+            play(recorded, [live.observer(recorded.info)], stop)
             live.keep_serving()
 
 
@@ -205,19 +209,39 @@ def refuse_overwriting(recorded: Path, out: Path | None) -> None:
 
 
 def _write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
-    """Replay a session into an .rrd file."""
+    """Write a session as an .rrd file, which replaces an earlier one when it is whole."""
     from slam.app.view.panels import RerunView  # half a second, loaded only if needed
 
-    source = recorded_source(session, stop)  # before an existing file is replaced
-    with naming(path):
-        path.open("wb").close()  # Rerun's own message would not name the remedy
-    _replay(session, source, RerunView(path, session.info))
+    with naming(path), written_whole(path) as fresh:
+        fresh.open("wb").close()  # Rerun's own message would not name the remedy
+        play(session, [RerunView(fresh, session.info, called=str(path))], stop)
 
 
-def _replay(session: RecordedSession, source: RunSource, view: SessionObserver) -> None:
-    execute(source, [Progress(source.info, None, source.lost_frames), view])
+def play(session: RecordedSession, sinks: Sequence[SessionObserver], stop: StopFlag) -> RunRecord:
+    """Give what was recorded to sinks, with a progress line.
+
+    A session without a state, such as an imported one, goes through SLAM first.
+
+    Raises
+    ------
+    AppError
+        The file is damaged other than by being cut, or has no state and cannot be replayed.
+    """
+    lost = LostFrames()
+    progress = Progress(session.info, None, lambda: lost.n_lost, end_ns=session.end_ns)
+    if _has_state(session, stop):
+        record = play_states(session, [lost, progress, *sinks], stop)
+    else:
+        note(f"{session.path} holds no state of SLAM, so SLAM runs over its frames")
+        record = execute(recorded_source(session, stop), [lost, progress, *sinks])
     if session.cut_at_byte is not None:
-        note(
-            f"{session.path} was cut at byte {session.cut_at_byte}; "
-            "the view shows what is left of it"
-        )
+        note(f"{session.path} was cut at byte {session.cut_at_byte}; this is what is left of it")
+    return record
+
+
+def _has_state(session: RecordedSession, stop: StopFlag) -> bool:
+    for record in session.records():
+        stop.check()
+        if isinstance(record, Snapshot):
+            return True
+    return False

@@ -37,6 +37,8 @@ class Progress(SessionObserver):
         Session time the run will cover; None if unknown.
     lost_frames, also
         Called when a line is shown; `also` returns text to add.
+    end_ns
+        Session time at which a recorded run ends; None if unknown.
     """
 
     def __init__(
@@ -46,8 +48,10 @@ class Progress(SessionObserver):
         lost_frames: Callable[[], int],
         *,
         also: Callable[[], str] = str,
+        end_ns: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._end_ns = end_ns
         self._n_radars, self._duration_ns = max(len(info.radars), 1), duration_ns
         self._lost_frames, self._also, self._clock = lost_frames, also, clock
         self._is_terminal = STDERR.is_terminal
@@ -63,6 +67,8 @@ class Progress(SessionObserver):
         self._n_frames += len(scan.frames)
         if self._start_ns is None:  # in the real world session time begins anywhere
             self._start_ns = 0 if self._duration_ns is not None else scan.t_ns
+            if self._end_ns is not None:
+                self._duration_ns = self._end_ns - self._start_ns
         self._t_ns = scan.t_ns - self._start_ns
         if self._clock() - self._shown >= self._period_s:
             self._show()

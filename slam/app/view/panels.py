@@ -404,6 +404,8 @@ class RerunView(SessionObserver):
         Live: longest time that a row waits before it is sent; None for full blocks only.
     clock_s
         Monotonic, for `flush_s`.
+    called
+        What messages call the file, if it gets its name later.
     time_of_day_ns
         Live: the clock for scans that arrive without a time of arrival; None leaves it unknown.
 
@@ -418,6 +420,7 @@ class RerunView(SessionObserver):
         target: Path | str,
         info: SessionInfo,
         *,
+        called: str | None = None,
         flush_s: float | None = None,
         clock_s: Callable[[], float] = time.monotonic,
         time_of_day_ns: Callable[[], int] | None = None,
@@ -437,6 +440,7 @@ class RerunView(SessionObserver):
             recording_id=f"{info.scene}-{info.preset}{seed}",
             name=f"{info.scene}, preset {info.preset}{of_seed}",
             start_ns=info.started_unix_ns or 0,
+            called=called,
         )
         text = rr.TextDocument(about(info), media_type=rr.MediaType.MARKDOWN)
         self._recording.static("about", text)

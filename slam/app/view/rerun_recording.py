@@ -114,6 +114,8 @@ class Recording:
         The same for the same run: a file written twice is the same.
     name, start_ns
         What viewers call it, and when it began, since 1970.
+    called
+        What messages call the file; None: its path.
 
     Attributes
     ----------
@@ -135,9 +137,10 @@ class Recording:
         recording_id: str,
         name: str,
         start_ns: int,
+        called: str | None = None,
     ) -> None:
         rr.set_strict_mode(True)
-        self._target = target
+        self._target, self._called = target, called or str(target)
         self.epoch_ns = 0
         self.sent: dict[str, int] = defaultdict(int)
         # Never `with` this stream: leaving the block closes the file and drops what follows.
@@ -151,7 +154,7 @@ class Recording:
                 self._stream.save(target, default_blueprint=blueprint)
             except RuntimeError as error:  # Rerun's own, with the system's message at its end
                 reason = str(error).rpartition(": ")[2]
-                raise AppError(f"{target}: cannot be written: {reason}") from None
+                raise AppError(f"{self._called}: cannot be written: {reason}") from None
         else:
             self._stream.connect_grpc(target, default_blueprint=blueprint)
         self._stream.send_recording_name(name)
@@ -199,7 +202,7 @@ class Recording:
         if closing.is_alive():
             rr.unregister_shutdown()  # or it waits once more when the interpreter ends
             if is_file:
-                raise AppError(f"{self._target}: cannot be finished; is the disk full?")
+                raise AppError(f"{self._called}: cannot be finished; is the disk full?")
         elif isinstance(self._target, Path):
             self._check_rows(self._target)
 
@@ -207,11 +210,11 @@ class Recording:
         try:
             found = count_rows(path)
         except RuntimeError:  # Rerun's own errors about a damaged file
-            raise AppError(f"{path}: is incomplete; is the disk full?") from None
+            raise AppError(f"{self._called}: is incomplete; is the disk full?") from None
         for entity, count in self.sent.items():
             if found.get(entity, 0) != count:
                 raise AppError(
-                    f"{path}: holds {found.get(entity, 0)} of {count} rows of {entity}; "
+                    f"{self._called}: holds {found.get(entity, 0)} of {count} rows of {entity}; "
                     "the view is incomplete, the session log is not affected"
                 )
 

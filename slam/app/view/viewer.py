@@ -115,7 +115,7 @@ class ViewerProcess:
         for port in ports:
             while not _listens(port):
                 stop.check()
-                self._require_alive()
+                self.require_alive()
                 if time.monotonic() > give_up:
                     raise AppError(f"the Rerun viewer did not listen within {_START_LIMIT_S:g} s")
                 time.sleep(_POLL_S)
@@ -123,14 +123,18 @@ class ViewerProcess:
             settled = time.monotonic() + _SETTLE_S
             while time.monotonic() < settled:
                 stop.check()
-                self._require_alive()
+                self.require_alive()
                 time.sleep(_POLL_S)
 
-    def _require_alive(self) -> None:
+    def require_alive(self, ending_s: float = 0.0) -> None:
+        """Raise AppError if the viewer has ended, or does so within this time."""
+        if self._process is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(timeout=ending_s)
         if self.has_ended:
             raise AppError(
-                "the Rerun viewer ended at once: it found no graphics driver; "
-                "install Vulkan's software driver (Debian: mesa-vulkan-drivers), "
+                "the Rerun viewer ended at once: a Vulkan driver is missing; install one such as "
+                "Mesa's lavapipe, which needs no graphics card (Debian: mesa-vulkan-drivers), "
                 "or let a browser show it (--rerun serve-web, view --web)"
             )
 
