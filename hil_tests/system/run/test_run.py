@@ -1,9 +1,11 @@
 """`uwb-slam run` as a user runs it: an emulator in real time, four ports, odometry beside them."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,6 +116,10 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
     used = [scan for scan, _ in session.scans() if scan.used]
     assert summary["frames"] == sum(len(scan.frames) for scan in used) > 0
     assert session.info.time_base == "arrival"
+    assert session.info.odometry_clock == "arrival"
+    assert session.info.started_unix_ns is not None
+    arrived_ns, stamp_ns = used[0].host_ns[0], used[0].frames[0].t_ns
+    assert abs(arrived_ns - stamp_ns - session.info.started_unix_ns) < seconds(1) * 1e9
     assert {row[0] for row in session.wire()} == {m.name for m in session.rig.mounts}
 
 
@@ -157,6 +163,41 @@ def test_a_signal_leaves_a_session_that_replays(
         ).read_bytes()
     n_again = len((tmp_path / "again" / "estimate.tum").read_text().splitlines())
     assert n_again > 5
+
+
+def test_a_run_whose_slam_is_too_slow_ends_at_once_with_all_results(
+    robot: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each step takes 0.8 s, so four of five scans have to be dropped; Ctrl-C before ten steps."""
+    out = tmp_path / "out"
+    command = run_command(robot, out, "--odometry", robot.odometry)
+    command[command.index("slam.app.cli")] = "hil_tests.system.run.slow_slam"
+    with subprocess.Popen(
+        command,
+        env=os.environ | {"SLOW_SLAM_S": "0.8"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        session = out / "session.mcap"
+        wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
+        wait_until(lambda: not all(s.used for s, _ in open_session(session).scans()), process)
+        began_s = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        printed, said = process.communicate(timeout=seconds(30))
+        took_s = time.monotonic() - began_s
+    assert process.returncode == 130
+    assert took_s < seconds(2)
+    assert "SLAM cannot keep up with the radars" in said
+    names = {"session.mcap", "map.png", "summary.json", "estimate.tum", "odometry.tum"}
+    assert {path.name for path in out.iterdir()} == names
+    rows = {line.split("  ")[0]: line.split() for line in printed.splitlines()}
+    scans = [scan for scan, _ in open_session(session).scans()]
+    unused = sum(not scan.used for scan in scans)
+    assert int(rows["dropped"][1]) + int(rows["left out"][2]) == unused > 0
+    assert "recorded states came again, to the last bit" in replayed(
+        out, tmp_path / "again", capsys
+    )
 
 
 def test_what_cannot_begin_says_why_in_one_line(

@@ -60,6 +60,7 @@ class ScriptedDriver:
     def __init__(self, *steps: object) -> None:
         self.steps = list(steps)
         self.reconnects: list[object] = []
+        self.is_closed = False
 
     def read_frame(self, timeout_s: float) -> Frame:
         if not self.steps:
@@ -71,6 +72,9 @@ class ScriptedDriver:
         assert isinstance(step, int)
         samples = np.zeros(4, dtype=np.float32)
         return Frame(counter=step, samples=samples, geometry=GEOMETRY, arrival_ns=step)
+
+    def close(self) -> None:
+        self.is_closed = True
 
     def reconnect(self, timeout_s: float) -> str:
         answer = self.reconnects.pop(0) if self.reconnects else Disconnected("gone")
@@ -108,6 +112,7 @@ def test_a_radar_that_vanishes_is_looked_for_until_it_is_back(
     driver = ScriptedDriver(7, 8, Disconnected("unplugged"), 9)
     driver.reconnects = [Disconnected("not yet"), Disconnected("not yet"), "found"]
     events = told_until([link_of(driver)], silent_fifo, lambda events: len(events) == 5)
+    assert driver.is_closed
     assert [event[2].counter for event in events if event[0] == "frame"] == [7, 8, 9]
     assert events[2:4] == [("lost", 0, "unplugged"), ("back", 0, "somewhere else")]
 

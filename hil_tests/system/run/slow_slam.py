@@ -1,0 +1,34 @@
+"""`uwb-slam` with SLAM slowed down: each step sleeps as long as `SLOW_SLAM_S` says, in seconds."""
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from slam.app.cli import main
+from slam.app.commands import run
+from slam.frames import RadarFrame
+from slam.results import PoseAt, Slam, StepResult
+
+
+class SlowSlam:
+    def __init__(self, slam: Slam) -> None:
+        self._slam = slam
+        self.config, self.step_detections = slam.config, slam.step_detections
+        self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        time.sleep(float(os.environ["SLOW_SLAM_S"]))
+        return self._slam.step(frames, pose_at, t_ns)
+
+
+def make_slow_slam(*of_slam: Any) -> Slam:  # noqa: ANN401 - passed on
+    return SlowSlam(make_slam(*of_slam))
+
+
+if __name__ == "__main__":
+    make_slam, run.make_slam = run.make_slam, make_slow_slam
+    sys.exit(main())
