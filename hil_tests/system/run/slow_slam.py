@@ -5,9 +5,11 @@ import sys
 import time
 from collections.abc import Sequence
 from typing import Any
+from unittest.mock import patch
 
 from slam.app.cli import main
 from slam.app.commands import run
+from slam.app.run.runner import make_slam
 from slam.frames import RadarFrame
 from slam.results import PoseAt, Slam, StepResult
 
@@ -30,5 +32,5 @@ def make_slow_slam(*of_slam: Any) -> Slam:  # noqa: ANN401 - passed on
 
 
 if __name__ == "__main__":
-    make_slam, run.make_slam = run.make_slam, make_slow_slam
-    sys.exit(main())
+    with patch.object(run, "make_slam", make_slow_slam):
+        sys.exit(main())
