@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import termios
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -85,7 +85,12 @@ class Command:
 
 @contextmanager
 def in_terminal(
-    module: str, arguments: Sequence[object], crashes: Path, *, ignores_hangup: bool = False
+    module: str,
+    arguments: Sequence[object],
+    crashes: Path,
+    *,
+    ignores_hangup: bool = False,
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[Command]:
     """Run ``python -m module arguments`` in a terminal of its own; kill it at the end.
 
@@ -107,6 +112,7 @@ def in_terminal(
             stdin=terminal,
             stdout=terminal,
             stderr=terminal,
+            env={**os.environ, **(environment or {})},
             start_new_session=True,
             preexec_fn=lead_the_session,
         )

@@ -9,14 +9,14 @@ from pathlib import Path
 
 from slam.app.convert.matlab import convert_mat, write_detections
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
-from slam.app.errors import AppError, UsageError
+from slam.app.errors import AppError, UsageError, naming
 from slam.app.rig.files import load_rig
 from slam.app.run.output import note, print_text
 from slam.app.run.replay import recorded_config
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import PathInUseError, StopFlag, locked
 
 
 def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
@@ -51,7 +51,6 @@ def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: St
 
 
 _SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
-_FILE_SUFFIXES = (_SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX, ".bag")  # any other is a folder
 _PRESET = "robust"
 _MAT_PRESET = "paper"  # such ranges are of its front end: they scatter by a bin, 7 mm
 
@@ -76,8 +75,8 @@ def run_convert(
         raise AppError(f"{out}: exists; choose another name")
     warnings: list[str] = []
     if source.suffix == _SESSION_SUFFIX and out.suffix != _SESSION_SUFFIX:
-        with _removing(out):
-            result = _from_session(open_session(source), out, preset, radar, stop)
+        with _whole(out) as fresh:
+            result = _from_session(open_session(source), fresh, preset, radar, stop)
     elif out.suffix != _SESSION_SUFFIX:
         raise UsageError(
             f"{out}: of a bag or MATLAB file a session is made; give a name that ends in .mcap"
@@ -92,13 +91,15 @@ def run_convert(
         name = preset or (_MAT_PRESET if is_mat else _PRESET)
         _config(name)  # reports a wrong name before anything is read
         given_rig = None if rig is None else load_rig(rig).rig
-        with _removing(out):
+        with _whole(out) as fresh:
             if is_mat:
-                result = convert_mat(source, out, stop, preset=name, rig=given_rig, rate_hz=rate_hz)
+                result = convert_mat(
+                    source, fresh, stop, preset=name, rig=given_rig, rate_hz=rate_hz
+                )
             else:
                 result, warnings = convert_bag(
                     source,
-                    out,
+                    fresh,
                     stop,
                     preset=name,
                     rig=given_rig or AUTHORS_RIG,
@@ -107,7 +108,7 @@ def run_convert(
                 )
     for line in warnings:
         note(f"{source}: {line}")
-    print_text(str(result))
+    print_text(result.replace(str(fresh), str(out)))
 
 
 def _is_session(path: Path) -> bool:
@@ -119,16 +120,36 @@ def _is_session(path: Path) -> bool:
 
 
 @contextmanager
-def _removing(out: Path) -> Iterator[None]:
-    """Remove the file or folder that was begun where the block fails."""
+def _whole(out: Path) -> Iterator[Path]:
+    """Give the block a path for a file or folder, which gets its name once it is whole.
+
+    What the block has begun is removed where it fails; what a killed one has begun, next time.
+    """
+    folder = out.with_name(f".unfinished.{out.name}")
+    fresh = folder / out.name
     try:
-        yield
-    except BaseException:
-        if out.is_dir() and out.suffix not in _FILE_SUFFIXES:  # a bag of ROS 2
-            shutil.rmtree(out, ignore_errors=True)
+        with naming(out):
+            folder.mkdir(parents=not out.suffix, exist_ok=True)
+            with locked(folder):
+                try:
+                    _empty(folder)
+                    yield fresh
+                    fresh.rename(out)
+                finally:
+                    _empty(folder)
+                    folder.rmdir()
+    except PathInUseError:
+        raise AppError(f"{out}: another conversion is writing it; wait for its end") from None
+    except AppError as error:
+        raise type(error)(str(error).replace(str(fresh), str(out))) from None
+
+
+def _empty(folder: Path) -> None:
+    for path in folder.iterdir():
+        if path.is_dir():  # a bag of ROS 2
+            shutil.rmtree(path)
         else:
-            out.unlink(missing_ok=True)
-        raise
+            path.unlink()
 
 
 def _from_session(
