@@ -22,7 +22,6 @@ from xethru_protocol.system import (
     STDERR,
     STDOUT,
     StopFlag,
-    StopRequestedError,
     each_line,
     flush_streams,
     json_text,
@@ -325,12 +324,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
-    try:
-        with stop.at_once():  # the imports take most of a second
-            # heavy, and only now: --help and usage errors answer at once
-            from emulator import serving
-    except StopRequestedError:
-        return 0
+    with stop.leaving(0):  # the imports take most of a second
+        # heavy, and only now: --help and usage errors answer at once
+        from emulator import serving
     start = {"serve": serving.serve, "play": serving.play, "proxy": serving.proxy}
     try:
         start[arguments.command](arguments, stop, _warn)

@@ -129,6 +129,7 @@ class StopFlag:
         self._second = second
         self._previous: dict[signal.Signals, Any] = {}
         self._at_once = False
+        self._leave: Callable[[signal.Signals], None] | None = None
         self._end: Callable[[], None] | None = None
 
     def __enter__(self) -> Self:
@@ -158,6 +159,28 @@ class StopFlag:
         finally:
             self._at_once = False
 
+    @contextmanager
+    def leaving(self, exit_code: int | None = None, *, program: str = "") -> Iterator[None]:
+        """Let a signal end the process where it arrives: for imports, before anything is begun.
+
+        An exception would not do: modules written in C report another in its place. The exit code
+        is that of the signal if none is given; with ``program``, standard error gets a line.
+        """
+
+        def leave(which: signal.Signals) -> None:
+            stopped = StopRequestedError(which)
+            if program:
+                STDERR.write_soon(f"{program}: {stopped}\n")
+            os._exit(stopped.exit_code if exit_code is None else exit_code)
+
+        try:
+            self._leave = leave
+            if self.received is not None:
+                leave(self.received)
+            yield
+        finally:
+            self._leave = None
+
     def attach(self, end: Callable[[], None]) -> None:
         """Call ``end`` at every request; at once if there was one already."""
         self._end = end
@@ -175,6 +198,8 @@ class StopFlag:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         which = signal.Signals(number)
         self.received = which
+        if self._leave is not None:
+            self._leave(which)
         if self._second == "default":
             signal.signal(which, signal.SIG_IGN if which is signal.SIGHUP else signal.SIG_DFL)
         elif self._second == "previous":

@@ -115,7 +115,7 @@ class _Command(NamedTuple):
     def start(self, arguments: argparse.Namespace, stop: StopFlag) -> None:
         module, _, name = self.function.partition(":")
         options: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k != "command"}
-        with stop.at_once():  # imports take seconds, and nothing was begun
+        with stop.leaving(program="uwb-slam"):  # imports take seconds
             function = getattr(import_module(module), name)
         function(stop, **options)
 

@@ -20,7 +20,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     stop = StopFlag("same")
     try:
         with stop, stop.at_once():
-            code = _run(argv)
+            code = _run(argv, stop)
         stop.check()  # a terminal that closes also takes no more output, which is a failure
     except KeyboardInterrupt:  # before the handlers were installed
         return 130
@@ -31,17 +31,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _run(argv: Sequence[str] | None) -> int:
-    from xethru_protocol.cli.arguments import parse
-    from xethru_protocol.cli.output import warn
-    from xethru_protocol.wire.errors import XeThruError
+def _run(argv: Sequence[str] | None, stop: StopFlag) -> int:
+    with stop.leaving():
+        from xethru_protocol.cli.arguments import parse
+        from xethru_protocol.cli.output import warn
+        from xethru_protocol.wire.errors import XeThruError
 
     code = _BY_A_SIGNAL
     try:
         arguments = parse(argv)
         try:
             file, _, function = arguments.run.partition(":")
-            run = getattr(import_module(f"xethru_protocol.cli.{file}"), function)
+            with stop.leaving():
+                run = getattr(import_module(f"xethru_protocol.cli.{file}"), function)
             code = run(arguments)
         except XeThruError as error:
             warn(f"xethru {arguments.command}: {error}")

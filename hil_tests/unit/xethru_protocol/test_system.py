@@ -364,3 +364,25 @@ def test_a_reader_that_has_ended_is_told_from_other_failures(
         assert isinstance(outlet.failure, BrokenPipeError)
         monkeypatch.undo()
     assert outlet.failure is None  # of the stream that is standard output now
+
+
+@pytest.mark.parametrize(("exit_code", "expected"), [(None, 143), (0, 0)])
+@pytest.mark.parametrize("is_early", [False, True])
+def test_a_signal_during_imports_ends_the_process_whatever_they_catch(
+    exit_code: int | None, expected: int, is_early: bool
+) -> None:
+    """As numpy does, which makes an ImportError of any error in its C code."""
+    kill = "os.kill(os.getpid(), signal.SIGTERM)\n"
+    code = (
+        "import os, signal\n"
+        "from xethru_protocol.system import StopFlag\n"
+        "with StopFlag() as stop:\n"
+        f"    {kill if is_early else ''}\n"
+        f"    with stop.leaving({exit_code}, program='xethru'):\n"
+        "        try:\n"
+        f"            {kill}\n"
+        "        except BaseException as error:\n"
+        "            raise ImportError('cannot import') from error\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (expected, "xethru: stopped by SIGTERM\n")

@@ -61,8 +61,7 @@ def run_demo(
         kept = f"; what was recorded is in {out}"
         with ExitStack() as stack:
             emulator = stack.enter_context(EmulatorProcess(scene, seed))
-            with stop.at_once():
-                from slam.app.view.panels import RerunView  # a second, while the emulator starts
+            from slam.app.view.panels import RerunView  # a second, while the emulator starts
 
             emulator.wait_until_ready(stop)
             odometry = read_odometry_socket(emulator.odometry_socket)

@@ -72,7 +72,7 @@ def run_experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
     name, out = arguments.name, arguments.out
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
-    with stop.at_once():  # imports take seconds
+    with stop.leaving(program="uwb-slam"):  # imports take seconds
         module = import_module(f"slam.app.experiments.{EXPERIMENTS[name].module}")
     result: Result = module.run(arguments, stop)
     # heavy, see module text
