@@ -29,13 +29,25 @@ def photograph(page: Path, out: Path, *, width: int = 1000, height: int = 1640) 
     RuntimeError
         It made no picture; with its last words.
     """
+    size, shot = f"--window-size={width},{height}", f"--screenshot={out.resolve()}"
+    last_words = _run(page, "--hide-scrollbars", size, shot).stderr[-500:]
+    if not out.is_file():
+        raise RuntimeError(f"the browser made no picture: {last_words}")
+
+
+def contents_of(page: Path) -> str:
+    """Return a page after its scripts have run; raises as `photograph`."""
+    # time goes as fast as the page allows, so that its frames are loaded
+    return _run(page, "--virtual-time-budget=10000", "--dump-dom").stdout
+
+
+def _run(page: Path, *options: str) -> subprocess.CompletedProcess[str]:
     browser = find_browser()
     if browser is None:
         raise FileNotFoundError(f"none of {', '.join(_NAMES)} is installed")
     with tempfile.TemporaryDirectory() as profile:
-        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", *options]
         command += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={profile}"]
-        command += [f"--window-size={width},{height}", f"--screenshot={out.resolve()}"]
         run = subprocess.run(
             [*command, page.resolve().as_uri()],
             capture_output=True,
@@ -43,8 +55,9 @@ def photograph(page: Path, out: Path, *, width: int = 1000, height: int = 1640) 
             timeout=_LIMIT_S,
             check=False,
         )
-    if run.returncode or not out.is_file():
-        raise RuntimeError(f"{browser} made no picture: {run.stderr[-500:]}")
+    if run.returncode:
+        raise RuntimeError(f"{browser} ended with {run.returncode}: {run.stderr[-500:]}")
+    return run
 
 
 def squeeze(png: Path) -> None:

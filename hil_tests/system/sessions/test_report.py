@@ -1,6 +1,8 @@
 """`uwb-slam report`: one page with everything inside, the run's numbers, legible in a browser."""
 
 import base64
+import html
+import json
 import re
 from dataclasses import dataclass
 from html.parser import HTMLParser
@@ -9,7 +11,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from hil_tests.browser import find_browser, photograph
+from hil_tests.browser import contents_of, find_browser, photograph
 from hil_tests.system.recorded_session import record_session
 from slam.app.cli import main
 from slam.app.view.rerun_recording import count_rows
@@ -58,7 +60,7 @@ def test_the_page_loads_nothing_from_elsewhere(reported: Reported) -> None:
     addresses = Addresses()
     addresses.feed(reported.text)
     assert addresses.tags.isdisjoint({"script", "link", "iframe", "object", "embed", "base"})
-    assert len(addresses.found) == 4  # map, errors, consistency, links
+    assert len(addresses.found) == 8  # map, errors, consistency, links; each wide and narrow
     for address in addresses.found:
         kind, _, data = address.partition(",")
         assert kind == "data:image/svg+xml;base64"
@@ -85,12 +87,12 @@ def test_the_numbers_are_those_of_a_replay(reported: Reported, tmp_path: Path) -
 def test_a_lost_frame_and_a_fault_are_told_and_escaped(reported: Reported) -> None:
     row = re.findall(r"<tr><td>rear_left</td>(.*?)</tr>", reported.text)[0]
     cells = re.findall(r"<td>(.*?)</td>", row)
-    assert cells[4].startswith("1 (")  # lost
-    assert cells[5:] == ["1", "1"]  # most in a row, faults
+    assert cells[3].startswith("1 (")  # lost
+    assert cells[4:6] == ["1", "1"]  # most in a row, faults
     assert "Warnings: 1<" in reported.text
     assert "CRC of 5731 bytes &lt;does not fit&gt;" in reported.text
     others = re.findall(r"<tr><td>front_left</td>(.*?)</tr>", reported.text)[0]
-    assert re.findall(r"<td>(.*?)</td>", others)[4:] == ["0 (0.00 %)", "0", "0"]
+    assert re.findall(r"<td>(.*?)</td>", others)[3:6] == ["0 (0.00 %)", "0", "0"]
 
 
 def test_the_same_session_gives_the_same_page(reported: Reported, tmp_path: Path) -> None:
@@ -111,6 +113,40 @@ def test_a_browser_without_network_shows_it(reported: Reported, tmp_path: Path) 
     assert {(255, 243, 214), (31, 111, 208), (194, 37, 92)} <= seen
 
 
+_FRAMES = """\
+<!DOCTYPE html><title>?</title><body></body><script>
+const page = {page}, widths = [];
+for (const width of [1100, 400]) {{
+  const frame = document.createElement("iframe");
+  frame.width = width;
+  frame.onload = () => {{
+    const root = frame.contentDocument.documentElement;
+    const images = [...frame.contentDocument.images].map(image => image.naturalWidth);
+    widths.push([width, root.scrollWidth, ...images]);
+    if (widths.length == 2) document.title = JSON.stringify(widths.sort((a, b) => b[0] - a[0]));
+  }};
+  frame.srcdoc = page;
+  document.body.append(frame);
+}}
+</script>
+"""
+
+
+@pytest.mark.skipif(find_browser() is None, reason="no Chromium is installed")
+def test_nothing_is_wider_than_a_screen_or_a_telephone(reported: Reported, tmp_path: Path) -> None:
+    (tmp_path / "frames.html").write_text(
+        _FRAMES.format(page=json.dumps(reported.text).replace("</", "<\\/")), encoding="utf-8"
+    )
+    dumped = contents_of(tmp_path / "frames.html")
+    wide, narrow = json.loads(html.unescape(re.findall("<title>(.*?)</title>", dumped)[0]))
+    assert wide[0] >= wide[1]  # room and need [px]
+    assert narrow[0] >= narrow[1]
+    # an inch has 96 px: text of 10 points then has 11 px or more on the telephone
+    assert all(width > 900 for width in wide[2:])
+    assert all(400 < width < 440 for width in narrow[2:])
+    assert len(wide) == len(narrow) == 6
+
+
 def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
     record_session(tmp_path / "session.mcap", "robust", has_truth=False)
     assert main(["report", str(tmp_path)]) == 0
@@ -124,7 +160,7 @@ def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
     assert "nearest truth" not in page
     assert "Errors over time" not in page
     pictures = [base64.b64decode(data).decode() for data in re.findall(r'base64,([^"]*)"', page)]
-    assert len(pictures) == 4
+    assert len(pictures) == 8
     assert main(["view", str(tmp_path / "session.mcap"), "--out", str(tmp_path / "v.rrd")]) == 0
     rows = count_rows(tmp_path / "v.rrd")
     assert rows["/map/estimate/path"] > 0

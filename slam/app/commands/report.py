@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from html import escape
@@ -37,6 +37,7 @@ from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
     LINK_COLOURS,
+    NARROW_IN,
     ODOMETRY,
     PALE_INK,
     draw_map,
@@ -157,6 +158,11 @@ img { max-width: 100%; height: auto; display: block; margin: .6rem 0; }
 pre { background: #f6f7f9; padding: .8rem; overflow-x: auto; font-size: .82rem; line-height: 1.35; }
 details { margin: .5rem 0; }
 summary { cursor: pointer; }
+@media (max-width: 600px) {
+  body { margin: 1rem auto; padding: 0 .9rem; }
+  th, td { padding-right: .6rem; }
+  h1, p { overflow-wrap: anywhere; }
+}
 """
 
 
@@ -173,10 +179,20 @@ class _Page:
     def note(self, text: str, kind: str = "note") -> None:
         self._parts.append(f'<p class="{kind}">{escape(text)}</p>')
 
-    def picture(self, svg: str, alt: str) -> None:
-        data = base64.b64encode(svg.encode()).decode()
+    def picture(
+        self,
+        alt: str,
+        draw: Callable[..., None],
+        *arguments: object,
+        height_in: float,
+        narrow_height_in: float,
+    ) -> None:
+        """Add what `draw(figure, *arguments)` draws, drawn anew for narrow screens."""
+        wide = svg_of(draw, *arguments, height_in=height_in)
+        narrow = svg_of(draw, *arguments, height_in=narrow_height_in, width_in=NARROW_IN)
         self._parts.append(
-            f'<img alt="{escape(alt, quote=True)}" src="data:image/svg+xml;base64,{data}">'
+            f'<picture><source media="(max-width: 600px)" srcset="{_address(narrow)}">'
+            f'<img alt="{escape(alt, quote=True)}" src="{_address(wide)}"></picture>'
         )
 
     def numbers(self, rows: Sequence[tuple[str, str, str]]) -> None:
@@ -210,6 +226,10 @@ class _Page:
         )
 
 
+def _address(svg: str) -> str:
+    return f"data:image/svg+xml;base64,{base64.b64encode(svg.encode()).decode()}"
+
+
 def _lines_of(values: Mapping[str, object], prefix: str = "") -> list[str]:
     """Return settings, a line each; nested ones have dotted names."""
     lines = []
@@ -235,11 +255,11 @@ def _draw_errors(figure: Figure, series: _Series) -> None:
         axes = panels[0]
         axes.plot(series.t_s, 1e3 * series.odometry_error_m, color=ODOMETRY, label="wheel odometry")
         axes.plot(series.t_s, 1e3 * series.slam_error_m, color=ESTIMATE, label="radar SLAM")
-        label(axes, "Position error, from the start pose, not aligned", "", "[mm]")
+        label(axes, "Position error, from the start pose, not aligned", "", "error [mm]")
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False, loc="upper left")
     panels[-1].step(series.t_s, series.n_landmarks, color=LANDMARK, where="post")
-    label(panels[-1], "Landmarks on the map", _TIME, "")
+    label(panels[-1], "Landmarks on the map", _TIME, "number [1]")
     panels[-1].set_ylim(bottom=0.0)
     panels[-1].yaxis.set_major_locator(MaxNLocator(integer=True))
 
@@ -255,13 +275,13 @@ def _draw_consistency(figure: Figure, series: _Series) -> None:
     panels[0].plot(
         series.t_s, series.nis_per_dof, linestyle="none", marker=".", markersize=2, color=ESTIMATE
     )
-    label(panels[0], "NIS of associations inside the gate / dof, 95 % band", "", "")
+    label(panels[0], "NIS of associations inside the gate / dof, 95 % band", "", "NIS / dof [1]")
     _scale(panels[0], series.nis_per_dof)
     if has_truth:
         bound = np.array(band_95(POSE_DOF)) / POSE_DOF
         _draw_band(panels[1], series.t_s, np.tile(bound, (len(series.t_s), 1)))
         panels[1].plot(series.t_s, series.nees_per_dof, color=ESTIMATE, linewidth=1.0)
-        label(panels[1], "NEES of the pose in the start frame / 3, 95 % band", "", "")
+        label(panels[1], "NEES of the pose in the start frame / 3, 95 % band", "", "NEES / 3 [1]")
         _scale(panels[1], series.nees_per_dof)
     panels[-1].set_xlabel(_TIME)
 
@@ -289,7 +309,9 @@ def _draw_links(
     for state, colour in LINK_COLOURS.items():
         if state in shown and state is not LinkState.ENDED:
             axes.plot([], [], linewidth=6, color=colour, label=str(state))
-    figure.legend(loc="outside right upper", frameon=False, handlelength=1.0)
+    is_narrow = figure.get_figwidth() <= NARROW_IN
+    place = "outside lower left" if is_narrow else "outside right upper"
+    figure.legend(loc=place, frameon=False, handlelength=1.0, ncols=3 if is_narrow else 1)
 
 
 def _draw_band(axes: Axes, t_s: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
@@ -342,12 +364,21 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     series = data.series()
     page.heading("Map and trajectory")
     page.picture(
-        svg_of(draw_map, info, record, summary, height_in=6.6), "map with paths and landmarks"
+        "map with paths and landmarks",
+        draw_map,
+        info,
+        record,
+        summary,
+        height_in=6.6,
+        narrow_height_in=5.8,
     )
     page.heading("Errors over time" if record.states.has_truth else "Over time")
     page.picture(
-        svg_of(_draw_errors, series, height_in=4.4),
         "position errors and number of landmarks over time",
+        _draw_errors,
+        series,
+        height_in=4.4,
+        narrow_height_in=4.6,
     )
     page.heading("Consistency")
     page.note(
@@ -355,7 +386,11 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         "band 95 % of the time; of one run, states are not independent."
     )
     page.picture(
-        svg_of(_draw_consistency, series, height_in=4.4), "NIS and NEES over time with their bands"
+        "NIS and NEES over time with their bands",
+        _draw_consistency,
+        series,
+        height_in=4.4,
+        narrow_height_in=4.4,
     )
     _write_landmarks(page, info, record.last)
     _write_links(page, info, data)
@@ -424,27 +459,27 @@ def _write_links(page: _Page, info: SessionInfo, data: _ReportData) -> None:
             [
                 radar.name,
                 radar.serial,
-                radar.port,
                 f"{radar.rate_hz:.4f}",
                 str(count.frames),
                 f"{count.lost} ({100.0 * share:.2f} %)",
                 str(count.longest_gap),
                 str(count.faults),
+                radar.port,  # last, as it may be so long that the table scrolls
             ]
         )
     page.table(
-        ["radar", "serial", "port", "frames/s", "frames", "lost", "most in a row", "faults"], rows
+        ["radar", "serial", "frames/s", "frames", "lost", "most in a row", "faults", "port"], rows
     )
     names = [radar.name for radar in info.radars]
+    height_in = 0.9 + 0.35 * len(names)
     page.picture(
-        svg_of(
-            _draw_links,
-            names,
-            data.changes,
-            data.duration_s,
-            height_in=0.9 + 0.35 * len(names),
-        ),
         "state of each link over time",
+        _draw_links,
+        names,
+        data.changes,
+        data.duration_s,
+        height_in=height_in,
+        narrow_height_in=height_in + 0.4,
     )
     if data.warnings:
         lines = [

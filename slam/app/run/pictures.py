@@ -72,10 +72,16 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
             few.save(fresh, format="png", optimize=True)
 
 
-def svg_of(draw: Callable[..., None], *arguments: object, height_in: float) -> str:
+NARROW_IN = 4.4
+"""Width of a picture for a telephone; one that is this narrow has its legend below."""
+
+
+def svg_of(
+    draw: Callable[..., None], *arguments: object, height_in: float, width_in: float = 9.5
+) -> str:
     """Return what `draw(figure, *arguments)` draws as an SVG, the same for the same arguments."""
     with matplotlib.rc_context(STYLE | {"svg.hashsalt": "xethru-hil"}):
-        figure = Figure(figsize=(9.5, height_in), layout="constrained", facecolor="white")
+        figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
         FigureCanvasSVG(figure)
         draw(figure, *arguments)
         drawn = io.StringIO()
@@ -183,9 +189,9 @@ def ellipse_text(enlarged: int) -> str:
     """Return what a legend calls ellipses that are enlarged so many times.
 
     >>> ellipse_text(1), ellipse_text(20)
-    ('95 % ellipse', '95 % ellipse, 20 x')
+    ('95 % ellipse', '95 % ellipse, enlarged 20 x')
     """
-    return "95 % ellipse" if enlarged == 1 else f"95 % ellipse, {enlarged} x"
+    return "95 % ellipse" if enlarged == 1 else f"95 % ellipse, enlarged {enlarged} x"
 
 
 def extent_m(*points_m: NDArray[np.float64]) -> float:
@@ -220,11 +226,12 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     for number, line in enumerate(info.outlines_m):
         name = "wall or box" if number == 0 else None
         axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
-    axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
+    axes.plot(*odometry.T, color=ODOMETRY, linewidth=1.1, alpha=0.9, label="wheel odometry")
     if summary is not None:
-        axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
-    axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
+        axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=4.0, alpha=0.6, label="true path")
+    axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.3, label="radar SLAM")
     _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
+    _draw_robot(axes, compose(place, states.estimate[-1]))
     if len(info.true_landmarks_m):
         axes.plot(
             *info.true_landmarks_m.T,
@@ -239,7 +246,8 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     for number, ends_m in enumerate(last.wall_spans_m):
         name = "estimated wall" if number == 0 else None
         axes.plot(*transform(place, ends_m).T, color=LANDMARK, linewidth=2.0, label=name)
-    _draw_landmarks(axes, last)
+    outlined = [transform(place, last.landmarks_m), estimate, info.true_landmarks_m]
+    _draw_landmarks(axes, last, extent_m(*outlined, *info.outlines_m))
     axes.margins(0.06)
     if summary is None:
         length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
@@ -258,8 +266,18 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
             "drawn from the start pose, while the ATE is after SE(2) alignment; "
             f"last state {1e3 * summary.final_error_m:.0f} mm off"
         )
-    label(axes, title, "x [m]", "y [m]", fontsize=11, pad=24)
+    is_narrow = figure.get_figwidth() <= NARROW_IN
+    if is_narrow:  # a line each for what was driven, and what came of it
+        title = title.replace(": ", ":\n", 1)
+        remark = remark.replace("; ", ";\n")
+    n_lines = remark.count("\n") + 1
+    label(axes, title, "x [m]", "y [m]", fontsize=10 if is_narrow else 11, pad=12 + 12 * n_lines)
     note(axes, remark, (0.0, 1.0), (0.0, 8.0), PALE_INK, xycoords="axes fraction")
+    if is_narrow:
+        figure.legend(
+            loc="outside lower left", ncols=2, frameon=False, handlelength=1.4, columnspacing=1.0
+        )
+        return
     # beside the axes, below a title that may be longer than they are wide
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handlelength=1.6)
 
@@ -268,31 +286,56 @@ def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
     axes.plot(
         *pose[:2],
         linestyle="none",
-        marker=(3, 0, np.degrees(pose[2]) - 90.0),
+        marker="o",
         markersize=11,
+        markerfacecolor="none",
+        markeredgewidth=1.6,
         color="#30343b",
         label="start",
-        zorder=5,
+        zorder=7,
     )
 
 
-def _draw_landmarks(axes: Axes, last: Snapshot) -> None:
-    if not len(last.landmark_ids):
-        return
+def _draw_robot(axes: Axes, pose: NDArray[np.float64]) -> None:
+    axes.plot(
+        *pose[:2],
+        linestyle="none",
+        marker=(3, 0, np.degrees(pose[2]) - 90.0),
+        markersize=10,
+        markeredgecolor="white",
+        markeredgewidth=0.8,
+        color=ESTIMATE,
+        label="last pose",
+        zorder=8,
+    )
+
+
+def _draw_landmarks(axes: Axes, last: Snapshot, map_extent_m: float) -> None:
+    """Draw landmarks, and their and the robot's ellipses, which are enlarged to be visible."""
     place = last.world_from_map
-    points = transform(place, last.landmarks_m)
-    covariances = rotate_covariances(place[2], last.landmark_covariances_m2)
-    outlines = [ellipse_95(*pair) for pair in zip(points, covariances, strict=True)]
+    here = transform(place, last.estimate[:2])[None]
+    points = transform(place, last.landmarks_m).reshape(-1, 2)
+    covariances = rotate_covariances(
+        place[2],
+        np.concatenate([last.landmark_covariances_m2, last.pose_covariance[None, :2, :2]]),
+    )
+    enlarged = enlargement(covariances, map_extent_m)
+    outlines = [
+        ellipse_95(*pair, enlarged=enlarged)
+        for pair in zip(np.concatenate([points, here]), covariances, strict=True)
+    ]
     axes.add_collection(
         PolyCollection(
             outlines,
-            facecolors=(*matplotlib.colors.to_rgb(LANDMARK), 0.14),
-            edgecolors=LANDMARK,
-            linewidths=1.0,
-            label="95 % ellipse",
+            facecolors=[(*matplotlib.colors.to_rgb(LANDMARK), 0.14)] * len(points)
+            + [(*matplotlib.colors.to_rgb(ESTIMATE), 0.14)],
+            edgecolors=[LANDMARK] * len(points) + [ESTIMATE],
+            linewidths=1.2,
             zorder=3,
         )
     )
+    if not len(points):
+        return
     axes.plot(
         *points.T,
         linestyle="none",
@@ -301,6 +344,17 @@ def _draw_landmarks(axes: Axes, last: Snapshot) -> None:
         color=LANDMARK,
         label="estimated landmark",
         zorder=6,
+    )
+    axes.plot(  # the legend's own sample: a collection of two colours has none
+        [],
+        [],
+        linestyle="none",
+        marker="o",
+        markersize=11,
+        markerfacecolor=(*matplotlib.colors.to_rgb(LANDMARK), 0.14),
+        markeredgecolor=LANDMARK,
+        markeredgewidth=1.2,
+        label=ellipse_text(enlarged),
     )
 
 

@@ -116,7 +116,7 @@ def test_ellipses_are_enlarged_as_the_map_says(tmp_path: Path) -> None:
     state = replace(snapshot(0), landmark_covariances_m2=small, pose_covariance=1e-6 * np.eye(3))
     path = drawn(tmp_path, state)
     (text,) = next(rows(path, "/map/landmarks/legend", "Points2D:labels"))[1]
-    times = float(text.removeprefix("95 % ellipse, ").removesuffix(" x"))
+    times = float(text.removeprefix("95 % ellipse, enlarged ").removesuffix(" x"))
     assert times > 1
     _, strips = next(rows(path, "/map/landmarks/ellipses", "LineStrips2D:strips"))
     half_axes = np.ptp(np.array(strips[0]), axis=0) / 2
