@@ -309,9 +309,10 @@ def _draw_links(
     for state, colour in LINK_COLOURS.items():
         if state in shown and state is not LinkState.ENDED:
             axes.plot([], [], linewidth=6, color=colour, label=str(state))
-    is_narrow = figure.get_figwidth() <= NARROW_IN
-    place = "outside lower left" if is_narrow else "outside right upper"
-    figure.legend(loc=place, frameon=False, handlelength=1.0, ncols=3 if is_narrow else 1)
+    if figure.get_figwidth() <= NARROW_IN:
+        figure.legend(loc="outside lower left", frameon=False, handlelength=1.0, ncols=3)
+    else:
+        figure.legend(loc="outside right upper", frameon=False, handlelength=1.0)
 
 
 def _draw_band(axes: Axes, t_s: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
