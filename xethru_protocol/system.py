@@ -73,7 +73,7 @@ def written_whole(path: Path) -> Iterator[Path]:
         with locked(fresh):
             try:
                 yield fresh
-                _sync(fresh)
+                sync(fresh)
                 fresh.replace(target)
             except BaseException:
                 fresh.unlink(missing_ok=True)
@@ -81,10 +81,11 @@ def written_whole(path: Path) -> Iterator[Path]:
     except PathInUseError:
         raise OSError(errno.EBUSY, "another process is writing it") from None
     with suppress(OSError):  # some file systems have no such thing for folders
-        _sync(target.parent)
+        sync(target.parent)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Wait until a file or folder is on disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

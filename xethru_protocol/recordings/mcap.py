@@ -51,6 +51,7 @@ from xethru_protocol.recordings.records import (
     report,
     writing,
 )
+from xethru_protocol.system import written_whole
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.messages import (
@@ -800,11 +801,13 @@ class _RecordingWriter:
 
 
 def write_mcap(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> None:
-    """Write messages to a new file; RecordingError if it exists or cannot be written.
+    """Write messages to a new file, which is there when it is whole.
 
-    What was written before an error stays.
+    RecordingError if it exists or cannot be written.
     """
-    with writing(path), path.open("xb") as stream:
+    if path.exists():
+        raise RecordingError(f"{path} exists already")
+    with writing(path), written_whole(path) as fresh, fresh.open("wb") as stream:
         writer = McapWriter(stream)
         writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
         recording = _RecordingWriter(writer)

@@ -30,6 +30,7 @@ from slam.config import WheelNoise
 from slam.geometry import Mount, Rig
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
+from xethru_protocol.system import written_whole
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import InfoItem
 from xethru_protocol.wire.errors import XeThruError
@@ -126,8 +127,8 @@ def write_rig(path: Path, rig: RigFile) -> None:
     if rig.wheels != RigWheels():
         lines = [f"{key} = {json.dumps(value)}" for key, value in rig.wheels.model_dump().items()]
         tables.append("\n".join(["[wheels]", *lines]))
-    with naming(path):
-        path.write_text("\n\n".join(tables) + "\n", encoding="utf-8")
+    with naming(path), written_whole(path) as fresh:
+        fresh.write_text("\n\n".join(tables) + "\n", encoding="utf-8")
 
 
 class _Module:

@@ -3,6 +3,8 @@
 import math
 import signal
 import sqlite3
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from hil_tests.patience import seconds
 from hil_tests.unit.slam.app.convert.authors_bag import (
     N_SCANS,
     START_NS,
@@ -258,6 +261,31 @@ def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path
                 radar=None,
             )
         assert not out.exists()
+
+
+@pytest.mark.parametrize(("name", "at_check"), [("s.mcap", 220), ("folder", 20)])
+def test_a_killed_conversion_leaves_nothing_under_its_name(
+    name: str, at_check: int, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = recorded if name == "folder" else authors_bag(tmp_path / "a.bag")
+    before, out = sorted(tmp_path.iterdir()), tmp_path / name
+    code = (
+        "import os, sys\n"
+        "from slam.app import cli\n"
+        "class Killer(cli.StopFlag):\n"
+        "    calls = 0\n"
+        "    def check(self):\n"
+        "        Killer.calls += 1\n"
+        f"        if Killer.calls == {at_check}: os.kill(os.getpid(), 9)\n"
+        "cli.StopFlag = Killer\n"
+        "cli.main(['convert', *sys.argv[1:]])\n"
+    )
+    command = [sys.executable, "-c", code, str(source), str(out)]
+    assert subprocess.run(command, timeout=seconds(30)).returncode == -signal.SIGKILL
+    assert not out.exists()
+    assert len(list(tmp_path.iterdir())) == len(before) + 1, "it was at it"
+    assert run(capsys, "convert", source, out)[0] == 0
+    assert sorted(tmp_path.iterdir()) == sorted([*before, out])
 
 
 @pytest.mark.parametrize(
