@@ -6,7 +6,7 @@ import math
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeGuard, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -61,6 +61,15 @@ def shipped_names(folder: str) -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (_FIXTURES / folder).glob("*.toml")))
 
 
+def is_name(path_or_name: str | Path) -> TypeGuard[str]:
+    """Return whether it is the name of a shipped file: no path separator, and no ``.toml``."""
+    return (
+        isinstance(path_or_name, str)
+        and not path_or_name.endswith(".toml")
+        and "/" not in path_or_name
+    )
+
+
 def load_table(
     model: type[TableT],
     path_or_name: str | Path,
@@ -78,7 +87,7 @@ def load_table(
     """
     text = str(path_or_name)
     source = Path(path_or_name)
-    if isinstance(path_or_name, str) and not text.endswith(".toml") and "/" not in text:
+    if is_name(path_or_name):
         if text not in shipped_names(folder):
             raise unknown(
                 f"{text}: no such {what}; known are {', '.join(shipped_names(folder))}, "

@@ -57,7 +57,7 @@ With ROS 2, whose stamps are seconds since 1970 (sed -u passes every line on at 
 With an emulator in another terminal, which has both radars and odometry:
 
   xethru-emulator serve lab --link-dir ports
-  uwb-slam run --rig robot.toml --odometry ports/odometry.sock
+  uwb-slam run --rig lab --odometry ports/odometry.sock
 """
 
 
@@ -166,7 +166,12 @@ def _add_report(report: argparse.ArgumentParser) -> None:
 
 def _add_run(run: argparse.ArgumentParser) -> None:
     run.formatter_class = argparse.RawDescriptionHelpFormatter
-    run.add_argument("--rig", type=Path, required=True, metavar="RIG", help="a rig file, TOML")
+    run.add_argument(
+        "--rig",
+        required=True,
+        metavar="RIG",
+        help="a rig file, TOML, or the name of a scene that an emulator serves",
+    )
     run.add_argument(
         "--odometry",
         required=True,
@@ -231,7 +236,9 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
     )
     convert.add_argument("out", type=Path, metavar="OUT", help="must not exist")
     convert.add_argument(
-        "--rig", type=Path, help="where the radars of a bag sit, named UWBradar1 and so on"
+        "--rig",
+        metavar="RIG",
+        help="rig file or scene: where the radars of a bag sit, named UWBradar1 and so on",
     )
     convert.add_argument(
         "--frame-area",

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import pytest
 
 from emulator.scene.scene import load_scene
 from hil_tests.device.serving import emulator
+from hil_tests.paths import REPOSITORY
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
@@ -165,6 +168,7 @@ def test_a_signal_leaves_a_session_that_replays(
     assert n_again > 5
 
 
+@pytest.mark.thorough
 def test_a_run_whose_slam_is_too_slow_ends_at_once_with_all_results(
     robot: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -226,3 +230,29 @@ def test_what_cannot_begin_says_why_in_one_line(
         said = capsys.readouterr()
         assert said.out == ""
         assert words in said.err.splitlines()[-1]
+
+
+@pytest.mark.thorough
+def test_the_run_that_the_readme_prints_works_in_a_clean_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both commands as printed, but for an end after a second; no other emulator is seen."""
+    (runtime := tmp_path / "runtime").mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    (clean := tmp_path / "clean").mkdir()
+    monkeypatch.chdir(clean)
+    printed = (REPOSITORY / "README.md").read_text()
+    serve, run = re.search(
+        r"^\$ xethru-emulator (serve .*)\n\$ uwb-slam (run .*?) *(?:#.*)?$", printed, re.MULTILINE
+    ).groups()  # type: ignore[union-attr]  # None fails the test
+    with emulator(*shlex.split(serve)) as served:
+        process = subprocess.run(
+            [*COMMAND, *shlex.split(run), "--duration", "1"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        served.end()
+    assert process.returncode == 0, process.stderr
+    names = {"session.mcap", "map.png", "summary.json", "estimate.tum", "odometry.tum"}
+    assert {path.name for path in (clean / "out" / "run").iterdir()} == names

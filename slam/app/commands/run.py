@@ -47,7 +47,7 @@ _STALE = ("session.rrd", "report.html")
 def run_rig(
     stop: StopFlag,
     *,
-    rig: Path,
+    rig: str,
     odometry: str,
     ports: list[str] | None,
     out: Path,
@@ -115,7 +115,7 @@ def run_rig(
             _prepare_the_end()
             start_ns = live.settle()
             info = SessionInfo(
-                scene=rig.stem,
+                scene=Path(rig).stem,
                 preset=preset,
                 seed=None,
                 radars=rig_source.radars,

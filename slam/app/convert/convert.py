@@ -60,7 +60,7 @@ def run_convert(
     *,
     source: Path,
     out: Path,
-    rig: Path | None,
+    rig: str | None,
     area_m: Sequence[float] | None,
     truth_topic: str,
     rate_hz: int,

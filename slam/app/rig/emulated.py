@@ -33,10 +33,10 @@ from emulator.module.memory import Identity
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
 from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.track import NS_PER_S
-from slam.app.rig.files import RigWheels
+from slam.app.rig.files import rig_file_of
 from slam.app.rig.sources import RadarLink, RecordObserver, RigSource, StreamBegins
 from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
-from slam.geometry import Mount, Rig, transform
+from slam.geometry import Rig, transform
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.system import StopFlag
@@ -215,14 +215,7 @@ def rig_of(scene: Scene) -> Rig:
 
     The modules' own range errors stay unknown to SLAM.
     """
-    return Rig(
-        mounts=tuple(
-            Mount(
-                name=radar.name, x_m=radar.x_m, y_m=radar.y_m, yaw_rad=math.radians(radar.yaw_deg)
-            )
-            for radar in scene.radars
-        )
-    )
+    return rig_file_of(scene).rig
 
 
 def wheels_of(scene: Scene) -> WheelNoise:
@@ -230,8 +223,7 @@ def wheels_of(scene: Scene) -> WheelNoise:
 
     Standard deviations, as a data sheet gives them; what was drawn for a run stays unknown.
     """
-    keys = set(RigWheels.model_fields)  # the same keys
-    return RigWheels.model_construct(**scene.odometry.model_dump(include=keys)).noise
+    return rig_file_of(scene).wheels.noise
 
 
 def true_landmarks_m(scene: Scene) -> NDArray[np.float64]:

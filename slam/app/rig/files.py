@@ -23,8 +23,9 @@ from typing import Annotated
 
 from pydantic import Field, StrictFloat
 
-from emulator.scene.tables import SerialNumber, Table, load_table
-from slam.app.errors import AppError, naming
+from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
+from emulator.scene.tables import SerialNumber, Table, is_name, load_table
+from slam.app.errors import AppError, UsageError, naming
 from slam.app.rig.sources import RadarLink, RecordObserver
 from slam.config import WheelNoise
 from slam.geometry import Mount, Rig
@@ -105,15 +106,52 @@ class RigFile(Table):
         )
 
 
-def load_rig(path: Path) -> RigFile:
-    """Read a rig file; AppError with file, key and what is allowed."""
-    rig = load_table(RigFile, path, folder="rigs", what="rig", error=AppError, unknown=AppError)
+def rig_file_of(scene: Scene) -> RigFile:
+    """Return the rig file of a scene's robot: what its user would write from a data sheet.
+
+    Mounts are nominal and wheels as specified; the modules' own errors, and what was drawn for a
+    run, stay unknown.
+    """
+    radars = tuple(
+        RigRadar(
+            name=radar.name,
+            serial=radar.serial,
+            x_m=radar.x_m,
+            y_m=radar.y_m,
+            yaw_deg=radar.yaw_deg,
+        )
+        for radar in scene.radars
+    )
+    keys = set(RigWheels.model_fields)  # the same keys
+    return RigFile(radars=radars, wheels=RigWheels(**scene.odometry.model_dump(include=keys)))
+
+
+def load_rig(rig: str | Path) -> RigFile:
+    """Read a rig file, or take that of a shipped scene's robot by the name of the scene.
+
+    A string without a path separator and without ``.toml`` is a name.
+
+    Raises
+    ------
+    UsageError
+        No scene of this name ships with the package.
+    AppError
+        One line with file, key and what is allowed.
+    """
+    if is_name(rig):
+        try:
+            return rig_file_of(load_scene(rig))
+        except UnknownSceneError as error:
+            raise UsageError(f"--rig {error}") from None
+        except SceneError as error:
+            raise AppError(str(error)) from None
+    found = load_table(RigFile, rig, folder="rigs", what="rig", error=AppError, unknown=AppError)
     for key in ("name", "serial"):
-        values = [getattr(radar, key) for radar in rig.radars]
+        values = [getattr(radar, key) for radar in found.radars]
         twice = sorted({value for value in values if values.count(value) > 1})
         if twice:
-            raise AppError(f"{path}: radars.{key}: must be unique, {twice[0]!r} is used twice")
-    return rig
+            raise AppError(f"{rig}: radars.{key}: must be unique, {twice[0]} is used twice")
+    return found
 
 
 def write_rig(path: Path, rig: RigFile) -> None:
@@ -163,7 +201,7 @@ class _Module:
 
 def open_rig(
     rig: RigFile,
-    rig_path: Path,
+    rig_path: str | Path,
     ports: Sequence[str] | None,
     observer: RecordObserver,
     note: Callable[[str], None],
@@ -233,7 +271,7 @@ def are_emulated(links: Sequence[RadarLink]) -> bool:
 
 def _match(
     rig: RigFile,
-    rig_path: Path,
+    rig_path: str | Path,
     modules: Sequence[_Module],
     *,
     named: Sequence[str],
@@ -276,7 +314,7 @@ def _match(
 
 
 def _missing_text(
-    rig_path: Path,
+    rig_path: str | Path,
     missing: Sequence[RigRadar],
     foreign: Sequence[_Module],
     modules: Sequence[_Module],

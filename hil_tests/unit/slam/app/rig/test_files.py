@@ -1,6 +1,7 @@
 """Rig files, and which radar is at which port: by serial numbers."""
 
 import math
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,10 +11,12 @@ from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
-from emulator.scene.scene import empty_room
+from emulator.scene.scene import empty_room, load_scene
+from hil_tests.paths import FIXTURES
 from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
-from slam.app.errors import AppError
+from slam.app.errors import AppError, UsageError
 from slam.app.rig import files as rig_match
+from slam.app.rig.emulated import rig_of
 from slam.app.rig.files import (
     RigFile,
     RigRadar,
@@ -72,6 +75,27 @@ def test_a_rig_file_gives_mounts_in_radians(tmp_path: Path) -> None:
     assert mount.yaw_rad == pytest.approx(math.pi / 2)
     assert mount.phase_offset_rad == pytest.approx(-math.pi / 4)
     assert (mount.name, mount.x_m, mount.y_m, mount.range_offset_m) == ("left", 0.1, 0.0, 0.02)
+
+
+def test_the_name_of_a_scene_gives_the_rig_file_that_ships_for_it() -> None:
+    """What the file holds, read as plain TOML, is what stands in the scene."""
+    file = FIXTURES / "rigs" / "lab.toml"
+    assert load_rig("lab") == load_rig(file) == load_rig(str(file))
+    rig, scene = (tomllib.loads(p.read_text()) for p in (file, FIXTURES / "scenes" / "lab.toml"))
+    assert rig["radars"] == scene["radars"]
+    assert rig["wheels"] | {"rate_hz": 5.0} == scene["odometry"]
+    assert load_rig("lab").rig == rig_of(load_scene("lab"))
+
+
+def test_a_name_that_is_no_scenes_is_refused_with_those_that_are() -> None:
+    with pytest.raises(UsageError, match=r"--rig robot: no such scene; known are .*lab"):
+        load_rig("robot")
+
+
+def test_two_radars_of_one_name_are_refused_in_plain_words(tmp_path: Path) -> None:
+    (path := tmp_path / "rig.toml").write_text(RADAR + RADAR)
+    with pytest.raises(AppError, match=r"radars.name: must be unique, left is used twice$"):
+        load_rig(path)
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
