@@ -12,11 +12,13 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal, Self, TextIO
+from typing import Any, Literal, Self, TextIO, TypeVar
+
+T = TypeVar("T")
 
 MOST_BYTES = 1 << 20
 
@@ -152,13 +154,28 @@ class StopFlag:
     @contextmanager
     def at_once(self) -> Iterator[None]:
         """Let a signal raise where it arrives: for waiting, where nothing is half-done."""
+        before = self._at_once
         try:
             # in this order: a signal is seen by the check, or raises where it arrives
             self._at_once = True
             self.check()
             yield
         finally:
-            self._at_once = False
+            self._at_once = before
+
+    def each(self, items: Iterable[T]) -> Iterator[T]:
+        """Yield items; a signal raises where it arrives while the next one is made, as by reading.
+
+        What is done with an item is not interrupted.
+        """
+        source = iter(items)
+        while True:
+            with self.at_once():
+                try:
+                    item = next(source)
+                except StopIteration:
+                    return
+            yield item
 
     @contextmanager
     def leaving(self, exit_code: int | None = None, *, program: str = "") -> Iterator[None]:

@@ -420,7 +420,14 @@ def _content_before_cut(body: bytes) -> bytes:
 
 
 def _unpacked(name: str, packed: bytes, size: int) -> bytes:
-    """Decompress, one byte more than ``size`` at most."""
+    """Decompress, one byte more than ``size`` at most; ValueError if no record comes first.
+
+    A few kilobytes may unpack to hundreds of megabytes of zeros.
+    """
+    if size > _PIECE_BYTES:
+        first = _unpacked(name, packed, _HEAD.size - 1)
+        if first and first[0] not in _IN_CHUNKS:
+            raise ValueError(f"a chunk cannot hold a record of kind {first[0]}")
     if name == "zstd":
         return zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
     if name == "lz4":

@@ -74,7 +74,7 @@ def run_calibrate(
     """Calibrate from a session file and print the table; write the rig file if asked for."""
     known = None if reflectors is None else _read_reflectors(reflectors)
     scene = None if truth is None else _scene(truth)
-    recorded = open_session(session)
+    recorded = open_session(session, stop)
     # before minutes of work: what can be refused already
     _planted(recorded.rig, scene)
     if rig is not None:

@@ -329,7 +329,7 @@ def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
 
 def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
     """Replay a session and write its report; beside the session if `out` is None."""
-    recorded = open_session(session_file(session))
+    recorded = open_session(session_file(session), stop)
     page = out or recorded.path.with_name("report.html")
     refuse_overwriting(recorded.path, page)
     text = _report_text(recorded, stop)

@@ -163,7 +163,7 @@ def run_view(
         with LiveView(where, stop, path) as live:
             live.keep_serving()
         return
-    recorded = open_session(path)
+    recorded = open_session(path, stop)
     if out is not None:
         _write_view(recorded, out, stop)
         print_text(one_line(str(out)))

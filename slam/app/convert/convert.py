@@ -76,12 +76,12 @@ def run_convert(
     warnings: list[str] = []
     if source.suffix == _SESSION_SUFFIX and out.suffix != _SESSION_SUFFIX:
         with _whole(out) as fresh:
-            result = _from_session(open_session(source), fresh, preset, radar, stop)
+            result = _from_session(open_session(source, stop), fresh, preset, radar, stop)
     elif out.suffix != _SESSION_SUFFIX:
         raise UsageError(
             f"{out}: of a bag or MATLAB file a session is made; give a name that ends in .mcap"
         )
-    elif source.suffix == _SESSION_SUFFIX and _is_session(source):
+    elif source.suffix == _SESSION_SUFFIX and _is_session(source, stop):
         raise UsageError(
             f"{source}: is a session already; name an OUT that ends in .mat, .xtwire or .bag, or "
             "a new folder for a bag of ROS 2"
@@ -111,9 +111,9 @@ def run_convert(
     print_text(result.replace(str(fresh), str(out)))
 
 
-def _is_session(path: Path) -> bool:
+def _is_session(path: Path, stop: StopFlag) -> bool:
     try:
-        open_session(path)
+        open_session(path, stop)
     except AppError:  # the reader of bags reports what it is, or what is wrong with it
         return False
     return True

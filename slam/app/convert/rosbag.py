@@ -203,8 +203,7 @@ def _contents(bag: Path, truth_topic: str, stop: StopFlag) -> _Contents:
     with _open(bag) as reader:
         for connection in reader.connections:
             _check_type(bag, connection.topic, connection.msgtype, truth_topic)
-        for connection, t_ns, raw in reader.messages():
-            stop.check()
+        for connection, t_ns, raw in stop.each(reader.messages()):
             topic = connection.topic
             if (radar := _radar_of(_FRAMES, topic)) is not None:
                 n_bins = len(reader.deserialize(raw, connection.msgtype).data)
@@ -341,8 +340,7 @@ def _frames(
     counters = [0] * len(names)
     with _open(bag) as reader:
         wanted = [one for one in reader.connections if _radar_of(_FRAMES, one.topic) is not None]
-        for connection, t_ns, raw in reader.messages(wanted):
-            stop.check()
+        for connection, t_ns, raw in stop.each(reader.messages(wanted)):
             index = names.index(str(_radar_of(_FRAMES, connection.topic)))
             message = reader.deserialize(raw, connection.msgtype)
             yield RadarFrame(

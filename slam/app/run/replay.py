@@ -53,7 +53,7 @@ class _RecordedSlam:
 
 def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
     """Replay a session, write its results into a folder and print its table."""
-    recorded = open_session(session)
+    recorded = open_session(session, stop)
     comparison = Comparison(different_constants(recorded.info.constants))
     source = recorded_source(recorded, stop, comparison)
     with ExitStack() as held:

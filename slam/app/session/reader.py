@@ -56,6 +56,7 @@ from xethru_protocol.recordings.mcap import (
     unpack_string,
 )
 from xethru_protocol.recordings.mcap import read_entries as entries_of
+from xethru_protocol.system import StopFlag
 
 _KINDS = {
     b"RRF": "a Rerun recording (.rrd), a view that other versions of Rerun may not open; the "
@@ -299,8 +300,10 @@ class RecordedSession:
         size: int | None = None,
         end_ns: int | None = None,
         channels: Mapping[int, Channel] | None = None,
+        stop: StopFlag | None = None,
     ) -> None:
         self.path = path
+        self._stop = stop or StopFlag()
         self._channels = dict(channels or {})
         self._size = size  # when it was opened: a run may be writing it still
         self.info = info
@@ -442,7 +445,8 @@ class RecordedSession:
                 yield entry, record
 
     def _messages(self) -> Iterator[Message]:
-        for entry in read_entries(self.path, self._size, dict(self._channels)):
+        entries = read_entries(self.path, self._size, dict(self._channels))
+        for entry in self._stop.each(entries):
             if isinstance(entry, Message):
                 yield entry
             elif isinstance(entry, Cut):
@@ -508,8 +512,10 @@ class _Head:
 RADAR_INFO = re.compile(r"/radar/(.+)/info")
 
 
-def open_session(path: Path) -> RecordedSession:
+def open_session(path: Path, stop: StopFlag | None = None) -> RecordedSession:
     """Read what describes a session: at its head, or where that is damaged in a later copy.
+
+    A signal that ``stop`` catches ends reading at once, here and later.
 
     Raises
     ------
@@ -520,7 +526,8 @@ def open_session(path: Path) -> RecordedSession:
         size = path.stat().st_size
     except OSError:
         size = None  # reading it reports what is wrong
-    head = _read_head(path, size)
+    stop = stop or StopFlag()
+    head = _read_head(path, size, stop)
     if head.table is None:
         if head.cut is not None:
             raise AppError(f"{path}: ends at byte {head.cut.at}, before it says what run it is of")
@@ -538,12 +545,12 @@ def open_session(path: Path) -> RecordedSession:
     info = read_session_table(path, head.table, tuple(head.radars[name] for name in names))
     with open_mcap(path, size) as opened:
         end_ns = end_time_of(*opened)
-    return RecordedSession(path, info, size=size, end_ns=end_ns, channels=head.channels)
+    return RecordedSession(path, info, size=size, end_ns=end_ns, channels=head.channels, stop=stop)
 
 
-def _read_head(path: Path, size: int | None) -> _Head:
+def _read_head(path: Path, size: int | None, stop: StopFlag) -> _Head:
     head = _Head()
-    for found in _found_in(path, size, head.channels):
+    for found in stop.each(_found_in(path, size, head.channels)):
         if isinstance(found, Cut):
             head.cut = found
         elif isinstance(found, Damage):

@@ -177,7 +177,7 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
         try:
             _write(path, fresh, survey, stop)
             _read_back(fresh, survey)
-            lost = _lost_description(fresh) if survey.is_session else ""
+            lost = _lost_description(fresh, stop) if survey.is_session else ""
             if out is not None:
                 fresh.replace(out)
             elif not lost:
@@ -195,10 +195,10 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
     return survey
 
 
-def _lost_description(fresh: Path) -> str:
+def _lost_description(fresh: Path, stop: StopFlag) -> str:
     """Return why nobody can read a session as one; "" if they can."""
     try:
-        open_session(fresh)
+        open_session(fresh, stop)
     except AppError as error:
         return str(error).removeprefix(f"{fresh}: ")
     return ""
@@ -244,14 +244,13 @@ def _held(path: Path) -> Iterator[None]:
 def _survey(path: Path, stop: StopFlag) -> Repair:
     survey, finder = Repair(path=path), GapFinder()
     with open_mcap(path) as opened:
-        for found in mcap.RecordReader(*opened).read():
+        for found in stop.each(mcap.RecordReader(*opened).read()):
             if isinstance(found, mcap.Cut):
                 survey.cut_at = found.at
             elif isinstance(found, mcap.Damage):
                 survey.damages.append(found)
                 finder.damage(found.at)
             else:
-                stop.check()
                 try:
                     _note(survey, finder, path, found)
                 except mcap.DAMAGES as error:
@@ -369,8 +368,8 @@ def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
         copy = _Copy(writer, survey)
         if survey.is_session:
             copy.write_head()
-        for found in mcap.RecordReader(*opened).read():
-            stop.check()
+        for found in stop.each(mcap.RecordReader(*opened).read()):
+            stop.check()  # also where nothing is read any more, but much is written
             if isinstance(found, mcap.Damage) and found.at in survey.gaps:
                 copy.write_gap(survey.gaps[found.at])
             if not isinstance(found, mcap.Record):
