@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from slam.app.commands.options import add_rerun, count, folder, seconds, seed
+from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep import STRESSES
@@ -133,6 +133,7 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
     demo.add_argument(
         "--wire", action="store_true", help="keep the raw bytes of all ports in the session, too"
     )
+    add_lean(demo)
     add_rerun(demo)
 
 
@@ -205,6 +206,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         help="end after so many seconds",
     )
     run.add_argument("--wire", action="store_true", help="record every byte of the ports, too")
+    add_lean(run)
     add_rerun(run)
 
 

@@ -54,7 +54,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Content:
     path = tmp_path_factory.mktemp("whole") / "session.mcap"
     info = session_info()
     info = replace(info, radars=tuple(replace(radar, n_bins=N_BINS) for radar in info.radars))
-    log = SessionLog(path, info, clock_ns=SlowClock())
+    log = SessionLog(path, info, drawn=False, clock_ns=SlowClock())
     for counter in range(N_SCANS):
         log.on_scan(scan(counter, n_bins=N_BINS))
         log.on_snapshot(snapshot(counter))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from emulator.scene.scene import load_scene
 from hil_tests.device.serving import emulator
@@ -90,7 +91,7 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
         [sys.executable, "-c", cat, robot.odometry], stdout=subprocess.PIPE
     ) as wheels:
         process = subprocess.run(
-            run_command(robot, out, "--odometry", "-", "--duration", "3", "--wire"),
+            run_command(robot, out, "--odometry", "-", "--duration", "3", "--wire", "--lean"),
             stdin=wheels.stdout,
             capture_output=True,
             text=True,
@@ -124,6 +125,12 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
     arrived_ns, stamp_ns = used[0].host_ns[0], used[0].frames[0].t_ns
     assert abs(arrived_ns - stamp_ns - session.info.started_unix_ns) < seconds(1) * 1e9
     assert {row[0] for row in session.wire()} == {m.name for m in session.rig.mounts}
+    with session.path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    topics = {channel.topic for channel in found.channels.values()}
+    assert "/landmarks" in topics
+    assert not topics & {"/estimate/path", "/landmarks/markers", "/radar/front_left/bscan"}
 
 
 @pytest.mark.parametrize(("which", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])

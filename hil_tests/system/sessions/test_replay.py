@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
 
 from hil_tests.system.recorded_session import record_session, write_shorter_scene
 from hil_tests.unit.slam.app.session.test_steps import assert_same_step
@@ -39,6 +40,7 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     # a third of the short scene: enough for landmarks, and for the paper's window to be full
     scene = write_shorter_scene(folder)
     options = ["--scene", str(scene), "--seed", str(SEED), "--preset", request.param, "--wire"]
+    options += ["--lean"] if request.param == "paper" else []
     assert main(["demo", *options, "--out", str(folder / "demo")]) == 0
     return Recorded(
         folder=folder / "demo", summary=json.loads((folder / "demo/summary.json").read_text())
@@ -66,6 +68,24 @@ def test_every_number_but_the_speed_comes_again(
     # from the ping on, which is sent before there is a session to write to
     assert recorded_bytes[0][1:3] == ("tx", bytes.fromhex("7d01aeeaaaee7c7e"))
     assert sum(len(data) for _, way, data, _ in recorded_bytes if way == "rx") > 300_000
+
+
+def test_a_lean_session_lacks_what_is_only_drawn(recorded: Recorded) -> None:
+    path = recorded.folder / "session.mcap"
+    with AnyReader([path]) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        for connection, _, raw in reader.messages():
+            reader.deserialize(raw, connection.msgtype)
+    n_states = counts["/slam/state"]
+    drawn = {"/estimate/pose": n_states, "/radar/rear_left/range": n_states}
+    once = {"/fields_of_view", "/scene", "/radar/rear_left/bscan/axes"}
+    if open_session(path).info.preset == "paper":
+        assert not counts.keys() & (drawn.keys() | once)
+    else:
+        assert {topic: counts.get(topic) for topic in drawn} == drawn
+        assert once <= counts.keys()
+        # a picture after every 32 frames, and one at the end
+        assert counts["/radar/rear_left/bscan"] == -(-counts["/radar/rear_left/frame"] // 32)
 
 
 def test_what_is_left_of_a_cut_file_is_the_beginning_of_the_run(

@@ -45,6 +45,7 @@ def run_demo(
     scene: str,
     preset: str,
     wire: bool = False,
+    lean: bool = False,
     rerun: str | None = None,
 ) -> None:
     """Run the emulated robot through its scene and write everything into one folder.
@@ -102,7 +103,8 @@ def run_demo(
             )
             stop.check()
             remove_earlier(out, _OUTPUTS)
-            log = SessionLog(out / "session.mcap", info, odometry, truth_at=trajectory.poses)
+            path = out / "session.mcap"
+            log = SessionLog(path, info, odometry, truth_at=trajectory.poses, drawn=not lean)
             stack.callback(log.close)
             view = RerunView(out / "session.rrd", info)
             sinks: list[SessionObserver] = [

@@ -56,6 +56,15 @@ def add_rerun(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_lean(parser: argparse.ArgumentParser) -> None:
+    """Add `--lean`, which keeps a session small."""
+    parser.add_argument(
+        "--lean",
+        action="store_true",
+        help="leave out of the session what only other viewers draw: B-scans, paths, ellipses",
+    )
+
+
 def _rerun_target(text: str) -> str:
     if text in {SPAWN, SERVE_WEB}:
         return text

@@ -56,6 +56,7 @@ def run_rig(
     clock: str,
     duration_s: float | None,
     wire: bool = False,
+    lean: bool = False,
     rerun: str | None = None,
 ) -> None:
     """Run SLAM on a rig until odometry ends, the time is over, or a signal comes.
@@ -139,7 +140,7 @@ def run_rig(
                 link_log=log,
             )
             remove_earlier(out, (*RESULTS, *_STALE))
-            session_log = SessionLog(out / _SESSION, info, start_ns=start_ns)
+            session_log = SessionLog(out / _SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [

@@ -38,6 +38,7 @@ from slam.app.odometry.track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSam
 from slam.app.records import RadarInfo, Scan, SessionInfo, TruthAt
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
 from slam.app.session import messages as ros
+from slam.app.session.cdr import wheel_odometry
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
     imported_info,
@@ -439,8 +440,7 @@ def _fill(bag: _Bag, session: RecordedSession, stop: StopFlag) -> tuple[int, int
             bag.write(topic, record.t_ns, FLOAT_ARRAY, pack_array(FLOAT_ARRAY, record.samples))
             frames += 1
         elif isinstance(record, TumSample):
-            data = ros.serialise(ros.odometry(record))
-            bag.write(ODOMETRY_TOPIC, record.t_ns, ros.ODOMETRY, data)
+            bag.write(ODOMETRY_TOPIC, record.t_ns, ros.ODOMETRY, wheel_odometry(record))
             poses += 1
         elif isinstance(record, ScanEnd) and record.truth is not None:
             data = ros.serialise(ros.pose_stamped(record.t_ns, "world", record.truth))

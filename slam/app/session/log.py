@@ -32,6 +32,8 @@ from slam.app.records import (
     TruthAt,
 )
 from slam.app.session import messages as ros
+from slam.app.session.cdr import NO_TWIST, wheel_odometry
+from slam.app.session.drawings import Drawings, WheelMotion
 from slam.app.session.messages import (
     METADATA_NAME,
     SESSION_TOPIC,
@@ -226,7 +228,10 @@ class SessionLog(SessionObserver):
     truth_at
         The robot's true pose; None if unknown.
     start_ns
-        Session time [ns] at which the file begins.
+        Session time of the first scan [ns], that of everything that has no time or an earlier one:
+        of latched messages and of lines about setting up.
+    drawn
+        Whether to write `drawings` for other programs, too.
     clock_ns
         Monotonic time [ns]; ends chunks.
 
@@ -244,9 +249,11 @@ class SessionLog(SessionObserver):
         *,
         truth_at: TruthAt | None = None,
         start_ns: int = 0,
+        drawn: bool = True,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._file = _SessionFile(path, start_ns, clock_ns)
+        self._start_ns = start_ns
         self._samples: Iterator[TumSample] = iter(odometry.samples if odometry else ())
         self._odometry_ns = -1  # of the newest sample written
         self._truth_at = truth_at
@@ -284,6 +291,9 @@ class SessionLog(SessionObserver):
         }
         static = ros.transforms(start_ns, self._placements)
         self._write(self._static_transforms, start_ns, static)
+        self._wheels = WheelMotion(info.wheels)
+        self._wheels_at: tuple[int, NDArray[np.float64]] | None = None
+        self._drawings = Drawings(self._file, info, start_ns) if drawn else None
         self._file.end_head()
 
     def on_scan(self, scan: Scan) -> None:
@@ -313,6 +323,8 @@ class SessionLog(SessionObserver):
         mark = pack_array(DOUBLE_ARRAY, row, "n_frames_radars_counters_truth")
         topic = self._scans if scan.used else self._unused_scans
         self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
+        if self._drawings is not None:
+            self._drawings.on_scan(scan)
 
     def on_detections(self, radar: int, t_ns: int, ranges_m: NDArray[np.float64]) -> None:
         """Write ranges of the scan that comes next, shape (n,) [m], of a radar by its index."""
@@ -320,8 +332,14 @@ class SessionLog(SessionObserver):
         self._file.write(channel, t_ns, pack_array(DOUBLE_ARRAY, ranges_m, "range_m"))
 
     def on_odometry(self, sample: TumSample) -> None:
-        self._write(self._odometry, sample.t_ns, ros.odometry(sample))
-        self._odometry_ns = sample.t_ns
+        t_ns, pose = sample.t_ns, np.array([sample.x_m, sample.y_m, sample.heading_rad])
+        twist = NO_TWIST
+        if self._wheels_at is not None:
+            earlier_ns, earlier = self._wheels_at
+            twist = self._wheels.twist(earlier, pose, t_ns - earlier_ns)
+        self._wheels_at = t_ns, pose
+        self._file.write(self._odometry, t_ns, wheel_odometry(sample, twist))
+        self._odometry_ns = t_ns
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Write a state of SLAM with its landmarks and transforms."""
@@ -345,10 +363,13 @@ class SessionLog(SessionObserver):
             self._file.write(self._steps, t_ns, message, sequence=snapshot.counter)
         state = pack_array(DOUBLE_ARRAY, state_row(snapshot), "state")
         self._file.write(self._states, t_ns, state, sequence=snapshot.counter)
+        if self._drawings is not None:
+            self._drawings.on_snapshot(snapshot)
 
     def on_log(self, line: LogLine) -> None:
-        message = ros.log_line(line.t_ns, line.radar, line.text, warning=line.warning)
-        self._write(self._log, line.t_ns, message)
+        t_ns = max(line.t_ns, self._start_ns)
+        message = ros.log_line(t_ns, line.radar, line.text, warning=line.warning)
+        self._write(self._log, t_ns, message)
 
     def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
         """Write bytes as a radar's port gave (rx) or took (tx) them, at a host time [ns].
@@ -372,4 +393,9 @@ class SessionLog(SessionObserver):
         return self._rare_channels[topic]
 
     def close(self) -> None:
-        self._file.close()
+        drawings, self._drawings = self._drawings, None
+        try:
+            if drawings is not None:
+                drawings.close()
+        finally:
+            self._file.close()

@@ -117,6 +117,8 @@ LANDMARK_DTYPE = np.dtype(
     ]
 )
 
+_POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+
 Message: TypeAlias = Any  # rosbags makes its message classes at run time
 
 
@@ -144,27 +146,6 @@ def serialise(message: Message) -> memoryview:
 def deserialise(data: bytes, message_type: str) -> Message:
     """Read CDR bytes back; arrays come as numpy arrays."""
     return _typestore().deserialize_cdr(data, message_type)
-
-
-def odometry(sample: TumSample) -> Message:
-    """Wrap an odometry sample; covariances are zero, which means unknown in ROS.
-
-    The quaternion is kept as it came, so replay sees the same floats.
-    """
-    pose = _pose(sample.x_m, sample.y_m, sample.qz, sample.qw)
-    with_covariance = _type("geometry_msgs/msg/PoseWithCovariance")(
-        pose=pose, covariance=np.zeros(36)
-    )
-    zero = _type("geometry_msgs/msg/Vector3")(x=0.0, y=0.0, z=0.0)
-    twist = _type("geometry_msgs/msg/TwistWithCovariance")(
-        twist=_type("geometry_msgs/msg/Twist")(linear=zero, angular=zero), covariance=np.zeros(36)
-    )
-    return _type(ODOMETRY)(
-        header=_header(sample.t_ns, "odom"),
-        child_frame_id="base_link",
-        pose=with_covariance,
-        twist=twist,
-    )
 
 
 def pose_sample(message: Message) -> TumSample:
@@ -215,14 +196,25 @@ def landmark_cloud(snapshot: Snapshot) -> Message:
     points["cov_xx"] = snapshot.landmark_covariances_m2[:, 0, 0]
     points["cov_xy"] = snapshot.landmark_covariances_m2[:, 0, 1]
     points["cov_yy"] = snapshot.landmark_covariances_m2[:, 1, 1]
+    return _cloud(snapshot.t_ns, "map", points)
+
+
+def path_cloud(t_ns: int, frame: str, poses: NDArray[np.float64]) -> Message:
+    """Wrap the positions of poses (n, 3) as points."""
+    points = np.zeros(len(poses), dtype=_POINT_DTYPE)
+    points["x"], points["y"] = poses[:, 0], poses[:, 1]
+    return _cloud(t_ns, frame, points)
+
+
+def _cloud(t_ns: int, frame: str, points: NDArray[Any]) -> Message:
     return _type(POINT_CLOUD)(
-        header=_header(snapshot.t_ns, "map"),
+        header=_header(t_ns, frame),
         height=1,
         width=len(points),
-        fields=_landmark_fields(),
+        fields=_point_fields(points.dtype),
         is_bigendian=False,
-        point_step=LANDMARK_DTYPE.itemsize,
-        row_step=LANDMARK_DTYPE.itemsize * len(points),
+        point_step=points.dtype.itemsize,
+        row_step=points.nbytes,
         data=points.view(np.uint8),
         is_dense=True,
     )
@@ -246,8 +238,8 @@ def number(value: int) -> Message:
 
 
 @cache
-def _landmark_fields() -> list[Message]:
-    fields = LANDMARK_DTYPE.fields
+def _point_fields(dtype: np.dtype[Any]) -> list[Message]:
+    fields = dtype.fields
     assert fields is not None
     return [
         _type("sensor_msgs/msg/PointField")(
@@ -256,7 +248,7 @@ def _landmark_fields() -> list[Message]:
             datatype=_POINT_FIELD_UINT32 if name == "id" else _POINT_FIELD_FLOAT32,
             count=1,
         )
-        for name in LANDMARK_DTYPE.names or ()
+        for name in dtype.names or ()
     ]
 
 

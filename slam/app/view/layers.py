@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import RadarInfo, Scan, SessionInfo, Snapshot
+from slam.app.rig.echoes import arcs, envelope_db, wedge
 from slam.app.run.pictures import (
     ellipse_95,
     ellipse_text,
@@ -51,9 +52,6 @@ from slam.frames import RadarFrame
 from slam.geometry import compose, transform
 from slam.results import Fix, Observation, StepResult
 
-_CARRIER_HZ = 7.29e9
-_LIGHT_MPS = 299_792_458.0
-
 # What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
 # sample, so an envelope of -62 dB) to a near rod.
 _SHOWN_RANGE_M = 3.0
@@ -67,17 +65,12 @@ def bscan_picture(
 
     `frames` is raw RF, shape (n_frames, n_bins), slow time downwards, with true metres of the first
     bin and between two bins. The result has shape (n_frames, n_shown - 2), up to 3 m of range; 0 is
-    -62 dB of full scale or less, 255 is -30 dB or more. The quadrature of the pulse comes from the
-    central difference of the samples, which for a carrier of w radians per sample is its Hilbert
-    partner times 2 sin w.
+    -62 dB of full scale or less, 255 is -30 dB or more.
     """
     n_wanted = int((_SHOWN_RANGE_M - range_start_m) / bin_length_m)
     n_shown = min(frames.shape[1], max(n_wanted, 3))
     echoes = frames[:, :n_shown] - frames[:, :n_shown].mean(axis=0)
-    phase_step_rad = 2.0 * np.pi * _CARRIER_HZ * 2.0 * bin_length_m / _LIGHT_MPS
-    quadrature = (echoes[:, 2:] - echoes[:, :-2]) / np.float32(2.0 * np.sin(phase_step_rad))
-    power = echoes[:, 1:-1] ** 2 + quadrature**2
-    level_db = 10.0 * np.log10(np.maximum(power, np.float32(1e-12)))
+    level_db = envelope_db(echoes, bin_length_m)
     scaled = (level_db - _FLOOR_DB) / (_TOP_DB - _FLOOR_DB)
     picture: NDArray[np.uint8] = (np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
     return picture
@@ -262,38 +255,6 @@ def _tensors(
     return arrow_column(template.component_descriptor(), column)
 
 
-_ARC_POINTS = 17
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Beams:
-    """Opening angle of radars, and the longest range of the front end."""
-
-    field_of_view_rad: float
-    reach_m: float
-
-    def arcs(self, radar: RadarInfo, ranges_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where echoes of these ranges (n,) may come from: shape (n, 17, 2), body frame."""
-        half = self.field_of_view_rad / 2
-        angles_rad = radar.yaw_rad + np.linspace(-half, half, _ARC_POINTS)
-        ray = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)
-        antenna = np.array([radar.x_m, radar.y_m])
-        arcs: NDArray[np.float64] = antenna + ranges_m[:, None, None] * ray
-        return arcs
-
-    def wedge(self, radar: RadarInfo) -> NDArray[np.float64]:
-        """Return the closed outline of the beam, shape (19, 2), body frame."""
-        antenna = np.array([[radar.x_m, radar.y_m]])
-        (rim,) = self.arcs(radar, np.array([self.reach_m]))
-        return np.concatenate([antenna, rim, antenna])
-
-
-def beams_of(info: SessionInfo) -> Beams:
-    """Return the beams that SLAM assumes."""
-    field = info.field_of_view
-    return Beams(field_of_view_rad=field.opening_rad, reach_m=field.max_range_m)
-
-
 def used_detections(step: StepResult) -> tuple[bool, ...]:
     """Return for each detection of a state whether it moved the estimate.
 
@@ -407,10 +368,10 @@ class Ground:
 class MapLayer:
     """Sends poses and echoes in blocks, the map once per second."""
 
-    def __init__(self, recording: Recording, info: SessionInfo, beams: Beams) -> None:
+    def __init__(self, recording: Recording, info: SessionInfo) -> None:
         self._recording = recording
         self._radars = info.radars
-        self._beams = beams
+        self._field = info.field_of_view
         self._paths: dict[str, list[Array]] = defaultdict(list)
         self._trails: dict[str, deque[Array]] = {
             name: deque(maxlen=TRAIL_STATES) for name, *_ in _POINTS
@@ -483,19 +444,19 @@ class MapLayer:
         style = rr.LineStrips2D.from_fields(colors=ROBOT_RGB, radii=_LINE_POINTS, draw_order=65.0)
         static("map/estimate/ellipse", style)
         for index, radar in enumerate(info.radars):
-            wedge = [screen(self._beams.wedge(radar))]
+            outline = [screen(wedge(self._field, radar))]
             static(
                 f"map/robot/{part(radar.name)}/wedge",
-                rr.LineStrips2D(wedge, colors=WEDGE_RGB, radii=0.003, draw_order=5.0),
+                rr.LineStrips2D(outline, colors=WEDGE_RGB, radii=0.003, draw_order=5.0),
             )
             for name, colour, radius_m in (
                 ("arcs_used", USED_RGB, 0.007),
                 ("arcs_unused", UNUSED_RGB, 0.004),
             ):
-                arcs = rr.LineStrips2D.from_fields(
+                style = rr.LineStrips2D.from_fields(
                     colors=colour, radii=radius_m, draw_order=6.0 + index
                 )
-                static(f"map/robot/{part(radar.name)}/{name}", arcs)
+                static(f"map/robot/{part(radar.name)}/{name}", style)
         for name, colour, radius_m, order in _POINTS:
             points = rr.Points2D.from_fields(colors=colour, radii=radius_m, draw_order=order)
             static(f"map/{name}", points)
@@ -592,8 +553,8 @@ class MapLayer:
         self, entity: str, stamps: Stamps, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]
     ) -> None:
         every_m = np.array([range_m for row in ranges_m for range_m in row], dtype=np.float64)
-        arcs = strips_column(screen(self._beams.arcs(radar, every_m)))
-        self._recording.rows(entity, stamps, [arcs.partition(lengths(ranges_m))])
+        strips = strips_column(screen(arcs(self._field, radar, every_m)))
+        self._recording.rows(entity, stamps, [strips.partition(lengths(ranges_m))])
 
     def _send_landmarks(self, snapshot: Snapshot, host_ns: int | None) -> None:
         stamps = Stamps()

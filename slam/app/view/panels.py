@@ -36,7 +36,6 @@ from slam.app.view.layers import (
     FrameLayer,
     Ground,
     MapLayer,
-    beams_of,
     known_world_m,
 )
 from slam.app.view.rerun_recording import (
@@ -447,7 +446,7 @@ class RerunView(SessionObserver):
         settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
         self._recording.static("radars", rr.TextDocument(settings))
         self._frames = FrameLayer(self._recording, info.radars)
-        self._map = MapLayer(self._recording, info, beams_of(info))
+        self._map = MapLayer(self._recording, info)
         style_numbers(self._recording)
         self._link = LinkLayer(self._recording, info.radars)
 

@@ -17,6 +17,7 @@ from slam.app.odometry.live import parse_source
 from slam.app.odometry.track import TumSample, parse_tum_line
 from slam.app.run.live_source import LiveLog
 from slam.app.session import messages as ros
+from slam.app.session.cdr import wheel_odometry
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
 
@@ -98,7 +99,9 @@ def test_lines_of_ros2_topic_echo_become_tum_lines_with_the_same_floats() -> Non
         TumSample(t_ns=1_700_000_000_000_000_005, x_m=1 / 3, y_m=-2e-17, qz=-0.6, qw=0.8),
         TumSample(t_ns=1_700_000_001_234_567_890, x_m=-1.5, y_m=0.0, qz=0.0, qw=1.0),
     ]
-    csv = "".join(f"{csv_of(ros.odometry(sample))}\n" for sample in samples)
+    csv = "".join(
+        f"{csv_of(ros.deserialise(wheel_odometry(sample), ros.ODOMETRY))}\n" for sample in samples
+    )
     assert csv.startswith("1700000000,5,odom,base_link,0.3333333333333333,-2e-17,0.0,0.0,0.0,-0.6,")
     done = subprocess.run(
         ["sed", "-uE", CSV_TO_TUM], input=csv, capture_output=True, text=True, check=True

@@ -25,6 +25,7 @@ from hil_tests.unit.slam.app.sessions import (
     write_scans,
     write_session,
 )
+from slam.app.records import LogLine
 from slam.app.session import messages as ros
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
@@ -179,8 +180,8 @@ def test_info_is_latched_and_tells_how_to_read_frames(finished: Path) -> None:
     assert (info["n_bins"], info["range_start_m"], info["rate_hz"]) == (1431, 0.2, 5.018533)
     summary = summary_of(finished)
     latched = {c.topic for c in summary.channels.values() if "durability: 1" in str(c.metadata)}
-    infos = {"/session/info", "/radar/radar0/info", "/radar/radar1/info"}
-    assert latched == {*infos, "/tf_static"}
+    of_radars = {f"/radar/radar{k}/{part}" for k in range(2) for part in ("info", "bscan/axes")}
+    assert latched == {*of_radars, *ONCE}
 
 
 def test_link_log_keeps_radar_and_level(finished: Path) -> None:
@@ -189,6 +190,35 @@ def test_link_log_keeps_radar_and_level(finished: Path) -> None:
         ("radar0", 20, "Ping -> Pong"),
         ("radar1", 30, "CRC fault"),
     ]
+
+
+ONCE = ("/session/info", "/tf_static", "/rerun/tf_static", "/scene", "/fields_of_view")
+FIRST_NS = 1_700_000_000_123_456_789
+
+
+def test_a_session_by_the_time_of_day_begins_with_its_first_scan(tmp_path: Path) -> None:
+    """Its lines about setting up come before there is a time; at 0 it would span 53 years."""
+    path = tmp_path / "s.mcap"
+    log = SessionLog(path, session_info(), start_ns=FIRST_NS)
+    log.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="tx Ping"))
+    log.on_wire("radar0", "rx", b"pong", 77)
+    for k in range(40):
+        t_ns = FIRST_NS + scan(k).t_ns
+        frames = tuple(dataclasses.replace(frame, t_ns=t_ns) for frame in scan(k).frames)
+        log.on_scan(dataclasses.replace(scan(k), t_ns=t_ns, frames=frames))
+        log.on_snapshot(dataclasses.replace(snapshot(k), t_ns=t_ns))
+    log.on_log(LogLine(t_ns=t_ns, radar="radar0", warning=False, text="tx SetMode"))
+    log.close()
+    statistics = summary_of(path).statistics
+    assert statistics is not None
+    assert statistics.message_start_time == FIRST_NS
+    assert statistics.message_end_time == FIRST_NS + scan(39).t_ns
+    first, last = messages(path, "/log")
+    assert (first[1], last[1]) == (FIRST_NS, FIRST_NS + scan(39).t_ns)
+    stamp = first[2].stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == FIRST_NS
+    for latched in ("/tf_static", "/scene", "/fields_of_view", "/radar/radar0/bscan/axes"):
+        assert messages(path, latched)[0][1] == FIRST_NS
 
 
 def test_rosbags_opens_the_bare_file_with_its_own_types(finished: Path) -> None:
@@ -281,5 +311,7 @@ def test_a_disk_that_fills_up_keeps_every_whole_chunk(tmp_path: Path) -> None:
     assert 600_000 < path.stat().st_size <= 1_000_000
     assert [one.counter for one in taken] == list(range(len(taken)))
     assert len(taken) > 50
-    assert f"its first {taken[-1].t_ns / 1e9:.1f} s are kept" in line
+    # the last chunk may end within the scan after the last whole one
+    last_s = [taken[-1].t_ns / 1e9, scan(len(taken)).t_ns / 1e9]
+    assert any(f"its first {t_s:.1f} s are kept" in line for t_s in last_s)
     assert session.cut_at_byte == path.stat().st_size  # not within a chunk: that room was freed

@@ -1,0 +1,422 @@
+"""What other programs draw of a session: B-scans, paths, ellipses, walls, beams, ranges.
+
+Nothing here is read back: it is made of what the session holds anyway, for programs that draw
+neither float arrays nor covariances. Topics:
+
+`/radar/<name>/bscan` and a latched `/radar/<name>/bscan/axes`
+    Envelope of the newest frames, at reduced range resolution; see `_Bscan`.
+`/radar/<name>/range`
+    The strongest detection of every state.
+`/estimate/pose`, `/estimate/odometry`
+    The estimate with its covariance, and with the wheels' velocity.
+`/odom/path`, `/estimate/path`, `/truth/path` and each with `_points`
+    The same path as poses and as a point cloud. The wheels' one is in the map frame, as if the
+    wheels had been right until the first state.
+`/landmarks/markers`
+    Landmarks, their 95 % ellipses, and the stretches of wall that answered.
+`/scene`, `/fields_of_view`
+    Latched: true walls and landmarks, if known; the beams of the radars.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.odometry.track import NS_PER_S
+from slam.app.records import RadarInfo, Scan, SessionInfo, Snapshot
+from slam.app.rig.echoes import envelope_db, wedge
+from slam.app.rig.sources import TRUE_PER_MODULE_METRE
+from slam.app.session import cdr
+from slam.app.session import messages as ros
+from slam.app.session.cdr import Marker, Shape
+from slam.config import WheelNoise
+from slam.frames import RadarFrame
+from slam.geometry import between, compose
+from xethru_protocol.recordings.mcap import STRING, pack_string
+
+Array = NDArray[np.float64]
+
+
+class Channels(Protocol):
+    """Takes messages in CDR; see `SessionLog`."""
+
+    def channel(self, topic: str, message_type: str, *, latched: bool = False) -> int: ...
+
+    def write(self, channel: int, t_ns: int, data: bytes | memoryview) -> None: ...
+
+
+class Drawings:
+    """Draws a session into channels of its file.
+
+    `start_ns` is the session time of the latched messages [ns].
+    """
+
+    def __init__(self, file: Channels, info: SessionInfo, start_ns: int) -> None:
+        self._file = file
+        self._radars = info.radars
+        self._field = info.field_of_view
+        self._wheels = WheelMotion(info.wheels)
+        self._newest_ns = start_ns
+        self._map_from_odom: Array | None = None
+        self._last: Snapshot | None = None
+        self._markers_ns = self._paths_ns = start_ns
+        self._bscans = {
+            index: _Bscan(file, radar, self._field.max_range_m, start_ns)
+            for index, radar in enumerate(info.radars)
+            if radar.n_bins >= _FEWEST_BINS
+        }
+        self._ranges = [
+            file.channel(f"/radar/{radar.name}/range", "sensor_msgs/msg/Range")
+            for radar in info.radars
+        ]
+        pose_type = "geometry_msgs/msg/PoseWithCovarianceStamped"
+        self._pose = file.channel("/estimate/pose", pose_type)
+        self._odometry = file.channel("/estimate/odometry", ros.ODOMETRY)
+        self._landmarks = file.channel("/landmarks/markers", _MARKERS)
+        self._paths = {
+            "/odom": _Path(file, "/odom/path", "map"),
+            "/estimate": _Path(file, "/estimate/path", "map"),
+        }
+        self._write_latched("/fields_of_view", "base_link", self._fields_of_view())
+        # Rerun's views are of its own root, which no transform of ROS leads to, and it takes
+        # transforms from any topic; other programs take theirs from /tf and /tf_static.
+        rerun = file.channel("/rerun/tf_static", ros.TRANSFORMS, latched=True)
+        link = ros.transforms(start_ns, {(_RERUN_ROOT, "world"): np.zeros(3)})
+        file.write(rerun, start_ns, ros.serialise(link))
+        if scene := _scene(info):
+            self._write_latched("/scene", "world", scene)
+            self._paths["/truth"] = _Path(file, "/truth/path", "world")
+
+    def on_scan(self, scan: Scan) -> None:
+        self._newest_ns = scan.t_ns
+        for frame in scan.frames:
+            if frame.radar in self._bscans:
+                self._bscans[frame.radar].add(frame)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        t_ns, last = snapshot.t_ns, self._last
+        if self._map_from_odom is None:
+            start = between(snapshot.odometry, np.zeros(3))
+            self._map_from_odom = compose(snapshot.estimate, start)
+        twist = cdr.NO_TWIST
+        if last is not None:
+            twist = self._wheels.twist(last.odometry, snapshot.odometry, t_ns - last.t_ns)
+        self._last = snapshot
+        covariance = snapshot.pose_covariance
+        pose = cdr.pose_with_covariance(t_ns, "map", snapshot.estimate, covariance)
+        self._file.write(self._pose, t_ns, pose)
+        placed = cdr.planar(snapshot.estimate)
+        odometry = cdr.odometry(t_ns, "map", placed, covariance, twist)
+        self._file.write(self._odometry, t_ns, odometry)
+        self._write_ranges(snapshot)
+        self._paths["/odom"].add(t_ns, compose(self._map_from_odom, snapshot.odometry))
+        self._paths["/estimate"].add(t_ns, snapshot.estimate)
+        if "/truth" in self._paths and np.isfinite(snapshot.truth).all():
+            self._paths["/truth"].add(t_ns, snapshot.truth)
+        if t_ns - self._markers_ns >= _MARKERS_EVERY_NS:
+            self._markers_ns = t_ns
+            self._write_landmarks(snapshot)
+        if t_ns - self._paths_ns >= _PATHS_EVERY_NS:
+            self._paths_ns = t_ns
+            for path in self._paths.values():
+                path.write(t_ns, most=_SHOWN_POSES)
+
+    def close(self) -> None:
+        """Write the last rows of the B-scans, the whole paths and the last map."""
+        for bscan in self._bscans.values():
+            bscan.write()
+        if self._last is not None:
+            self._write_landmarks(self._last)
+            for path in self._paths.values():
+                path.write(self._last.t_ns, most=_KEPT_POSES)
+
+    def _write_latched(self, topic: str, frame: str, drawn: Sequence[Marker]) -> None:
+        channel = self._file.channel(topic, _MARKERS, latched=True)
+        self._file.write(channel, self._newest_ns, cdr.markers(self._newest_ns, frame, drawn))
+
+    def _fields_of_view(self) -> list[Marker]:
+        return [
+            Marker(
+                group="fields of view",
+                shape=Shape.LINE_STRIP,
+                number=number,
+                size_m=(0.005, 0.0, 0.0),
+                colour=(0.6, 0.6, 0.6, 1.0),
+                points_m=wedge(self._field, radar),
+                moves=True,
+            )
+            for number, radar in enumerate(self._radars)
+        ]
+
+    def _write_ranges(self, snapshot: Snapshot) -> None:
+        if snapshot.step is None:
+            return
+        for index, radar in enumerate(self._radars):
+            own = [one for one in snapshot.step.detections if one.radar == index]
+            strongest = max(
+                own,
+                # the nearest where amplitudes are unknown
+                key=lambda one: -math.inf if math.isnan(one.amplitude) else one.amplitude,
+                default=None,
+            )
+            message = cdr.echo_range(
+                snapshot.t_ns if strongest is None else strongest.t_ns,
+                f"radar_{radar.name}",
+                field_of_view_rad=self._field.opening_rad,
+                limits_m=(self._field.min_range_m, self._field.max_range_m),
+                range_m=math.inf if strongest is None else strongest.range_m,
+            )
+            self._file.write(self._ranges[index], snapshot.t_ns, message)
+
+    def _write_landmarks(self, snapshot: Snapshot) -> None:
+        drawn = []
+        if len(snapshot.wall_spans_m):
+            drawn.append(
+                Marker(
+                    group="walls",
+                    shape=Shape.LINE_LIST,
+                    size_m=(0.03, 0.0, 0.0),
+                    colour=_BLUE,
+                    points_m=snapshot.wall_spans_m.reshape(-1, 2),
+                )
+            )
+        if len(snapshot.landmark_ids):
+            drawn.append(
+                Marker(
+                    group="landmarks",
+                    shape=Shape.SPHERE_LIST,
+                    size_m=(0.05,) * 3,
+                    colour=_RED,
+                    points_m=snapshot.landmarks_m,
+                )
+            )
+            variances, axes = np.linalg.eigh(snapshot.landmark_covariances_m2)
+            long_first = 2.0 * ENLARGED * _CHI_95 * np.sqrt(np.maximum(variances, 0.0))[:, ::-1]
+            turns = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
+            for id_, place, turn, size in zip(
+                snapshot.landmark_ids.tolist(),
+                snapshot.landmarks_m,
+                turns,
+                long_first.tolist(),
+                strict=True,
+            ):
+                drawn.append(
+                    Marker(
+                        group=f"95 % ellipses, {ENLARGED} x",
+                        shape=Shape.CYLINDER,
+                        number=id_,
+                        size_m=(size[0], size[1], 0.01),
+                        colour=_PALE_RED,
+                        pose=np.append(place, turn),
+                    )
+                )
+        message = cdr.markers(snapshot.t_ns, "map", drawn)
+        self._file.write(self._landmarks, snapshot.t_ns, message)
+
+
+_RERUN_ROOT = "tf#/"
+_MARKERS = "visualization_msgs/msg/MarkerArray"
+_MARKERS_EVERY_NS = 2 * NS_PER_S
+_PATHS_EVERY_NS = 10 * NS_PER_S
+_CHI_95 = math.sqrt(-2.0 * math.log(0.05))  # of two degrees of freedom
+
+_RED, _PALE_RED, _BLUE = (0.84, 0.15, 0.16, 1.0), (0.84, 0.15, 0.16, 0.35), (0.12, 0.47, 0.71, 1.0)
+
+ENLARGED = 10
+"""How many times larger than they are the ellipses of landmarks are drawn."""
+
+
+def _scene(info: SessionInfo) -> list[Marker]:
+    """Draw what is truly there, world frame; nothing if it is unknown."""
+    drawn = [
+        Marker(
+            group="true walls",
+            shape=Shape.LINE_STRIP,
+            number=number,
+            size_m=(0.02, 0.0, 0.0),
+            colour=(0.5, 0.5, 0.5, 1.0),
+            points_m=line,
+        )
+        for number, line in enumerate(info.outlines_m)
+    ]
+    if len(info.true_landmarks_m):
+        drawn.append(
+            Marker(
+                group="true landmarks",
+                shape=Shape.SPHERE_LIST,
+                size_m=(0.03,) * 3,
+                colour=(0.2, 0.2, 0.2, 1.0),
+                points_m=info.true_landmarks_m,
+            )
+        )
+    return drawn
+
+
+class WheelMotion:
+    """Velocity by the wheels between two poses, with the errors that SLAM assumes of them.
+
+    `errors` are the fields of `WheelNoise`; without them the covariance is zero, which in ROS means
+    unknown.
+    """
+
+    def __init__(self, errors: Mapping[str, float]) -> None:
+        self._noise = WheelNoise(**errors) if errors else None
+
+    def twist(self, before: Array, after: Array, dt_ns: int) -> cdr.Twist:
+        """Return the constant velocity that leads from one pose (3,) to the other in a time."""
+        if dt_ns <= 0:
+            return cdr.NO_TWIST
+        dt_s = dt_ns / NS_PER_S
+        dx, dy, turn = between(before, after).tolist()
+        # along an arc of constant curvature: a pose is the exponential of its twist
+        half = turn / 2.0
+        stretch = half / math.tan(half) if abs(half) > 1e-9 else 1.0
+        forwards, left = stretch * dx + half * dy, stretch * dy - half * dx
+        velocity = np.array([forwards, left, turn]) / dt_s
+        if self._noise is None:
+            return cdr.Twist(velocity=velocity, covariance=np.zeros((3, 3)))
+        noise, distance_m = self._noise, math.hypot(forwards, left)
+        variances = np.array(noise.step_variances(distance_m, turn))
+        variances[:2] += (noise.scale_sigma * np.array([forwards, left])) ** 2
+        variances[2] += (noise.turn_scale_sigma * turn) ** 2
+        variances[2] += (noise.curvature_sigma_rad_per_m * distance_m) ** 2
+        return cdr.Twist(velocity=velocity, covariance=np.diag(variances) / dt_s**2)
+
+
+_SHOWN_POSES = 256
+"""Of a path that is still driven, so that what is written of it in an hour stays in proportion."""
+_KEPT_POSES = 3600
+
+
+class _Path:
+    """A path that grows: all poses up to 3600, then every second, every fourth, and so on."""
+
+    def __init__(self, file: Channels, topic: str, frame: str) -> None:
+        self._file, self._frame = file, frame
+        self._path = file.channel(topic, "nav_msgs/msg/Path")
+        self._points = file.channel(f"{topic}_points", ros.POINT_CLOUD)
+        self._stamps: list[int] = []
+        self._poses: list[tuple[float, ...]] = []
+        self._every, self._n_added = 1, 0
+        self._newest: tuple[int, tuple[float, ...]] | None = None
+
+    def add(self, t_ns: int, pose: Array) -> None:
+        self._newest = t_ns, tuple(pose.tolist())
+        if self._n_added % self._every == 0:
+            self._stamps.append(t_ns)
+            self._poses.append(self._newest[1])
+        self._n_added += 1
+        if len(self._poses) >= _KEPT_POSES:
+            self._every *= 2
+            del self._stamps[1::2], self._poses[1::2]
+
+    def write(self, t_ns: int, *, most: int) -> None:
+        """Write the path, thinned to so many poses at most, to its end."""
+        if self._newest is None:
+            return
+        step = -(-len(self._poses) // (most - 1))
+        stamps, poses = self._stamps[::step], self._poses[::step]
+        if stamps[-1] != self._newest[0]:
+            stamps, poses = [*stamps, self._newest[0]], [*poses, self._newest[1]]
+        rows = np.array(poses)
+        message = cdr.path(t_ns, self._frame, np.array(stamps), rows)
+        self._file.write(self._path, t_ns, message)
+        cloud = ros.serialise(ros.path_cloud(t_ns, self._frame, rows))
+        self._file.write(self._points, t_ns, cloud)
+
+
+_ROWS = 128
+_NEW_ROWS = 32
+_BINS_PER_COLUMN = 4
+_REACHES = 2.0
+_FLOOR_DB, _STEP_DB = -62.0, 0.5
+_FEWEST_BINS = 2 * _BINS_PER_COLUMN
+"""Sessions made of ranges have frames without samples."""
+
+
+class _Bscan:
+    """The newest frames of a radar as a picture that grows downwards, 32 frames at a time.
+
+    A row is a frame, a column 4 bins, a quarter of what the pulse resolves, up to twice the range
+    that SLAM looks at. A value is the largest envelope in them, in decibels above -62 dB of full
+    scale, which is the receiver's noise, rounded to 0.5 dB, and 0 below. No value is negative, as
+    viewers take images of one float per pixel for depths. What stayed the same over the last 128
+    frames is taken away. A lost frame is a row of NaN. After 128 rows a new picture begins.
+    """
+
+    def __init__(self, file: Channels, radar: RadarInfo, reach_m: float, start_ns: int) -> None:
+        self._file = file
+        self._frame_id = f"radar_{radar.name}"
+        self._images = file.channel(f"/radar/{radar.name}/bscan", "sensor_msgs/msg/Image")
+        self._recent: deque[NDArray[np.float32]] = deque(maxlen=_ROWS)
+        self._n_new = 0
+        self._last: RadarFrame | None = None
+        self._rows: list[NDArray[np.float32]] = []
+        self._gaps: list[int] = []  # before each new frame
+        bin_m = radar.bin_length_m * TRUE_PER_MODULE_METRE
+        first_bin = 1 + (_BINS_PER_COLUMN - 1) / 2
+        start_m = radar.range_start_m * TRUE_PER_MODULE_METRE - radar.range_offset_m
+        n_shown = min(max(int((_REACHES * reach_m - start_m) / bin_m), _FEWEST_BINS), radar.n_bins)
+        self._n_columns = (n_shown - 2) // _BINS_PER_COLUMN
+        about = {
+            "value": "envelope of the echoes, the mean of the last 128 frames taken away",
+            "unit": f"dB above {_FLOOR_DB:g} dB of full scale",
+            "columns": {
+                "what": "range from the antenna",
+                "unit": "m",
+                "first": start_m + first_bin * bin_m,
+                "step": _BINS_PER_COLUMN * bin_m,
+                "count": self._n_columns,
+            },
+            "rows": {
+                "what": "time of the frame; the last row is of the stamp in the header",
+                "unit": "s",
+                "step": 1.0 / radar.rate_hz,
+                "most": _ROWS,
+            },
+            "lost frames": "NaN",
+        }
+        info = file.channel(f"/radar/{radar.name}/bscan/axes", STRING, latched=True)
+        file.write(info, start_ns, pack_string(json.dumps(about)))
+
+    def add(self, frame: RadarFrame) -> None:
+        last = self._last
+        gap = 0
+        if last is not None:
+            gap = frame.counter - last.counter - 1 if frame.stream == last.stream else 1
+        self._last = frame
+        self._gaps.append(min(max(gap, 0), _ROWS))
+        self._recent.append(frame.samples)
+        self._n_new += 1
+        if self._n_new == _NEW_ROWS:
+            self.write()
+
+    def write(self) -> None:
+        """Write the picture with the frames that came since the last time."""
+        if self._last is None or not self._n_new:
+            return
+        n_bins = 2 + self._n_columns * _BINS_PER_COLUMN
+        recent = np.stack([samples[:n_bins] for samples in self._recent])
+        recent = np.nan_to_num(recent, copy=False)
+        echoes = recent[-self._n_new :] - recent.mean(axis=0)
+        levels = envelope_db(echoes, self._last.bin_length_m)
+        columns = levels.reshape(self._n_new, self._n_columns, _BINS_PER_COLUMN).max(axis=2)
+        steps = np.round((columns - np.float32(_FLOOR_DB)) / np.float32(_STEP_DB))
+        rounded = np.maximum(steps, 0.0) * np.float32(_STEP_DB)
+        missing = np.full(self._n_columns, np.nan, dtype=np.float32)
+        if len(self._rows) >= _ROWS:
+            self._rows = []
+        for gap, row in zip(self._gaps, rounded, strict=True):
+            self._rows += [missing] * gap
+            self._rows.append(row)
+        self._rows = self._rows[-_ROWS:]
+        self._gaps, self._n_new = [], 0
+        message = cdr.image(self._last.t_ns, self._frame_id, np.array(self._rows))
+        self._file.write(self._images, self._last.t_ns, message)
