@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.wire.codes import X4Setting
-from xethru_protocol.wire.messages import DataFloat, ReplyInt
+from xethru_protocol.wire.messages import DataFloat, ReplyFloat, ReplyInt, X4Value
 from xethru_protocol.wire.rows import Response
 
 _MOST_BASEBAND_BINS = 188  # Protocol reference 9.4
@@ -101,6 +102,38 @@ class FrameLayouts:
         if roughness is None or _SMOOTH <= roughness <= _ROUGH:
             return FrameLayout(values=length, downconversion=None)
         return FrameLayout(values=length, downconversion=roughness < _SMOOTH, inferred=True)
+
+
+class FrameGeometries:
+    """Gathers the module's answers about its frame area, which say where a frame's bins lie.
+
+    ``answers`` has them by the names of `X4Setting`: FRAMEAREA (start, end) in module metres and
+    FRAMEBINCOUNT.
+    """
+
+    def __init__(self) -> None:
+        self.answers: dict[str, X4Value] = {}
+
+    def take(self, message: Response) -> None:
+        match message:
+            case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
+                self.answers[X4Setting.FRAMEAREA.name] = start_m, end_m
+            case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(n_bins,)):
+                self.answers[X4Setting.FRAMEBINCOUNT.name] = n_bins
+
+    def of(self, frame: DataFloat) -> FrameGeometry | None:
+        """Return where the bins of a frame lie; None if the answers are missing or of others."""
+        area_m = self.answers.get(X4Setting.FRAMEAREA.name)
+        n_bins = self.answers.get(X4Setting.FRAMEBINCOUNT.name)
+        if not isinstance(area_m, tuple) or not isinstance(n_bins, int):
+            return None
+        if len(frame.values) not in {n_bins, 2 * n_bins}:
+            return None  # of another time
+        return FrameGeometry.from_read_back(
+            area_m=(float(area_m[0]), float(area_m[1])),
+            n_bins=n_bins,
+            downconversion=len(frame.values) == 2 * n_bins,
+        )
 
 
 def _is_rf(length: int) -> bool:

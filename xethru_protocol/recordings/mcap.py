@@ -39,6 +39,7 @@ from mcap.records import Statistics
 from mcap.writer import CompressionType, Writer
 
 from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.recordings.frame_layout import FrameGeometries
 from xethru_protocol.recordings.records import (
     FaultHandler,
     RadarFacts,
@@ -53,14 +54,10 @@ from xethru_protocol.recordings.records import (
 )
 from xethru_protocol.system import written_whole
 from xethru_protocol.wire.codec import decode_response, describe, encode
-from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.messages import (
     BasebandAp,
     BasebandIq,
     DataFloat,
-    ReplyFloat,
-    ReplyInt,
-    X4Value,
 )
 from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
 from xethru_protocol.wire.x4 import RF_BIN_M
@@ -718,7 +715,7 @@ class _RecordingWriter:
         self._channels: dict[tuple[str, bool], int] = {}
         self._others = 0
         self._has_info = False
-        self._settings: dict[str, X4Value] = {}  # as the recorded module read them back
+        self._geometries = FrameGeometries()
 
     def write(self, message: Response, t_ns: int | None) -> None:
         if isinstance(message, DataFloat) and message.content_id == 0:
@@ -726,11 +723,7 @@ class _RecordingWriter:
             data = pack_array(FLOAT_ARRAY, message.values)
             self._add("frame", FLOAT_ARRAY, data, t_ns, message.info)
             return
-        match message:  # the module's answers about its frame area
-            case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
-                self._settings[X4Setting.FRAMEAREA.name] = start_m, end_m
-            case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(n_bins,)):
-                self._settings[X4Setting.FRAMEBINCOUNT.name] = n_bins
+        self._geometries.take(message)
         bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
         if isinstance(message, BasebandIq | BasebandAp):
             self._info(message, t_ns)
@@ -760,7 +753,7 @@ class _RecordingWriter:
             "bin_length_m": None if geometry is None else geometry.bin_length_m,
             "n_bins": None if geometry is None else geometry.n_bins,
             "rate_hz": None,
-            "settings": self._settings,
+            "settings": self._geometries.answers,
             "length_unit": _LENGTH_UNIT,
         }
         self._add("info", STRING, pack_string(json.dumps(info)), t_ns, 0)
@@ -774,17 +767,7 @@ class _RecordingWriter:
                 n_bins=frame.num_bins,
                 downconversion=True,
             )
-        area_m = self._settings.get(X4Setting.FRAMEAREA.name)
-        n_bins = self._settings.get(X4Setting.FRAMEBINCOUNT.name)
-        if not isinstance(area_m, tuple) or not isinstance(n_bins, int):
-            return None
-        if len(frame.values) not in {n_bins, 2 * n_bins}:
-            return None  # of another time
-        return FrameGeometry.from_read_back(
-            area_m=(float(area_m[0]), float(area_m[1])),
-            n_bins=n_bins,
-            downconversion=len(frame.values) == 2 * n_bins,
-        )
+        return self._geometries.of(frame)
 
     def _add(self, topic: str, schema: str, data: bytes, t_ns: int | None, sequence: int) -> None:
         key = topic, t_ns is not None

@@ -94,8 +94,8 @@ class FrameLayer:
         self._blocks = [_FrameBlock(radar.name) for radar in radars]
         for index, radar in enumerate(radars):
             colour = RADAR_RGB[index % len(RADAR_RGB)]
-            recording.static(f"radar/{part(radar.name)}/frame", _chart_style(color=colour))
-            recording.static(f"radar/{part(radar.name)}/detections", _chart_style(color=FAULT_RGB))
+            recording.static(f"radar/{part(radar.name)}/frame", chart_style(color=colour))
+            recording.static(f"radar/{part(radar.name)}/detections", chart_style(color=FAULT_RGB))
 
     def on_scan(self, scan: Scan) -> None:
         """Take the frames of one tick; a full block goes out at once."""
@@ -151,9 +151,9 @@ class FrameLayer:
         if block.axis != (axis := (newest.range_start_m, newest.bin_length_m, n_bins)):
             block.axis = axis
             labels_m = (axis[0] + axis[1] * np.arange(n_bins)).astype(np.float32)
-            style = _chart_style(abscissa=labels_m, bar_m=newest.bin_length_m)
+            style = chart_style(abscissa=labels_m, bar_m=newest.bin_length_m)
             self._recording.static(f"{block.entity}/frame", style)
-        charts = _tensors("BarChart:values", samples.ravel(), np.full(n_frames, n_bins))
+        charts = chart_values("BarChart:values", samples.ravel(), np.full(n_frames, n_bins))
         self._recording.rows(f"{block.entity}/frame", block.stamps, [charts])
         block.shown.extend(block.frames)
         # Stamped with its first frame, so that the cursor is inside the picture it shows; where
@@ -186,7 +186,7 @@ class _FrameBlock:
         self.frames: list[RadarFrame] = []
 
 
-def _chart_style(
+def chart_style(
     *,
     color: Rgb | None = None,
     abscissa: NDArray[np.float32] | None = None,
@@ -209,13 +209,13 @@ def _charts(
     every_width = rr.BarChart(_ONE_VALUE, widths=np.concatenate(widths)).as_component_batches()
     (width,) = (b for b in every_width if b.component_descriptor().component == "BarChart:widths")
     return [
-        _tensors("BarChart:values", np.concatenate(heights), sizes),
-        _tensors("BarChart:abscissa", np.concatenate(places), sizes),
+        chart_values("BarChart:values", np.concatenate(heights), sizes),
+        chart_values("BarChart:abscissa", np.concatenate(places), sizes),
         rr.ComponentColumn(width.component_descriptor(), width).partition(sizes),
     ]
 
 
-def _tensors(
+def chart_values(
     component: str, values: NDArray[np.float32], sizes: NDArray[np.int64]
 ) -> rr.ComponentColumn:
     """Make a column of one-dimensional tensors, one per row, of the sizes given.

@@ -104,10 +104,12 @@ class Stamps:
 
 
 class Recording:
-    """Sends rows to an .rrd file or to a viewer that listens, and knows how many.
+    """Sends rows to an .rrd file, to a viewer that listens or to one that reads standard output.
 
     Parameters
     ----------
+    target
+        A file, the address of a viewer, or None for standard output.
     blueprint
         How a viewer lays it out, unless its user chose otherwise.
     recording_id
@@ -131,13 +133,14 @@ class Recording:
 
     def __init__(
         self,
-        target: Path | str,
+        target: Path | str | None,
         blueprint: rrb.Blueprint,
         *,
         recording_id: str,
         name: str,
         start_ns: int,
         called: str | None = None,
+        application_id: str = "xethru-hil",
     ) -> None:
         rr.set_strict_mode(True)
         self._target, self._called = target, called or str(target)
@@ -145,7 +148,7 @@ class Recording:
         self.sent: dict[str, int] = defaultdict(int)
         # Never `with` this stream: leaving the block closes the file and drops what follows.
         self._stream: rr.RecordingStream | None = rr.RecordingStream(
-            "xethru-hil", recording_id=recording_id
+            application_id, recording_id=recording_id
         )
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
@@ -155,6 +158,8 @@ class Recording:
             except RuntimeError as error:  # Rerun's own, with the system's message at its end
                 reason = str(error).rpartition(": ")[2]
                 raise AppError(f"{self._called}: cannot be written: {reason}") from None
+        elif target is None:
+            self._stream.stdout(default_blueprint=blueprint)
         else:
             self._stream.connect_grpc(target, default_blueprint=blueprint)
         self._stream.send_recording_name(name)
@@ -163,6 +168,10 @@ class Recording:
     @property
     def is_finished(self) -> bool:
         return self._stream is None
+
+    def arrange(self, blueprint: rrb.Blueprint) -> None:
+        """Lay out what is sent by now in another way."""
+        self._open().send_blueprint(blueprint)
 
     def static(
         self, entity: str, what: rr.AsComponents | Sequence[rr.DescribedComponentBatch]
@@ -198,7 +207,11 @@ class Recording:
         closing = Thread(target=stream.disconnect, daemon=True)
         closing.start()
         is_file = isinstance(self._target, Path)
-        closing.join(_FILE_CLOSE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S)
+        if self._target is None:  # who reads decides how fast
+            limit_s = None
+        else:
+            limit_s = _FILE_CLOSE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S
+        closing.join(limit_s)
         if closing.is_alive():
             rr.unregister_shutdown()  # or it waits once more when the interpreter ends
             if is_file:
