@@ -58,7 +58,6 @@ scenes: $(VENV)/installed-demo
 # for that of the report. RECORDING names the real recording that `recording` compares with.
 pictures: $(VENV)/installed-test
 	$(BIN)/uwb-slam demo --out out/pictures/demo
-	cp out/pictures/demo/map.png fixtures/pictures/lab_map.png
 	$(BIN)/uwb-slam demo --scene classroom --out out/pictures/classroom
 	cp out/pictures/classroom/map.png fixtures/pictures/classroom_map.png
 	$(BIN)/uwb-slam view out/pictures/demo --screenshot fixtures/pictures/lab_rerun.png --at 330

@@ -441,7 +441,7 @@ class MapLayer:
         if len(info.true_landmarks_m):
             static("map/landmarks/true", _crosses(info.true_landmarks_m))
         self._send_ground()
-        style = rr.LineStrips2D.from_fields(colors=ROBOT_RGB, radii=_LINE_POINTS, draw_order=65.0)
+        style = rr.LineStrips2D.from_fields(colors=ROBOT_RGB, radii=_LINE_POINTS, draw_order=59.0)
         static("map/estimate/ellipse", style)
         for index, radar in enumerate(info.radars):
             outline = [screen(wedge(self._field, radar))]
@@ -586,9 +586,10 @@ class MapLayer:
         )
         self._recording.row("map/landmarks/estimated", stamps, dots)
         self._recording.row("map/landmarks/ellipses", stamps, ellipses)
-        corner = np.array([[self._ground.low_m[0], self._ground.high_m[1]]])
+        ground = self._ground
+        top = np.array([[(ground.low_m[0] + ground.high_m[0]) / 2, ground.high_m[1]]])
         legend = rr.Points2D(
-            screen(corner + np.array([1.0, 0.0]) * MAP_MARGIN_M),
+            screen(top),
             labels=[ellipse_text(enlarged)],
             show_labels=True,
             colors=LANDMARK_RGB,

@@ -62,12 +62,12 @@ A robot drives through a room and maps it with {n_radars} short-range radars, wh
 only. {data}
 
 * **Map** (left, metres, y up). {truth}Orange: where its *wheels* alone say it went. Blue: where
-  *radar SLAM* says, with the robot as a disk and an arrow forwards. Red: *landmarks* it found, with
-  95 % ellipses, enlarged as the corner says so that they can be seen.
+  *radar SLAM* says, with the robot as a disk with an arrow. Red: *landmarks* it found, with
+  95 % ellipses, enlarged as the map says.
 * **Around the robot**: a grey wedge is what one radar can see. An echo has a distance but no
   direction, so it is an arc: **green** if it moved the estimate, **dim** if not. {points}
-* **B-scan** (middle, a tab per radar): echoes of up to {block} frames, time downwards, range to
-  the right, constant part removed. A landmark that the robot passes is a curved line.
+* **B-scan** (middle, a tab per radar): echoes of up to {block} frames, constant part removed. A
+  landmark that the robot passes is a curved line.
 * **Frame**: the newest raw frame; red bars are detections.
 * **Error** (below the map): distance to the truth, which SLAM never sees. **SLAM**: the same, with
   the grey band that should hold it in 95 % of cases. **NEES**, **NIS**: errors of the pose over 3,
@@ -76,8 +76,8 @@ only. {data}
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
   every command and answer under *Log*.
 
-Move the cursor of the time line below. `device_time` is the radars' own time, `frame` the
-tick (frame periods since the start), `host_time`, if there, when frames arrived.
+Move the cursor of the time line below. `device_time` is the radars' own time, `frame` counts frame
+periods, `host_time`, if there, is when frames arrived.
 """
 
 _TRUTH = "Grey: the *true* path, and crosses where the landmarks truly are. "
@@ -183,8 +183,11 @@ def _numbers(info: SessionInfo) -> rrb.Tabs:
         "NIS": ("/consistency/nis", ["$origin/**"]),
         "Landmarks": ("/landmarks", ["$origin/**"]),
     }
+    corner = rrb.Corner2D.LeftTop  # errors grow, so that there is room
     views = [
-        rrb.TimeSeriesView(name=name, origin=origin, contents=shown, axis_x=_whole_run())
+        rrb.TimeSeriesView(
+            name=name, origin=origin, contents=shown, axis_x=_whole_run(), plot_legend=corner
+        )
         for name, (origin, shown) in contents.items()
     ]
     return rrb.Tabs(*views, active_tab=0 if is_world_known(info) else 1)
@@ -341,7 +344,7 @@ def style_numbers(recording: Recording) -> None:
         )
         recording.static(entity, line)
     for entity, name, unit in _BANDS:
-        band = rr.Measurements.from_fields(colors=BAND_RGB, names=name, units=unit, widths=0.5)
+        band = rr.Measurements.from_fields(colors=BAND_RGB, names=name, units=unit, widths=0.0)
         recording.static(entity, band)
 
 

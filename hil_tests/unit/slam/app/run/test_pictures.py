@@ -3,22 +3,29 @@
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
 
+from hil_tests.unit.slam.app.sessions import session_info, snapshot
 from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
     LINK_COLOURS,
+    NARROW_IN,
     ODOMETRY,
     TRUTH,
+    draw_map,
     ellipse_95,
     enlargement,
     rotate_covariances,
 )
+from slam.app.run.runner import RunRecord, States
 from slam.app.view import rerun_recording as view
 
 
@@ -69,6 +76,45 @@ def test_ellipses_are_as_large_as_the_map_allows(sigmas_m: list[float], size_m: 
 
     assert times == 1 or fits(times * (1 - 1e-6))
     assert times == 1000 or not fits(steps[steps.index(times) + 1] * (1 + 1e-6))
+
+
+@pytest.mark.parametrize("width_in", [9.0, NARROW_IN])
+def test_the_map_says_how_much_its_ellipses_are_enlarged(width_in: float) -> None:
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.5, 0.3]])
+    covariance = np.diag([4e-6, 1e-6])
+    last = replace(
+        snapshot(2),
+        estimate=poses[-1],
+        pose_covariance=np.diag([4e-6, 1e-6, 1e-6]),
+        landmark_covariances_m2=np.array([covariance, covariance]),
+    )
+    states = States(
+        t_ns=np.arange(3),
+        truth=np.full((3, 3), np.nan),
+        odometry=poses,
+        estimate=poses,
+        pose_covariances=np.zeros((3, 3, 3)),
+        nis=np.zeros(3),
+        nis_dof=np.zeros(3, dtype=np.int32),
+    )
+    record = RunRecord(states=states, last=last, n_frames=6, duration_ns=1, wall_s=1.0)
+    figure = Figure(figsize=(width_in, 6.0), layout="constrained")
+    draw_map(figure, session_info(), record, None)
+    (axes,) = figure.axes
+    legend = figure.legends[0] if width_in == NARROW_IN else axes.get_legend()
+    assert legend is not None
+    texts = [text.get_text() for text in legend.get_texts()]
+    (text,) = (text for text in texts if text.startswith("95 % ellipse"))
+    times = float(text.removeprefix("95 % ellipse, enlarged ").removesuffix(" x"))
+    assert times > 1
+    assert {"start", "last pose", "true landmark", "estimated landmark", "radar SLAM"} < set(texts)
+    (ellipses,) = (c for c in axes.collections if isinstance(c, PolyCollection))
+    outlines = [path.vertices for path in ellipses.get_paths()]
+    assert len(outlines) == 3  # two landmarks and the robot
+    for outline in outlines:
+        half_axes = np.ptp(np.asarray(outline), axis=0) / 2
+        np.testing.assert_allclose(half_axes, times * 2.4477468 * np.array([2e-3, 1e-3]), rtol=1e-4)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
 
 
 # Machado, Oliveira, Fernandes: A physiologically-based model for simulation of color vision
