@@ -76,8 +76,8 @@ class SessionInfo:
     has_detections
         Whether ranges were recorded that SLAM takes instead of what it finds in frames.
     started_unix_ns
-        Time of day at session time 0, 0 where session time is the time of day; None if it has no
-        meaning.
+        Time of day at session time 0, of a demo when it began; 0 where session time is the time of
+        day; None if it has no meaning.
     odometry_clock
         Text of the option --odometry-clock of a live run, "" of any other.
     constants

@@ -77,6 +77,13 @@ def test_exactly_the_promised_files(demo: Finished) -> None:
     }
 
 
+def test_the_session_has_the_time_of_day(demo: Finished) -> None:
+    with (demo.out / "session.mcap").open("rb") as stream:
+        (table, *_) = [found.metadata for found in make_reader(stream).iter_metadata()]
+    folder = demo.out.parent.stat()
+    assert folder.st_mtime_ns <= int(table["started_unix_ns"]) < demo.out.stat().st_mtime_ns
+
+
 def test_summary_agrees_with_the_trajectory_files(demo: Finished) -> None:
     summary = json.loads((demo.out / "summary.json").read_text())
     assert summary["landmarks"]["true"] > 0

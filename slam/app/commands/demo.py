@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -89,6 +90,7 @@ def run_demo(
                 constants=slam_constants(),
                 wheels=asdict(wheels),
                 outlines_m=outlines_m(loaded),
+                started_unix_ns=time.time_ns(),
             )
             source = RunSource(
                 info=info,

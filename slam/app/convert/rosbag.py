@@ -103,6 +103,7 @@ def _radar_of(pattern: re.Pattern[str], topic: str) -> str | None:
 
 # A header's stamp further from the time of recording is of another clock.
 _SAME_CLOCK_NS = NS_PER_S
+_TIME_OF_DAY_NS = 1_000_000_000 * NS_PER_S  # of 2001; simulated clocks begin at 0
 _TRUTH_TYPES = (ros.POSE, "geometry_msgs/msg/PoseWithCovarianceStamped", ros.ODOMETRY)
 _PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
 
@@ -320,7 +321,9 @@ def _session_info(
         except ValueError as error:
             raise AppError(f"{bag}: {SESSION_TOPIC} cannot be read: {error}") from None
         return read_session_table(bag, table, radars)
-    return imported_info(bag, radars, preset, time_base="recording")
+    info = imported_info(bag, radars, preset, time_base="recording")
+    first_ns = min(stream.stamps_ns[0] for stream in contents.streams.values())
+    return replace(info, started_unix_ns=0 if first_ns > _TIME_OF_DAY_NS else None)
 
 
 def _truth_at(track: OdometryTrack) -> TruthAt:

@@ -118,6 +118,7 @@ def test_the_authors_layout_becomes_a_session(
     assert (code, err) == (0, "")
     assert f"{4 * N_SCANS} frames of 4 radars in {N_SCANS} scans" in out
     session = open_session(tmp_path / "s.mcap")
+    assert session.info.started_unix_ns == 0  # stamps are the time of day
     assert [(m.name, m.x_m, m.y_m, round(math.degrees(m.yaw_rad))) for m in session.rig.mounts] == [
         ("UWBradar1", 0.1, -0.2, -90),
         ("UWBradar2", -0.1, 0.2, 90),
