@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import combinations
 from random import Random
 
@@ -529,6 +530,21 @@ def test_every_true_pair_is_found_among_at_most_k_squared(
     shuffled = list(detections)
     shuffler.shuffle(shuffled)
     assert set(trilaterator.locate(shuffled, 0)) == set(fixes)
+
+
+@given(crowds(), st.sampled_from([1e-4, 1.0, 5.0]), st.sampled_from([-1, 1]))
+def test_a_rig_with_yaws_as_measured_finds_every_target_that_both_radars_see(
+    targets: list[Array], off_deg: float, way: int
+) -> None:
+    mounts = list(paper_rig().mounts)
+    for radar, turn in ((0, way), (1, -way)):
+        yaw_rad = mounts[radar].yaw_rad + turn * math.radians(off_deg)
+        mounts[radar] = replace(mounts[radar], yaw_rad=yaw_rad)
+    rig = Rig(mounts=tuple(mounts))
+    fixes = Trilaterator(TrilaterationConfig(), rig).locate(echoes(rig, targets), 0)
+    for target in targets:
+        if all(abs(off_boresight(mount, target)) < HALF_VIEW_RAD for mount in rig.mounts[:2]):
+            assert min(math.dist((fix.x_m, fix.y_m), target) for fix in fixes) <= 1e-12
 
 
 @given(

@@ -60,6 +60,26 @@ def test_a_lap_of_the_lab_gives_a_clean_map() -> None:
     assert ate_rmse_m(path[:, :2], run.poses[:, :2]) < ate_rmse_m(odometry[:, :2], run.poses[:, :2])
 
 
+def turned(rig: Rig, off_deg: float) -> Rig:
+    """Return the rig with its first radar, one of the left pair, mounted at another yaw."""
+    first = rig.mounts[0]
+    yaw_rad = first.yaw_rad + math.radians(off_deg)
+    return Rig(mounts=(replace(first, yaw_rad=yaw_rad), *rig.mounts[1:]))
+
+
+@pytest.mark.parametrize(("off_deg", "apart_m"), [(1e-4, 1e-6), (1.0, 2e-3), (5.0, 5e-3)])
+def test_a_radar_mounted_a_little_aslant_gives_nearly_the_same_run(
+    off_deg: float, apart_m: float
+) -> None:
+    run = cut(simulate(LAB, 0, SIGMA_M), 250)
+    straight, path = drive(run, paper_rig())
+    aslant, other = drive(run, turned(paper_rig(), off_deg))
+    assert np.abs(other - path)[:, :2].max() <= apart_m
+    here, there = belief_of(straight).landmarks, belief_of(aslant).landmarks
+    assert len(here) == len(there) >= 4
+    assert np.hypot(*(here[:, None] - there).T).min(axis=0).max() <= 3 * apart_m
+
+
 def test_the_same_run_gives_the_same_bits() -> None:
     rig = paper_rig()
     run = cut(simulate(LAB, 3, SIGMA_M), 200)

@@ -17,6 +17,8 @@ from slam.app.run.evaluation import NEES_AT, Summary, summarise
 from slam.app.run.output import summary_rows, table_text
 from slam.app.run.results import evaluate
 from slam.app.run.runner import RunRecord
+from slam.app.session.messages import settings_text
+from slam.config import BackEnd, DetectionConfig, RobustConfig, SlamConfig, TrilaterationConfig
 from slam.evaluation import LandmarkScore
 from slam.geometry import Mount, Rig
 from slam.results import Association, Belief, Observation, StepResult
@@ -96,6 +98,27 @@ def test_landmarks_are_judged_after_the_trajectorys_alignment_and_expected_only_
     assert score.rmse_m == pytest.approx(0.0, abs=1e-9)
     # the path is right, the map is 30 mm off
     assert run(offset_m=0.0, drift=0.0, variance=0.01).landmarks.rmse_m == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize(
+    ("back_end", "opening_deg"), [(BackEnd.PAPER, 60.0), (BackEnd.ROBUST, 50.0)]
+)
+def test_the_field_of_view_is_that_of_the_settings(back_end: BackEnd, opening_deg: float) -> None:
+    config = SlamConfig(
+        back_end=back_end,
+        trilateration=TrilaterationConfig(field_of_view_deg=60.0),
+        robust=RobustConfig(field_of_view_deg=50.0),
+        detection=DetectionConfig(min_range_m=0.3, max_range_m=5.0),
+    )
+    field = dataclasses.replace(INFO, config_json=settings_text(config)).field_of_view
+    assert math.degrees(field.opening_rad) == pytest.approx(opening_deg)
+    assert (field.min_range_m, field.max_range_m) == (0.3, 5.0)
+
+
+def test_a_session_without_settings_has_the_papers_field_of_view() -> None:
+    field = dataclasses.replace(INFO, config_json="").field_of_view
+    assert math.degrees(field.opening_rad) == pytest.approx(65.0)
+    assert (field.min_range_m, field.max_range_m) == (0.2, 1.5)
 
 
 PLACE = np.array([5.0, -3.0, 0.8])
