@@ -10,6 +10,7 @@ import fcntl
 import json
 import os
 import select
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -84,6 +85,35 @@ def written_whole(path: Path) -> Iterator[Path]:
         raise OSError(errno.EBUSY, "another process is writing it") from None
     with suppress(OSError):  # some file systems have no such thing for folders
         sync(target.parent)
+
+
+@contextmanager
+def built_aside(path: Path) -> Iterator[Path]:
+    """Give the block a path of the same name in a hidden folder beside ``path``, or in it.
+
+    The block moves what it has built there to ``path`` when that is whole. The folder is removed
+    at the end; one that a killed process left is removed by the next.
+
+    Raises OSError if the folder cannot be made, PathInUseError if another process is using it.
+    """
+    around = path if path.is_dir() else path.parent  # a folder may be a file system of its own
+    folder = around / f".unfinished.{path.name}"
+    folder.mkdir(exist_ok=True)
+    with locked(folder):
+        try:
+            _empty(folder)
+            yield folder / path.name
+        finally:
+            _empty(folder)
+            folder.rmdir()
+
+
+def _empty(folder: Path) -> None:
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def sync(path: Path) -> None:

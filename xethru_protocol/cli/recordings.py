@@ -32,9 +32,10 @@ from xethru_protocol.recordings import (
     recording_facts,
 )
 from xethru_protocol.recordings import convert as convert_recording
+from xethru_protocol.recordings.records import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
-from xethru_protocol.system import one_line
+from xethru_protocol.system import PathInUseError, built_aside, one_line
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import LocalProtocolError
@@ -275,9 +276,10 @@ def convert(arguments: Namespace) -> int:
         newest = messages
         progress.show(lambda: f"{newest} messages")
 
-    with set_aside(path, replace=arguments.force):
+    files_to_replace((path,), replace=arguments.force)
+    with _whole(path, replace=arguments.force) as fresh:
         try:
-            done = convert_recording(source, target, show, radar=arguments.radar)
+            done = convert_recording(source, str(fresh), show, radar=arguments.radar)
         finally:
             progress.finish(lambda: f"{newest} messages")
     if arguments.json:
@@ -323,6 +325,37 @@ def is_part_of(source: Path, target: Path) -> bool:
     return target.exists() and any(
         path.exists() and path.samefile(source) for path in (target, *_recording_files(target))
     )
+
+
+@contextmanager
+def _whole(target: Path, *, replace: bool) -> Iterator[Path]:
+    """Give the block a path for a recording, which replaces an older one when it is whole.
+
+    Whatever ends the block, or kills it, the older one is there until then.
+    """
+    fresh = target
+    try:
+        with writing(target):
+            if not target.suffix:
+                target.parent.mkdir(parents=True, exist_ok=True)
+        with writing(target), built_aside(target) as fresh:
+            if target.is_dir():
+                fresh.mkdir()
+            yield fresh
+            with set_aside(target, replace=replace):
+                _move(fresh, target)
+    except PathInUseError:
+        raise RecordingError(f"{target} is being written by another conversion") from None
+    except RecordingError as error:
+        raise RecordingError(str(error).replace(str(fresh), str(target))) from None
+
+
+def _move(fresh: Path, target: Path) -> None:
+    if not target.is_dir():
+        fresh.replace(target)
+        return
+    for path in fresh.iterdir():
+        path.replace(target / path.name)
 
 
 @contextmanager

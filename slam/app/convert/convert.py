@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +15,7 @@ from slam.app.run.replay import recorded_config
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
-from xethru_protocol.system import PathInUseError, StopFlag, locked, sync
+from xethru_protocol.system import PathInUseError, StopFlag, built_aside, sync
 
 
 def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
@@ -125,33 +124,20 @@ def _whole(out: Path) -> Iterator[Path]:
 
     What the block has begun is removed where it fails; what a killed one has begun, next time.
     """
-    folder = out.with_name(f".unfinished.{out.name}")
-    fresh = folder / out.name
+    fresh = out
     try:
         with naming(out):
-            folder.mkdir(parents=not out.suffix, exist_ok=True)
-            with locked(folder):
-                try:
-                    _empty(folder)
-                    yield fresh
-                    for path in filter(Path.is_file, (fresh, *fresh.rglob("*"))):
-                        sync(path)
-                    fresh.rename(out)
-                finally:
-                    _empty(folder)
-                    folder.rmdir()
+            if not out.suffix:
+                out.parent.mkdir(parents=True, exist_ok=True)
+            with built_aside(out) as fresh:
+                yield fresh
+                for path in filter(Path.is_file, (fresh, *fresh.rglob("*"))):
+                    sync(path)
+                fresh.rename(out)
     except PathInUseError:
         raise AppError(f"{out}: another conversion is writing it; wait for its end") from None
     except AppError as error:
         raise type(error)(str(error).replace(str(fresh), str(out))) from None
-
-
-def _empty(folder: Path) -> None:
-    for path in folder.iterdir():
-        if path.is_dir():  # a bag of ROS 2
-            shutil.rmtree(path)
-        else:
-            path.unlink()
 
 
 def _from_session(

@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -185,6 +187,37 @@ def test_a_conversion_that_fails_brings_the_older_one_back(
     after = snapshot(tmp_path)
     assert after != before
     assert not [path for path in after if path.name.endswith(".old")]
+
+
+@pytest.mark.parametrize("name", ["new/copy.mcap", "new/copy"])
+def test_a_conversion_that_is_killed_leaves_the_older_one_and_no_half_of_its_own(
+    name: str, tmp_path: Path
+) -> None:
+    code = (
+        "import os, sys\n"
+        "from xethru_protocol.cli import main, recordings\n"
+        "convert = recordings.convert_recording\n"
+        "def killed(*arguments, **options):\n"
+        "    convert(*arguments, **options)\n"
+        "    os.kill(os.getpid(), 9)\n"
+        "recordings.convert_recording = killed\n"
+        "main(sys.argv[1:])\n"
+    )
+    target = tmp_path / name
+    target.parent.mkdir()
+    command = ["convert", str(RECORDINGS / "single"), str(target)]
+    for _ in range(2):
+        before = snapshot(tmp_path)
+        killed = subprocess.run([sys.executable, "-c", code, *command, "--force"], check=False)
+        assert killed.returncode == -9
+        after = snapshot(tmp_path)
+        assert all(after[path] == content for path, content in before.items())
+        assert all(
+            ".unfinished" in str(path.relative_to(tmp_path)) for path in after.keys() - before
+        )
+        assert main([*command, "--force"]) == 0
+        assert len(list(read_recording(target))) == 40
+        assert not list(tmp_path.rglob(".unfinished*"))
 
 
 def test_a_part_of_a_recording_is_not_converted_into_it(tmp_path: Path, capsys: Capture) -> None:
