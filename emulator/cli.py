@@ -27,6 +27,7 @@ from xethru_protocol.system import (
     json_text,
     one_line,
 )
+from xethru_protocol.validation import shown
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -118,7 +119,9 @@ def _list(arguments: argparse.Namespace) -> int:
         kinds = [kind for kind in kinds if kind.name == arguments.kind]
         if not kinds:
             remedy = "`xethru-emulator faults` lists them"
-            return _failed(f"no kind of fault is called {arguments.kind!r}; {remedy}", exit_code=2)
+            return _failed(
+                f"no kind of fault is called {shown(arguments.kind)}; {remedy}", exit_code=2
+            )
     if arguments.json:
         _print(json.dumps([described(kind) for kind in kinds], indent=2))
         return 0
@@ -549,16 +552,16 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _whole(least: int, most: int, shown: str | None = None) -> Callable[[str], int]:
+def _whole(least: int, most: int, limit: str | None = None) -> Callable[[str], int]:
     """Return the type of an option that takes a whole number within limits."""
 
     def value_of(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+            raise argparse.ArgumentTypeError(f"{shown(text)} is not a whole number") from None
         if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"{value} is not in {least}...{shown or most}")
+            raise argparse.ArgumentTypeError(f"{value} is not in {least}...{limit or most}")
         return value
 
     return value_of
@@ -592,13 +595,13 @@ def _host(text: str) -> str:
 def _link(text: str) -> tuple[str, float | None]:
     kind, colon, number = text.partition(":")
     if kind not in _LINKS:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither usb nor uart")
+        raise argparse.ArgumentTypeError(f"{shown(text)} is neither usb nor uart")
     if not colon:
         return kind, None
     least, most = _LINKS[kind]
     value = _number_or_nan(number)
     if not least <= value <= most:  # so not-a-number, too
-        raise argparse.ArgumentTypeError(f"{number!r} of {kind} is not in {least}...{most}")
+        raise argparse.ArgumentTypeError(f"{shown(number)} of {kind} is not in {least}...{most}")
     return kind, value
 
 

@@ -41,6 +41,7 @@ from xethru_protocol.recordings import (
     recording_radars,
 )
 from xethru_protocol.recordings.records import TimedMessages
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import BootloaderReply, ResponseCode, SensorMode, X4Setting
 from xethru_protocol.wire.messages import (
@@ -192,7 +193,9 @@ def kinds(names: Iterable[str]) -> frozenset[str]:
     """
     wanted = frozenset(map(_slug, names))
     for name in sorted(wanted - _KINDS):
-        raise ValueError(f"{name!r} is no kind of message; known are {', '.join(sorted(_KINDS))}")
+        raise ValueError(
+            f"{shown(name)} is no kind of message; known are {', '.join(sorted(_KINDS))}"
+        )
     return wanted
 
 

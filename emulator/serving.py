@@ -38,6 +38,7 @@ from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.system import STDOUT, StopFlag, json_text
 from xethru_protocol.transport import open_line
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.errors import PortUnavailable
 
 NS_PER_MS = 1_000_000
@@ -103,7 +104,7 @@ class FaultSession:
             for name in spec.radar:
                 if name not in self.devices:
                     raise FaultPlanError(
-                        f"fault[{index}].radar: no radar is called {name!r}; "
+                        f"fault[{index}].radar: no radar is called {shown(name)}; "
                         f"there are {', '.join(self.devices)}"
                     )
 

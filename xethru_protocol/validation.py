@@ -11,6 +11,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from xethru_protocol.system import one_line
+
 _MUST = {
     "string_type": "be text in quotes",
     "int_type": "be a whole number",
@@ -73,7 +75,7 @@ def shown(value: object) -> str:
     "lab" true a list -0.5
     """
     if isinstance(value, bool | str):
-        text = json.dumps(value, ensure_ascii=False)
+        text = one_line(json.dumps(value, ensure_ascii=False))
     elif isinstance(value, dict):
         return "a table"
     elif isinstance(value, list | tuple):
@@ -85,6 +87,19 @@ def shown(value: object) -> str:
     else:
         text = str(value)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def reason_of(error: Exception) -> str:
+    """Return why reading something failed, without Python's own words for what it met.
+
+    >>> reason_of(KeyError("lap"))
+    'lap is missing'
+    """
+    if isinstance(error, KeyError):
+        return f"{error.args[0]} is missing"
+    if isinstance(error, TypeError | AttributeError | IndexError):
+        return "a part of it is of another kind"
+    return str(error) or type(error).__name__
 
 
 def _text(problem: Problem, keys: Sequence[str], table: Any) -> str:  # noqa: ANN401

@@ -17,6 +17,7 @@ from typing import Protocol
 from emulator.chip.chip import Refusal
 from emulator.module.modes import Start
 from emulator.module.settings import ProfileSettings
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.codes import FORMAT_KEY, FileError, InfoItem
 from xethru_protocol.wire.versions import FIRMWARE_ID, Firmware
 
@@ -52,7 +53,7 @@ class Identity:
 
     def __post_init__(self) -> None:
         if len(self.serial) != 12 or not self.serial.isascii() or not self.serial.isdigit():
-            raise ValueError(f"serial number {self.serial!r}: an X4M300 has 12 digits")
+            raise ValueError(f"serial number {shown(self.serial)}: an X4M300 has 12 digits")
 
     @property
     def core_id(self) -> str:

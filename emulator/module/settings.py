@@ -225,18 +225,18 @@ def option_of(text: str) -> tuple[str, object]:
     ('storage_bytes', 98304)
     >>> option_of("bad_value=ignore")
     Traceback (most recent call last):
-    ValueError: bad_value='ignore': must be refuse or clamp
+    ValueError: bad_value=ignore: must be refuse or clamp
     """
     name, equals, value = text.partition("=")
     kind = _OPTION_TYPES.get(name)
     if kind is None:
-        raise ValueError(f"no option is called {name!r}; there are {', '.join(_OPTION_TYPES)}")
+        raise ValueError(f"no option is called {name}; there are {', '.join(_OPTION_TYPES)}")
     try:
         if not equals:
             raise ValueError
         return name, _value_of(kind, value)
     except ValueError:
-        shown = f"{name}={value!r}" if equals else f"{name}: no value"
+        shown = f"{name}={value}" if equals else f"{name}: no value"
         raise ValueError(f"{shown}: must be {_allowed(kind)}") from None
 
 

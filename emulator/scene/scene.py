@@ -27,6 +27,7 @@ from emulator.scene.motion import (
     drive,
 )
 from emulator.scene.tables import Number, SerialNumber, Table, load_table
+from xethru_protocol.validation import shown
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
 """Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
@@ -304,7 +305,7 @@ class Scene(Table):
         ):
             twice = sorted({value for value in values if values.count(value) > 1})
             if twice:
-                raise ValueError(f"{key}: each must be unique, {twice[0]!r} is used twice")
+                raise ValueError(f"{key}: each must be unique, {shown(twice[0])} is used twice")
         return self
 
     @model_validator(mode="after")

@@ -27,6 +27,7 @@ from xethru_protocol.system import (
     one_line,
     open_closed_streams,
 )
+from xethru_protocol.validation import shown
 
 _BY_A_SIGNAL = 128
 """Exit codes from here on are of signals."""
@@ -344,7 +345,7 @@ def _setting(text: str) -> tuple[str, tuple[str, ...]]:
     key, _, values = text.partition("=")
     named = tuple(value.strip() for value in values.split(","))
     if not key or not all(named):
-        raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {text!r}")
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {shown(text)}")
     return key.strip(), named
 
 

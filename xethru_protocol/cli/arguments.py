@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from xethru_protocol.cli.version import add_version
+from xethru_protocol.validation import shown
 
 if TYPE_CHECKING:
     from xethru_protocol.driver.link import RawConfig
@@ -41,7 +42,7 @@ def _number(
         except ValueError:
             value = math.nan
         if not is_allowed(value):
-            raise ArgumentTypeError(f"{text!r} must be {allowed}")
+            raise ArgumentTypeError(f"{shown(text)} must be {allowed}")
         return value
 
     return read
@@ -72,8 +73,8 @@ def split_limit(text: str) -> tuple[str, float]:
     found = _LIMIT.fullmatch(text)
     if found is None or (found[3] and int(found[3]) > 23) or (found[1] and not float(found[1])):
         raise ArgumentTypeError(
-            f"{text!r} is no limit: write 500records, 10MB (B, kB, MB, GB), 600s (s, min, h) or"
-            " daily@14 (an hour, 0 ... 23)"
+            f"{shown(text)} is no limit: write 500records, 10MB (B, kB, MB, GB), 600s (s, min, h) "
+            "or daily@14 (an hour, 0 ... 23)"
         )
     number, unit, hour = found.groups()
     if hour:
@@ -89,7 +90,8 @@ def base_name(text: str) -> tuple[str, str]:
     kind, equals, name = text.partition("=")
     if not (kind and equals and re.fullmatch(r"[\w.+-]+", name)):
         raise ArgumentTypeError(
-            f"{text!r} must be KIND=NAME, such as datafloat=lab, the name of letters, digits and _"
+            f"{shown(text)} must be KIND=NAME, such as datafloat=lab, the name of letters, digits "
+            "and _"
         )
     return kind, name
 

@@ -127,7 +127,7 @@ def port_users(path: str) -> tuple[str, ...]:
     if not stat.S_ISCHR(device.st_mode):
         return ()
     return tuple(
-        f"{_name(pid)!r} (pid {pid})"
+        f"{_name(pid)} (pid {pid})"
         for pid in sorted(int(process.name) for process in Path("/proc").glob("[0-9]*"))
         if _has_open(pid, device) and not _serves(pid, device)
     )

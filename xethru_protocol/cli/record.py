@@ -44,6 +44,7 @@ from xethru_protocol.recordings import (
 from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.recordings.vendor.writer import new_session_id
 from xethru_protocol.system import StopFlag
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FileType, MatrixControl, OutputFeature, ProfileId
 from xethru_protocol.wire.errors import (
@@ -391,7 +392,7 @@ def _profile_of(arguments: Namespace) -> Profile | None:
                 arguments.refuse(f"output {part} belongs to --profile {others[0]}, not {name}")
             if part not in known:
                 arguments.refuse(
-                    f"profile {name} has no output {part!r}; known: {', '.join(known)}"
+                    f"profile {name} has no output {shown(part)}; known: {', '.join(known)}"
                 )
         for rivals in _RIVALS:
             both = [part for part in names if part in rivals]
@@ -415,7 +416,9 @@ def _writer_options(arguments: Namespace) -> RecordingOptions:
     kinds = {kind.name: kind.message for kind in KINDS}
     for name, _ in arguments.basename:
         if name not in kinds:
-            arguments.refuse(f"--basename: no data files are called {name!r}; {', '.join(kinds)}")
+            arguments.refuse(
+                f"--basename: no data files are called {shown(name)}; {', '.join(kinds)}"
+            )
     options: RecordingOptions = {
         "user_header": arguments.user_header.encode(),
         "split": split,

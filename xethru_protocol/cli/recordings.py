@@ -36,6 +36,7 @@ from xethru_protocol.recordings.records import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
 from xethru_protocol.system import PathInUseError, built_aside, one_line
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import LocalProtocolError
@@ -145,7 +146,8 @@ def _from_hex(line: bytes, name: str, number: int) -> bytes:
     except ValueError:
         text = line.strip()[:40].decode("ascii", "replace")
         raise CommandFailed(
-            f"{name} line {number} is not hexadecimal bytes: {text!r}; write them like 7D 10 6D 7E"
+            f"{name} line {number} is not hexadecimal bytes: {shown(text)}; write them like "
+            "7D 10 6D 7E"
         ) from None
 
 

@@ -18,6 +18,7 @@ from typing import Any, Final, Generic, Literal, Self, TypeVar, overload
 
 from xethru_protocol.driver import raw_mode
 from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncPart, Link, Part, Steps
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import FramePostprocessing, X4Setting
@@ -172,7 +173,9 @@ class PostprocessingRow(Setting[int]):
 def _postprocessing(link: Link, setting: FramePostprocessing) -> Steps[float]:
     values = (yield from link.request(m.FramePostprocessingGet(setting=setting))).values
     if len(values) != 1:
-        raise RemoteProtocolError(f"{link.name} reads back {setting.name} as {values!r}")
+        raise RemoteProtocolError(
+            f"{link.name} reads back {len(values)} values of {setting.name}, not one"
+        )
     return values[0]
 
 
@@ -372,7 +375,9 @@ def read_register(link: Link, space: RegisterSpace, address: int) -> Steps[int]:
     command = m.X4DriverGet(setting=_space(space), address=_byte("address", address))
     values = (yield from link.request(command)).values
     if len(values) != 1:
-        raise RemoteProtocolError(f"{link.name} reads {space} register {address} as {values!r}")
+        raise RemoteProtocolError(
+            f"{link.name} reads {len(values)} values of {space} register {address}, not one"
+        )
     return int(values[0])
 
 
@@ -406,7 +411,7 @@ def write_i2c(link: Link, address: int, data: bytes) -> Steps[None]:
 
 def _space(name: str) -> X4Setting:
     if name not in _SPACES:
-        raise LocalProtocolError(f"registers lie in {', '.join(_SPACES)}, not in {name!r}")
+        raise LocalProtocolError(f"registers lie in {', '.join(_SPACES)}, not in {shown(name)}")
     return _SPACES[name]
 
 

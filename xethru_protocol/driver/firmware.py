@@ -22,6 +22,7 @@ from xethru_protocol.driver.link import (
     Steps,
 )
 from xethru_protocol.system import read_bounded
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import (
@@ -321,14 +322,14 @@ def _check(link: Link, image: FirmwareImage, banner: str) -> Steps[bool]:
     is_open = "OPENBOOTLOADER" in banner
     if is_open and image.certificate is not None:
         raise FirmwareError(
-            f"the image is signed for the vendor's bootloader, but the module has {banner!r}; "
+            f"the image is signed for the vendor's bootloader, but the module has {shown(banner)}; "
             "nothing was written. Switch the module off and on, and take an image without signature"
         )
     if not is_open:
         if image.certificate is None:
             raise FirmwareError(
-                f"the module's bootloader is {banner!r}, which takes signed images only, and this "
-                "one is not signed; nothing was written. Switch the module off and on"
+                f"the module's bootloader is {shown(banner)}, which takes signed images only, and "
+                "this one is not signed; nothing was written. Switch the module off and on"
             )
         return False
     size = yield from link.request(m.BootloaderPageSize())

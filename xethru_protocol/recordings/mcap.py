@@ -53,6 +53,7 @@ from xethru_protocol.recordings.records import (
     writing,
 )
 from xethru_protocol.system import written_whole
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.messages import (
     BasebandAp,
@@ -432,7 +433,7 @@ def _unpacked(name: str, packed: bytes, size: int) -> bytes:
         return unpacked
     if name == "":
         return packed
-    raise ValueError(f"chunks compressed with {name!r} are not read here")
+    raise ValueError(f"chunks compressed with {shown(name)} are not read here")
 
 
 def _records_in(at: int, content: bytes) -> Iterator[Record]:
@@ -845,7 +846,7 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
             raise RecordingError(f"{path}: a message is damaged: {error}") from None
         yield message, None if "xethru-hil" in entry.channel.metadata else entry.t_ns
     if not radars and radar is not None and (names := _names(path)):
-        raise RecordingError(f"{path} holds no radar {radar!r}; it holds {names}")
+        raise RecordingError(f"{path} holds no radar {shown(radar)}; it holds {names}")
     if not radars and not faults:
         raise RecordingError(f"{path} holds no topic /radar/<name>/frame or .../payload")
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
     InfoItem,
@@ -355,8 +356,8 @@ def firmware_named(name: str) -> Firmware:
     """
     if name not in FIRMWARE_NAMES:
         raise ValueError(
-            f"firmware {name!r} is not known; it is one of {', '.join(FIRMWARE_NAMES)} (without a "
-            "version: the newest)"
+            f"firmware {shown(name)} is not known; it is one of {', '.join(FIRMWARE_NAMES)} "
+            "(without a version: the newest)"
         )
     line, _, version = name.partition("-")
     if line == _BASE.lower():

@@ -35,7 +35,7 @@ def test_a_scenario_for_another_radar_is_refused_in_one_line(
     assert main(["serve", "--bare", "--faults", str(scenario)]) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "no radar is called 'nose'; there are radar_1" in error
+    assert 'no radar is called "nose"; there are radar_1' in error
 
 
 def test_no_control_character_reaches_the_terminal(

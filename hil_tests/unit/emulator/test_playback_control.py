@@ -189,7 +189,9 @@ def test_a_start_command_ends_the_wait_of_a_paused_host_too() -> None:
 
 
 def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"'x-ray' is no kind of message; known are .*data-float"):
+    with pytest.raises(
+        ValueError, match=r"\"x-ray\" is no kind of message; known are .*data-float"
+    ):
         kinds(["X ray"])
 
 
@@ -303,7 +305,7 @@ def test_one_radar_of_a_session_is_read_by_its_name(tmp_path: Path) -> None:
     assert [message for message, _ in read] == [
         m.DataFloat(info=counter, values=samples(1, counter)) for counter in range(6)
     ]
-    with pytest.raises(RecordingError, match="holds no radar 'middle'; it holds left, right"):
+    with pytest.raises(RecordingError, match='holds no radar "middle"; it holds left, right'):
         list(read_recording(path, radar="middle"))
 
 

@@ -130,11 +130,12 @@ def test_nonsense_of_set_is_one_plain_line() -> None:
         ("a\n\x1b[2J", '"a\\n\\u001b[2J"'),
         ("x" * 200, '"' + "x" * 56 + "..."),
         (10**5000, "a number that long"),
+        ("\udcff\x9b", '"\\udcff\\x9b"'),  # bytes of a shell that are no text
         (None, "nothing"),
         ({"a": 1}, "a table"),
         (math.nan, "nan"),
     ],
-    ids=["control", "long", "digits", "none", "table", "nan"],
+    ids=["control", "long", "digits", "bytes", "none", "table", "nan"],
 )
 def test_a_value_is_shown_as_a_person_would_write_it(value: object, expected: str) -> None:
     assert shown(value) == expected

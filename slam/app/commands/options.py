@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
+from xethru_protocol.validation import shown
 
 
 def folder(text: str) -> Path:
@@ -14,7 +15,7 @@ def folder(text: str) -> Path:
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {shown(text)}") from None
     return Path(text)
 
 
@@ -30,7 +31,9 @@ def count(text: str) -> int:
 
 def _whole_number(text: str, *, least: int) -> int:
     if not text.isascii() or not text.isdigit() or not least <= int(text) < 2**63:
-        raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more, not {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number, {least} or more, not {shown(text)}"
+        )
     return int(text)
 
 
@@ -41,7 +44,7 @@ def seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0.0):
-        raise argparse.ArgumentTypeError(f"must be seconds, 0 or more, not {text!r}")
+        raise argparse.ArgumentTypeError(f"must be seconds, 0 or more, not {shown(text)}")
     return value
 
 
@@ -74,5 +77,5 @@ def _rerun_target(text: str) -> str:
         return text
     raise argparse.ArgumentTypeError(
         f"must be {SPAWN}, {CONNECT}, {SERVE_WEB}, or an address like {DEFAULT_VIEWER_URL}, "
-        f"not {text!r}"
+        f"not {shown(text)}"
     )

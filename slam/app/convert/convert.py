@@ -16,6 +16,7 @@ from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
 from xethru_protocol.system import PathInUseError, StopFlag, built_aside, sync
+from xethru_protocol.validation import shown
 
 
 def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
@@ -33,7 +34,7 @@ def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: St
         raise AppError(f"{session.path}: holds several radars ({names}); choose one: --radar NAME")
     chosen = known[0] if radar is None else radar
     if chosen not in known:
-        raise AppError(f"{session.path}: holds no radar {chosen}; it holds {names}")
+        raise AppError(f"{session.path}: holds no radar {shown(chosen)}; it holds {names}")
     sizes = {"rx": 0, "tx": 0}
     try:
         with WireCapture(out, {"radar": chosen, "clock": "monotonic"}) as capture:

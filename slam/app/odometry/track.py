@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from slam.app.errors import AppError, OdometryError
 from slam.geometry import wrap_angle
 from xethru_protocol.system import read_bounded
+from xethru_protocol.validation import shown
 
 NS_PER_S = 1_000_000_000
 MOST_GAP_NS = NS_PER_S
@@ -78,20 +79,22 @@ def parse_tum_line(line: str) -> TumSample:
     if len(fields) != _FIELDS:
         raise TumError(
             "expected 8 numbers (timestamp x y z qx qy qz qw), "
-            f"found {len(fields)}: {line.strip()!r}"
+            f"found {len(fields)}: {shown(line.strip())}"
         )
     try:
         stamp_s = Decimal(fields[0])
         x, y, _z, _qx, _qy, qz, qw = (float(field) for field in fields[1:])
     except (InvalidOperation, ValueError):
-        raise TumError(f"not a number in TUM line {line.strip()!r}") from None
+        raise TumError(f"not a number in TUM line {shown(line.strip())}") from None
     if not stamp_s.is_finite() or not all(map(math.isfinite, (x, y, qz, qw))):
-        raise TumError(f"not a finite number in TUM line {line.strip()!r}")
+        raise TumError(f"not a finite number in TUM line {shown(line.strip())}")
     # copy_abs, as abs would round to the context and overflow on a huge exponent
     if stamp_s.copy_abs() >= _MAX_STAMP_S:
-        raise TumError(f"stamps must be seconds, found {fields[0]} in TUM line {line.strip()!r}")
+        raise TumError(
+            f"stamps must be seconds, found {fields[0]} in TUM line {shown(line.strip())}"
+        )
     if qz == 0.0 and qw == 0.0:
-        raise TumError(f"quaternion without a heading in TUM line {line.strip()!r}")
+        raise TumError(f"quaternion without a heading in TUM line {shown(line.strip())}")
     return TumSample(t_ns=round(stamp_s * NS_PER_S), x_m=x, y_m=y, qz=qz, qw=qw)
 
 

@@ -40,6 +40,7 @@ from slam.geometry import Rig, transform
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.system import StopFlag
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import real_frame_rate
 
@@ -152,7 +153,7 @@ class EmulatorProcess:
             self.odometry_socket = ready["odometry"]
             self.control_socket = ready["control"]
         except (ValueError, KeyError, TypeError):
-            raise EmulatorError(f"the emulator's ready line is unknown: {line[:200]!r}") from None
+            raise EmulatorError(f"the emulator's ready line is unknown: {shown(line)}") from None
 
     def stream_begins_ns(self, radar: str) -> int:
         """Return where the newest stream of a radar begins in scene time [ns].

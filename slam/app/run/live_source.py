@@ -41,6 +41,7 @@ from slam.frames import RadarFrame
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
 Event: TypeAlias = (
@@ -158,7 +159,7 @@ def _read_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Ev
                     inbox.hand_over(("back", radar, link.driver.port), stopped)
                 received_s = time.monotonic()
     except Exception as error:  # a bug: reported, so that no radar is lost silently
-        inbox.hand_over(("lost", radar, f"its reader failed: {error!r}"), stopped)
+        inbox.hand_over(("lost", radar, f"its reader failed: {reason_of(error)}"), stopped)
         raise
     finally:
         with suppress(XeThruError):  # what is wrong with it was reported
@@ -184,7 +185,7 @@ def _read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) -
     except OdometryError as error:
         trouble = str(error)
     except Exception as error:  # a bug, as above
-        inbox.hand_over(("odometry end", f"its reader failed: {error!r}"), stopped)
+        inbox.hand_over(("odometry end", f"its reader failed: {reason_of(error)}"), stopped)
         raise
     inbox.hand_over(("odometry end", trouble), stopped)
 

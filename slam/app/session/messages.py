@@ -34,6 +34,7 @@ from slam.app.records import RadarInfo, SessionInfo, Snapshot
 from slam.app.session.constants import slam_constants
 from slam.config import SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount
+from xethru_protocol.validation import reason_of, shown
 
 _COUNTS = 2
 _PER_LANDMARK = 7
@@ -366,7 +367,9 @@ def read_session_table(
             odometry_clock=table.get("odometry_clock", ""),
         )
     except (KeyError, ValueError, TypeError) as error:
-        raise AppError(f"{path}: metadata {METADATA_NAME!r} cannot be read: {error!r}") from None
+        raise AppError(
+            f'{path}: metadata "{METADATA_NAME}" cannot be read: {reason_of(error)}'
+        ) from None
 
 
 def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
@@ -384,7 +387,7 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
             field.name: facts[field.name] for field in fields(RadarInfo) if field.name in facts
         }
     except (ValueError, TypeError, KeyError) as error:
-        raise AppError(f"{path}: {topic} cannot be read: {error!r}") from None
+        raise AppError(f"{path}: {topic} cannot be read: {reason_of(error)}") from None
     missing = [
         field.name
         for field in fields(RadarInfo)
@@ -393,7 +396,7 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
     if missing:
         raise AppError(f"{path}: {topic} does not tell {', '.join(missing)}")
     if unit != LENGTH_UNIT:
-        raise AppError(f"{path}: {topic}: lengths in {unit!r}, expected {LENGTH_UNIT!r}")
+        raise AppError(f"{path}: {topic}: lengths in {shown(unit)}, must be in {LENGTH_UNIT}")
     return RadarInfo(**known)
 
 

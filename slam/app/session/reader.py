@@ -532,7 +532,7 @@ def open_session(path: Path, stop: StopFlag | None = None) -> RecordedSession:
         if head.cut is not None:
             raise AppError(f"{path}: ends at byte {head.cut.at}, before it says what run it is of")
         raise AppError(
-            f"{path}: an MCAP file, but no session of `uwb-slam`: its metadata {METADATA_NAME!r} "
+            f'{path}: an MCAP file, but no session of `uwb-slam`: its metadata "{METADATA_NAME}" '
             "is missing; of a bag in the layout of the paper's data set `uwb-slam convert` makes a "
             "session"
         )

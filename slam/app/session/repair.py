@@ -23,6 +23,7 @@ from slam.app.session.messages import GAP_TOPIC, METADATA_NAME, SESSION_TOPIC
 from slam.app.session.reader import RADAR_INFO, open_mcap, open_session
 from xethru_protocol.recordings import mcap
 from xethru_protocol.system import STDOUT, PathInUseError, StopFlag, each_line, locked
+from xethru_protocol.validation import reason_of
 
 Row = TypeVar("Row")
 
@@ -92,7 +93,9 @@ class Repair:
     def lose(self, record: mcap.Record, error: Exception) -> None:
         """Note that a record is left out, once for all that begin in the same place."""
         if not self.damages or self.damages[-1].at != record.at:
-            self.damages.append(mcap.Damage(record.at, record.at, f"records there: {error!r}"))
+            self.damages.append(
+                mcap.Damage(record.at, record.at, f"records there: {reason_of(error)}")
+            )
 
     @property
     def was_whole(self) -> bool:

@@ -53,6 +53,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from xethru_protocol.recordings.records import EARLIEST_MS, LATEST_MS, MS_NS, RecordingError
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import fields, messages
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.rows import ROWS, Response
@@ -164,7 +165,7 @@ def _list_text(values: Iterable[float]) -> str:
 
 def _list(text: str) -> tuple[float, ...]:
     if not (text.startswith("[") and text.endswith("]")):
-        raise ValueError(f"a list in square brackets was expected, not {text!r}")
+        raise ValueError(f"a list in square brackets was expected, not {shown(text)}")
     numbers = [float(item) for item in text[1:-1].split(",") if item]
     layout = f"<{len(numbers)}f"
     return struct.unpack(layout, struct.pack(layout, *numbers))

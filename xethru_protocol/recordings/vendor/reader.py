@@ -40,6 +40,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     kind_of_file,
     parse_meta,
 )
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.rows import Response
@@ -128,7 +129,7 @@ class _DataFile:
         found: tuple[Response | None, int | None] = None, None
         if line.startswith(b"TimeStamp;"):
             if line.rstrip() != kind.titles.rstrip():
-                self.report(f"its columns are not those known: {line.rstrip()!r}")
+                self.report(f"its columns are not those known: {shown(line.rstrip())}")
                 self.ended = self.faulty = True
                 return None
         else:

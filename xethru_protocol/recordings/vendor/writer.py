@@ -27,6 +27,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     Meta,
     closing_order,
 )
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.rows import Response
 
 
@@ -428,7 +429,7 @@ def _checked_basenames(names: Mapping[type[Response], str]) -> Mapping[type[Resp
             raise RecordingError(f"a recording has no file of {message.__name__}")
         if not re.fullmatch(r"[\w.+-]+", name):
             raise RecordingError(
-                f"{name!r} cannot begin the name of a file: use letters, digits, _"
+                f"{shown(name)} cannot begin the name of a file: use letters, digits, _"
             )
     if len(set(names.values())) < len(names):
         raise RecordingError("two kinds of data file have the same base name")

@@ -119,5 +119,5 @@ def test_boards_kept_no_offset_before_2_2_0() -> None:
 
 
 def test_an_unknown_version_is_no_option() -> None:
-    with pytest.raises(ValueError, match="'sensor-2' is not known; it is one of sensor, "):
+    with pytest.raises(ValueError, match='"sensor-2" is not known; it is one of sensor, '):
         DeviceOptions(firmware="sensor-2")
