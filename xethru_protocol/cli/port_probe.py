@@ -21,6 +21,7 @@ from typing import Generic, TypeVar
 from xethru_protocol.driver.link import ModuleInfo
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import LineTransport, is_network_port, open_line
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
@@ -127,7 +128,7 @@ def port_users(path: str) -> tuple[str, ...]:
     if not stat.S_ISCHR(device.st_mode):
         return ()
     return tuple(
-        f"{_name(pid)} (pid {pid})"
+        f"{shown(_name(pid))} (pid {pid})"
         for pid in sorted(int(process.name) for process in Path("/proc").glob("[0-9]*"))
         if _has_open(pid, device) and not _serves(pid, device)
     )

@@ -86,7 +86,7 @@ def test_a_reset_is_a_reboot(line: FaultyLine) -> None:
         ({"verb": "state", "colour": 1}, "colour: "),
         ({"verb": "state", "radar": "nose"}, "radar: "),
         ({"verb": "fault add"}, "fault: "),
-        ({"verb": "fault add", "fault": {"kind": "crc"}}, "no kind of fault is called 'crc'"),
+        ({"verb": "fault add", "fault": {"kind": "crc"}}, 'no kind of fault is called "crc"'),
         ({"verb": "fault add", "fault": {"kind": "stall", "radar": ["x"]}}, "must be some of"),
         ({"verb": "fault clear", "id": 9}, "id: "),
         ({"verb": "unplug", "seconds": -1}, "seconds: "),

@@ -349,7 +349,7 @@ def test_the_process_that_serves_a_port_is_not_its_user() -> None:
         assert port_users(module.path) == ()
         with reader(module.path) as pid:
             (user,) = port_users(module.path)
-            assert user.startswith("'-c import os")
+            assert user.startswith('"-c import os')
             assert user.endswith(f" (pid {pid})")
     assert port_users("/no/such/port") == ()
     assert port_users(__file__) == ()
@@ -369,7 +369,7 @@ def test_a_port_locked_by_a_program_that_cannot_be_seen(
 
 
 def test_many_readers_are_not_all_named(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    users = tuple(f"'reader' (pid {number})" for number in range(10, 20))
+    users = tuple(f'"reader" (pid {number})' for number in range(10, 20))
     monkeypatch.setattr(port_probe, "port_users", lambda path: users)
     with PtyModule(stock()) as module:
         _, finding = only_finding(capsys, module.path)
