@@ -118,8 +118,6 @@ class Job:
         Arguments that are added for another run into the same folder.
     result
         Returns what every whole run gives alike; raises Problem if it is not there.
-    size_bytes
-        About what it writes, for a disk that gets full.
     refuses
         What it never replaces.
     """
@@ -128,17 +126,17 @@ class Job:
     arguments: Callable[[Path], Sequence[object]]
     check: Callable[[Killed], None]
     result: Callable[[Path], object]
-    size_bytes: int
     again: Sequence[str] = ()
     refuses: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Whole:
-    """How long a command takes that is not stopped [s], and what it gives."""
+    """How long a command takes that is not stopped, last time [s]; what it gives; and its size."""
 
     took_s: float
     result: object
+    size_bytes: int
 
 
 @dataclass(kw_only=True)
@@ -249,7 +247,6 @@ def demo(place: Path, findings: Findings) -> Job:
         arguments=lambda out: ["demo", "--preset", "paper", "--scene", scene, "--out", out],
         check=check,
         result=results_of,
-        size_bytes=6_000_000,
     )
 
 
@@ -286,7 +283,6 @@ def run(place: Path, findings: Findings, stack: ExitStack) -> Job:
         arguments=lambda out: ["run", "--rig", rig, *drive, "--out", out],
         check=check,
         result=result,
-        size_bytes=500_000,
         refuses="session.mcap",
     )
 
@@ -317,7 +313,6 @@ def record(place: Path, findings: Findings, stack: ExitStack) -> Job:
         arguments=lambda out: ["record", "--port", port, "--out", out / "rec", "--count", "60"],
         check=check,
         result=result,
-        size_bytes=60 * 5744,
         again=("--force",),
     )
 
@@ -347,7 +342,6 @@ def sweep(place: Path) -> Job:
         arguments=lambda out: ["sweep", *drives, "--json", out / "sweep.json"],
         check=check,
         result=result,
-        size_bytes=20_000,
     )
 
 
@@ -368,7 +362,6 @@ def replay(session: Path) -> Job:
         arguments=lambda out: ["replay", session, "--out", out],
         check=check,
         result=results_of,
-        size_bytes=150_000,
     )
 
 
@@ -389,7 +382,6 @@ def report(session: Path) -> Job:
         arguments=lambda out: ["report", session, "--out", out / "report.html"],
         check=check,
         result=result,
-        size_bytes=300_000,
     )
 
 
@@ -410,7 +402,6 @@ def convert(session: Path) -> Job:
         arguments=lambda out: ["convert", session, out / "bag"],
         check=check,
         result=result,
-        size_bytes=6_000_000,
         refuses="bag",
     )
 
@@ -520,6 +511,10 @@ def make_room(folder: Path) -> None:
     subprocess.run(["mount", "-o", "remount,size=100m", str(folder)], check=True)
 
 
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
 def codes_of(kind: Kind) -> set[int]:
     """Return the exit codes of a command that is ended so, or was done just before."""
     if kind.value is None:
@@ -533,8 +528,8 @@ def trial(job: Job, kind: Kind, place: Path, chance: random.Random, whole: Whole
     """Kill a command and look at what is left, then run it again; return the exit code."""
     place.mkdir()
     (folder := place / "out").mkdir()
-    after_s = chance.uniform(0.0, 1.05 * whole.took_s)
-    size_bytes = chance.randrange(8192, job.size_bytes)
+    after_s = chance.uniform(0.0, whole.took_s)
+    size_bytes = chance.randrange(4096, whole.size_bytes)
     with ExitStack() as stack:
         if kind is Kind.FULL_DISK:
             stack.enter_context(small_disk(folder, size_bytes))
@@ -550,7 +545,7 @@ def trial(job: Job, kind: Kind, place: Path, chance: random.Random, whole: Whole
                 make_room(folder)
             is_refused = job.refuses is not None and (folder / job.refuses).exists()
             again = folder / "again" if is_refused else folder
-            run_whole(job, place, again, job.again)
+            whole.took_s = run_whole(job, place, again, job.again)
             require_nothing_is_left(place, folder)
             require(job.result(again) == whole.result, "another run gives another result")
             require(not list(again.glob(".unfinished*")), "unfinished files are left")
@@ -586,23 +581,26 @@ def run_trials(
         chosen = {name: jobs[name]() for name in names}
         wholes = {}
         for name, job in chosen.items():
-            (of_whole := place / f"whole-{name}").mkdir()
-            took_s = run_whole(job, of_whole, of_whole)
-            wholes[name] = Whole(took_s=took_s, result=job.result(of_whole))
+            (at := place / f"whole-{name}").mkdir()
+            (of_whole := at / "out").mkdir()
+            took_s = run_whole(job, at, of_whole)
+            wholes[name] = Whole(
+                took_s=took_s, result=job.result(of_whole), size_bytes=size_of(of_whole)
+            )
             say(f"{name}: {took_s:.1f} s")
         for number in range(count):
             name = names[number % len(names)]
             kind = kinds[(number // len(names)) % len(kinds)]
             at = place / f"trial-{seed}-{number}"
-            code = 0
+            what = f"{number + 1} of {count}: {name}, {kind.name}"
             try:
                 code = trial(chosen[name], kind, at, chance, wholes[name])
+                findings.ended[name, kind.name, code] += 1
+                say(f"{what}, exit code {code}")
             except Problem as problem:
-                findings.problems.append(f"{number}: {name}, {kind.name}: {problem}")
+                findings.problems.append(f"{what}: {problem}")
                 say(findings.problems[-1])
-            findings.ended[name, kind.name, code] += 1
             shutil.rmtree(at, ignore_errors=True)
-            say(f"{number + 1} of {count}, {len(findings.problems)} problems")
     return findings
 
 
