@@ -71,6 +71,11 @@ class Command:
             while self._master is not None and select.select([self._master], [], [], 0.0)[0]:
                 self.printed += os.read(self._master, 65536)
 
+    def press(self, key: bytes) -> None:
+        """Give the terminal a key, as its code."""
+        assert self._master is not None
+        os.write(self._master, key)
+
     def hang_up(self) -> None:
         """Close the terminal: the command gets SIGHUP, and errors from now on."""
         if self._master is not None:

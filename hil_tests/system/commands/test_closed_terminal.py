@@ -40,6 +40,7 @@ x_m = {x_m}
 y_m = {y_m}
 yaw_deg = {yaw_deg}
 """
+CTRL_S, CTRL_Q = b"\x13", b"\x11"
 END_OF_PNG = b"IEND\xaeB`\x82"
 RESULTS = ("summary.json", "map.png", "estimate.tum", "odometry.tum")
 
@@ -220,6 +221,23 @@ def test_a_sweep_whose_terminal_closes_keeps_its_runs(tmp_path: Path) -> None:
     assert not out.exists()
     part = out.with_name("out.json.part").read_text()
     assert part.count('"realtime_factor"') >= 1
+
+
+@pytest.mark.thorough
+def test_a_stopped_terminal_stops_no_demo(tmp_path: Path) -> None:
+    """Ctrl-S holds back what is printed, until Ctrl-Q; the results are there before."""
+    out = tmp_path / "out"
+    arguments = ["demo", "--preset", "paper", "--scene", write_shorter_scene(tmp_path)]
+    with in_terminal(UWB_SLAM, [*arguments, "--out", out], tmp_path / "crash") as command:
+        command.wait_for_handlers()
+        command.press(CTRL_S)
+        command.read_until((out / "map.png").exists)
+        assert command.process.poll() is None, "it waits for the terminal now"
+        assert command.printed == b""
+        command.press(CTRL_Q)
+        command.read_until(lambda: b"SLAM ATE" in command.printed)
+        assert end(command) == 0
+    assert has_results(out)
 
 
 def _has_two_runs(folder: Path) -> bool:
