@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +99,7 @@ class SessionInfo:
     started_unix_ns: int | None = None
     has_detections: bool = False
     odometry_clock: str = ""
+    constants: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def field_of_view(self) -> FieldOfView:
@@ -106,17 +107,28 @@ class SessionInfo:
 
         Read key by key: those of another version may have keys that this one does not have.
         """
-        settings = json.loads(self.config_json) if self.config_json else {}
-        angle = settings.get("robust" if settings.get("back_end") == "robust" else "trilateration")
-        limits = settings.get("detection", {})
-        opening_deg = (angle or {}).get("field_of_view_deg", math.degrees(PAPERS_FIELD.opening_rad))
+        part = "robust" if self.settings.get("back_end") == "robust" else "trilateration"
+        opening_deg = math.degrees(PAPERS_FIELD.opening_rad)
         return FieldOfView(
-            opening_rad=math.radians(opening_deg),
-            min_range_m=limits.get("min_range_m", PAPERS_FIELD.min_range_m),
-            max_range_m=limits.get("max_range_m", PAPERS_FIELD.max_range_m),
+            opening_rad=math.radians(self.setting(part, "field_of_view_deg", opening_deg)),
+            min_range_m=self.setting("detection", "min_range_m", PAPERS_FIELD.min_range_m),
+            max_range_m=self.setting("detection", "max_range_m", PAPERS_FIELD.max_range_m),
         )
 
-    constants: Mapping[str, object] = field(default_factory=dict)
+    @property
+    def settings(self) -> dict[str, Any]:
+        """SLAM's settings as recorded, of whatever version; {} where they cannot be read."""
+        try:
+            settings = json.loads(self.config_json)
+        except ValueError:
+            return {}
+        return settings if isinstance(settings, dict) else {}
+
+    def setting(self, part: str, key: str, default: float) -> float:
+        """Return a number of the settings; the default where it was not recorded."""
+        table = self.settings.get(part)
+        value = table.get(key) if isinstance(table, dict) else None
+        return float(value) if isinstance(value, int | float) else default
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import base64
-import json
+import html
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from html import escape
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,7 +48,7 @@ from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
 from slam.packed import PackedRows
-from xethru_protocol.system import StopFlag, one_line, written_whole
+from xethru_protocol.system import StopFlag, each_line, one_line, written_whole
 
 _KEPT_WARNINGS = 200
 
@@ -164,6 +163,11 @@ summary { cursor: pointer; }
   h1, p { overflow-wrap: anywhere; }
 }
 """
+
+
+def escape(text: str, *, quote: bool = True) -> str:
+    """Return text of a file for HTML, its control characters written out."""
+    return html.escape(each_line(text), quote)
 
 
 class _Page:
@@ -300,7 +304,7 @@ def _draw_links(
                 width_s = max(stop_s - start_s, 0.002 * end_s)
                 place, height = [(start_s, width_s)], (row - _BAR / 2, _BAR)
                 axes.broken_barh(place, height, facecolors=LINK_COLOURS[state])
-    axes.set_yticks(range(len(names)), names)
+    axes.set_yticks(range(len(names)), [*map(one_line, names)])
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(0.0, max(end_s, 1e-3))
     label(axes, "State of each link", _TIME, "")
@@ -413,8 +417,7 @@ def _write_numbers(
         page.note("The truth of this drive is unknown, so there are no errors.")
         page.numbers(driven)
         return
-    window = json.loads(info.config_json or "{}").get("window", {})
-    lag_states = int(window.get("size", 1)) - 1
+    lag_states = int(info.setting("window", "size", 1)) - 1
     rows = summary_rows(
         summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
     )
@@ -512,7 +515,7 @@ def _write_parameters(page: _Page, info: SessionInfo) -> None:
     )
     page.note("Mounts in the robot's frame: x forward, y left. First bin in module metres.")
     settings: dict[str, Mapping[str, object]] = {
-        "SLAM": json.loads(info.config_json or "{}"),
+        "SLAM": info.settings,
         "Wheels, as SLAM assumes": info.wheels,
         "Radars": {radar.name: asdict(radar) for radar in info.radars},
         "Versions of the run": info.versions,

@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -25,7 +26,7 @@ from slam.app.records import SessionInfo, Snapshot
 from slam.app.run.evaluation import Summary
 from slam.app.run.runner import LinkState, RunRecord
 from slam.geometry import between, compose, transform
-from xethru_protocol.system import written_whole
+from xethru_protocol.system import each_line, written_whole
 
 # What is drawn alike differs also for those who see two colours only.
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#9aa0a8", "#e08a2c", "#1f6fd0", "#c2255c"
@@ -64,6 +65,7 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
         )
         FigureCanvasAgg(figure)
         yield figure
+        _make_printable(figure)
         drawn = io.BytesIO()
         figure.savefig(drawn, format="png")
         with Image.open(drawn) as colours:
@@ -84,9 +86,18 @@ def svg_of(
         figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
         FigureCanvasSVG(figure)
         draw(figure, *arguments)
+        _make_printable(figure)
         drawn = io.StringIO()
         figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
     return drawn.getvalue()
+
+
+def _make_printable(figure: Figure) -> None:
+    """Write out control characters in names from a file: no font has them."""
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        if not text.get_text().isprintable():
+            text.set_text(each_line(text.get_text()))
 
 
 def label(

@@ -94,13 +94,14 @@ def is_world_known(info: SessionInfo) -> bool:
 
 def about(info: SessionInfo) -> str:
     """Return the text about a run."""
-    settings = json.loads(info.config_json or "{}")
     return _ABOUT.format(
         n_radars=len(info.radars),
         block=BLOCK_FRAMES,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
         truth=_TRUTH if is_world_known(info) else "",
-        points="" if settings.get("back_end") == "robust" else _POINTS.format(states=TRAIL_STATES),
+        points=""
+        if info.settings.get("back_end") == "robust"
+        else _POINTS.format(states=TRAIL_STATES),
     )
 
 
