@@ -1,6 +1,7 @@
 """`rerun-importer-xethru` as the Rerun viewer calls it, its drawing read back by Rerun's reader."""
 
 import os
+import shutil
 import stat
 import struct
 import subprocess
@@ -20,7 +21,7 @@ from hil_tests.paths import FIXTURES, REPOSITORY
 from hil_tests.patience import seconds
 from hil_tests.system.sessions.test_view import HAS_LAVAPIPE
 from slam.app.view.importer import INCOMPATIBLE, main
-from slam.app.view.rerun_recording import RrdReader, ViewerClient, rr
+from slam.app.view.rerun_recording import RrdReader, ViewerClient, count_rows, rr
 from slam.app.view.viewer import ViewerKind, ViewerProcess
 from xethru_protocol.recordings import WireCapture, read_recording
 from xethru_protocol.system import StopFlag
@@ -226,6 +227,36 @@ def test_a_cut_capture_is_drawn_as_far_as_it_goes(
     frame_bytes = 13 + 4 + 1 + 1 + 4 * 4 + 4 * N_BINS  # a chunk with one frame, not less
     assert 100_000 // frame_bytes - 5 <= len(shown) <= 100_000 // (4 * N_BINS)
     assert any("last chunk" in text for _, (text,) in rows(drawn, "/log", "TextLog:text"))
+
+
+@pytest.mark.parametrize("kind", ["wire", "every_kind"])
+def test_damage_anywhere_ends_in_at_most_one_line(
+    wire: Path, tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes], kind: str
+) -> None:
+    rng = np.random.default_rng(11)
+    for case in range(4):
+        folder = tmp_path / str(case)
+        if kind == "wire":
+            folder.mkdir()
+            recording = folder / wire.name
+            recording.write_bytes(wire.read_bytes()[:40_000])
+            files = [recording]
+        else:
+            recording = shutil.copytree(FIXTURES / "recordings" / kind, folder)
+            files = sorted(recording.iterdir())
+        for file in files:
+            content = np.frombuffer(file.read_bytes(), np.uint8).copy()
+            places = rng.integers(0, len(content), 1 + len(content) // 400)
+            content[places] = rng.integers(0, 256, len(places))
+            file.write_bytes(content.tobytes())
+        code = main([str(recording), "--recording-id", f"{kind}-{case}"])
+        out, err = capfdbinary.readouterr()
+        lines = err.decode().splitlines()
+        assert (code, len(lines)) in {(0, 0), (1, 1)}, lines
+        if out:
+            drawn = tmp_path / f"{case}.rrd"
+            drawn.write_bytes(out)
+            assert count_rows(drawn)["/about (static)"] == 1
 
 
 def test_it_is_installed_under_the_name_that_the_viewer_looks_for() -> None:

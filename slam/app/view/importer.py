@@ -330,6 +330,8 @@ class _Drawing:
         self, name: str, n_values: int, is_complex: bool, place: tuple[float, float] | None
     ) -> _Waiting | None:
         """Return where frames of one kind and layout wait; None if it has too many layouts."""
+        if not n_values:
+            return None  # a frame without samples
         key = (name, n_values, is_complex, place)
         if key in self._waiting:
             return self._waiting[key]
@@ -387,7 +389,7 @@ class _Drawing:
         from slam.app.view.layers import chart_values
         from slam.app.view.rerun_recording import rr
 
-        if not waiting.samples or not waiting.axis.n_bins:
+        if not waiting.samples:
             return
         axis, stamps = waiting.axis, waiting.stamps
         samples: NDArray[Any] = np.stack(waiting.samples)
