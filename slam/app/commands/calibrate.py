@@ -84,12 +84,14 @@ def run_calibrate(
         cut = f"{session}: cut at byte {recorded.cut_at_byte}; read up to there"
         print_progress(cut)
     planted = _planted(report.drive.rig, scene)
-    if as_json:
-        print_text(json_text(_facts(report, planted), indent=2, allow_nan=False))
-    else:
-        print_text("\n".join(one_line(line) for line in _lines(report, planted)))
-    if rig is not None:
-        write_rig(rig, _rig_file(recorded.info, report))
+    try:
+        if rig is not None:
+            write_rig(rig, _rig_file(recorded.info, report))
+    finally:  # behind the file, which no output can cost; and also if it cannot be written
+        if as_json:
+            print_text(json_text(_facts(report, planted), indent=2, allow_nan=False))
+        else:
+            print_text("\n".join(one_line(line) for line in _lines(report, planted)))
 
 
 def _drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
