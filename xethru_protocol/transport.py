@@ -35,6 +35,7 @@ from typing import Any, Protocol
 import serial
 from serial.tools import list_ports
 
+from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 _CHUNK_BYTES = 65536
@@ -216,7 +217,9 @@ class SerialTransport(LineTransport):
         try:
             self._port.baudrate = baudrate
         except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise Disconnected(f"{self.name} cannot be set to {baudrate} baud: {error}") from error
+            raise Disconnected(
+                f"{self.name} cannot be set to {baudrate} baud: {reason_of(error)}"
+            ) from error
 
     def close(self) -> None:
         if self._fd >= 0:

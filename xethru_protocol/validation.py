@@ -95,10 +95,15 @@ def reason_of(error: Exception) -> str:
     >>> reason_of(KeyError("lap"))
     'lap is missing'
     """
-    if isinstance(error, KeyError):
-        return f"{error.args[0]} is missing"
-    if isinstance(error, TypeError | AttributeError | IndexError):
-        return "a part of it is of another kind"
+    match error:
+        case KeyError():
+            return f"{error.args[0]} is missing"
+        case TypeError() | AttributeError() | IndexError():
+            return "a part of it is of another kind"
+        case UnicodeDecodeError():
+            return f"not UTF-8 text at byte {error.start}"
+        case OSError(strerror=str(reason)):
+            return reason
     return str(error) or type(error).__name__
 
 

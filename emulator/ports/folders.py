@@ -31,6 +31,7 @@ from emulator.module.settings import ProfileSettings
 from emulator.ports.pty import LinkError
 from xethru_protocol.system import PathInUseError, locked
 from xethru_protocol.transport import is_private, is_running, run_directory
+from xethru_protocol.validation import problem_text, reason_of
 
 _PORTS = "ports-"
 
@@ -235,9 +236,9 @@ class DirectoryMemory:
         except FileNotFoundError:
             return None
         except ValidationError as error:
-            reason = error.errors()[0]["msg"]
+            reason = problem_text(error.errors(), _State)
         except (OSError, ValueError) as error:
-            reason = str(error)
+            reason = reason_of(error)
         self._warn(f"{self._path}: not the state of this module, which starts new: {reason}")
         return None
 
@@ -252,7 +253,7 @@ class DirectoryMemory:
             unfinished.write_text(text)
             os.replace(unfinished, self._path)
         except OSError as error:
-            self._warn(f"{self._path}: the state of the module is not kept: {error}")
+            self._warn(f"{self._path}: the state of the module is not kept: {reason_of(error)}")
             with contextlib.suppress(OSError):
                 unfinished.unlink(missing_ok=True)
 

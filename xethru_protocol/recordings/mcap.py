@@ -53,7 +53,7 @@ from xethru_protocol.recordings.records import (
     writing,
 )
 from xethru_protocol.system import written_whole
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.messages import (
     BasebandAp,
@@ -843,7 +843,7 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
             else:
                 message = decode_response(unpack_array(BYTE_ARRAY, entry.data).tobytes())
         except (ValueError, struct.error) as error:
-            raise RecordingError(f"{path}: a message is damaged: {error}") from None
+            raise RecordingError(f"{path}: a message is damaged: {reason_of(error)}") from None
         yield message, None if "xethru-hil" in entry.channel.metadata else entry.t_ns
     if not radars and radar is not None and (names := _names(path)):
         raise RecordingError(f"{path} holds no radar {shown(radar)}; it holds {names}")
@@ -895,7 +895,9 @@ def mcap_facts(path: Path) -> RecordingFacts:
             try:
                 return RecordingFacts.from_json(json.loads(entry.values["facts"]))
             except (KeyError, ValueError, TypeError, RecursionError) as error:
-                raise RecordingError(f"{path}: what it says about itself: {error}") from None
+                raise RecordingError(
+                    f"{path}: what it says about itself: {reason_of(error)}"
+                ) from None
         if isinstance(entry, Message):
             break
     return RecordingFacts()

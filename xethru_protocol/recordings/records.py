@@ -8,6 +8,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Self, get_type_hints
 
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.rows import Response
 
@@ -166,5 +167,5 @@ class RecordingFacts:
                 known[name] = bytes.fromhex(known[name])
         for name, hint in get_type_hints(cls).items():
             if name in known and not isinstance(known[name], hint):
-                raise TypeError(f"{name} cannot be {known[name]!r}")
+                raise ValueError(f"{name} cannot be {shown(known[name])}")
         return cls(**known)

@@ -38,6 +38,7 @@ from xethru_protocol.recordings.records import (
     reading,
     report,
 )
+from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.framing import Direction, FramingFault, NeedData, PacketReader
 
@@ -137,7 +138,7 @@ def wire_facts(path: Path) -> RecordingFacts:
     try:
         return RecordingFacts.from_json(read_note(path).get("facts", {}))
     except (ValueError, TypeError, AttributeError) as error:
-        raise RecordingError(f"{path}: its description is damaged: {error}") from None
+        raise RecordingError(f"{path}: its description is damaged: {reason_of(error)}") from None
 
 
 def read_wire(path: Path, on_fault: FaultHandler | None) -> TimedMessages:

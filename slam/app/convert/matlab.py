@@ -46,6 +46,7 @@ from slam.front_end import make_detector
 from slam.geometry import Mount, RadarPair, Rig
 from slam.paper.trilateration import Trilaterator
 from xethru_protocol.system import StopFlag
+from xethru_protocol.validation import reason_of
 
 _MM = 1e-3
 _POSE_UNITS = np.array([_MM, _MM, 1.0])
@@ -93,7 +94,7 @@ def read_mat(path: Path) -> MatDrive:
     except OSError as error:
         raise AppError(f"{path}: cannot read: {error.strerror or error}") from None
     except Exception as error:  # scipy documents no exceptions for damaged files
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(reason_of(error).split())
         raise AppError(
             f"{path}: no MATLAB file, or a damaged one{describe_kind(path)}: {reason}"
         ) from None

@@ -53,6 +53,7 @@ from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, STRING, pack_array, pack_string
 from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import frame_area
 
@@ -265,7 +266,7 @@ def _open(bag: Path) -> Iterator[Any]:
     except OSError as error:
         raise AppError(f"{bag}: cannot read: {error.strerror or error}") from None
     except Exception as error:  # rosbags documents no exceptions for damaged bags
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(reason_of(error).split())
         raise AppError(
             f"{bag}: no bag of ROS 1 or 2, or a damaged one: {reason}; `rosbag reindex` or "
             "`ros2 bag reindex` mend some"

@@ -39,6 +39,7 @@ from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.state import CALIBRATION
 from xethru_protocol.system import StopFlag
+from xethru_protocol.validation import reason_of
 
 Array = NDArray[np.float64]
 
@@ -104,7 +105,7 @@ def read_drive(path: Path) -> Drive:
     try:
         lines = path.read_text(encoding="ascii").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise AppError(f"{path}: cannot be read: {error}") from None
+        raise AppError(f"{path}: cannot be read: {reason_of(error)}") from None
     for number, line in enumerate(lines, start=1):
         try:
             kind, first, second, *rest = line.split()

@@ -40,7 +40,7 @@ from slam.geometry import Rig, transform
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.system import StopFlag
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import real_frame_rate
 
@@ -165,7 +165,9 @@ class EmulatorProcess:
             answer = json.loads(emulator_cli.ask(path, {"verb": "state", "radar": radar}))
             return int(answer["radars"][radar]["stream"]["scene_time_ns"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise EmulatorError(f"the emulator does not say when {radar} began: {error}") from None
+            raise EmulatorError(
+                f"the emulator does not say when {radar} began: {reason_of(error)}"
+            ) from None
 
     def _end(self) -> None:
         if self._process.stdout is not None:
