@@ -292,8 +292,8 @@ _LINE_POINTS = rr.Radius.ui_points(0.8)
 _PATH_STEP = 5
 """One point per five states is 5 cm of path: no corner is lost."""
 
-MAP_MARGIN_M = 0.6
-"""Free border of the map, in which the numbers of its axes are."""
+_MARGIN_M, _MARGIN_PART = 0.6, 0.1
+"""Free border of the map, in which the numbers of its axes are: metres, or a part of its size."""
 
 _TICKS = 6
 """About so many lines of the grid cross the longer side of the map."""
@@ -323,25 +323,35 @@ def known_world_m(info: SessionInfo) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ground:
-    """What the map is drawn on, world frame: `low_m` and `high_m`, shape (2,), are its corners."""
+    """What the map is drawn on, world frame.
+
+    `low_m` and `high_m`, shape (2,), are its corners, `margin_m` of it a free border.
+    """
 
     low_m: Array
     high_m: Array
+    margin_m: float
 
     @classmethod
     def around(cls, points_m: Array) -> Ground:
         """Return the ground that holds points, shape (n, 2), n > 0, with a border."""
-        low_m, high_m = points_m.min(axis=0), points_m.max(axis=0)
-        return cls(low_m=low_m - MAP_MARGIN_M, high_m=high_m + MAP_MARGIN_M)
+        margin_m = max(_MARGIN_M, _MARGIN_PART * extent_m(points_m))
+        low_m, high_m = points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m
+        return cls(low_m=low_m, high_m=high_m, margin_m=margin_m)
 
     @property
     def size_m(self) -> float:
         """The longer side, without the border."""
-        return max(extent_m(np.array([self.low_m, self.high_m])) - 2 * MAP_MARGIN_M, 1.0)
+        return max(extent_m(np.array([self.low_m, self.high_m])) - 2 * self.margin_m, 1.0)
+
+    @property
+    def inner_corners_m(self) -> Array:
+        """Two corners of it without the border, shape (2, 2)."""
+        return np.array([self.low_m + self.margin_m, self.high_m - self.margin_m])
 
     def holds(self, points_m: Array) -> bool:
         """Return whether points, shape (n, 2), lie on it, at most half in its border."""
-        border = MAP_MARGIN_M / 2
+        border = self.margin_m / 2
         return bool(
             np.all(points_m >= self.low_m + border) and np.all(points_m <= self.high_m - border)
         )
@@ -358,7 +368,7 @@ class Ground:
                 ends[:, axis] = tick
                 lines.append(ends)
                 # a number lies in the border, outside of what is drawn
-                place = self.low_m + MAP_MARGIN_M * np.array([0.25, 0.45])
+                place = self.low_m + 0.5 * self.margin_m
                 place[axis] = tick
                 places.append(place)
                 texts.append(f"{name} {tick:g} m")
@@ -395,7 +405,7 @@ class MapLayer:
         self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
         if np.isfinite(snapshot.truth).all():
             if not self._paths["truth"]:  # no robot is shown where there is no truth
-                self._send_robot("map/truth/robot", TRUTH_RGB, 45.0)
+                self._send_robot("map/truth/robot", TRUTH_RGB, TRUTH_RGB, 45.0)
             self._paths["truth"].append(snapshot.truth[:2])
         if snapshot.t_ns >= self._next_map_ns:
             self._next_map_ns = snapshot.t_ns + _MAP_PERIOD_NS
@@ -472,16 +482,16 @@ class MapLayer:
             screen(places), labels=texts, show_labels=True, colors=TICK_RGB, radii=0.0
         )
         self._recording.static("map/grid/numbers", numbers)
-        self._send_robot("map/robot", ESTIMATE_RGB, 60.0)
+        self._send_robot("map/robot", ESTIMATE_RGB, ROBOT_RGB, 60.0)
         if self._paths["truth"]:
-            self._send_robot("map/truth/robot", TRUTH_RGB, 45.0)
+            self._send_robot("map/truth/robot", TRUTH_RGB, TRUTH_RGB, 45.0)
 
-    def _send_robot(self, entity: str, colour: Rgb, order: float) -> None:
+    def _send_robot(self, entity: str, colour: Rgb, rim: Rgb, order: float) -> None:
         """Send a disk with an arrow forwards, in the body's frame."""
         radius_m = max(_ROBOT_PART * self._ground.size_m, _ROBOT_M)
         centre = np.zeros((1, 2), dtype=np.float32)
         for name, size_m, rgb, depth in (
-            ("rim", radius_m, ROBOT_RGB, 0.0),
+            ("rim", radius_m, rim, 0.0),
             ("body", 0.8 * radius_m, colour, 1.0),
         ):
             disk = rr.Points2D(centre, colors=rgb, radii=size_m, draw_order=order + depth)
@@ -489,7 +499,7 @@ class MapLayer:
         arrow = rr.Arrows2D(
             origins=centre,
             vectors=[[2.2 * radius_m, 0.0]],
-            colors=ROBOT_RGB,
+            colors=rim,
             radii=0.2 * radius_m,
             draw_order=order + 2.0,
         )
@@ -566,8 +576,7 @@ class MapLayer:
         here = transform(snapshot.world_from_map, snapshot.estimate[:2])[None]
         seen = np.concatenate([points, here])
         if self._grows and not self._ground.holds(seen):
-            corners = [self._ground.low_m + MAP_MARGIN_M, self._ground.high_m - MAP_MARGIN_M]
-            self._ground = Ground.around(np.concatenate([seen, corners]))
+            self._ground = Ground.around(np.concatenate([seen, self._ground.inner_corners_m]))
             self._send_ground()
         enlarged = self._enlargement(snapshot)
         outlines = [
