@@ -10,6 +10,7 @@ process, a recorded session) parses the same lines here, so all of them see the 
 from __future__ import annotations
 
 import math
+import re
 import socket
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
@@ -29,6 +30,9 @@ NS_PER_S = 1_000_000_000
 MOST_GAP_NS = NS_PER_S
 """Between two samples farther apart the motion of the robot is unknown."""
 _FIELDS = 8
+_BLANKS = re.compile(r"[ \t]+")
+# Python's own readers take digits of every script, underscores, hexadecimals and words, too.
+_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _MAX_BYTES = 1 << 28
 """Weeks of poses; a longer or endless file is not a trajectory."""
 _MAX_STAMP_S = Decimal(2**63) / NS_PER_S
@@ -69,18 +73,20 @@ def parse_tum_line(line: str) -> TumSample:
     Raises
     ------
     TumError
-        Fewer or more than eight numbers, a number that is not finite, a stamp that cannot be
-        seconds, a quaternion without length.
+        Fewer or more than eight numbers, one that is no finite decimal in ASCII, a stamp that
+        cannot be seconds, a quaternion without length.
 
     >>> parse_tum_line("12.000000005 1.5 -2 0 0 0 0 1")
     TumSample(t_ns=12000000005, x_m=1.5, y_m=-2.0, qz=0.0, qw=1.0)
     """
-    fields = line.split()
+    fields = _BLANKS.split(line.strip(" \t\r\n"))
     if len(fields) != _FIELDS:
         raise TumError(
             "expected 8 numbers (timestamp x y z qx qy qz qw), "
             f"found {len(fields)}: {shown(line.strip())}"
         )
+    if not all(map(_DECIMAL.fullmatch, fields)):
+        raise TumError(f"not a decimal number in TUM line {shown(line.strip())}")
     try:
         stamp_s = Decimal(fields[0])
         x, y, _z, _qx, _qy, qz, qw = (float(field) for field in fields[1:])
@@ -127,7 +133,7 @@ def read_tum(path: Path) -> Trajectory:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise TumError(f"{path}: cannot read: {reason}") from None
     samples = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from slam.app.errors import OdometryError
 from slam.app.odometry import track
+from slam.app.odometry.live import LiveOdometry
 from slam.app.odometry.track import (
     OdometryTrack,
     Trajectory,
@@ -185,6 +186,39 @@ number_like = st.one_of(
     st.decimals().map(str),
     st.from_regex(r"[+-]?[0-9]{1,4}(\.[0-9]{0,12})?[eE][+-]?[0-9]{1,20}", fullmatch=True),
 )
+
+
+NO_DECIMALS = (
+    "1_000", "0x10", "0x1p3", "nan", "-inf", "Infinity", "\u0661", "\uff11", "1\u0660", "+-1", "1e",
+    ".", "1.2.3", "1,5", "--1", "e5", "\u2212" "1", "1\x0b", "1\x1c", "\xa0" "1",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", NO_DECIMALS, ids=ascii)
+@pytest.mark.parametrize("place", range(8))
+def test_numbers_are_ascii_decimals_in_every_field_and_reader(
+    text: str, place: int, tmp_path: Path
+) -> None:
+    """Python's own float and int read more: other scripts' digits, underscores, hex, words."""
+    fields = ["1", "0", "0", "0", "0", "0", "0", "1"]
+    fields[place] = text
+    line = " ".join(fields)
+    with pytest.raises(TumError):
+        parse_tum_line(line)
+    with pytest.raises(OdometryError):
+        OdometryTrack.from_lines(["0 0 0 0 0 0 0 1", line])
+    (path := tmp_path / "t.tum").write_text(f"0 0 0 0 0 0 0 1\n{line}\n", encoding="utf-8")
+    with pytest.raises(TumError):
+        read_tum(path)
+    live = LiveOdometry("test")
+    live.take(line, 0)
+    assert live.n_refused == 1
+
+
+@pytest.mark.parametrize("text", ["1", "+1", "-1", "1.", ".5", "1.25", "1e-05", "1.0E+2", "007"])
+def test_every_ascii_decimal_is_read(text: str) -> None:
+    assert parse_tum_line(f"3 {text} 0 0 0 0 0 1\r\n").x_m == float(text)
+    assert parse_tum_line(f"\t{text} 2  0 0 0 0 0\t1").t_ns == round(float(text) * 1e9)
 
 
 @given(st.lists(number_like, min_size=8, max_size=8))
