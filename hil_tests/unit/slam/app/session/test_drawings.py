@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from hil_tests.paths import FIXTURES
 from hil_tests.unit.slam.app.session.test_steps import robust_state
 from hil_tests.unit.slam.app.sessions import (
     FRAME_NS,
@@ -413,3 +415,78 @@ def test_rerun_finds_a_way_from_its_own_root_to_the_world(tmp_path: Path) -> Non
     (link,) = message.transforms
     assert (link.header.frame_id, link.child_frame_id) == ("tf#/", "world")
     assert link.transform.rotation.w == 1.0
+
+
+def types_of(path: Path) -> dict[str, str]:
+    """Return the type of every topic of a session, its radars called <name>."""
+    with AnyReader([path]) as reader:
+        return {
+            re.sub(r"^/radar/[^/]+/", "/radar/<name>/", connection.topic): connection.msgtype
+            for connection in reader.connections
+        }
+
+
+RARE = {  # in few sessions
+    "/radar/<name>/stream": "std_msgs/msg/UInt32",
+    "/radar/<name>/rx": "std_msgs/msg/UInt8MultiArray",
+    "/radar/<name>/tx": "std_msgs/msg/UInt8MultiArray",
+    "/radar/<name>/detections": "std_msgs/msg/Float64MultiArray",
+    "/session/gap": "std_msgs/msg/String",
+}
+
+
+def test_every_topic_is_in_the_docs_and_every_topic_of_the_docs_is_there(tmp_path: Path) -> None:
+    written(tmp_path / "s.mcap", [robust_state()], [scan(0)])
+    text = (FIXTURES.parent / "docs" / "sessions.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(/\S+)` \| `(\S+/msg/\S+)` \|", text, re.MULTILINE)
+    assert len(dict(rows)) == len(rows)
+    assert dict(rows) == types_of(tmp_path / "s.mcap") | RARE
+
+
+def strings_of(part: object) -> Iterable[str]:
+    if isinstance(part, dict):
+        for key, value in part.items():
+            yield from (key, *strings_of(value))
+    elif isinstance(part, list):
+        for value in part:
+            yield from strings_of(value)
+    elif isinstance(part, str):
+        yield part
+
+
+def test_the_views_that_ship_show_what_sessions_have(tmp_path: Path) -> None:
+    names = ("left_rear", "left_front", "right_rear", "right_front")
+    info = session_info(4)
+    radars = zip(info.radars, names, strict=True)
+    info = replace(info, radars=tuple(replace(radar, name=name) for radar, name in radars))
+    log = SessionLog(tmp_path / "s.mcap", info, odometry(3))
+    log.on_scan(scan(1, 4))
+    log.on_snapshot(robust_state())
+    log.close()
+    found = read(tmp_path / "s.mcap")
+    whole = types_of(tmp_path / "s.mcap")
+    foxglove = json.loads((FIXTURES / "views" / "foxglove.json").read_text("utf-8"))
+    paths = [text for text in strings_of(foxglove) if text.startswith("/")]
+    for path in paths:
+        topic, *fields = path.split(".")
+        assert re.sub(r"^/radar/[^/]+/", "/radar/<name>/", topic) in whole, topic
+        value: Any = found[topic][0][1] if fields else None
+        for field in fields:  # of a plot, down to a number
+            name, _, index = field.rstrip("]").partition("[")
+            value = getattr(value, name)[int(index)] if index else getattr(value, name)
+        if fields:
+            float(value)
+    assert {f"/radar/{name}/bscan" for name in names} <= set(paths)
+    assert {"/landmarks/markers", "/estimate/path", "/estimate/pose", "/log"} <= set(paths)
+    rviz = (FIXTURES / "views" / "session.rviz").read_text("utf-8")
+    displays = re.findall(
+        r"Class: rviz_default_plugins/(\w+)\n.*?Durability Policy: ([\w ]+)\n.*?Value: (/\S+)",
+        re.sub(r"(?s)\A.*?Show Names", "", rviz),
+        re.DOTALL,
+    )
+    assert len(displays) == 15
+    for display, durability, topic in displays:
+        kind = whole[re.sub(r"^/radar/[^/]+/", "/radar/<name>/", topic)]
+        assert kind.rsplit("/", 1)[1] in {display, f"{display}Stamped"}
+        latched = topic in {"/scene", "/fields_of_view"}
+        assert durability == ("Transient Local" if latched else "Volatile")
