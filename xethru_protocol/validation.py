@@ -98,7 +98,7 @@ def reason_of(error: Exception) -> str:
     match error:
         case KeyError():
             return f"{error.args[0]} is missing"
-        case TypeError() | AttributeError() | IndexError():
+        case TypeError() | AttributeError():
             return "a part of it is of another kind"
         case UnicodeDecodeError():
             return f"not UTF-8 text at byte {error.start}"
