@@ -5,11 +5,15 @@ from __future__ import annotations
 import atexit
 import gc
 import re
+import signal
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
+from types import FrameType
+from typing import Self
 
 import numpy as np
 
@@ -31,17 +35,20 @@ from slam.app.run.live_source import (
 )
 from slam.app.run.output import Progress, Row, note
 from slam.app.run.results import RESULTS, finish, hold_folder, remove_earlier
-from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
+from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, execute, make_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
+from slam.frames import RadarFrame
+from slam.results import PoseAt, Slam, StepResult
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 _SESSION = "session.mcap"
 _STALE = ("session.rrd", "report.html")
 """Made from a session by other commands; those of an earlier session would mislead."""
+_STEP_LIMIT_S = 0.3
 
 
 def run_rig(
@@ -101,7 +108,7 @@ def run_rig(
         stop.check()
         rig_source.start(RAW_CONFIG, fps)
         wheels = rig_file.wheels.noise
-        slam = make_slam(config, rig_file.rig, wheels)
+        slam = held.enter_context(PromptSlam(make_slam(config, rig_file.rig, wheels), stop))
         log = LiveLog()
         live = LiveSource(
             rig_source.radars,
@@ -151,7 +158,7 @@ def run_rig(
             record = execute(source, sinks)
             end_reading()  # the modules are stopped while the results are written
             # without the flag: the signal that ended the drive does not end the writing
-            finish(out, source, record, StopFlag(), _rows(record, live, live_odometry))
+            finish(out, source, record, StopFlag(), _rows(record, live, live_odometry, slam))
         rig_source.close()  # while a page is served, others may have the modules
         _report_end(live, log, out)
         if view is not None:
@@ -166,6 +173,50 @@ def _prepare_the_end() -> None:
     """
     import_module("slam.app.run.pictures")
     atexit.register(gc.freeze)
+
+
+class PromptSlam:
+    """SLAM that gives up the step in hand if it takes longer than 0.3 s after a signal.
+
+    A step may take seconds on a busy machine, and must not hold up the end of a run in real time.
+    It watches the flag while it is entered, in the main thread. `step` raises StepGivenUpError.
+    """
+
+    def __init__(self, slam: Slam, stop: StopFlag) -> None:
+        self._slam, self._stop = slam, stop
+        self._in_step = False
+        self.n_given_up = 0
+        self._cleanup = ExitStack()
+        self.config, self.step_detections = slam.config, slam.step_detections
+        self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
+
+    def __enter__(self) -> Self:
+        previous = signal.signal(signal.SIGALRM, self._give_up)
+        self._cleanup.callback(signal.signal, signal.SIGALRM, previous)
+        self._cleanup.callback(signal.setitimer, signal.ITIMER_REAL, 0.0)
+        self._cleanup.callback(self._stop.detach)
+        self._stop.attach(self._set_alarm)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._cleanup.close()
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        try:
+            self._in_step = True
+            return self._slam.step(frames, pose_at, t_ns)
+        finally:
+            self._in_step = False
+
+    def _set_alarm(self) -> None:
+        signal.setitimer(signal.ITIMER_REAL, _STEP_LIMIT_S)
+
+    def _give_up(self, number: int, frame: FrameType | None) -> None:
+        if self._in_step:
+            self.n_given_up += 1
+            raise StepGivenUpError
 
 
 def parse_clock(text: str, source: LineSource) -> ClockLine | None:
@@ -211,7 +262,10 @@ def _report_end(live: LiveSource, log: LiveLog, out: Path) -> None:
     note(f"{ended}{kept}")
 
 
-def _rows(record: RunRecord, live: LiveSource, odometry: LiveOdometry) -> list[Row]:
+def _rows(
+    record: RunRecord, live: LiveSource, odometry: LiveOdometry, slam: PromptSlam
+) -> list[Row]:
+    left_out = live.ticks.n_unused - live.ticks.n_dropped + slam.n_given_up
     load = live.busy_s / max(record.duration_ns / NS_PER_S, 1e-9)
     rows = [
         (
@@ -227,7 +281,7 @@ def _rows(record: RunRecord, live: LiveSource, odometry: LiveOdometry) -> list[R
         ),
         (
             "left out",
-            f"{live.ticks.n_unused - live.ticks.n_dropped}",
+            f"{left_out}",
             f"more scans recorded without SLAM; {live.ticks.n_left_out} frames came too late",
         ),
     ]

@@ -68,6 +68,13 @@ class Odometry(Protocol):
     def pose_at(self, t_ns: int) -> NDArray[np.float64]: ...
 
 
+class StepGivenUpError(BaseException):
+    """SLAM broke off a step since the run has to end; it must not be used any more.
+
+    No `Exception`: it comes in the middle of anything, as KeyboardInterrupt does.
+    """
+
+
 class LinkLog(SessionObserver):
     """Stamps what is logged with session time; lines wait until sinks are attached."""
 
@@ -304,7 +311,8 @@ def run_slam(
 ) -> RunRecord:
     """Feed scans to SLAM as they come, and scans and states to the observers.
 
-    A scan that is not `used` goes to the observers only, and so does the truth. BLAS runs on one
+    A scan that is not `used` goes to the observers only, and so does the truth. One whose step SLAM
+    gave up, at the end of a run, counts as not used. BLAS runs on one
     thread, as everywhere else, so that results are the same bits. Observers get frames as received,
     SLAM gets them without each radar's gain, if `gains_db` has any. `true_landmarks_m`, shape
     (m, 2), world frame, is for the record only.
@@ -333,17 +341,26 @@ def run_slam(
                 observer.on_snapshot(snapshot)
 
     with threadpool_limits(limits=1):
+        given_up = False
         for scan in scans:
-            for observer in observers:
-                observer.on_scan(scan)
-            if not scan.used:
-                continue
-            if world_from_map is None:
-                world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
-            counter_at[scan.t_ns] = scan.counter
-            frames = [_less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames]
-            take(slam.step(frames, odometry.pose_at, scan.t_ns))
-        take(slam.flush())
+            results: tuple[StepResult, ...] = ()
+            try:
+                if scan.used:
+                    if world_from_map is None:
+                        world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
+                    counter_at[scan.t_ns] = scan.counter
+                    frames = [
+                        _less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames
+                    ]
+                    results = slam.step(frames, odometry.pose_at, scan.t_ns)
+            except StepGivenUpError:
+                given_up, scan = True, replace(scan, used=False)
+            finally:
+                for observer in observers:
+                    observer.on_scan(scan)
+            take(results)
+        if not given_up:  # SLAM is in the middle of a step then
+            take(slam.flush())
     return recorder.record()
 
 

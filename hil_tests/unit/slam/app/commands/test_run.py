@@ -1,25 +1,35 @@
 """The command uwb-slam run: its arguments, and its session wherever the disk ends."""
 
+import os
+import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from hil_tests.patience import seconds
 from hil_tests.unit.slam.app.sessions import Listener, scan, session_info
 from slam.app.cli import CSV_TO_TUM, main
-from slam.app.commands.run import parse_clock
+from slam.app.commands.run import PromptSlam, parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
-from slam.app.odometry.track import TumSample, parse_tum_line
+from slam.app.odometry.track import OdometryTrack, TumSample, parse_tum_line
+from slam.app.records import Scan
 from slam.app.run.live_source import LiveLog
+from slam.app.run.runner import run_slam, unknown_truth
 from slam.app.session import messages as ros
 from slam.app.session.cdr import wheel_odometry
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
+from slam.config import load_preset
+from slam.frames import Detection, RadarFrame
+from slam.results import PoseAt
+from xethru_protocol.system import StopFlag
 
 
 def pose(number: int) -> TumSample:
@@ -130,3 +140,55 @@ def test_a_unix_clock_shows_the_seconds_since_1970(monkeypatch: pytest.MonkeyPat
     clock = parse_clock("unix", parse_source("-"))
     assert clock is not None
     assert clock.nominal_ns(105_000_000_000) == 1_700_000_105_000_000_007
+
+
+class StubbornSlam:
+    """SLAM whose second step takes so long, and which has a state left at the end."""
+
+    def __init__(self, slow_s: float) -> None:
+        self._slow_s = slow_s
+        self.n_steps = self.n_flushed = 0
+        self.config = load_preset("robust")
+
+    def step(self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int) -> tuple[()]:
+        self.n_steps += 1
+        if self.n_steps == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(self._slow_s)
+        return ()
+
+    def step_detections(
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
+    ) -> tuple[()]:
+        return ()
+
+    def flush(self) -> tuple[()]:
+        self.n_flushed += 1
+        return ()
+
+    def wall_spans_m(self) -> NDArray[np.float64]:
+        return np.empty((0, 2, 2))
+
+
+@pytest.mark.parametrize(("slow_s", "used"), [(0.0, True), (seconds(60), False)])
+def test_a_step_that_takes_long_after_a_signal_is_given_up_and_its_scan_is_not_used(
+    slow_s: float, used: bool
+) -> None:
+    slam, heard, stop = StubbornSlam(slow_s), Listener(), StopFlag()
+
+    def scans() -> Iterator[Scan]:
+        for number in range(9):
+            if stop.received is None:
+                yield scan(number)
+
+    alarm = signal.getsignal(signal.SIGALRM)
+    began_s = time.monotonic()
+    with stop, PromptSlam(slam, stop) as prompt:
+        track = OdometryTrack([pose(0), pose(10**10)])
+        run_slam(scans(), track, prompt, unknown_truth, [heard])
+    assert time.monotonic() - began_s < seconds(30)
+    assert [one.used for one in heard.scans] == [True, used]
+    assert prompt.n_given_up == (not used)
+    assert slam.n_flushed == used  # it is in the middle of a step otherwise
+    assert signal.getsignal(signal.SIGALRM) is alarm
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

@@ -24,7 +24,7 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
 from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry
-from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver
+from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import sampler_limits
 from slam.app.run.live_source import Event, Inbox, LiveLog, LiveSource
@@ -91,7 +91,7 @@ class SignalAt(StopFlag):
             raise StopRequestedError(signal.SIGINT)
 
 
-class Given(SessionObserver):
+class Given:
     """When each scan was given out, virtual time, and how many frames waited then at most."""
 
     def __init__(self, inbox: VirtualInbox) -> None:
@@ -100,10 +100,12 @@ class Given(SessionObserver):
         self.most_waiting = 0
         self._n_waiting = -inbox.n_frames  # those from before the first tick are dropped
 
-    def on_scan(self, scan: Scan) -> None:
-        self.scans.append((self._inbox.now_ns, scan))
-        self._n_waiting -= len(scan.frames)
-        self.most_waiting = max(self.most_waiting, self._inbox.n_frames + self._n_waiting)
+    def noted(self, scans: Iterator[Scan]) -> Iterator[Scan]:
+        for scan in scans:
+            self.scans.append((self._inbox.now_ns, scan))
+            self._n_waiting -= len(scan.frames)
+            self.most_waiting = max(self.most_waiting, self._inbox.n_frames + self._n_waiting)
+            yield scan
 
 
 @dataclass
@@ -157,11 +159,11 @@ class Overloaded:
             info=info,
             rig=rig_of(drive.scene),
             slam=SlowSlam(slam, self.inbox, self.more_s),
-            scans=self.live.scans(),
+            scans=self.given.noted(self.live.scans()),
             odometry=odometry,
             link_log=log,
         )
-        self.record = execute(source, [self.given, self.heard])
+        self.record = execute(source, [self.heard])
         return self
 
     def _events(self) -> Iterator[Timed]:
