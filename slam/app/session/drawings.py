@@ -197,12 +197,14 @@ class Drawings:
                     points_m=snapshot.landmarks_m,
                 )
             )
-            variances, axes = np.linalg.eigh(snapshot.landmark_covariances_m2)
+            covariances = snapshot.landmark_covariances_m2
+            known = np.isfinite(covariances).all(axis=(1, 2))
+            variances, axes = np.linalg.eigh(covariances[known])
             long_first = 2.0 * ENLARGED * _CHI_95 * np.sqrt(np.maximum(variances, 0.0))[:, ::-1]
             turns = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
             for id_, place, turn, size in zip(
-                snapshot.landmark_ids.tolist(),
-                snapshot.landmarks_m,
+                snapshot.landmark_ids[known].tolist(),
+                snapshot.landmarks_m[known],
                 turns,
                 long_first.tolist(),
                 strict=True,
@@ -356,7 +358,7 @@ class _Bscan:
         self._frame_id = f"radar_{radar.name}"
         self._images = file.channel(f"/radar/{radar.name}/bscan", "sensor_msgs/msg/Image")
         self._recent: deque[NDArray[np.float32]] = deque(maxlen=_ROWS)
-        self._n_new = 0
+        self._n_bins, self._n_new = radar.n_bins, 0
         self._last: RadarFrame | None = None
         self._rows: list[NDArray[np.float32]] = []
         self._gaps: list[int] = []  # before each new frame
@@ -387,6 +389,8 @@ class _Bscan:
         file.write(info, start_ns, pack_string(json.dumps(about)))
 
     def add(self, frame: RadarFrame) -> None:
+        if len(frame.samples) != self._n_bins:
+            return  # of other settings than the picture
         last = self._last
         gap = 0
         if last is not None:

@@ -294,6 +294,18 @@ def test_landmarks_have_their_ellipses_ten_times_enlarged(tmp_path: Path) -> Non
         assert math.tan(angle) == pytest.approx(slope, abs=1e-9)
 
 
+@pytest.mark.parametrize("unknown", [math.inf, math.nan])
+def test_a_landmark_of_unknown_covariance_has_no_ellipse_and_ends_nothing(
+    unknown: float, tmp_path: Path
+) -> None:
+    covariances = np.array([np.diag([4e-4, 1e-4]), np.full((2, 2), unknown)])
+    state = replace(snapshot(11), landmark_covariances_m2=covariances)
+    (_, message) = written(tmp_path / "s.mcap", [state])["/landmarks/markers"][-1]
+    groups = groups_of(message)
+    assert [marker.id for marker in groups["95 % ellipses, 10 x"]] == [3]
+    assert len(groups["landmarks"][0].points) == 2
+
+
 def test_beams_and_the_true_scene_are_there_from_the_start(tmp_path: Path) -> None:
     config = {"back_end": "robust", "robust": {"field_of_view_deg": 60.0}}
     config["detection"] = {"min_range_m": 0.3, "max_range_m": 2.0}
@@ -408,6 +420,16 @@ def test_another_stream_is_a_gap_of_one_row_whatever_its_counters(tmp_path: Path
     scans += [echo_scan(k, 1.0, 0.02, stream=1) for k in range(90, 106)]
     ((_, message),) = written(tmp_path / "s.mcap", scans=scans)["/radar/radar0/bscan"]
     assert np.flatnonzero(np.isnan(pixels(message)[:, 0])).tolist() == [16]
+
+
+def test_a_frame_of_another_length_is_not_drawn_and_ends_nothing(tmp_path: Path) -> None:
+    scans = [echo_scan(k, 1.0, 0.02) for k in range(32)]
+    short = scans[20].frames[0].samples[:50]
+    frames = (replace(scans[20].frames[0], samples=short), scans[20].frames[1])
+    scans[20] = replace(scans[20], frames=frames)
+    found = written(tmp_path / "s.mcap", scans=scans)
+    ((_, message),) = found["/radar/radar0/bscan"]
+    assert np.flatnonzero(np.isnan(pixels(message)[:, 0])).tolist() == [20]
 
 
 def test_rerun_finds_a_way_from_its_own_root_to_the_world(tmp_path: Path) -> None:
