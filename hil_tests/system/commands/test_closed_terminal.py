@@ -291,7 +291,7 @@ COMMANDS: dict[str, tuple[str, Callable[[Path], bool]]] = {
 
 
 @pytest.mark.parametrize(
-    "name", ["replay", *(THOROUGH(name) for name in COMMANDS if name != "replay")]
+    "name", ["convert", *(THOROUGH(name) for name in COMMANDS if name != "convert")]
 )
 def test_a_terminal_that_is_gone_from_the_start_costs_no_result(
     name: str, session: Path, tmp_path: Path
