@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Generic, TypeVar
+from array import array
+from bisect import bisect_left
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,13 +17,15 @@ _FIRST_ROWS = 64
 class PackedRows(Generic[Number]):
     """Rows of one shape and type in one buffer, whose size is doubled when it is full.
 
-    >>> poses = PackedRows(np.float64, 3)
+    A type with fields makes a table: a row is a tuple then.
+
+    >>> poses = PackedRows(np.dtype(np.float64), 3)
     >>> poses.append([1.0, 2.0, 0.5])
     >>> poses.rows
     array([[1. , 2. , 0.5]])
     """
 
-    def __init__(self, kind: type[Number], *shape: int) -> None:
+    def __init__(self, kind: np.dtype[Number], *shape: int) -> None:
         self._buffer: NDArray[Number] = np.empty((_FIRST_ROWS, *shape), dtype=kind)
         self._n_rows = 0
 
@@ -30,7 +34,10 @@ class PackedRows(Generic[Number]):
 
     @property
     def rows(self) -> NDArray[Number]:
-        """Return the rows so far, shape (n, ...); a view, which later rows do not change."""
+        """Return the rows so far, shape (n, ...): a view, to be written to before the next append.
+
+        Its values stay as they are when rows are appended.
+        """
         return self._buffer[: self._n_rows]
 
     def append(self, row: ArrayLike) -> None:
@@ -41,3 +48,54 @@ class PackedRows(Generic[Number]):
             self._buffer = more
         self._buffer[self._n_rows] = row
         self._n_rows += 1
+
+    def keep(self, wanted: NDArray[np.bool_]) -> None:
+        """Remove all other rows; ``wanted`` has shape (n,)."""
+        kept = self.rows[wanted]
+        self._n_rows = len(kept)
+        self._buffer[: self._n_rows] = kept
+
+
+class RowsByTime(Generic[Number]):
+    """Packed rows by the times [ns] they are of; the last one of a time counts.
+
+    Times may come in any order, but need a dictionary once one is not later than all before it.
+
+    >>> counters = RowsByTime(np.dtype(np.int64))
+    >>> counters.put(200, 1)
+    >>> int(counters.at(200)), counters.at(201)
+    (1, None)
+    """
+
+    def __init__(self, kind: np.dtype[Number], *shape: int) -> None:
+        self._stamps_ns = array("q")
+        self._rows = PackedRows(kind, *shape)
+        self._places: dict[int, int] | None = None
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def rows(self) -> NDArray[Number]:
+        """Return the rows in the order in which their times came first."""
+        return self._rows.rows
+
+    def put(self, t_ns: int, row: ArrayLike) -> None:
+        if self._stamps_ns and t_ns <= self._stamps_ns[-1] and self._places is None:
+            self._places = {stamp_ns: place for place, stamp_ns in enumerate(self._stamps_ns)}
+        if self._places is not None:
+            place = self._places.setdefault(t_ns, len(self))
+            if place < len(self):
+                self._rows.rows[place] = row
+                return
+        self._stamps_ns.append(t_ns)
+        self._rows.append(row)
+
+    def at(self, t_ns: int) -> Any:  # noqa: ANN401 - a scalar or an array, as the rows are
+        """Return the row of a time, None if there is none; one with fields can be written to."""
+        if self._places is not None:
+            place = self._places.get(t_ns)
+            return None if place is None else self._rows.rows[place]
+        place = bisect_left(self._stamps_ns, t_ns)
+        is_there = place < len(self._stamps_ns) and self._stamps_ns[place] == t_ns
+        return self._rows.rows[place] if is_there else None

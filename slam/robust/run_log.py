@@ -1,18 +1,20 @@
 """The log of one run: the measurements of a solution over all poses.
 
-The measurements of poses that are kept no longer are condensed into a prior on the first pose kept,
-the calibration, the offsets and the landmarks.
+The measurements of old poses are condensed into a prior on the first pose after them, the
+calibration, the offsets and the landmarks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import compose, wrap_angle
+from slam.packed import PackedRows
 from slam.robust.state import Array, Indices, Motion, State, rotation
 
 # Standard deviations of calibration and offsets below this are taken as this, so that information
@@ -203,29 +205,45 @@ def _columns(rows: Sequence[int], head: int) -> Indices:
     return np.stack([first, first + 1], axis=-1).ravel()
 
 
-@dataclass(slots=True)
-class _Ranges:
-    poses: list[int] = field(default_factory=list)
-    radars: list[int] = field(default_factory=list)
-    landmarks: list[int] = field(default_factory=list)
-    antennas: list[tuple[float, float]] = field(default_factory=list)
-    ranges_m: list[float] = field(default_factory=list)
-    sigmas_m: list[float] = field(default_factory=list)
-    alone: list[bool] = field(default_factory=list)
+class _Measurements:
+    """Measurements of the whole run in the order they were used in, nearly that of their poses."""
+
+    def __init__(self, kind: np.dtype[np.void]) -> None:
+        self._table = PackedRows(kind)
+        self._begin = 0  # all rows before it are of poses that are condensed
+
+    def append(self, row: ArrayLike) -> None:
+        self._table.append(row)
+
+    def all(self) -> NDArray[np.void]:
+        return self._table.rows
+
+    def since(self, first_pose: int) -> NDArray[np.void]:
+        """Return the measurements of a pose and later ones, the first of those not condensed."""
+        rows = self._table.rows[self._begin :]
+        return rows[rows["pose"] >= first_pose]
+
+    def newest(self, count: int) -> NDArray[np.void]:
+        """Return the newest measurements, at most so many."""
+        return self._table.rows[max(len(self._table) - count, self._begin) :]
+
+    def keep(self, wanted: NDArray[np.bool_], first_pose: int) -> None:
+        """Remove other measurements; poses before ``first_pose`` are condensed."""
+        self._table.keep(wanted)
+        since = np.flatnonzero(self._table.rows["pose"] >= first_pose)
+        self._begin = int(since[0]) if len(since) else len(self._table)
 
 
-@dataclass(slots=True)
-class _Points:
-    poses: list[int] = field(default_factory=list)
-    landmarks: list[int] = field(default_factory=list)
-    points: list[Array] = field(default_factory=list)
-    roots: list[Array] = field(default_factory=list)
+def _no_ranges() -> _Measurements:
+    whose = [(name, np.int32) for name in ("pose", "radar", "landmark")]
+    where = [("antenna", np.float64, 2), ("range_m", np.float64), ("sigma_m", np.float64)]
+    return _Measurements(np.dtype([*whose, *where, ("alone", np.bool_)]))
 
 
-def _keep(table: _Ranges | _Points, at: Sequence[int]) -> None:
-    for name in (column.name for column in fields(table)):
-        values = getattr(table, name)
-        setattr(table, name, [values[i] for i in at])
+def _no_points() -> _Measurements:
+    whose = [(name, np.int32) for name in ("pose", "landmark")]
+    where = [("point", np.float64, 2), ("root", np.float64, (2, 2))]
+    return _Measurements(np.dtype([*whose, *where]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -247,19 +265,20 @@ class LoggedSightings:
 class RunLog:
     """Increments, used ranges and points, with the trajectory they were last solved for.
 
-    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark.
+    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark. What is
+    condensed stays, too, in packed arrays: all poses of a run can be solved for at its end.
     """
 
     def __init__(self, wheels: WheelNoise) -> None:
         self._wheels = wheels
-        self._first = 0
+        self._first = 0  # poses before it are condensed
         self._condensed: Condensed | None = None
-        self._increments: list[Array] = []
-        self._covariances: list[Array] = []
-        self._walks: list[float] = []
-        self._causal: list[Array] = [np.zeros(3)]
-        self._ranges = _Ranges()
-        self._points = _Points()
+        self._increments = PackedRows(np.dtype(np.float64), 3)
+        self._covariances = PackedRows(np.dtype(np.float64), 3, 3)
+        self._walks = PackedRows(np.dtype(np.float64))
+        self._causal = PackedRows(np.dtype(np.float64), 3)
+        self._causal.append(np.zeros(3))
+        self._ranges, self._points = _no_ranges(), _no_points()
         self._names: dict[int, int | None] = {}
         self.since_solved = 0
         """How many steps ago the trajectory was last solved for, or that was tried."""
@@ -267,15 +286,16 @@ class RunLog:
 
     @property
     def n_poses(self) -> int:
-        return self._first + len(self._causal)
+        return len(self._causal)
 
     @property
     def n_kept(self) -> int:
-        return len(self._causal)
+        """How many poses are not condensed."""
+        return len(self._causal) - self._first
 
     def add_motion(self, increment: Array, motion: Motion) -> None:
         """Append a step as reported; ``motion`` is the step as the calibration corrects it."""
-        self._increments.append(np.array(increment, dtype=np.float64))
+        self._increments.append(increment)
         self._covariances.append(motion.covariance)
         self._walks.append(motion.walk_variance)
         heading = float(self._stored_pose[2])
@@ -286,7 +306,7 @@ class RunLog:
 
     def set_causal(self, pose: Array) -> None:
         """Store the filter's newest pose, its measurements included."""
-        self._causal[-1] = pose
+        self._causal.rows[-1] = pose
 
     def parted(self, pose: Array) -> tuple[float, float]:
         """Return how far [m], and by what angle [rad], a pose is from the stored trajectory."""
@@ -296,19 +316,20 @@ class RunLog:
     def forget_from(self, pose: int) -> None:
         """Forget all measurements from a pose on; the steps stay."""
         for table in (self._ranges, self._points):
-            _keep(table, np.flatnonzero(np.array(table.poses) < pose).tolist())
+            table.keep(table.all()["pose"] < pose, self._first)
 
     def break_odometry(self, pose: Array) -> None:
         """Make the last step uninformative, and set the newest pose."""
-        self._covariances[-1] = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
-        self._causal[-1] = pose
+        self._covariances.rows[-1] = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
+        self._causal.rows[-1] = pose
         self._stored_pose = pose
 
     def move_poses(self, first: int, motion: Array) -> None:
         """Apply a motion (3,) from the left to all poses from one on."""
-        for k in range(max(first - self._first, 0), len(self._causal)):
-            self._causal[k] = compose(motion, self._causal[k])
-        self._stored_pose = self._causal[-1]
+        poses = self._causal.rows
+        for k in range(first, len(poses)):
+            poses[k] = compose(motion, poses[k])
+        self._stored_pose = poses[-1].copy()
 
     def add_range(
         self,
@@ -333,21 +354,11 @@ class RunLog:
         """
         if pose < self._first:
             raise ValueError(f"pose {pose} is kept no longer, the first one is {self._first}")
-        ranges = self._ranges
-        ranges.poses.append(pose)
-        ranges.radars.append(radar)
-        ranges.landmarks.append(landmark_id)
-        ranges.antennas.append(antenna)
-        ranges.ranges_m.append(range_m)
-        ranges.sigmas_m.append(sigma_m)
-        ranges.alone.append(alone)
+        self._ranges.append((pose, radar, landmark_id, antenna, range_m, sigma_m, alone))
 
     def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
-        points = self._points
-        points.poses.append(self.n_poses - 1)
-        points.landmarks.append(landmark_id)
-        points.points.append(np.array(point, dtype=np.float64))
-        points.roots.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        self._points.append((self.n_poses - 1, landmark_id, point.tolist(), root.tolist()))
 
     def rename(self, gone: int, kept: int) -> None:
         self._names[gone] = kept
@@ -371,21 +382,17 @@ class RunLog:
         These are ``window`` poses, fewer if the robot turned by more than ``most_turn_rad`` since.
         """
         first = max(self.n_poses - 1 - window, self._first)
-        steps = np.array(self._increments[first - self._first :]).reshape(-1, 3)
-        turned_rad = np.cumsum(np.abs(steps[::-1, 2]))
+        turned_rad = np.cumsum(np.abs(self._increments.rows[first:][::-1, 2]))
         first = max(first, self.n_poses - 1 - int(np.sum(turned_rad <= most_turn_rad)))
-        steps = np.array(self._increments[first - self._first :]).reshape(-1, 3)
-        ranges = self._ranges
+        steps = self._increments.rows[first:]
         # Rows are nearly in order of time: tracklets look back a few frames only.
-        begin = max(len(ranges.poses) - _MOST_RANGES_PER_POSE * window, 0)
-        poses = np.array(ranges.poses[begin:], dtype=np.intp)
-        names = self._rows_of(ranges.landmarks[begin:], {landmark_id: 0})
-        alone = np.array(ranges.alone[begin:], dtype=bool)
-        rows = begin + np.flatnonzero((names == 0) & (poses >= first) & alone)
-        at = np.array([ranges.poses[row] for row in rows], dtype=np.intp) - first
+        newest = self._ranges.newest(_MOST_RANGES_PER_POSE * window)
+        names = self._rows_of(newest["landmark"], {landmark_id: 0})
+        own = newest[(names == 0) & (newest["pose"] >= first) & newest["alone"]]
+        at = own["pose"].astype(np.intp) - first
         chain = _chain(np.zeros(3), steps, calibration)
         way_m = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
-        mounts = np.array([ranges.antennas[row] for row in rows]).reshape(-1, 2)
+        mounts = own["antenna"]
         c, s = np.cos(chain[at, 2]), np.sin(chain[at, 2])
         turned = np.column_stack(
             [c * mounts[:, 0] - s * mounts[:, 1], s * mounts[:, 0] + c * mounts[:, 1]]
@@ -395,45 +402,50 @@ class RunLog:
             places_m=chain[at, :2],
             headings_rad=chain[at, 2],
             way_m=way_m[at],
-            ranges_m=np.array([ranges.ranges_m[row] for row in rows]),
-            sigmas_m=np.array([ranges.sigmas_m[row] for row in rows]),
-            radars=np.array([ranges.radars[row] for row in rows], dtype=np.intp),
+            ranges_m=own["range_m"].copy(),
+            sigmas_m=own["sigma_m"].copy(),
+            radars=own["radar"].astype(np.intp),
             newest=chain[-1],
         )
 
-    def problem(self, state: State, prior: Prior) -> Problem:
+    def problem(self, state: State, prior: Prior, *, whole: bool = False) -> Problem:
         """Return all measurements of the landmarks the state has now.
 
-        ``prior`` is that of the start; condensed poses include it already.
+        ``prior`` is that of the start; condensed poses include it already, unless the problem is to
+        be that of the ``whole`` run.
         """
-        if self._condensed is not None:
+        first = 0 if whole else self._first
+        if self._condensed is not None and not whole:
             prior = self._condensed.of(state.feature_ids, len(state.wall_ids))
         rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
-        ranges, points = self._ranges, self._points
-        of_range = self._rows_of(ranges.landmarks, rows)
-        of_point = self._rows_of(points.landmarks, rows)
-        used, used_points = np.flatnonzero(of_range >= 0), np.flatnonzero(of_point >= 0)
+        ranges, points = (
+            table.all() if whole else table.since(first) for table in (self._ranges, self._points)
+        )
+        of_range = self._rows_of(ranges["landmark"], rows)
+        of_point = self._rows_of(points["landmark"], rows)
+        ranges, of_range = ranges[of_range >= 0], of_range[of_range >= 0]
+        points, of_point = points[of_point >= 0], of_point[of_point >= 0]
         sigmas = np.square(self._wheels.calibration_sigmas)
-        sigmas_m = np.array(ranges.sigmas_m)[used]
+        sigmas_m = ranges["sigma_m"].copy()
         if state.shape_sigmas_m:
-            sigmas_m = np.hypot(sigmas_m, state.feature_shape_sigmas_m[of_range[used]])
+            sigmas_m = np.hypot(sigmas_m, state.feature_shape_sigmas_m[of_range])
         # What lies on a round target's surface is nearer than its axis, which is the landmark.
-        ranges_m = np.array(ranges.ranges_m)[used] + state.feature_radii_m[of_range[used]]
+        ranges_m = ranges["range_m"] + state.feature_radii_m[of_range]
         return Problem(
-            increments=np.array(self._increments).reshape(-1, 3),
-            covariances=np.array(self._covariances).reshape(-1, 3, 3),
-            walks=np.array(self._walks)[:, None] * sigmas,
+            increments=self._increments.rows[first:].copy(),
+            covariances=self._covariances.rows[first:].copy(),
+            walks=self._walks.rows[first:, None] * sigmas,
             prior=prior,
-            range_poses=np.array(ranges.poses, dtype=np.intp)[used] - self._first,
-            range_radars=np.array(ranges.radars, dtype=np.intp)[used],
-            range_landmarks=of_range[used],
-            range_antennas=np.array(ranges.antennas).reshape(-1, 2)[used],
+            range_poses=ranges["pose"].astype(np.intp) - first,
+            range_radars=ranges["radar"].astype(np.intp),
+            range_landmarks=of_range,
+            range_antennas=ranges["antenna"].copy(),
             ranges_m=ranges_m,
             range_sigmas_m=sigmas_m,
-            point_poses=np.array(points.poses, dtype=np.intp)[used_points] - self._first,
-            point_landmarks=of_point[used_points],
-            points=np.array(points.points).reshape(-1, 2)[used_points],
-            point_roots=np.array(points.roots).reshape(-1, 2, 2)[used_points],
+            point_poses=points["pose"].astype(np.intp) - first,
+            point_landmarks=of_point,
+            points=points["point"].copy(),
+            point_roots=points["root"].copy(),
             n_walls=len(state.wall_ids),
         )
 
@@ -443,51 +455,50 @@ class RunLog:
         One chains all increments with the present calibration, which a closed loop has corrected
         for the whole run; the other keeps the filter's own past.
         """
-        shape = (len(self._causal), 3) if problem.is_walking else (1, 3)
-        poses = np.array(self._causal)
+        n_poses = len(problem.increments) + 1
+        poses = self._causal.rows[-n_poses:].copy()
+        chained = _chain(poses[0], problem.increments, state.calibration)
         poses[-1] = state.pose
         causal = Estimate(
             poses=poses,
-            calibration=np.broadcast_to(state.calibration, shape).copy(),
+            calibration=np.broadcast_to(
+                state.calibration, (n_poses if problem.is_walking else 1, 3)
+            ).copy(),
             offsets_m=state.offsets_m.copy(),
             landmarks_m=state.features,
         )
-        chained = _chain(self._causal[0], problem.increments, state.calibration)
         return [causal, replace(causal, poses=chained)]
 
     def solved(self, estimate: Estimate) -> None:
-        self._causal = list(estimate.poses)
+        self._causal.rows[-len(estimate.poses) :] = estimate.poses
         self._stored_pose = estimate.poses[-1].copy()
         self.since_solved = 0
 
     def condense(self, prior: Prior, landmark_ids: Sequence[int], n_steps: int) -> None:
-        """Forget the first ``n_steps`` poses kept; ``prior`` replaces their measurements.
+        """Let ``prior`` replace the first ``n_steps`` poses kept and their measurements.
 
         Its landmarks are those of ``landmark_ids``, the present map. Measurements of landmarks that
         are gone are dropped.
         """
         self._condensed = Condensed(prior, landmark_ids)
+        self._first += n_steps
         rows = {id_: id_ for id_ in landmark_ids}
         for table in (self._ranges, self._points):
-            names = self._rows_of(table.landmarks, rows)
-            table.landmarks = names.tolist()
-            _keep(table, np.flatnonzero(names >= 0).tolist())
+            measured = table.all()
+            measured["landmark"] = self._rows_of(measured["landmark"], rows)
+            table.keep(measured["landmark"] >= 0, self._first)
         self._names.clear()
-        for kept in (self._increments, self._covariances, self._walks, self._causal):
-            del kept[:n_steps]
-        self._first += n_steps
-        for table in (self._ranges, self._points):
-            _keep(table, np.flatnonzero(np.array(table.poses) >= self._first).tolist())
 
-    def _rows_of(self, ids: list[int], rows: dict[int, int]) -> Indices:
-        """Return the present row of each id, -1 for landmarks that are gone."""
-        final: dict[int, int] = {}
-        for id_ in set(ids):
+    def _rows_of(self, ids: NDArray[np.int32], rows: dict[int, int]) -> Indices:
+        """Return the present row of each id, shape (m,), -1 for landmarks that are gone."""
+        present = np.flatnonzero(np.bincount(ids))
+        final = np.full(int(present[-1]) + 1 if len(present) else 0, -1, dtype=np.intp)
+        for id_ in present.tolist():
             name: int | None = id_
             while name is not None and name in self._names:
                 name = self._names[name]
             final[id_] = -1 if name is None else rows.get(name, -1)
-        return np.array([final[id_] for id_ in ids], dtype=np.intp)
+        return final[ids]
 
 
 def _chain(first: Array, increments: Array, calibration: Array) -> Array:

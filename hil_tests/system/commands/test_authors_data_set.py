@@ -39,7 +39,7 @@ def test_whoever_downloads_it_can_run_it(
                 # a few milliseconds for the line and the recorder
                 late_ns = 4_000_000 + int(np.random.default_rng(frame.counter).integers(3_000_000))
                 bag.add_frame(START_NS + frame.t_ns + late_ns, radar, frame.samples)
-    for sample in OdometryTrack.from_lines(scene_odometry(scene, SEED)).samples:
+    for sample in OdometryTrack.from_lines(scene_odometry(scene, SEED)):
         t_ns = START_NS + sample.t_ns
         bag.add_odometry(t_ns, t_ns, (sample.x_m, sample.y_m, sample.heading_rad))
         x_m, y_m, heading = trajectory.poses(np.array([sample.t_ns]))[0].tolist()

@@ -111,7 +111,7 @@ def _drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
         raise AppError(f"{session.path}: holds no radar frame; record a longer drive")
     if len(samples) < 2:
         raise AppError(f"{session.path}: holds no odometry to speak of; record a longer drive")
-    track = OdometryTrack(samples).samples
+    track = tuple(OdometryTrack(samples))
     return make_drive(
         session.rig,
         np.array([sample.t_ns for sample in track], dtype=np.int64),

@@ -89,7 +89,7 @@ class _ReportData(SessionObserver):
         self.n_warnings = 0
         self.start_ns: int | None = None
         self.end_ns = 0
-        self._rows = PackedRows(np.float64, len(_Series._fields))
+        self._rows = PackedRows(np.dtype(np.float64), len(_Series._fields))
         self._odom: NDArray[np.float64] | None = None
 
     @property

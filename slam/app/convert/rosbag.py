@@ -196,7 +196,7 @@ def convert_bag(
     n_frames = sum(len(stream.stamps_ns) for stream in contents.streams.values())
     return (
         f"{out}: {n_frames} frames of {len(radars)} radars in {n_scans} scans, "
-        f"{len(odometry.samples)} poses of the wheels, {len(contents.truth)} true poses",
+        f"{len(odometry)} poses of the wheels, {len(contents.truth)} true poses",
         warnings,
     )
 

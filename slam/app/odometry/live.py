@@ -199,6 +199,10 @@ class LiveOdometry:
         """Return whether the pose at this time lies between two samples close enough."""
         return self._track is not None and self._track.is_known(t_ns)
 
+    def forget_before(self, t_ns: int) -> None:
+        """Forget what no pose from a session time on depends on."""
+        self._whole().forget_before(t_ns)
+
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
         return self._whole().pose_at(t_ns)
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 import math
 import re
 import socket
+from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -35,7 +36,7 @@ _BLANKS = re.compile(r"[ \t]+")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _MAX_BYTES = 1 << 28
 """Weeks of poses; a longer or endless file is not a trajectory."""
-_MAX_STAMP_S = Decimal(2**63) / NS_PER_S
+_MAX_STAMP_S = Decimal(2**63 - 1) / NS_PER_S
 """Where int64 nanoseconds end; a larger stamp was written in another unit."""
 
 
@@ -155,31 +156,48 @@ def read_tum(path: Path) -> Trajectory:
 _HOLD_NS = NS_PER_S // 2
 
 
+_FEWEST_FORGOTTEN = 64
+"""Forgetting moves all later samples, so it is done for some at a time."""
+
+
 class OdometryTrack:
     """Odometry samples in time order, asked for the pose at any time between them.
 
     Later ones may be appended while a robot drives; what lies between earlier ones stays the same
-    to the last bit.
+    to the last bit. Iterating gives the samples.
     """
 
     def __init__(self, samples: Iterable[TumSample]) -> None:
-        self._samples: list[TumSample] = []
-        self._stamps_ns: list[int] = []
+        self._stamps_ns = array("q")
+        # Of each sample: x [m], y [m], and the quaternion's z and w
+        self._x_m, self._y_m, self._qz, self._qw = (array("d") for _ in range(4))
         # Unwrapped, so that interpolation across +-pi takes the short way round.
-        self._heading_rad: list[float] = []
+        self._heading_rad = array("d")
         self._turns_rad = 0.0  # what unwrapping adds to the newest heading
+        self._n_forgotten = 0
         for sample in samples:
             self.append(sample)
-        if not self._samples:
+        if not self._stamps_ns:
             raise OdometryError("odometry: the source sent no pose")
 
-    @property
-    def samples(self) -> tuple[TumSample, ...]:
-        return tuple(self._samples)
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def __iter__(self) -> Iterator[TumSample]:
+        return map(self._sample, range(len(self)))
+
+    def _sample(self, row: int) -> TumSample:
+        return TumSample(
+            t_ns=self._stamps_ns[row],
+            x_m=self._x_m[row],
+            y_m=self._y_m[row],
+            qz=self._qz[row],
+            qw=self._qw[row],
+        )
 
     @property
     def last(self) -> TumSample:
-        return self._samples[-1]
+        return self._sample(-1)
 
     @property
     def first_ns(self) -> int:
@@ -207,14 +225,27 @@ class OdometryTrack:
 
     def append(self, sample: TumSample) -> None:
         """Take a sample; OdometryError if it is not later than all before it."""
-        if self._samples:
+        if self._stamps_ns:
             if sample.t_ns <= self._stamps_ns[-1]:
-                number = len(self._samples) + 1
+                number = self._n_forgotten + len(self) + 1
                 raise OdometryError(f"odometry: line {number} is not later than the line before")
-            self._turns_rad += _unwrapping(self._samples[-1].heading_rad, sample.heading_rad)
-        self._samples.append(sample)
+            self._turns_rad += _unwrapping(self.last.heading_rad, sample.heading_rad)
         self._stamps_ns.append(sample.t_ns)
+        self._x_m.append(sample.x_m)
+        self._y_m.append(sample.y_m)
+        self._qz.append(sample.qz)
+        self._qw.append(sample.qw)
         self._heading_rad.append(sample.heading_rad + self._turns_rad)
+
+    def forget_before(self, t_ns: int) -> None:
+        """Forget samples, now or later, that no pose from a session time on depends on."""
+        n_needless = bisect_right(self._stamps_ns, t_ns) - 1
+        if n_needless < _FEWEST_FORGOTTEN:
+            return
+        self._n_forgotten += n_needless
+        columns = (self._x_m, self._y_m, self._qz, self._qw, self._heading_rad)
+        for column in (self._stamps_ns, *columns):
+            del column[:n_needless]
 
     @classmethod
     def from_lines(cls, lines: Iterable[str]) -> OdometryTrack:
@@ -246,16 +277,15 @@ class OdometryTrack:
         after = bisect_right(stamps_ns, t_ns)
         if after in (0, len(stamps_ns)):
             row = min(after, len(stamps_ns) - 1)
-            held = self._samples[row]
-            return np.array([held.x_m, held.y_m, wrap_angle(self._heading_rad[row])])
-        old, new = self._samples[after - 1], self._samples[after]
-        part = (t_ns - old.t_ns) / (new.t_ns - old.t_ns)
+            return np.array([self._x_m[row], self._y_m[row], wrap_angle(self._heading_rad[row])])
+        part = (t_ns - stamps_ns[after - 1]) / (stamps_ns[after] - stamps_ns[after - 1])
+        x_m, y_m = self._x_m[after - 1], self._y_m[after - 1]
         turn_rad = self._heading_rad[after] - self._heading_rad[after - 1]
         heading_rad = self._heading_rad[after - 1] + part * turn_rad
         return np.array(
             [
-                old.x_m + part * (new.x_m - old.x_m),
-                old.y_m + part * (new.y_m - old.y_m),
+                x_m + part * (self._x_m[after] - x_m),
+                y_m + part * (self._y_m[after] - y_m),
                 wrap_angle(heading_rad),
             ]
         )

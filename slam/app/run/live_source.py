@@ -555,6 +555,7 @@ class LiveSource:
                 started_ns = self._clock_ns()
                 yield scan
                 self.busy_s += (self._clock_ns() - started_ns) / NS_PER_S
+                self._odometry.forget_before(scan.t_ns)  # later scans ask for later poses
                 self._drain(0.0)
         now_ns = self._odometry.session_ns(self._clock_ns())
         over_ns = min(now_ns, self._duration_end_ns, self._odometry_end_ns)

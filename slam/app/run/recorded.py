@@ -1,14 +1,42 @@
-"""A recorded session given to sinks again, as its run gave them: without SLAM."""
+"""A recorded session read again: its scans for SLAM, or all of it for sinks, without SLAM."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 
-from slam.app.records import LogLine, SessionObserver, Snapshot
-from slam.app.run.runner import RunRecord, RunRecorder
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
+from slam.app.run.runner import LinkLog, LostFrames, RunRecord, RunRecorder
 from slam.app.session.reader import RecordedScan, RecordedSession
+from slam.packed import RowsByTime
 from xethru_protocol.system import StopFlag
+
+
+class RecordedScans:
+    """The scans of a session, with the truth and the log lines between them."""
+
+    def __init__(self, session: RecordedSession, stop: StopFlag) -> None:
+        self._session, self._stop = session, stop
+        self._truth = RowsByTime(np.dtype(np.float64), 3)
+        self.lost = LostFrames()
+        self.link_log = LinkLog()
+
+    def truth_at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.array([self._truth.at(t_ns) for t_ns in stamps_ns.tolist()]).reshape(-1, 3)
+
+    def __iter__(self) -> Iterator[Scan]:
+        for record in self._session.played():
+            self._stop.check()
+            if isinstance(record, LogLine):
+                self.link_log.pass_on(record)
+            elif isinstance(record, RecordedScan):
+                scan, truth = record.scan, record.truth
+                self._truth.put(scan.t_ns, np.full(3, np.nan) if truth is None else truth)
+                self.lost.on_scan(scan)
+                yield scan
 
 
 def play_states(

@@ -14,20 +14,21 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
+from slam.app.records import Gap, SessionObserver, Snapshot
 from slam.app.run.output import Progress, note
+from slam.app.run.recorded import RecordedScans
 from slam.app.run.results import finish, hold_folder, saying_what_is_left
-from slam.app.run.runner import LinkLog, LostFrames, RunSource, execute, make_slam
+from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.session.constants import different_constants, recorded_rules
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
+from slam.packed import RowsByTime
 from slam.results import PoseAt, Slam, StepResult
 from xethru_protocol.system import StopFlag
 from xethru_protocol.validation import problem_text
@@ -107,24 +108,13 @@ def recorded_source(
         wheels = WheelNoise(**session.info.wheels)
     except TypeError:
         raise AppError(f"{session.path}: its description of the wheels is unknown here") from None
-    samples: list[TumSample] = []
-    lines: list[LogLine] = []
-    for record in session.records():
-        if isinstance(record, TumSample):
-            samples.append(record)
-        elif isinstance(record, LogLine):
-            lines.append(record)
-        elif isinstance(record, Snapshot) and comparison is not None:
-            comparison.expect(record)
-        elif isinstance(record, Gap) and comparison is not None:
-            comparison.expect_gap(record)
     try:
-        odometry = OdometryTrack(samples)
+        odometry = OdometryTrack(_samples(session, stop, comparison))
     except OdometryError as error:
         raise AppError(f"{session.path}: {error}") from None
     rules = recorded_rules(session.info.constants)
     slam = make_slam(config, session.rig, wheels, rules=rules)
-    scans = _RecordedScans(session, lines, stop)
+    scans = RecordedScans(session, stop)
     return RunSource(
         info=session.info,
         rig=session.rig,
@@ -137,32 +127,21 @@ def recorded_source(
     )
 
 
-class _RecordedScans:
-    """The scans of a session, with the truth and the log lines between them."""
+def _samples(
+    session: RecordedSession, stop: StopFlag, comparison: Comparison | None
+) -> Iterator[TumSample]:
+    """Yield the odometry; `comparison` gets the states and gaps between it."""
+    for record in session.records():
+        stop.check()
+        if isinstance(record, TumSample):
+            yield record
+        elif isinstance(record, Snapshot) and comparison is not None:
+            comparison.expect(record)
+        elif isinstance(record, Gap) and comparison is not None:
+            comparison.expect_gap(record)
 
-    def __init__(self, session: RecordedSession, lines: Sequence[LogLine], stop: StopFlag) -> None:
-        self._session, self._lines, self._stop = session, lines, stop
-        self._truth: dict[int, NDArray[np.float64]] = {}
-        self.lost = LostFrames()
-        self.link_log = LinkLog()
 
-    def truth_at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        return np.array([self._truth[t_ns] for t_ns in stamps_ns.tolist()]).reshape(-1, 3)
-
-    def __iter__(self) -> Iterator[Scan]:
-        waiting = iter(self._lines)
-        line = next(waiting, None)
-        for scan, pose in self._session.scans():
-            self._stop.check()
-            while line is not None and line.t_ns <= scan.t_ns:
-                self.link_log.pass_on(line)
-                line = next(waiting, None)
-            self._truth[scan.t_ns] = np.full(3, np.nan) if pose is None else pose
-            self.lost.on_scan(scan)
-            yield scan
-        while line is not None:
-            self.link_log.pass_on(line)
-            line = next(waiting, None)
+_DIGEST_BYTES = 16
 
 
 class Comparison(SessionObserver):
@@ -173,14 +152,15 @@ class Comparison(SessionObserver):
 
     def __init__(self, different: Sequence[str] = ()) -> None:
         self._different = different
-        self._expected: dict[int, bytes] = {}
+        # Of each recorded state its digest, and whether it came again
+        kind = np.dtype([("digest", np.void, _DIGEST_BYTES), ("same", np.bool_)])
+        self._expected = RowsByTime(kind)
         self._gaps: list[Gap] = []
         self._n_before_gap: int | None = None
-        self._came_again: set[int] = set()
         self._first_other_ns: int | None = None
 
     def expect(self, snapshot: Snapshot) -> None:
-        self._expected[snapshot.t_ns] = _digest(snapshot)
+        self._expected.put(snapshot.t_ns, (_digest(snapshot), False))
 
     def expect_gap(self, gap: Gap) -> None:
         """Take it that what is expected from now on was recorded behind a gap."""
@@ -189,11 +169,11 @@ class Comparison(SessionObserver):
             self._n_before_gap = len(self._expected)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        expected = self._expected.get(snapshot.t_ns)
+        expected = self._expected.at(snapshot.t_ns)
         if expected is None:
             return
-        if expected == _digest(snapshot):
-            self._came_again.add(snapshot.t_ns)
+        if expected["digest"].tobytes() == _digest(snapshot):
+            expected["same"] = True
         elif self._first_other_ns is None:
             self._first_other_ns = snapshot.t_ns
 
@@ -202,28 +182,31 @@ class Comparison(SessionObserver):
         n_expected = len(self._expected)
         if not n_expected:
             return "no states are recorded, so there are none to compare with"
-        if len(self._came_again) == n_expected:
+        if self._n_same(n_expected) == n_expected:
             return f"all {n_expected} recorded states came again, to the last bit"
         if self._n_before_gap is None:
             return self._verdict_on(n_expected, "") + self._reason()
-        before = list(self._expected)[: self._n_before_gap]
-        n_same = sum(t_ns in self._came_again for t_ns in before)
+        n_before = self._n_before_gap
+        n_same = self._n_same(n_before)
         gaps = "; ".join(map(str, self._gaps))
         behind = (
-            f"the other {n_expected - len(before)} cannot be compared, as SLAM lacks what damage "
+            f"the other {n_expected - n_before} cannot be compared, as SLAM lacks what damage "
             f"took: {gaps}"
         )
-        if not before:
+        if not n_before:
             return f"none of the {n_expected} recorded states precedes the first gap; {behind}"
-        if n_same == len(before):
+        if n_same == n_before:
             return (
                 f"all {n_same} recorded states before the first gap came again, to the last bit; "
                 f"{behind}"
             )
-        return f"{self._verdict_on(len(before), ' before the first gap')}{self._reason()}; {behind}"
+        return f"{self._verdict_on(n_before, ' before the first gap')}{self._reason()}; {behind}"
+
+    def _n_same(self, n_first: int) -> int:
+        return int(self._expected.rows["same"][:n_first].sum())
 
     def _verdict_on(self, n_expected: int, which: str) -> str:
-        n_same = sum(t_ns in self._came_again for t_ns in list(self._expected)[:n_expected])
+        n_same = self._n_same(n_expected)
         where = ""
         if self._first_other_ns is not None:
             where = f", the first other one at {self._first_other_ns / 1e9:.3f} s"
@@ -242,4 +225,5 @@ _MOST_SHOWN = 10
 
 
 def _digest(snapshot: Snapshot) -> bytes:
-    return hashlib.blake2b(state_row(snapshot).tobytes(), digest_size=16).digest()
+    row = state_row(snapshot).tobytes()
+    return hashlib.blake2b(row, digest_size=_DIGEST_BYTES).digest()

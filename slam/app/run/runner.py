@@ -30,7 +30,7 @@ from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import TrueAssociationNis, true_range_nis
 from slam.frames import Detector, RadarFrame
 from slam.geometry import Rig
-from slam.packed import PackedRows
+from slam.packed import PackedRows, RowsByTime
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, StepResult
 from slam.robust.parameters import BackEndParameters
@@ -207,6 +207,7 @@ class RunRecord:
 
 
 _FIX_DOF = 2
+_FLOAT = np.dtype(np.float64)
 
 
 class RunRecorder(SessionObserver):
@@ -218,10 +219,10 @@ class RunRecorder(SessionObserver):
     def __init__(self, true_landmarks_m: NDArray[np.float64]) -> None:
         self._true_landmarks_m = true_landmarks_m
         self._fixes_nis = TrueAssociationNis(true_landmarks_m)
-        self._t_ns = PackedRows(np.int64)
-        self._truth, self._odometry, self._estimate = (PackedRows(np.float64, 3) for _ in range(3))
-        self._covariances = PackedRows(np.float64, 3, 3)
-        self._nis, self._nis_dof = PackedRows(np.float64), PackedRows(np.int32)
+        self._t_ns = PackedRows(np.dtype(np.int64))
+        self._truth, self._odometry, self._estimate = (PackedRows(_FLOAT, 3) for _ in range(3))
+        self._covariances = PackedRows(_FLOAT, 3, 3)
+        self._nis, self._nis_dof = PackedRows(_FLOAT), PackedRows(np.dtype(np.int32))
         self._last: Snapshot | None = None
         self._start_ns: int | None = None
         self._n_frames = self._duration_ns = 0
@@ -324,7 +325,7 @@ def run_slam(
     """
     recorder = RunRecorder(true_landmarks_m)
     observers = [recorder, *observers]
-    counter_at: dict[int, int] = {}
+    counters = RowsByTime(np.dtype(np.int64))
     world_from_map: NDArray[np.float64] | None = None
 
     def take(new: Iterable[StepResult]) -> None:
@@ -332,7 +333,7 @@ def run_slam(
             assert world_from_map is not None
             snapshot = snapshot_of_step(
                 result,
-                counter=counter_at.pop(result.t_ns),
+                counter=int(counters.at(result.t_ns)),
                 truth=truth_at(np.array([result.t_ns]))[0],
                 world_from_map=world_from_map,
                 wall_spans_m=slam.wall_spans_m(),
@@ -348,7 +349,7 @@ def run_slam(
                 if scan.used:
                     if world_from_map is None:
                         world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
-                    counter_at[scan.t_ns] = scan.counter
+                    counters.put(scan.t_ns, scan.counter)
                     frames = [
                         _less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames
                     ]

@@ -254,7 +254,7 @@ class SessionLog(SessionObserver):
     ) -> None:
         self._file = _SessionFile(path, start_ns, clock_ns)
         self._start_ns = start_ns
-        self._samples: Iterator[TumSample] = iter(odometry.samples if odometry else ())
+        self._samples: Iterator[TumSample] = iter(odometry or ())
         self._odometry_ns = -1  # of the newest sample written
         self._truth_at = truth_at
         self._t_ns = start_ns

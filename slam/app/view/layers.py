@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,6 +50,7 @@ from slam.app.view.rerun_recording import (
 )
 from slam.frames import RadarFrame
 from slam.geometry import compose, transform
+from slam.packed import PackedRows
 from slam.results import Fix, Observation, StepResult
 
 # What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
@@ -382,7 +383,7 @@ class MapLayer:
         self._recording = recording
         self._radars = info.radars
         self._field = info.field_of_view
-        self._paths: dict[str, list[Array]] = defaultdict(list)
+        self._paths = {name: PackedRows(np.dtype(np.float64), 2) for name, *_ in _PATHS}
         self._trails: dict[str, deque[Array]] = {
             name: deque(maxlen=TRAIL_STATES) for name, *_ in _POINTS
         }
@@ -613,7 +614,7 @@ class MapLayer:
             points = self._paths[name]
             if not points:
                 continue
-            path = screen(np.array([*points[::_PATH_STEP], points[-1]]))
+            path = screen(np.concatenate([points.rows[::_PATH_STEP], points.rows[-1:]]))
             line = rr.LineStrips2D([path], colors=colour, radii=radius_m, draw_order=order)
             self._recording.row(f"map/{name}/path", stamps, line)
 

@@ -2,8 +2,10 @@
 
 import math
 import pickle
+import tracemalloc
+from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -17,9 +19,9 @@ from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import RangeBearing
+from slam.robust.initialisation import BodyPoint, RangeBearing, initialise_landmark
 from slam.robust.parameters import RelinearisationRule
-from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, _keep, start_prior
+from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, start_prior
 from slam.robust.smoother import (
     Smoother,
     is_determined,
@@ -404,8 +406,8 @@ def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
     assert len(back_end.state.landmark_ids) == 2
 
 
-def test_a_long_run_keeps_its_belief_and_forgets_its_rows() -> None:
-    """Forgetting at 80 poses changes the belief of 330 by little, and the memory stays."""
+def test_a_long_run_keeps_its_belief_and_what_it_solves_for_stays_small() -> None:
+    """Condensing at 80 poses changes the belief of 330 by little."""
     rig, parameters = paper_rig(), parameters_for(LAB, 7.4e-3)
     run = simulate(LAB, 1, 7.4e-3, labelled=True)
     rule = replace(parameters.relinearisation, most_poses=80, kept_share=0.7)
@@ -417,7 +419,7 @@ def test_a_long_run_keeps_its_belief_and_forgets_its_rows() -> None:
             back_end.predict(run.increments[k])
             back_end.update(run.scans[k])
         if k in (200, 329):
-            sizes.append((len(pickle.dumps(bounded)), len(pickle.dumps(whole))))
+            sizes.append((size_of_problem(bounded), size_of_problem(whole)))
     whole.relinearise()
     bounded.relinearise()
     sigmas = np.sqrt(np.diag(whole.pose_covariance))
@@ -426,6 +428,78 @@ def test_a_long_run_keeps_its_belief_and_forgets_its_rows() -> None:
     (early, early_whole), (late, late_whole) = sizes
     assert late - early < 0.25 * (late_whole - early_whole)
     assert late < 0.5 * late_whole
+
+
+def size_of_problem(back_end: RobustBackEnd) -> int:
+    """Return how many bytes a solution starts from."""
+    state = back_end.state
+    unused = start_prior((1.0,) * 3, (1.0,) * N_RADARS, len(state.feature_ids))
+    return len(pickle.dumps(back_end._log.problem(state, unused)))
+
+
+def drive_along(
+    log: RunLog, n_poses: int, landmarks: Sequence[int], rng: np.random.Generator
+) -> None:
+    """Log a drive along x with a range of each landmark at every pose."""
+    for _ in range(n_poses):
+        log.add_motion(*step_of(np.array([0.02, 0.0, 0.0]), 1e-4))
+        for landmark in landmarks:
+            log.add_range(
+                log.n_poses - 1,
+                landmark % N_RADARS,
+                landmark,
+                antenna=(0.1, 0.2),
+                range_m=float(rng.uniform(0.3, 1.5)),
+                sigma_m=0.01,
+            )
+
+
+def test_what_is_condensed_is_there_for_a_solution_of_the_whole_run() -> None:
+    wheels, n_landmarks = WheelNoise(), 4
+    state = State(wheels.calibration_sigmas, (0.0,) * N_RADARS)
+    for row in range(n_landmarks):
+        point = BodyPoint(
+            point_m=np.array([1.0, float(row)]),
+            covariance=1e-4 * np.eye(2),
+            by_offsets=np.zeros((2, N_RADARS)),
+        )
+        initialise_landmark(state, point)
+    prior = start_prior((0.01,) * 3, (0.0,) * N_RADARS, n_landmarks - 1)
+    logs = RunLog(wheels), RunLog(wheels)
+    for is_condensed, log in zip((True, False), logs, strict=True):
+        rng = np.random.default_rng(4)
+        for names in ([0, 1, 2, 3], [0, 1, 2, 3], [0, 1, 3]):
+            drive_along(log, 50, names, rng)
+            if is_condensed:
+                unused = start_prior((0.01,) * 3, (0.0,) * N_RADARS, len(names))
+                log.condense(unused, names, 40)
+            if len(names) == 4:
+                log.rename(2, 0)
+    state.remove(2)
+    wanted = logs[1].problem(state, prior)
+    assert len(wanted.ranges_m) == 50 * (4 + 4 + 3)
+    assert len(logs[0].problem(state, prior).increments) == 30
+    found = logs[0].problem(state, prior, whole=True)
+    for column in fields(Problem):
+        if column.name not in {"prior", "n_walls"}:
+            values = getattr(found, column.name), getattr(wanted, column.name)
+            np.testing.assert_array_equal(*values, err_msg=column.name)
+    assert found.prior is prior
+    assert len(logs[0].starts(state, found)[0].poses) == 151
+
+
+@pytest.mark.parametrize("n_ranges", [14, 60])
+def test_a_range_costs_a_row_of_numbers_and_no_object(n_ranges: int) -> None:
+    """A range is 45 bytes and a pose 128, in buffers that may be half empty."""
+    log, n_poses = RunLog(WheelNoise()), 1000
+    tracemalloc.start()
+    try:
+        drive_along(log, n_poses, range(n_ranges), np.random.default_rng(6))
+        grown, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert log.n_poses == n_poses + 1
+    assert grown < 2.1 * n_poses * (45 * n_ranges + 128)
 
 
 def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
@@ -456,11 +530,8 @@ def test_a_solution_that_knows_nothing_of_a_landmark_is_refused() -> None:
     back_end, _ = drive(RODS, 0, WheelNoise())
     state, log = back_end.state, back_end._log
     assert relinearise(log, state, back_end.parameters)
-    ranges = log._ranges
-    victim = state.landmark_ids[-1]
-    for row, id_ in enumerate(ranges.landmarks):
-        if id_ == victim:
-            ranges.sigmas_m[row] = 1e6
+    ranges = log._ranges.all()
+    ranges["sigma_m"][ranges["landmark"] == state.landmark_ids[-1]] = 1e6
     assert _is_sane(state)
     assert not relinearise(log, state, back_end.parameters)
     assert _is_sane(state)
@@ -474,12 +545,12 @@ def test_a_range_beyond_the_limit_is_no_part_of_what_is_condensed() -> None:
     priors = []
     for is_measured in (True, False):
         state, log = deepcopy((back_end.state, back_end._log))
-        ranges = log._ranges
-        assert ranges.poses[5] < 100
+        ranges = log._ranges.all()
+        assert ranges["pose"][5] < 100
         if is_measured:
-            ranges.ranges_m[5] += 50 * SIGMA_M
+            ranges["range_m"][5] += 50 * SIGMA_M
         else:
-            _keep(ranges, [row for row in range(len(ranges.poses)) if row != 5])
+            log._ranges.keep(np.arange(len(ranges)) != 5, first_pose=0)
         assert relinearise(log, state, parameters)
         assert log.n_kept < 60
         unused = start_prior((1.0,) * 3, (1.0,) * 4, len(state.feature_ids))

@@ -69,7 +69,7 @@ def test_a_session_gets_the_ranges_that_the_fixes_are_made_of(
     assert "no stamps, 10 states/s are assumed" in said
     session = open_session(out)
     assert session.info.has_detections
-    assert [sample.t_ns for sample in session.odometry().samples] == [
+    assert [sample.t_ns for sample in session.odometry()] == [
         k * 100_000_000 for k in range(N_STATES)
     ]
     found = session.detections()
