@@ -64,6 +64,10 @@ BoolArray = NDArray[np.bool_]
 _PROBES = np.linspace(-2.0, 2.0, 9)
 # Bins from one value of y to the next.
 BINS_PER_STEP = 2
+# Distance of the samples that the noise is taken from, in envelope sigmas
+_STRIDE_SIGMAS = 0.75
+# No threshold is so high, in standard deviations of the noise.
+_LARGEST_THRESHOLD = 1e6
 # Variance of a mean of exponential powers, correlated by rho**2, over that of their median / ln 2;
 # (ln 2)**2 if they were independent. A series of Laguerre polynomials gives it, see its test.
 _MEDIAN_EFFICIENCY = 0.643
@@ -127,7 +131,7 @@ class PulseFilter:
         spectrum = np.fft.fft(placed).real
         self._spectrum = spectrum[: self._n_fft // BINS_PER_STEP] / BINS_PER_STEP
         self._n_steps = math.ceil(n_bins / BINS_PER_STEP)
-        self._stride = max(1, int(0.75 * self.sigma_bins / BINS_PER_STEP))
+        self._stride = max(1, int(_STRIDE_SIGMAS * self.sigma_bins / BINS_PER_STEP))
         self.probes = np.unique(np.rint(_PROBES * self.sigma_bins / BINS_PER_STEP).astype(np.intp))
         """Where around a peak the misfit is looked at, in steps of y."""
         probe_bins = BINS_PER_STEP * self.probes.astype(np.float64)
@@ -183,7 +187,7 @@ def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_know
         return math.log(rate * r) - tail - math.log(false_alarms)
 
     # Upcrossings are rarer below the level sigma_y than at it; no threshold lies there.
-    return float(brentq(excess, 1.0, 1e6)) if excess(1.0) > 0 else 1.0
+    return float(brentq(excess, 1.0, _LARGEST_THRESHOLD)) if excess(1.0) > 0 else 1.0
 
 
 def _median(values: Array) -> float:

@@ -65,6 +65,15 @@ T = TypeVar("T")
 _MAX_STEPS = 30
 # Of the envelope's sigma.
 _LARGEST_STEP = 0.5
+# Damping of the first step, by what it is multiplied after a step that helped and one that did
+# not, and its least part, as a share of the largest information
+_DAMPING, _EASED, _STIFFENED, _LEAST_DAMPING = 1e-3, 0.1, 10.0, 1e-12
+# What keeps the matrix of the pulses regular, and shares of a pulse's norm and information below
+# which a position explains nothing of its own
+_RIDGE, _LEAST_NORM, _LEAST_INFORMATION = 1e-13, 1e-3, 1e-12
+# How far from the ends of a window echoes are looked for, in envelope sigmas
+_OFF_THE_ENDS = 1.5
+_LARGEST_RISE = 200.0
 # Damping at which the search ends: it presses against a limit.
 _HOPELESS = 1e3
 # Added to what may be zero where no sample is usable.
@@ -133,7 +142,7 @@ class Solver:
     def polish(self, data: Window, begun: State, tolerance: float) -> State:
         """Return the fits at which searches from some fits end; parameters as in `fit`."""
         state = begun.rows(np.arange(len(begun.sse)))
-        damping = np.full(len(state.sse), 1e-3)
+        damping = np.full(len(state.sse), _DAMPING)
         going = np.arange(len(state.sse))
         diagonal = np.arange(state.positions.shape[1])
         largest = _LARGEST_STEP * self.sigma
@@ -141,7 +150,7 @@ class Solver:
             at = state.rows(going)
             damped = at.information
             scale = damped[:, diagonal, diagonal]
-            floor = 1e-12 * scale.max(axis=1, keepdims=True) + TINY
+            floor = _LEAST_DAMPING * scale.max(axis=1, keepdims=True) + TINY
             damped[:, diagonal, diagonal] += damping[going, np.newaxis] * scale + floor
             step = np.linalg.solve(damped, at.gradient[..., np.newaxis])[..., 0]
             wanted = at.positions + np.clip(step, -largest, largest)
@@ -150,7 +159,7 @@ class Solver:
             better = (tried.sse < at.sse) & self._apart(wanted)
             for table, values in zip(state, tried, strict=True):
                 table[going[better]] = values[better]
-            damping[going] *= np.where(better, 0.1, 10.0)
+            damping[going] *= np.where(better, _EASED, _STIFFENED)
             # the model's own forecast of the gain, for a step that was not taken
             promised = np.einsum("rk,rk->r", step, at.gradient)
             gained = np.where(better, at.sse - tried.sse, promised)
@@ -178,7 +187,7 @@ def evaluate(data: Window, positions: Array, sigma: float) -> State:
     matched = (columns @ samples)[..., 0]
     gram = columns @ columns.swapaxes(1, 2)
     diagonal = np.arange(2 * n_echoes)
-    gram[:, diagonal, diagonal] *= 1 + 1e-13
+    gram[:, diagonal, diagonal] *= 1 + _RIDGE
     gram[:, diagonal, diagonal] += TINY
     linear = np.linalg.solve(gram, matched[..., np.newaxis])[..., 0]
     residual = data.samples - (linear[:, np.newaxis] @ columns)[:, 0]
@@ -251,7 +260,7 @@ def one_more(data: Window, state: State, grid: Array, sigma: float, separation: 
     known = np.linalg.solve(weighted @ mine.swapaxes(1, 2) + TINY * np.eye(mine.shape[1]), mixed)
     left = norm - (mixed * known).sum(axis=1)
     far = np.abs(grid - state.positions[..., np.newaxis]).min(axis=1) >= separation
-    explained = np.where(far, np.abs(matched) ** 2 / np.maximum(left, 1e-3 * norm), -1.0)
+    explained = np.where(far, np.abs(matched) ** 2 / np.maximum(left, _LEAST_NORM * norm), -1.0)
     added = grid[explained.argmax(axis=1)][:, np.newaxis]
     starts = [np.concatenate([state.positions, added], axis=1)]
     for k in range(state.positions.shape[1]):
@@ -310,7 +319,7 @@ def fit_echoes(
     split = split or SplitTest()
     n_bins = len(samples)
     sigma = pulse.envelope_sigma_bins
-    first, last = search_bins or (1.5 * sigma, n_bins - 1 - 1.5 * sigma)
+    first, last = search_bins or (_OFF_THE_ENDS * sigma, n_bins - 1 - _OFF_THE_ENDS * sigma)
     angle = pulse.carrier_rad_per_bin * np.arange(n_bins)
     weight = np.ones(n_bins) if usable is None else usable.astype(np.float64)
     data = Window(
@@ -355,7 +364,7 @@ def split_threshold(false_split: float, search_sigmas: float) -> float:
     def excess(h: float) -> float:
         return math.log1p(search_sigmas * math.sqrt(h / (4 * math.pi))) - h / 2
 
-    return float(brentq(lambda h: excess(h) - math.log(false_split), 0.0, 200.0))
+    return float(brentq(lambda h: excess(h) - math.log(false_split), 0.0, _LARGEST_RISE))
 
 
 def _echoes(fit: State, noise_sigma: float, carrier_rad_per_bin: float) -> tuple[EchoFit, ...]:
@@ -496,10 +505,10 @@ def _polished(
     """
     first, last, separation = search[:3]
     largest = _LARGEST_STEP * data.sigma_bins
-    damping = 1e-3
+    damping = _DAMPING
     for _ in range(_MAX_STEPS):
         damped = [row.copy() for row in fit.information]
-        floor = 1e-12 * max(row[k] for k, row in enumerate(damped))
+        floor = _LEAST_DAMPING * max(row[k] for k, row in enumerate(damped))
         if floor <= 0.0:  # nothing is there
             break
         for k, row in enumerate(damped):
@@ -517,10 +526,10 @@ def _polished(
         gained = tried.explained - fit.explained
         if gained > 0.0:
             fit = tried
-            damping *= 0.1
+            damping *= _EASED
         else:
             gained = promised
-            damping *= 10.0
+            damping *= _STIFFENED
         if gained <= tolerance * data.sigma_y**2 or damping >= _HOPELESS:
             break
     return fit
@@ -586,7 +595,7 @@ def _one_more(fit: _Fit, search: _Search, s: float, needed: float) -> list[list[
     overlap = np.exp(-0.25 * (apart / s) ** 2)
     residual = z - np.array(fit.amplitudes) @ overlap
     norm = 1 - np.einsum("kn,kn->n", overlap, np.array(fit.inverse) @ overlap)
-    explained = (residual.real**2 + residual.imag**2) / np.maximum(norm, 1e-3)
+    explained = (residual.real**2 + residual.imag**2) / np.maximum(norm, _LEAST_NORM)
     if _OPTIMISM * explained.max() < needed:
         return []
     explained[np.abs(apart).min(axis=0) < separation] = -1.0
@@ -623,7 +632,7 @@ def _fitted_echoes(fit: _Fit, sigma_y: float) -> tuple[EchoFit, ...]:
     information = fit.information
     diagonal = [row[k] for k, row in enumerate(information)]
     variances = [math.inf] * len(information)
-    if min(diagonal) > 1e-12 * max(diagonal):
+    if min(diagonal) > _LEAST_INFORMATION * max(diagonal):
         variances = [row[k] for k, row in enumerate(_inverse(information))]
     spread = [sigma_y * math.sqrt(v) if v > 0.0 else math.inf for v in variances]
     return tuple(

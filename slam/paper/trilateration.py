@@ -21,6 +21,7 @@ from slam.results import Fix
 
 Array = NDArray[np.float64]
 
+_PAPERS_LIMITS_M = (0.2, 1.5)
 _NS_PER_S = 1_000_000_000
 # No range of this world; beyond it squares of lengths would not be numbers.
 _MAX_LENGTH_M = 1e150
@@ -88,7 +89,7 @@ class Trilaterator:
         self,
         config: TrilaterationConfig,
         rig: Rig,
-        range_limits_m: tuple[float, float] = (0.2, 1.5),
+        range_limits_m: tuple[float, float] = _PAPERS_LIMITS_M,
     ) -> None:
         self.config = config
         self.rig = rig

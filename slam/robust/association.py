@@ -41,6 +41,11 @@ from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 LONGEST_M = 1e6
 # Two pulses closer than this in range are hard to tell apart: the width of one at half height.
 BLUR_M = 0.12
+# Keeps the direction to what stands at an antenna finite.
+_LEAST_RANGE_M = 1e-9
+# How far an echo may lie from its prediction to answer it, and a landmark outside the limits of
+# range to be looked for, in standard deviations
+_ANSWER_SIGMAS, _VIEW_SIGMAS = 4.0, 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,7 +150,7 @@ def view(state: State, antennas: Antennas) -> View:
     offsets = body[None, :, :] - antennas.position_m[:, None, :]
     ranges = np.hypot(offsets[..., 0], offsets[..., 1])
     bearings = np.arctan2(offsets[..., 1], offsets[..., 0])
-    directions = (offsets / np.maximum(ranges, 1e-9)[..., None]) @ R.T
+    directions = (offsets / np.maximum(ranges, _LEAST_RANGE_M)[..., None]) @ R.T
     by_feature = directions
     if len(state.walls):
         places = state.position_m + antennas.position_m @ R.T
@@ -294,7 +299,7 @@ class SureLandmarks:
         per_landmark = len(self.rows.radars) // len(self.landmarks)
         variances = self.prior.diagonal()
         silent = variances <= within_m**2
-        reaches_m = 4.0 * np.sqrt(variances + noise.sigma_m**2)
+        reaches_m = _ANSWER_SIGMAS * np.sqrt(variances + noise.sigma_m**2)
         for k in np.flatnonzero(silent).tolist():
             scan, range_m = scan_of[int(self.rows.radars[k])], self.rows.predicted_m[k]
             silent[k] = not scan.answers(float(range_m), float(reaches_m[k]))
@@ -310,7 +315,7 @@ def landmarks_in_view(
 ) -> SureLandmarks | None:
     """Return the landmarks that any of some radars, all with frames, may see, or None."""
     looking = np.array(radars, dtype=np.intp)
-    margin_m = 5.0 * noise.sigma_m
+    margin_m = _VIEW_SIGMAS * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[looking]
     landmarks = np.flatnonzero(inside.any(axis=0))
     if not len(landmarks):

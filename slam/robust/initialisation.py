@@ -48,6 +48,13 @@ _SINGLE_BEARINGS_RAD = (0.0, -0.25, 0.25, -0.5, 0.5)
 _SINGLE_SPREAD_RAD = 0.2
 _SINGLE_RANGE_SIGMA_M = 0.05
 _FORBIDDEN = 1e9
+# What one degree of freedom is worth against chi-square, where tracklets compete
+_DOF_WORTH = 4.0
+_LEAST_WAY_M = 1e-6
+# Offsets surer than this share of a range's standard deviation are taken for known.
+_KNOWN_SHARE = 0.1
+# Gauss-Newton steps of a fit with offsets, and what keeps its matrices regular
+_STEPS, _PRIOR_FLOOR_M2, _LEAST_INFORMATION = 4, 1e-12, 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,7 +338,7 @@ class Tracklet:
     @property
     def score(self) -> float:
         """Return 4 dof - chi-square, by which tracklets compete for ranges."""
-        return 4.0 * self.dof - self.chi_square
+        return _DOF_WORTH * self.dof - self.chi_square
 
     @property
     def antennas_m(self) -> Array:
@@ -344,7 +351,7 @@ class Tracklet:
             point_m=self.target,
             covariance=self.covariance,
             by_offsets=self.by_offsets,
-            outward=away / max(math.hypot(away[0], away[1]), 1e-6),
+            outward=away / max(math.hypot(away[0], away[1]), _LEAST_WAY_M),
         )
 
 
@@ -405,7 +412,7 @@ class Tracker:
         self._offsets: list[float] = offsets_m.tolist()
         self._offset_covariance = offset_covariance
         self._offset_variances: list[float] = offset_covariance.diagonal().tolist()
-        least = (0.1 * self._noise.sigma_m) ** 2
+        least = (_KNOWN_SHARE * self._noise.sigma_m) ** 2
         self._offsets_known = max(self._offset_variances, default=0.0) <= least
 
     def follow(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
@@ -497,9 +504,9 @@ class Tracker:
         offset_part = np.zeros((len(z), len(radars)))
         offset_part[np.arange(len(z)), place] = 1.0
         prior = self._offset_covariance[np.ix_(radars, radars)]
-        prior = np.asarray(np.linalg.inv(prior + 1e-12 * np.eye(len(radars))))
+        prior = np.asarray(np.linalg.inv(prior + _PRIOR_FLOOR_M2 * np.eye(len(radars))))
         point, offsets = walked.target.copy(), np.zeros(len(radars))
-        for _ in range(4):
+        for _ in range(_STEPS):
             away = point - antennas
             distance = np.hypot(away[:, 0], away[:, 1])
             u = away / distance[:, None]
@@ -509,7 +516,9 @@ class Tracker:
             information[2:, 2:] += prior
             gradient = (J.T / variance) @ residual
             gradient[2:] -= prior @ offsets
-            change = np.linalg.solve(information + 1e-9 * np.eye(len(information)), gradient)
+            change = np.linalg.solve(
+                information + _LEAST_INFORMATION * np.eye(len(information)), gradient
+            )
             point, offsets = point + change[:2], offsets + change[2:]
         covariance = np.linalg.inv((u.T / variance) @ u + np.eye(2) / self._rule.prior_sigma_m**2)
         by_offsets = np.zeros((2, len(self._offsets)))

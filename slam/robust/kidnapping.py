@@ -52,6 +52,13 @@ from slam.robust.state import (
 # Far more than what is left to know of T once it is found; sets nothing.
 _FREE_RAD, _FREE_M = 1.0, 1.0
 _SURROUNDINGS_M = 1.5
+# A target in view may be missed, however sure the front end is.
+_LEAST_MISSED = 1e-3
+# Probability that chi-square of a right join is larger than is believed
+_JOIN_TAIL = 0.001
+# Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
+# that keeps the matrix regular
+_STEPS, _LEAST_CHANGE, _VARIANCE_FLOOR_M2 = 5, 1e-9, 1e-10
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +87,7 @@ def evidence(
     counts = inside[rows.radars, rows.landmarks] & (variances <= rule.most_sigma_m**2)
     counts &= rows.landmarks < n_points  # a wall may end before it comes into view
     by_radar = {scan.radar: scan for scan in scans}
-    detection = min(noise.detection_probability, 1.0 - 1e-3)
+    detection = min(noise.detection_probability, 1.0 - _LEAST_MISSED)
     span_m = noise.max_range_m - noise.min_range_m
     found = []
     for k in np.flatnonzero(counts).tolist():
@@ -261,7 +268,7 @@ def _judged(
         motion, residual, S, N = _aligned(state, pairs)
         S_inverse = np.linalg.inv(S)
         distance = float(residual @ S_inverse @ residual)
-        if distance <= chdtri(max(2 * len(pairs) - 3, 1), 0.001):
+        if distance <= chdtri(max(2 * len(pairs) - 3, 1), _JOIN_TAIL):
             information = N.T @ S_inverse @ N
             log_det = float(np.linalg.slogdet(math.tau * S)[1])
             log_det += float(np.linalg.slogdet(information / math.tau)[1])
@@ -293,11 +300,11 @@ def _aligned(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[Array, A
     P = np.asarray(T @ state.P.block(at) @ T.T)
     k = 2 * len(pairs)
     motion = align_se2(points, targets)
-    for _ in range(5):
+    for _ in range(_STEPS):
         turned = np.kron(np.eye(len(pairs)), rotation(float(motion[2])))
         H = np.hstack([turned, -np.eye(k)])
         S = H @ P @ H.T
-        S = (S + S.T) / 2 + 1e-10 * np.eye(k)
+        S = (S + S.T) / 2 + _VARIANCE_FLOOR_M2 * np.eye(k)
         moved = transform(motion, points)
         residual = (moved - targets).ravel()
         N = np.zeros((k, 3))
@@ -306,7 +313,7 @@ def _aligned(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[Array, A
         weighted = np.linalg.solve(S, N)
         change = -np.linalg.solve(N.T @ weighted, weighted.T @ residual)
         motion = compose(np.array([change[0], change[1], change[2]]), motion)
-        if float(np.abs(change).max()) < 1e-9:
+        if float(np.abs(change).max()) < _LEAST_CHANGE:
             break
     residual = (transform(motion, points) - targets).ravel()
     return motion, residual, S, N

@@ -47,6 +47,12 @@ from slam.robust.state import Array, Indices, State, quarter_turn
 # Gauss-Newton steps of a fit of a law and of a radius
 _STEPS, _RADIUS_STEPS = 8, 6
 _DAMPING = 1e-6
+# The smallest share of a step that is tried, and the decrease of chi-square that ends a fit
+_LEAST_SHARE, _LEAST_DECREASE = 1e-3, 1e-4
+# What keeps matrices regular, and the direction to what stands at an antenna finite
+_FLOOR, _LEAST_WAY_M = 1e-12, 1e-6
+# What rounding may add to d^2, as a share
+_ROUNDING = 1e-6
 # A radius off by e misses ranges up to 30 degrees from the middle one by e (1 - cos 30 deg), all
 # alike: to the hundred of one passage that is as noise ten times as large.
 _SHAPE_SIGMA_PER_RADIUS_SIGMA = 1.3
@@ -207,7 +213,7 @@ def _candidates(
     distances = _distances_sq(state, near, rule.merge_sigma_m)
     # The last word is the judge's: here, rounding must not leave out what it would accept.
     found = []
-    for first, second in near[distances <= (1.0 + 1e-6) * rule.merge_gate].tolist():
+    for first, second in near[distances <= (1.0 + _ROUNDING) * rule.merge_gate].tolist():
         ids = state.landmark_ids[first], state.landmark_ids[second]
         if existence.are_apart(*ids) or not old_map.isdisjoint(ids):
             continue
@@ -233,7 +239,7 @@ def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
     # Where rounding has left no spread at all, nothing is ruled out here.
     determinant = np.maximum(xx * yy - xy**2, 0.0)
     numerator = yy * x**2 - 2.0 * xy * x * y + xx * y**2
-    spread_out = determinant > 1e-12 * xx * yy
+    spread_out = determinant > _FLOOR * xx * yy
     return np.where(spread_out, numerator / np.where(spread_out, determinant, 1.0), 0.0)
 
 
@@ -313,7 +319,7 @@ def fit_wall(sightings: Sightings, start: Array) -> Fit:
 
 def _point_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
     away = unknown - antennas
-    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_WAY_M)
     return distance, away / distance[:, None]
 
 
@@ -347,7 +353,7 @@ def _least(
         information += _DAMPING * np.diag(information.diagonal() + 1.0)
         change = np.linalg.solve(information, gradient)
         share = 1.0
-        while share > 1e-3:
+        while share > _LEAST_SHARE:
             moved = unknown + share * change[:2], offsets + share * change[2:]
             value = chi_square(*moved)
             if value <= best:
@@ -357,7 +363,7 @@ def _least(
             break
         decrease, best = best - value, value
         unknown, offsets = moved
-        if decrease < 1e-4:
+        if decrease < _LEAST_DECREASE:
             break
     return Fit(
         unknown=unknown,
@@ -376,7 +382,7 @@ def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
         return np.zeros((k, 0)), np.zeros((0, 0)), ()
     used: Sequence[int] = np.unique(sightings.radars).tolist()
     part = (sightings.radars[:, None] == np.array(used)[None, :]).astype(np.float64)
-    covariance = sightings.offset_covariance[np.ix_(used, used)] + 1e-12 * np.eye(len(used))
+    covariance = sightings.offset_covariance[np.ix_(used, used)] + _FLOOR * np.eye(len(used))
     return part, np.asarray(np.linalg.inv(covariance)), tuple(used)
 
 
@@ -419,11 +425,11 @@ def radius_of(
     at = np.array([3, 5, *range(state.offsets.start, state.offsets.stop)])
     prior = np.zeros((nuisance.shape[2], nuisance.shape[2]))
     known = 2 + n_offsets
-    prior[:known, :known] = np.linalg.inv(state.P.block(at) + 1e-12 * np.eye(known))
+    prior[:known, :known] = np.linalg.inv(state.P.block(at) + _FLOOR * np.eye(known))
     white = np.square(
         [wheels.heading_rad_per_sqrt_m, wheels.along_m_per_sqrt_m, wheels.across_m_per_sqrt_m]
     )
-    per_step = np.repeat(white * step_m + 1e-12, _KNOTS)
+    per_step = np.repeat(white * step_m + _FLOOR, _KNOTS)
     prior[known:, known:] = np.diag(1.0 / per_step)
     ranges_m, variances = seen.ranges_m - state.offsets_m[seen.radars], np.square(seen.sigmas_m)
     start_m = transform(seen.newest, transform(between(state.pose, np.zeros(3)), place))
@@ -431,7 +437,7 @@ def radius_of(
     for _ in range(_RADIUS_STEPS):
         q = unknown[3:]
         away = unknown[:2] - seen.antennas_m - nuisance @ q
-        distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+        distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_WAY_M)
         u = away / distance[:, None]
         residual = ranges_m - (distance - unknown[2] + by_offset @ q)
         by_q = by_offset - np.einsum("ki,kiq->kq", u, nuisance)

@@ -20,6 +20,8 @@ from slam.robust.state import Array, Indices, Motion, State, rotation
 # Standard deviations of calibration and offsets below this are taken as this, so that information
 # stays finite.
 _LEAST_SIGMA = 1e-7
+# Of the first pose [m, rad], where a run's own map begins
+_POSE_SIGMA = 1e-6
 # Standard deviations of a step that the wheels did not measure.
 _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 # No frame gives more used ranges than that.
@@ -108,7 +110,7 @@ def start_prior(
     calibration_sigmas: tuple[float, float, float],
     offset_sigmas_m: tuple[float, ...],
     n_landmarks: int,
-    pose_sigma: float = 1e-6,
+    pose_sigma: float = _POSE_SIGMA,
 ) -> Prior:
     """Return the prior of a run that starts at the origin of its own map."""
     calibration = np.maximum(calibration_sigmas, _LEAST_SIGMA)

@@ -50,6 +50,12 @@ POSE, CALIBRATION = slice(0, 3), slice(3, 6)
 BORDER_HEAD = 6
 _LEAST_WALK_SHARE = 1e-5
 _UNKNOWN = 100.0
+# The decrease of the cost that ends a search, what rounding may add to it, and how often a step is
+# halved
+_TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
+# What keeps a direction finite where a landmark stands at an antenna, or at the robot, and a root
+# where nothing walks
+_LEAST_RANGE_M, _LEAST_RANGE_M2, _LEAST_RADIUS_WAY_M, _TINY = 1e-9, 1e-18, 1e-6, 1e-300
 
 
 def first_values(estimate: Estimate) -> Array:
@@ -215,7 +221,7 @@ def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
     places = pose[:, :2] + arm
     landmarks = estimate.landmarks_m[problem.range_landmarks]
     away = landmarks - places
-    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
+    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_RANGE_M)
     sigmas = problem.range_sigmas_m
     u = away / (distance * sigmas)[:, None]
     by_landmark = u
@@ -246,7 +252,7 @@ def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
 def _point_rows(problem: Problem, estimate: Estimate) -> Rows:
     pose = estimate.poses[problem.point_poses]
     away = estimate.landmarks_m[problem.point_landmarks] - pose[:, :2]
-    q = np.maximum(np.sum(away**2, axis=1), 1e-18)
+    q = np.maximum(np.sum(away**2, axis=1), _LEAST_RANGE_M2)
     distance = np.sqrt(q)
     residual = np.column_stack([distance, np.arctan2(away[:, 1], away[:, 0]) - pose[:, 2]])
     residual -= problem.points
@@ -439,9 +445,9 @@ class Smoother:
         # W with W C W^T = I, shape (k, 3, 3)
         self._roots = np.asarray(np.linalg.inv(np.linalg.cholesky(problem.covariances)))
         least = _LEAST_WALK_SHARE * np.sqrt(problem.walks.max(axis=0, initial=0.0))
-        self._walk_roots = 1.0 / np.sqrt(problem.walks + least**2 + 1e-300)
+        self._walk_roots = 1.0 / np.sqrt(problem.walks + least**2 + _TINY)
 
-    def solve(self, start: Estimate, tolerance: float = 1e-2) -> Solution | None:
+    def solve(self, start: Estimate, tolerance: float = _TOLERANCE) -> Solution | None:
         """Return the solution reached from a start, or None if it failed.
 
         The search ends when the cost decreases by less than ``tolerance``.
@@ -457,10 +463,10 @@ class Smoother:
             except np.linalg.LinAlgError:
                 return None
             share, better = 1.0, estimate
-            for _ in range(8):
+            for _ in range(_HALVINGS):
                 better = _moved(estimate, change, share)
                 new_cost = self.cost(better, limit)
-                if new_cost <= cost + 1e-12:
+                if new_cost <= cost + _ROUNDING:
                     break
                 share *= 0.5
             else:
@@ -605,7 +611,9 @@ def give_radius(
     id_, point_m = state.landmark_ids[row], state.landmarks_m[row].copy()
     before_m = state.radii_m.pop(id_, 0.0)
     away = point_m - state.position_m
-    state.landmarks_m[row] += (radius_m - before_m) * away / max(float(np.hypot(*away)), 1e-6)
+    state.landmarks_m[row] += (
+        (radius_m - before_m) * away / max(float(np.hypot(*away)), _LEAST_RADIUS_WAY_M)
+    )
     if radius_m:
         state.radii_m[id_] = radius_m
     smoother, start = _all_poses(log, state, parameters)

@@ -66,3 +66,24 @@ def test_a_number_has_one_name() -> None:
     """`overlapping` defines TINY and `matched_filter` may import it."""
     tails = [name for name in slam_constants() if name.endswith(".TINY")]
     assert tails == ["slam.front_end.overlapping.TINY"]
+
+
+_OF_FORMULAS = {0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 6.0, 24.0}
+"""Numbers of mathematics and of thirds and halves; whatever else is a choice, and has a name."""
+
+
+@pytest.mark.parametrize("file", _FILES, ids=name_of)
+def test_no_choice_hides_within_a_function_of_slam(file: Path) -> None:
+    """Such a number would be in no session."""
+    hidden = [
+        f"line {part.lineno}: {part.value}"
+        for function in ast.walk(ast.parse(file.read_text()))
+        if isinstance(function, ast.FunctionDef)
+        for part in ast.walk(function)
+        if isinstance(part, ast.Constant)
+        and isinstance(part.value, float)
+        and part.value not in _OF_FORMULAS
+    ]
+    if file.name == "geometry.py":  # the mounts of the paper's rig, which a session has
+        hidden = [line for line in hidden if not line.endswith((" 0.1", " 0.2"))]
+    assert hidden == []
