@@ -144,7 +144,8 @@ class _SessionFile:
             return
         size = len(data) + _RECORD_OVERHEAD_BYTES
         late = self._clock_ns() - self._chunk_started_ns >= _CHUNK_NS
-        if late or self._pending_bytes + size > CHUNK_BYTES:
+        is_head = not self._writer.has_copies  # which is one chunk, however slow the machine is
+        if not is_head and (late or self._pending_bytes + size > CHUNK_BYTES):
             self.cut_chunk()
         self._pending_bytes += size
         self._newest_ns = max(self._newest_ns, t_ns)
