@@ -3,8 +3,9 @@
 Every trajectory error states its alignment. ``ate_rmse_m`` is the one to quote; the ICP numbers
 of the paper answer a different question.
 
-How many looks make a landmark observable is part of the metric, not of the design under test, so
-these numbers are constants here; how far a radar looks is the preset's.
+From how many poses a landmark must be in view to be observable is part of the metric, not of the
+design under test, so these numbers are constants here; field of view and range limits are the
+preset's.
 """
 
 from __future__ import annotations

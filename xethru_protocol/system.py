@@ -51,9 +51,18 @@ def locked(path: Path) -> Iterator[None]:
             raise PathInUseError(f"{path}: in use") from None
         except OSError:
             pass  # no locks here
+        if not _is_open_as(descriptor, path):  # who held it has moved or removed it
+            raise PathInUseError(f"{path}: in use")
         yield
     finally:
         os.close(descriptor)
+
+
+def _is_open_as(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 @contextmanager

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
+
+from xethru_protocol.system import STDOUT
 
 _PACKAGE = "xethru-hil"
 
@@ -27,12 +28,10 @@ class _Show(argparse.Action):
             parser.exit(
                 1, f"{parser.prog}: {_PACKAGE} is not installed, so its version is unknown\n"
             )
-        try:
-            if sys.stdout is not None:  # the shell may have closed it
-                sys.stdout.write(f"{_PACKAGE} {version}\n")
-                sys.stdout.flush()
-        except OSError as error:
-            parser.exit(1, f"{parser.prog}: cannot write the version: {error.strerror}\n")
+        STDOUT.write(f"{_PACKAGE} {version}\n")
+        if STDOUT.failure is not None:
+            reason = STDOUT.failure.strerror
+            parser.exit(1, f"{parser.prog}: cannot write the version: {reason}\n")
         parser.exit()
 
 

@@ -22,7 +22,6 @@ import contextlib
 import heapq
 import json
 import math
-import os
 import shutil
 import zipfile
 import zlib
@@ -47,6 +46,7 @@ from xethru_protocol.recordings.records import (
     writing,
 )
 from xethru_protocol.recordings.vendor.layouts import BINARY_KINDS, KIND_OF_MESSAGE, BinaryKind
+from xethru_protocol.system import written_whole
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.rows import Response
 
@@ -154,7 +154,6 @@ def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> N
         raise RecordingError(f"{path} exists already")
     bulk: dict[int, _Bulk] = {}
     others = _Others()
-    partial = path.with_name(path.name + ".part")
     with writing(path), contextlib.ExitStack() as cleanup:
         for index, (message, t_ns) in enumerate(messages):
             kind = KIND_OF_MESSAGE.get(type(message))
@@ -167,14 +166,13 @@ def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> N
             group.add(message)
             group.index.append(index)
             group.t_ns.append(NO_TIME_NS if t_ns is None else t_ns)
-        cleanup.callback(partial.unlink, missing_ok=True)
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        fresh = cleanup.enter_context(written_whole(path))
+        with zipfile.ZipFile(fresh, "w", zipfile.ZIP_DEFLATED) as archive:
             _add(archive, "format", np.array(FORMAT))
             _add(archive, "facts", np.array(json.dumps(facts.as_json())))
             others.save(archive)
             for part in bulk.values():
                 part.save(archive)
-        os.replace(partial, path)
 
 
 def _new_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import fcntl
 import os
 import select
 import signal
@@ -256,6 +257,22 @@ def test_two_do_not_write_one_file_at_a_time(tmp_path: Path) -> None:
         with pytest.raises(OSError, match="another process is writing it"), written_whole(result):
             pytest.fail("both write")
     assert result.read_text() == "first"
+
+
+def test_a_lock_that_came_as_its_holder_moved_the_file_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, fresh = tmp_path / "out.json", tmp_path / ".unfinished.out.json"
+    real_lock = fcntl.flock
+
+    def lock_late(descriptor: int, operation: int) -> None:
+        if fresh.exists():
+            fresh.replace(result)  # the other process is done just now
+        real_lock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", lock_late)
+    with pytest.raises(OSError, match="another process is writing it"), written_whole(result):
+        pytest.fail("what is written now has no lock")
 
 
 def test_links_stay_links_and_what_is_no_file_is_written_to_itself(tmp_path: Path) -> None:

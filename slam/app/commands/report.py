@@ -332,7 +332,7 @@ def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
 
 
 def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
-    """Replay a session and write its report; beside the session if `out` is None."""
+    """Write the report of a session; beside the session if `out` is None."""
     recorded = open_session(session_file(session), stop)
     page = out or recorded.path.with_name("report.html")
     refuse_overwriting(recorded.path, page)
@@ -348,7 +348,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     Raises
     ------
     AppError
-        The session cannot be replayed, or no state was estimated in it.
+        The session cannot be read, or no state was estimated in it.
     """
     data = _ReportData(session.info)
     record = play(session, [data], stop)
@@ -421,7 +421,7 @@ def _write_numbers(
     rows = summary_rows(
         summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
     )
-    judged = [row for row in rows if row[0] != "speed"]  # the replay's, not the run's
+    judged = [row for row in rows if row[0] != "speed"]  # of reading the session, not of the run
     times = [row for row in driven if row[0] in {"time", "driven"}]
     nis = "-" if summary.nis_mean is None else f"{summary.nis_mean:.2f}"
     page.numbers(

@@ -181,7 +181,7 @@ def run_view(
 def session_file(given: Path, *, allow_view: bool = False) -> Path:
     """Return a file as it is, or the session of a run's folder.
 
-    `allow_view` prefers the .rrd of a folder, which needs no replay, if it was closed.
+    `allow_view` prefers the .rrd of a folder, which is drawn already, if it was closed.
     """
     if not given.is_dir():
         if not given.exists():

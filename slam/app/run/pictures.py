@@ -260,16 +260,18 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     outlined = [transform(place, last.landmarks_m), estimate, info.true_landmarks_m]
     _draw_landmarks(axes, last, extent_m(*outlined, *info.outlines_m))
     axes.margins(0.06)
+    simulated = " (simulated)" if info.simulated else ""
     if summary is None:
         length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
         title = (
-            f"{info.scene}, preset {info.preset}{' (simulated)' if info.simulated else ''}: "
+            f"{info.scene}, preset {info.preset}{simulated}: "
             f"{length_m:.1f} m driven, no truth to compare with"
         )
         remark = "map frame: the origin is the robot's first pose"
     else:
+        seed = "" if summary.seed is None else f", seed {summary.seed}"
         title = (
-            f"{summary.scene}, preset {summary.preset}, seed {summary.seed} (simulated): "
+            f"{summary.scene}, preset {summary.preset}{seed}{simulated}: "
             f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
             f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm"
         )

@@ -35,8 +35,8 @@ def finish(
 ) -> None:
     """Write a run's results into an existing folder, then print its table; `also` are more rows.
 
-    They replace those of an earlier run, each once it is whole. If a file cannot be written, the
-    table is printed nevertheless.
+    The files of an earlier run are removed first, and each new one has its name once it is whole.
+    If one cannot be written, the table is printed nevertheless.
     """
     stop.check()
     summary = summarise(record, source.info, source.rig)

@@ -211,14 +211,15 @@ class _SessionFile:
 class SessionLog(SessionObserver):
     """Writes a session as it happens.
 
-    Topics: `/radar/<name>/frame` with the frame counter in the record's sequence number and a
-    latched `/radar/<name>/info` (JSON), `/radar/<name>/stream` before the first frame of every
-    stream but number 0; `/scan` after the frames of each scan, with their counters
-    and the true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`,
-    `/landmarks`, `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit
-    (`state_row`), `/slam/step`, what led to each (`step_row`); where there are such, raw bytes in
+    Topics: latched `/session/info`, the table of the run (`session_table`), which is also a
+    metadata record; `/radar/<name>/frame` with the frame counter in the record's sequence number
+    and a latched `/radar/<name>/info` (JSON), `/radar/<name>/stream` before the first frame of
+    every stream but number 0; `/scan` after the frames of each scan, with their counters and the
+    true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`,
+    `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`state_row`),
+    `/slam/step`, what led to each (`step_row`); where there are such, raw bytes in
     `/radar/<name>/rx` and `tx`, and ranges that another program found in
-    `/radar/<name>/detections`. A metadata record is `session_table`.
+    `/radar/<name>/detections`.
 
     Parameters
     ----------

@@ -394,7 +394,7 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
         if field.default is MISSING and known.get(field.name) is None
     ]
     if missing:
-        raise AppError(f"{path}: {topic} does not tell {', '.join(missing)}")
+        raise AppError(f"{path}: {topic} lacks {', '.join(missing)}")
     if unit != LENGTH_UNIT:
         raise AppError(f"{path}: {topic}: lengths in {shown(unit)}, must be in {LENGTH_UNIT}")
     return RadarInfo(**known)

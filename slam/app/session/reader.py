@@ -57,6 +57,7 @@ from xethru_protocol.recordings.mcap import (
 )
 from xethru_protocol.recordings.mcap import read_entries as entries_of
 from xethru_protocol.system import StopFlag
+from xethru_protocol.validation import reason_of
 
 _KINDS = {
     b"RRF": "a Rerun recording (.rrd), a view that other versions of Rerun may not open; the "
@@ -468,7 +469,7 @@ def _naming(path: Path, message: Message) -> Iterator[None]:
     ) as error:
         raise AppError(
             f"{path}: a message of {message.topic} at "
-            f"{message.t_ns / 1e9:.3f} s cannot be read: {error}"
+            f"{message.t_ns / 1e9:.3f} s cannot be read: {reason_of(error)}"
         ) from None
 
 

@@ -27,7 +27,7 @@ from xethru_protocol.recordings.formats import message_name, recording_facts, re
 from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayouts
 from xethru_protocol.recordings.vendor.layouts import META_NAME
 from xethru_protocol.recordings.wire_capture import SUFFIX, read_note
-from xethru_protocol.system import STDERR, flush_streams, one_line, open_closed_streams
+from xethru_protocol.system import STDERR, STDOUT, flush_streams, one_line, open_closed_streams
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.rows import Response
 from xethru_protocol.wire.x4 import BASEBAND_BIN_M, RF_BIN_M
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     path = Path(options.path)
     if not _is_ours(path):
         return INCOMPATIBLE
-    if sys.stdout.isatty():
+    if STDOUT.is_terminal:
         return _end(
             "the drawing is for the Rerun viewer, not for a terminal; "
             f"open the recording with it: rerun {path}",
@@ -184,12 +184,11 @@ class _Waiting:
     samples: list[Samples] = field(default_factory=list)
 
 
-def bscan(
-    samples: Samples,
-) -> NDArray[np.float32]:
-    """Return the envelope of frames without their constant part, shape (n_frames, n_bins).
+def bscan(samples: Samples) -> NDArray[np.float32]:
+    """Return the envelope of frames without their constant part.
 
-    A single frame keeps its constant part. The envelope of RF is that of its analytic signal.
+    Both have shape (n_frames, n_bins). A single frame keeps its constant part. The envelope of RF
+    is that of its analytic signal.
     """
     moving = samples - samples.mean(axis=0) if len(samples) > 1 else samples
     if not np.iscomplexobj(moving):
@@ -456,10 +455,10 @@ def _blueprint(axes: Sequence[_Axis], prefix: str) -> rrb.Blueprint:
                 charts.append(rrb.BarChartView(name=title, origin=origin))
     log = rrb.TextLogView(name="Log", origin=f"/{prefix}log")
     about = rrb.TextDocumentView(name="What you see", origin=f"/{prefix}about")
-    words = rrb.Vertical(about, log)
+    texts = rrb.Vertical(about, log)
     drawn = rrb.Vertical(rrb.Tabs(*scans), rrb.Tabs(*charts), row_shares=[3, 2])
     return rrb.Blueprint(
-        rrb.Horizontal(drawn, words, column_shares=[3, 2]) if scans else words,
+        rrb.Horizontal(drawn, texts, column_shares=[3, 2]) if scans else texts,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=DEVICE_TIME),

@@ -129,7 +129,8 @@ class _DataFile:
         found: tuple[Response | None, int | None] = None, None
         if line.startswith(b"TimeStamp;"):
             if line.rstrip() != kind.titles.rstrip():
-                self.report(f"its columns are not those known: {shown(line.rstrip())}")
+                columns = line.rstrip().decode("latin-1")
+                self.report(f"its columns are not the known ones: {shown(columns)}")
                 self.ended = self.faulty = True
                 return None
         else:

@@ -13,6 +13,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from hil_tests.unit.slam.app.sessions import session_info, snapshot
+from slam.app.run.evaluation import Summary
 from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
@@ -27,6 +28,7 @@ from slam.app.run.pictures import (
 )
 from slam.app.run.runner import RunRecord, States
 from slam.app.view import rerun_recording as view
+from slam.evaluation import LandmarkScore
 
 
 @given(st.floats(0.01, 2), st.floats(0.01, 2), st.floats(-3, 3))
@@ -78,8 +80,7 @@ def test_ellipses_are_as_large_as_the_map_allows(sigmas_m: list[float], size_m: 
     assert times == 1000 or not fits(steps[steps.index(times) + 1] * (1 + 1e-6))
 
 
-@pytest.mark.parametrize("width_in", [9.0, NARROW_IN])
-def test_the_map_says_how_much_its_ellipses_are_enlarged(width_in: float) -> None:
+def short_run() -> RunRecord:
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.5, 0.3]])
     covariance = np.diag([4e-6, 1e-6])
     last = replace(
@@ -97,7 +98,12 @@ def test_the_map_says_how_much_its_ellipses_are_enlarged(width_in: float) -> Non
         nis=np.zeros(3),
         nis_dof=np.zeros(3, dtype=np.int32),
     )
-    record = RunRecord(states=states, last=last, n_frames=6, duration_ns=1, wall_s=1.0)
+    return RunRecord(states=states, last=last, n_frames=6, duration_ns=1, wall_s=1.0)
+
+
+@pytest.mark.parametrize("width_in", [9.0, NARROW_IN])
+def test_the_map_says_how_much_its_ellipses_are_enlarged(width_in: float) -> None:
+    record = short_run()
     figure = Figure(figsize=(width_in, 6.0), layout="constrained")
     draw_map(figure, session_info(), record, None)
     (axes,) = figure.axes
@@ -115,6 +121,39 @@ def test_the_map_says_how_much_its_ellipses_are_enlarged(width_in: float) -> Non
         half_axes = np.ptp(np.asarray(outline), axis=0) / 2
         np.testing.assert_allclose(half_axes, times * 2.4477468 * np.array([2e-3, 1e-3]), rtol=1e-4)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
+
+
+@pytest.mark.parametrize(
+    ("seed", "simulated", "title"),
+    [
+        (7, True, "made_up, preset paper, seed 7 (simulated): ATE 1.0 mm, 0.10 of odometry's 10"),
+        (None, False, "made_up, preset paper: ATE 1.0 mm, 0.10 of odometry's 10.0 mm"),
+    ],
+)
+def test_the_map_of_a_real_drive_with_truth_has_no_seed(
+    seed: int | None, simulated: bool, title: str
+) -> None:
+    summary = Summary(
+        scene="made_up",
+        preset="paper",
+        seed=seed,
+        frames=6,
+        duration_s=1.0,
+        realtime_factor=1.0,
+        ate_rmse_m=0.001,
+        ate_icp_rmse_m=0.001,
+        odometry_ate_rmse_m=0.01,
+        final_error_m=0.001,
+        landmarks=LandmarkScore(
+            true=2, observable=2, estimated=2, precision=1.0, recall=1.0, duplicates=0, rmse_m=0.0
+        ),
+        nees_pose=(),
+        nis_mean=None,
+    )
+    figure = Figure(layout="constrained")
+    info = replace(session_info(), seed=seed, simulated=simulated)
+    draw_map(figure, info, short_run(), summary)
+    assert figure.axes[0].get_title(loc="left").startswith(title)
 
 
 # Machado, Oliveira, Fernandes: A physiologically-based model for simulation of color vision
