@@ -59,7 +59,9 @@ def problem_text(problems: Sequence[Problem], model: Any) -> str:  # noqa: ANN40
         if each["type"] != "too_short" or each["loc"] not in refused:
             location, keys, table = _place(each["loc"], model)
             of_key = texts.setdefault(_key(location), [])
-            of_key += [text] if (text := _text(each, keys, table)) not in of_key else []
+            text = _text(each, keys, table)
+            if text not in of_key:
+                of_key.append(text)
     key, first = next(iter(texts.items()))
     more = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
     # several texts of one key: the value may be of several kinds, and is of none
@@ -107,7 +109,7 @@ def reason_of(error: Exception) -> str:
     return str(error) or type(error).__name__
 
 
-def _text(problem: Problem, keys: Sequence[str], table: Any) -> str:  # noqa: ANN401
+def _text(problem: Problem, keys: Sequence[str], table: Any) -> str:  # noqa: ANN401 - as above
     """Describe a value in a table of these keys that should be a ``table``, None if no table."""
     kind, value, limits = problem["type"], problem.get("input"), problem.get("ctx", {})
     match kind:
@@ -141,7 +143,7 @@ def _plain(limit: object) -> object:
     return int(limit) if isinstance(limit, float) and limit.is_integer() else limit
 
 
-def _place(location: Location, model: Any) -> tuple[Location, list[str], Any]:  # noqa: ANN401
+def _place(location: Location, model: Any) -> tuple[Location, list[str], Any]:  # noqa: ANN401 - as above
     """Follow a location: without the kinds of value that were tried, and its table's keys.
 
     Third comes the model of what is there, None if that is no table.

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
+from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
 from slam.app.errors import AppError
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session, read_entries
@@ -36,17 +36,6 @@ class Content(bytes):
 
 
 NO_CHECK = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-
-
-class SlowClock:
-    """Every look at it takes 0.15 s, so that a chunk holds half a dozen messages."""
-
-    def __init__(self) -> None:
-        self.now_ns = 0
-
-    def __call__(self) -> int:
-        self.now_ns += 150_000_000
-        return self.now_ns
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
+from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
 from slam.app.records import LogLine
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
@@ -24,17 +24,6 @@ N_SCANS = 20
 INFO = replace(
     session_info(), radars=tuple(replace(radar, n_bins=N_BINS) for radar in session_info().radars)
 )
-
-
-class SlowClock:
-    """Every look at it takes 0.15 s, so that a chunk holds half a dozen messages."""
-
-    def __init__(self) -> None:
-        self.now_ns = 0
-
-    def __call__(self) -> int:
-        self.now_ns += 150_000_000
-        return self.now_ns
 
 
 @pytest.fixture(scope="module")

@@ -95,6 +95,13 @@ def test_a_lost_frame_and_a_fault_are_told_and_escaped(reported: Reported) -> No
     assert re.findall(r"<td>(.*?)</td>", others)[3:6] == ["0 (0.00 %)", "0", "0"]
 
 
+def test_settings_are_shown_as_json_has_them(reported: Reported) -> None:
+    lines = re.findall(r"(?m)^[a-z_.]+ = (.*?)(?:</pre>.*)?$", reported.text)
+    assert len(lines) > 50
+    for line in lines:
+        json.loads(html.unescape(line))
+
+
 def test_the_same_session_gives_the_same_page(reported: Reported, tmp_path: Path) -> None:
     again = tmp_path / "again.html"
     assert main(["report", str(reported.session), "--out", str(again)]) == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -235,13 +236,13 @@ def _address(svg: str) -> str:
 
 
 def _lines_of(values: Mapping[str, object], prefix: str = "") -> list[str]:
-    """Return settings, a line each; nested ones have dotted names."""
+    """Return settings, a line each, values as JSON; nested ones have dotted names."""
     lines = []
     for key, value in values.items():
         if isinstance(value, Mapping):
             lines += _lines_of(value, f"{prefix}{key}.")
         else:
-            lines.append(f"{prefix}{key} = {value}")
+            lines.append(f"{prefix}{key} = {json.dumps(value, ensure_ascii=False)}")
     return lines
 
 

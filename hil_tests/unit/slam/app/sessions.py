@@ -20,6 +20,17 @@ FRAME_NS = 199_261_498
 N_BINS = 1431
 
 
+class SlowClock:
+    """Every look at it takes 0.15 s, so that a chunk holds half a dozen messages."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def __call__(self) -> int:
+        self.now_ns += 150_000_000
+        return self.now_ns
+
+
 def session_info(n_radars: int = 2) -> SessionInfo:
     radars = tuple(
         RadarInfo(
