@@ -61,8 +61,12 @@ def locked(path: Path) -> Iterator[None]:
 def _is_open_as(descriptor: int, path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
+    except OSError:  # the path leads nowhere any more, or the shell closed the stream
         return False
+
+
+def _is_output(path: Path) -> bool:
+    return _is_open_as(1, path) or _is_open_as(2, path)
 
 
 @contextmanager
@@ -71,11 +75,12 @@ def written_whole(path: Path) -> Iterator[Path]:
 
     Whoever reads ``path`` finds the file of before or all of the new one, also after a kill or a
     power failure. An error or a signal in the block leaves the file of before. What is there and
-    no regular file, such as a pipe or ``/dev/stdout``, is written to itself.
+    no regular file, such as a pipe, is written to itself; so is ``/dev/stdout``, and the file that
+    it is redirected to, as what is printed would go to the file of before.
 
     Raises OSError if the file cannot be written, or another process is just doing so.
     """
-    if path.exists() and not path.is_file():
+    if path.exists() and (not path.is_file() or _is_output(path)):
         yield path
         return
     target = Path(os.path.realpath(path))  # a link stays one

@@ -259,6 +259,22 @@ def test_two_do_not_write_one_file_at_a_time(tmp_path: Path) -> None:
     assert result.read_text() == "first"
 
 
+def test_what_is_printed_is_not_lost_where_the_result_goes_to_the_same_file(tmp_path: Path) -> None:
+    code = (
+        "import pathlib\n"
+        "from xethru_protocol.system import written_whole\n"
+        "with written_whole(pathlib.Path('/dev/stdout')) as fresh:\n"
+        "    fresh.open('a').write('result\\n')\n"
+        "print('the table behind it')\n"
+    )
+    printed = tmp_path / "printed"
+    with printed.open("a") as stream:
+        command = [sys.executable, "-c", code]
+        subprocess.run(command, stdout=stream, timeout=seconds(20), check=True)
+    assert printed.read_text() == "result\nthe table behind it\n"
+    assert list(tmp_path.iterdir()) == [printed]
+
+
 def test_a_lock_that_came_as_its_holder_moved_the_file_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
