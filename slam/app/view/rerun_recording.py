@@ -7,9 +7,17 @@ Rerun's 2D views have y downwards, our frames upwards: only `screen` negates it.
 from __future__ import annotations
 
 import os
+
+# Rerun reports a full disk or a closed viewer in lines of its own, from its own threads; we report
+# it in one.
+os.environ.setdefault("RUST_LOG", "off")
+# Rerun's allocator keeps freed memory, tens of megabytes in an hour of a run, unless this is set
+# before it is loaded.
+os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
+
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
@@ -26,10 +34,6 @@ from rerun.experimental import ViewerClient
 from slam.app.errors import AppError
 
 __all__ = ["RrdReader", "ViewerClient", "rr", "rrb"]
-
-# Rerun reports a full disk or a closed viewer in lines of its own, from its own threads; we report
-# it in one.
-os.environ.setdefault("RUST_LOG", "off")
 
 Rgb = tuple[int, int, int]
 
@@ -59,8 +63,8 @@ DEVICE_TIME, HOST_TIME, FRAME = "device_time", "host_time", "frame"
 
 _STATIC = " (static)"
 
-_FILE_CLOSE_LIMIT_S = 20.0
-"""Longest wait for Rerun to finish the file."""
+_FILE_LIMIT_S = 20.0
+"""Longest wait for Rerun to begin or to finish a file."""
 _VIEWER_CLOSE_LIMIT_S = 5.0
 """Longest wait for a viewer to take the last rows."""
 
@@ -153,17 +157,29 @@ class Recording:
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
         if isinstance(target, Path):
-            try:
-                self._stream.save(target, default_blueprint=blueprint)
-            except RuntimeError as error:  # Rerun's own, with the system's message at its end
-                reason = str(error).rpartition(": ")[2]
-                raise AppError(f"{self._called}: cannot be written: {reason}") from None
+            self._begin_file(self._stream, target, blueprint)
         elif target is None:
             self._stream.stdout(default_blueprint=blueprint)
         else:
             self._stream.connect_grpc(target, default_blueprint=blueprint)
         self._stream.send_recording_name(name)
         self._stream.send_recording_start_time_nanos(start_ns)
+
+    def _begin_file(self, stream: rr.RecordingStream, path: Path, blueprint: rrb.Blueprint) -> None:
+        reasons: list[str] = []
+
+        def save() -> None:
+            try:
+                stream.save(path, default_blueprint=blueprint)
+            except RuntimeError as error:  # Rerun's own, with the system's message at its end
+                reasons.append(str(error).rpartition(": ")[2])
+
+        # On a full disk Rerun's writer may be gone before it has the blueprint, and save waits.
+        if not _ends_within(_FILE_LIMIT_S, save):
+            rr.unregister_shutdown()  # or it waits once more when the interpreter ends
+            reasons.append("it takes nothing; is the disk full?")
+        if reasons:
+            raise AppError(f"{self._called}: cannot be written: {reasons[0]}")
 
     @property
     def is_finished(self) -> bool:
@@ -203,16 +219,13 @@ class Recording:
         if self._stream is None:
             return
         stream, self._stream = self._stream, None
-        # On a full disk Rerun's writer is gone and disconnect may wait for it without end.
-        closing = Thread(target=stream.disconnect, daemon=True)
-        closing.start()
         is_file = isinstance(self._target, Path)
         if self._target is None:  # who reads decides how fast
             limit_s = None
         else:
-            limit_s = _FILE_CLOSE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S
-        closing.join(limit_s)
-        if closing.is_alive():
+            limit_s = _FILE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S
+        # On a full disk Rerun's writer is gone and disconnect may wait for it without end.
+        if not _ends_within(limit_s, stream.disconnect):
             rr.unregister_shutdown()  # or it waits once more when the interpreter ends
             if is_file:
                 raise AppError(f"{self._called}: cannot be finished; is the disk full?")
@@ -235,6 +248,14 @@ class Recording:
         if self._stream is None:
             raise ValueError("the view is closed already")
         return self._stream
+
+
+def _ends_within(limit_s: float | None, function: Callable[[], object]) -> bool:
+    """Call a function in a thread that may hang; return whether it ended in time."""
+    calling = Thread(target=function, daemon=True)
+    calling.start()
+    calling.join(limit_s)
+    return not calling.is_alive()
 
 
 def count_rows(path: Path) -> dict[str, int]:
