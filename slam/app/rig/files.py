@@ -34,7 +34,7 @@ from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.system import written_whole
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import InfoItem
-from xethru_protocol.wire.errors import XeThruError
+from xethru_protocol.wire.errors import PortUnavailable, XeThruError
 from xethru_protocol.wire.messages import SystemGetInfo
 
 _Sigma = Annotated[StrictFloat, Field(ge=0, le=10, allow_inf_nan=False)]
@@ -184,7 +184,7 @@ class _Module:
                 request = SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)
                 self.serial = self.driver.request(request).text
             except XeThruError as error:
-                raise AppError(f"{port}: {error}") from None
+                raise AppError(f"{port}: {error}") from error
             held.push(unless_it_answers.pop_all())
 
     def name(self, name: str) -> None:
@@ -236,20 +236,26 @@ def open_rig(
             )
         modules = []
         passed_over = []
+        unopened = []
         for port in dict.fromkeys(candidates):
             try:
                 module = _Module(port, observer, unless_it_works)
-            except AppError:
+            except AppError as error:
                 if port in named:
                     raise
-                passed_over.append(f"{port} (no module answers)")
+                if isinstance(error.__cause__, PortUnavailable):
+                    unopened.append(port)
+                else:
+                    passed_over.append(f"{port} (no module answers)")
                 continue
             modules.append(module)
             if port not in named and module.serial not in {radar.serial for radar in rig.radars}:
                 passed_over.append(f"{port} (module {module.serial})")
         if passed_over:
             note(f"passed over, not of this rig: {', '.join(passed_over)}")
-        links = _match(rig, rig_path, modules, named=named, note=note)
+        if unopened:
+            note(f"passed over, in use or not to be opened: {', '.join(unopened)}")
+        links = _match(rig, rig_path, modules, named=named, unopened=unopened, note=note)
         kept = {link.driver for link in links}
         for module in modules:
             if module.driver not in kept:
@@ -275,6 +281,7 @@ def _match(
     modules: Sequence[_Module],
     *,
     named: Sequence[str],
+    unopened: Sequence[str],
     note: Callable[[str], None],
 ) -> tuple[RadarLink, ...]:
     wanted = {radar.serial for radar in rig.radars}
@@ -289,7 +296,9 @@ def _match(
     foreign = [module for module in modules if module.serial not in wanted]
     missing = [radar for radar in rig.radars if radar.serial not in by_serial]
     if missing:
-        raise AppError(_missing_text(rig_path, missing, foreign, modules))
+        text = _missing_text(rig_path, missing, foreign, modules)
+        busy = " (`xethru doctor` says who has the ports that were passed over)" if unopened else ""
+        raise AppError(text + busy)
     for module in foreign:
         if module.port in named:
             raise AppError(

@@ -69,10 +69,7 @@ only. {data}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, constant part removed. A
   landmark that the robot passes is a curved line.
 * **Frame**: the newest raw frame; red bars are detections.
-* **Error** (below the map): distance to the truth, which SLAM never sees. **SLAM**: the same, with
-  the grey band that should hold it in 95 % of cases. **NEES**, **NIS**: errors of the pose over 3,
-  and of predicted echoes over their number, by their own covariance; inside the grey 95 % band
-  most of the time if consistent, below if the covariance is too large.
+{numbers}
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
   every command and answer under *Log*.
 
@@ -80,6 +77,16 @@ Move the cursor of the time line below. `device_time` is the radars' own time, `
 periods, `host_time`, if there, is when frames arrived.
 """
 
+_ERRORS = """\
+* **Error** (below the map): distance to the truth, which SLAM never sees. **SLAM**: the same, with
+  the grey band that should hold it in 95 % of cases. **NEES**, **NIS**: errors of the pose over 3,
+  and of predicted echoes over their number, by their own covariance; inside the grey 95 % band
+  most of the time if consistent, below if the covariance is too large."""
+_NO_ERRORS = """\
+* **SLAM** (below the map): the grey band should hold its error in 95 % of cases; the truth is not
+  known, so *Error* and *NEES* are empty. **NIS**: errors of predicted echoes over their number, by
+  their own covariance; inside the grey 95 % band most of the time if consistent, below if the
+  covariance is too large."""
 _TRUTH = "Grey: the *true* path, and crosses where the landmarks truly are. "
 _POINTS = (
     "Yellow points are where two arcs cross (trilateration), of the last {states} states; red "
@@ -99,6 +106,7 @@ def about(info: SessionInfo) -> str:
         block=BLOCK_FRAMES,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
         truth=_TRUTH if is_world_known(info) else "",
+        numbers=_ERRORS if is_world_known(info) else _NO_ERRORS,
         points=""
         if info.settings.get("back_end") == "robust"
         else _POINTS.format(states=TRAIL_STATES),
@@ -179,7 +187,7 @@ def _numbers(info: SessionInfo) -> rrb.Tabs:
     """Lay out the curves; without truth, errors and NEES stay empty."""
     contents = {
         "Error [m]": ("/error", ["$origin/slam", "$origin/odometry"]),
-        "SLAM [m]": ("/error", ["$origin/slam", "$origin/believed"]),
+        "SLAM [m]": ("/error", ["$origin/slam", "$origin/believed/**"]),
         "NEES": ("/consistency/nees", ["$origin/**"]),
         "NIS": ("/consistency/nis", ["$origin/**"]),
         "Landmarks": ("/landmarks", ["$origin/**"]),
@@ -347,6 +355,8 @@ def style_numbers(recording: Recording) -> None:
     for entity, name, unit in _BANDS:
         band = rr.Measurements.from_fields(colors=BAND_RGB, names=name, units=unit, widths=0.0)
         recording.static(entity, band)
+        edge = rr.SeriesLines(colors=BAND_RGB, names="edge of the band", widths=1.0)
+        recording.static(f"{entity}/edge", edge)
 
 
 def send_numbers(
@@ -385,6 +395,9 @@ def send_numbers(
             middle, half = (high + low)[finite_rows] / 2, (high - low)[finite_rows] / 2
             columns = rr.Measurements.columns(values=middle, variances=half**2)
             recording.rows(entity, stamps.at(finite_rows.tolist()), columns)
+            # the view's axis holds values only, and would cut the shade off
+            edge = rr.Scalars.columns(scalars=high[finite_rows])
+            recording.rows(f"{entity}/edge", stamps.at(finite_rows.tolist()), edge)
 
 
 def _band(dof: int | None) -> tuple[float, float]:

@@ -227,11 +227,25 @@ def test_ports_in_the_way_cost_one_line_and_are_closed(
     for link in bench.find():
         link.driver.close()
     skipped = [note for note in bench.notes if "passed over" in note]
-    assert len(skipped) == 1
-    assert skipped[0].count("no module answers") == 2
-    assert all(port in skipped[0] for port in ("mute", "c (module", "no (", "d (module"))
+    assert len(skipped) == 2
+    assert skipped[0].count("no module answers") == 1
+    assert all(port in skipped[0] for port in ("mute (no", "c (module", "d (module"))
+    assert skipped[1] == "passed over, in use or not to be opened: no"
     assert not any(bench.is_open(port) for port in bench.serials)
     assert mute.closed
+
+
+def test_a_port_in_use_is_not_called_a_module_that_does_not_answer(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.serials = {"a": LEFT}
+    monkeypatch.setattr(rig_match, "known_ports", lambda: ("a", "busy"))
+    with pytest.raises(AppError) as refused:
+        bench.find()
+    assert bench.notes == ["passed over, in use or not to be opened: busy"]
+    assert str(refused.value).endswith(
+        "is it plugged in? (`xethru doctor` says who has the ports that were passed over)"
+    )
 
 
 def test_a_rig_file_names_ports_itself(bench: Bench, tmp_path: Path) -> None:

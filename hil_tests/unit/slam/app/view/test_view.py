@@ -167,6 +167,10 @@ def test_the_error_is_shown_with_what_slam_believes_of_it(finished: Path) -> Non
     # both deviations are 0.01 m: 95 % of a planar Gaussian are within sqrt(-2 ln 0.05) of them
     expected = [0.0, 0.01 * np.sqrt(-2.0 * np.log(0.05))]
     np.testing.assert_allclose(band(finished, "/error/believed"), expected, atol=1e-9)
+    # Rerun's axis leaves out what is only shaded, so that the band needs a line on its edge
+    edges = dict(rows(finished, "/error/believed/edge", "Scalars:scalars"))
+    assert len(edges) == N_SCANS
+    assert edges[0] == [pytest.approx(expected[1])]
 
 
 def test_a_fault_is_a_marker_and_a_state_of_its_lane(finished: Path) -> None:
@@ -184,6 +188,8 @@ def test_the_guide_speaks_of_truth_only_where_there_is_one(tmp_path: Path, is_kn
     known = info if is_known else replace(info, true_landmarks_m=np.empty((0, 2)))
     (_, (text,)) = next(rows(drawn(tmp_path, info=known), "/about", "TextDocument:text"))
     assert ("*true* path" in text) is is_known
+    assert ("distance to the truth" in text) is is_known
+    assert ("*Error* and *NEES* are empty" in text) is not is_known
     assert "2 short-range radars" in text
 
 
