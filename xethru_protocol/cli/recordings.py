@@ -35,7 +35,7 @@ from xethru_protocol.recordings import convert as convert_recording
 from xethru_protocol.recordings.records import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
-from xethru_protocol.system import PathInUseError, built_aside, one_line
+from xethru_protocol.system import PathInUseError, built_aside, one_line, sync
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
@@ -344,8 +344,12 @@ def _whole(target: Path, *, replace: bool) -> Iterator[Path]:
             if target.is_dir():
                 fresh.mkdir()
             yield fresh
-            with set_aside(target, replace=replace):
-                _move(fresh, target)
+            if replace and fresh.is_file() and target.is_file():
+                sync(fresh)
+                fresh.replace(target)  # at once: whatever kills it finds one of both there
+            else:
+                with set_aside(target, replace=replace):
+                    _move(fresh, target)
     except PathInUseError:
         raise RecordingError(f"{target} is being written by another conversion") from None
     except RecordingError as error:

@@ -220,6 +220,29 @@ def test_a_conversion_that_is_killed_leaves_the_older_one_and_no_half_of_its_own
         assert not list(tmp_path.rglob(".unfinished*"))
 
 
+@pytest.mark.parametrize("n_renamed", [0, 1, 2])
+def test_a_conversion_that_is_killed_between_renames_leaves_one_of_both_files(
+    n_renamed: int, tmp_path: Path
+) -> None:
+    code = (
+        "import os, pathlib, sys\n"
+        "from xethru_protocol.cli import main\n"
+        "rename, renamed = pathlib.Path.replace, []\n"
+        "def killed(path, target):\n"
+        "    if len(renamed) == int(sys.argv[1]):\n"
+        "        os.kill(os.getpid(), 9)\n"
+        "    renamed.append(path)\n"
+        "    return rename(path, target)\n"
+        "pathlib.Path.replace = killed\n"
+        "sys.exit(main(sys.argv[2:]))\n"
+    )
+    target = tmp_path / "kept.npz"
+    assert main(["convert", str(IQ), str(target)]) == 0
+    command = ["convert", str(RECORDINGS / "single"), str(target), "--force"]
+    subprocess.run([sys.executable, "-c", code, str(n_renamed), *command], check=False)
+    assert len(list(read_recording(target))) == 40
+
+
 def test_a_part_of_a_recording_is_not_converted_into_it(tmp_path: Path, capsys: Capture) -> None:
     own = tmp_path / "own"
     shutil.copytree(IQ, own)
