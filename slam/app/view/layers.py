@@ -359,8 +359,11 @@ class Ground:
 
     def grid(self) -> tuple[list[Array], Array, list[str]]:
         """Return lines, shape (2, 2) each, and the places (n, 2) and texts of their numbers."""
-        steps = (digit * 10.0**power for power in range(-1, 5) for digit in (1, 2, 5))
-        step_m = next(step for step in steps if self.size_m <= _TICKS * step)
+        least_m = self.size_m / _TICKS
+        power = 10.0 ** math.floor(math.log10(least_m))
+        step_m = next(
+            (digit * power for digit in (1, 2, 5) if digit * power >= least_m), 10 * power
+        )
         lines, places, texts = [], [], []
         for axis, name in enumerate("xy"):
             first, last = np.ceil(self.low_m[axis] / step_m), np.floor(self.high_m[axis] / step_m)
@@ -576,6 +579,7 @@ class MapLayer:
         )
         here = transform(snapshot.world_from_map, snapshot.estimate[:2])[None]
         seen = np.concatenate([points, here])
+        seen = seen[np.isfinite(seen).all(axis=1)]
         if self._grows and not self._ground.holds(seen):
             self._ground = Ground.around(np.concatenate([seen, self._ground.inner_corners_m]))
             self._send_ground()

@@ -241,6 +241,18 @@ def test_a_map_of_an_unknown_world_grows_with_what_is_found(tmp_path: Path) -> N
     assert "x 6 m" in texts[-1]
 
 
+@pytest.mark.parametrize("far_m", [4e5, 1e8, float("nan")])
+def test_a_robot_that_is_very_far_away_or_nowhere_ends_no_view(
+    far_m: float, tmp_path: Path
+) -> None:
+    """As after a jump of its odometry, of which a live run warns and then goes on."""
+    info = replace(session_info(), true_landmarks_m=np.empty((0, 2)))
+    far = replace(snapshot(9), estimate=np.array([far_m, 0.0, 0.0]))
+    path = drawn(tmp_path, snapshot(0), far, info=info)
+    texts = [t for _, t in rows(path, "/map/grid/numbers", "Points2D:labels") if t]
+    assert 3 <= len([text for text in texts[-1] if text.startswith("x ")]) <= 14
+
+
 def test_the_robot_lies_above_its_path_and_is_larger(finished: Path) -> None:
     orders = {
         name: next(v for _, v in rows(finished, entity, f"{kind}:draw_order") if v)[0]
