@@ -46,6 +46,9 @@ class GapFinder:
         self._start_ns: int | None = None
         self._places: list[_Place] = []
         self._counts: list[_Count] = []
+        self._n_places_of_data: int | None = None
+        self.n_elsewhere = 0
+        """Messages that are missing where nothing is damaged; `gaps` counts them."""
 
     def damage(self, at: int) -> None:
         self._places.append(_Place(at=at, before=dict(self._newest)))
@@ -53,10 +56,15 @@ class GapFinder:
     def message(self, channel: int, sequence: int, t_ns: int) -> None:
         self._start_ns = t_ns if self._start_ns is None else self._start_ns
         self._found[channel] = self._found.get(channel, 0) + 1
+        self._n_places_of_data = None
         newest = self._newest.get(channel, (0, t_ns))[1]
         self._newest[channel] = sequence, max(newest, t_ns)
         if self._places:
             self._places[-1].behind.setdefault(channel, (sequence, t_ns))
+
+    def end_data(self) -> None:
+        """Take the end of the data: damage behind it loses nothing, if no message follows."""
+        self._n_places_of_data = len(self._places)
 
     def count(self, n_before: int) -> None:
         """Take the number of messages before this place, those of latched channels left out."""
@@ -72,16 +80,18 @@ class GapFinder:
 
     def _lossy(self, topics: Mapping[int, str]) -> Iterator[tuple[_Place, int | None]]:
         """Yield the places that lost something, each with how many messages, if known."""
-        n_lost_before = done = 0
+        n_lost_before = done = self.n_elsewhere = 0
+        of_data = self._places[: self._n_places_of_data]
         for count in self._counts:
-            places = self._merged(self._places[done : count.n_places], topics)
+            places = self._merged(of_data[done : count.n_places], topics)
             n_found = sum(n for channel, n in count.found.items() if channel in topics)
             n_lost = count.n_before - n_found - n_lost_before
             if n_lost > 0:
                 yield from ((place, n_lost if len(places) == 1 else None) for place in places)
+                self.n_elsewhere += 0 if places else n_lost
             n_lost_before += max(n_lost, 0)
             done = count.n_places
-        yield from ((place, None) for place in self._merged(self._places[done:], topics))
+        yield from ((place, None) for place in self._merged(of_data[done:], topics))
 
     @staticmethod
     def _merged(places: list[_Place], topics: Mapping[int, str]) -> list[_Place]:

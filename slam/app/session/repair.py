@@ -64,6 +64,8 @@ class Repair:
         checksum.
     gaps
         Of a session, what is lost, by the byte at which the damage begins.
+    n_elsewhere
+        Of a session, messages that are missing where nothing is damaged, as of a chunk cut out.
     n_messages, first_ns, last_ns
         Messages in the new file, and the session time they span [ns].
     kept
@@ -82,6 +84,7 @@ class Repair:
     head: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, str] | None = None
     gaps: dict[int, Gap] = field(default_factory=dict)
+    n_elsewhere: int = 0
     message_counts: dict[int, int] = field(default_factory=dict)
     data_end: int = 0
     checksum: int = 0
@@ -130,7 +133,9 @@ class Repair:
             wrong = "a byte outside of its chunks" if self.has_index else "its index"
             lines.append(f"  {wrong} was missing or wrong")
         lines += [f"  lost: {gap}" for gap in self.gaps.values()]
-        if self.is_session and not self.gaps and self.cut_at is None:
+        if self.n_elsewhere:
+            lines.append(f"  lost: {self.n_elsewhere} messages, where no damage shows")
+        elif self.is_session and not self.gaps and self.cut_at is None:
             lines.append("  nothing that was recorded is lost")
         if self.kept is not None:
             lines.append(f"  as it was: {self.kept}")
@@ -268,7 +273,7 @@ def _survey(path: Path, stop: StopFlag) -> Repair:
     if survey.is_session:
         if survey.message_counts:
             finder.count(sum(n for number, n in survey.message_counts.items() if number in topics))
-        survey.gaps = finder.gaps(topics)
+        survey.gaps, survey.n_elsewhere = finder.gaps(topics), finder.n_elsewhere
         _order_head(survey)
     else:
         survey.head, survey.metadata = {}, None
@@ -325,6 +330,7 @@ def _note(survey: Repair, finder: GapFinder, path: Path, record: mcap.Record) ->
     elif record.code == mcap.DATA_END:
         survey.data_end = record.at
         (survey.checksum,) = struct.unpack_from("<I", body)
+        finder.end_data()
     elif record.code == mcap.STATISTICS:
         survey.message_counts = mcap.message_counts(body)
     elif record.code == mcap.FOOTER:

@@ -25,7 +25,7 @@ from slam.app.errors import AppError, UsageError, naming
 from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.sweep import CLEAN
 from slam.app.sweep.bound import PURPOSE, load_gtsam
-from slam.app.sweep.run import Case, SweepRun, make_case, program_version, run_case
+from slam.app.sweep.run import Case, Key, SweepRun, make_case, program_version, run_case
 from slam.app.sweep.statistics import (
     group_line,
     settings_text,
@@ -120,11 +120,13 @@ def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[Swe
         known = None
     if not isinstance(known, dict):
         raise _not_a_part(path, "not what a sweep leaves unfinished")
-    runs = []
+    runs: dict[Key, SweepRun] = {}
     for number, line in enumerate(rest, start=2):
         try:
-            runs.append(_RUN_READER.validate_json(line))
-        except ValidationError:
+            run = _RUN_READER.validate_json(line)
+            _line(asdict(run))  # ValueError for a number that is not finite
+            runs[run.key] = run
+        except ValueError:
             raise _not_a_part(path, f"line {number} is damaged, or no run of a sweep") from None
     differing = [name for name in command if known.get(name) != command[name]]
     if differing or set(known) != set(command):
@@ -133,7 +135,7 @@ def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[Swe
             f"{path}: holds {len(runs)} runs of another sweep (other: {names}); give that one's "
             "command to go on with it, choose another --json, or move this file away to begin anew"
         )
-    return runs
+    return list(runs.values())
 
 
 def _finished(out: Path, command: Mapping[str, str]) -> list[SweepRun]:
@@ -202,6 +204,8 @@ def run_sweep(
         raise AppError(f"{out}: is no regular file, must be one")
     command = _command(cases, presets, n_seeds, settings, bound=bound)
     path = out.with_name(f"{out.name}.part")
+    if path.exists() and not path.is_file():  # opening a pipe waits for who writes into it
+        raise AppError(f"{path}: is no regular file; choose another --json, or move it away")
     with ExitStack() as held:
         with naming(path):  # what cannot be written ends the command before any run, too
             path.parent.mkdir(parents=True, exist_ok=True)

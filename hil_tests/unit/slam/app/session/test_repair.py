@@ -16,6 +16,7 @@ from slam.app.records import Gap
 from slam.app.session.reader import ScanEnd, open_session
 from slam.app.session.repair import repair
 from slam.frames import RadarFrame
+from xethru_protocol.recordings.mcap import is_latched
 from xethru_protocol.system import StopFlag, StopRequestedError, locked
 
 
@@ -107,13 +108,17 @@ def test_a_file_that_cannot_take_its_place_leaves_everything_as_it_was(
 
 
 def chunks_of(content: bytes | bytearray) -> list[int]:
-    """Return where the chunks of an MCAP file begin."""
-    at, chunks = 8, []
+    return records_of(content, 6)
+
+
+def records_of(content: bytes | bytearray, code: int) -> list[int]:
+    """Return where the records of one kind begin in an MCAP file."""
+    at, found = 8, []
     while at + 9 <= len(content):
-        if content[at] == 6:
-            chunks.append(at)
+        if content[at] == code:
+            found.append(at)
         at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
-    return chunks
+    return found
 
 
 @pytest.fixture
@@ -145,6 +150,39 @@ def test_it_says_what_is_lost_and_writes_it_into_the_file(
     n_left = {name: sum(f.radar == k for f in frames) for k, name in enumerate(row["frames"])}
     assert row["frames"] == {name: 60 - n_left[name] for name in ("radar0", "radar1")}
     assert row["from_ns"] <= gone[0] * FRAME_NS <= gone[-1] * FRAME_NS <= row["to_ns"]
+
+
+def test_damage_of_the_index_loses_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_session(tmp_path / "session.mcap", 60)
+    content = bytearray(path.read_bytes())
+    (data_end,) = records_of(content, 15)
+    content[data_end + 13] = 0  # the code of the first record of the index
+    path.write_bytes(content)
+    code, out, _ = run(capsys, "repair", path)
+    assert (code, "nothing that was recorded is lost" in out, "lost:" in out) == (0, True, False)
+
+
+def test_a_chunk_that_was_cut_out_whole_is_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_session(tmp_path / "session.mcap", 60)
+
+    def n_messages() -> int:  # but those that are repeated
+        with path.open("rb") as stream:
+            rows = make_reader(stream).iter_messages()
+            return sum(not is_latched(channel.metadata) for _, channel, _ in rows)
+
+    n_before = n_messages()
+    content = path.read_bytes()
+    chunks = chunks_of(content)
+    at = chunks[len(chunks) // 2]
+    (size,) = struct.unpack_from("<Q", content, at + 1)
+    path.write_bytes(content[:at] + content[at + 9 + size :])
+    code, out, _ = run(capsys, "repair", path)
+    assert (code, "nothing that was recorded is lost" in out) == (0, False)
+    assert f"lost: {n_before - n_messages()} messages" in out
 
 
 def gaps_in(path: Path) -> Iterator[Gap]:

@@ -304,6 +304,7 @@ BEFORE_LINES = b"""{"command": {
         lambda _: b'{"command": []}\n',
         lambda _: b'{"command": "seeds"}\n',
         lambda _: b"[" * 100_000 + b"\n",
+        lambda whole: whole.replace(b'"duration_s": ', b'"duration_s": 1e999, "was": ', 1),
     ],
 )
 def test_a_damaged_file_is_one_line_and_stays_as_it_is(
@@ -315,6 +316,19 @@ def test_a_damaged_file_is_one_line_and_stays_as_it_is(
     with pytest.raises(AppError, match="move this file away to begin anew"):
         PartFile(path, COMMAND)
     assert path.read_bytes() == before
+
+
+def test_a_run_that_is_there_twice_counts_once(tmp_path: Path) -> None:
+    part_with(path := tmp_path / "o.part", 2)
+    *lines, last = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines, last, last]))
+    assert PartFile(path, COMMAND).runs == runs()[:2]
+
+
+def test_a_pipe_in_place_of_the_part_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "o.json.part")
+    with StopFlag() as stop, pytest.raises(AppError, match="no regular file"):
+        run_sweep(stop, out=tmp_path / "o.json", n_seeds=1)
 
 
 def test_an_infinite_nees_is_kept_as_a_huge_one_and_a_diverged_run_is_named() -> None:
