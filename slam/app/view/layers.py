@@ -600,6 +600,10 @@ class MapLayer:
         )
         self._recording.row("map/landmarks/estimated", stamps, dots)
         self._recording.row("map/landmarks/ellipses", stamps, ellipses)
+        spans = [transform(snapshot.world_from_map, ends) for ends in snapshot.wall_spans_m]
+        walls = [screen(ends) for ends in spans if np.isfinite(ends).all()]
+        answered = rr.LineStrips2D(walls, colors=LANDMARK_RGB, radii=0.02, draw_order=34.0)
+        self._recording.row("map/landmarks/walls", stamps, answered)
         ground = self._ground
         top = np.array([[(ground.low_m[0] + ground.high_m[0]) / 2, ground.high_m[1]]])
         legend = rr.Points2D(

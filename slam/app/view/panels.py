@@ -62,8 +62,8 @@ A robot drives through a room and maps it with {n_radars} short-range radars, wh
 only. {data}
 
 * **Map** (left, metres, y up). {truth}Orange: where its *wheels* alone say it went. Blue: where
-  *radar SLAM* says, with the robot as a disk with an arrow. Red: *landmarks* it found, with
-  95 % ellipses, enlarged as the map says.
+  *radar SLAM* says, with the robot as a disk with an arrow. Red: *landmarks* and walls it found,
+  with 95 % ellipses, enlarged as the map says.
 * **Around the robot**: a grey wedge is what one radar can see. An echo has a distance but no
   direction, so it is an arc: **green** if it moved the estimate, **dim** if not. {points}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, constant part removed. A

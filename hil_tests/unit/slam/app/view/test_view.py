@@ -111,6 +111,13 @@ def test_ellipses_are_rotated_polygons(finished: Path) -> None:
     assert longest[0] * longest[1] < 0
 
 
+def test_the_walls_of_a_map_are_lines(tmp_path: Path) -> None:
+    spans = np.array([[[0.0, 1.0], [2.0, 1.5]], [[np.nan, 0.0], [1.0, 0.0]]])
+    path = drawn(tmp_path, replace(snapshot(0), wall_spans_m=spans))
+    _, (strip,) = next(rows(path, "/map/landmarks/walls", "LineStrips2D:strips"))
+    np.testing.assert_allclose(strip, [[0.0, -1.0], [2.0, -1.5]], rtol=1e-6)
+
+
 def test_ellipses_are_enlarged_as_the_map_says(tmp_path: Path) -> None:
     small = np.array([np.diag([4e-6, 1e-6])] * 2)
     state = replace(snapshot(0), landmark_covariances_m2=small, pose_covariance=1e-6 * np.eye(3))
