@@ -620,6 +620,7 @@ class McapWriter(Writer):
         # pins the minor version of mcap for this line; the tests of chunks cut by time and of
         # files never finished fail if the method does not write the pending chunk any more.
         self._Writer__finalize_chunk()  # type: ignore[attr-defined]  # see above
+        self._pack_indexes()
         self._n_chunks += 1
         if self.has_copies and self._n_chunks.bit_count() == 1:
             self.write_copy()
@@ -637,12 +638,35 @@ class McapWriter(Writer):
             if last is not None:
                 super().add_message(number, last.t_ns, last.data, last.publish_ns, sequence)
         self._Writer__finalize_chunk()  # type: ignore[attr-defined]
+        self._pack_indexes()
+
+    def _pack_indexes(self) -> None:
+        """Pack where the newest chunk's message indexes begin: the writer keeps it to the end."""
+        chunks = self._Writer__chunk_indices  # type: ignore[attr-defined]  # private as well
+        if chunks and isinstance(chunks[-1].message_index_offsets, dict):
+            chunks[-1].message_index_offsets = _Offsets(chunks[-1].message_index_offsets)
 
     def finish(self) -> None:
         if self.has_copies:
             self.end_chunk()
             self.write_copy()
         super().finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+
+
+class _Offsets:
+    """Where the message indexes of a chunk begin, by channel: ten bytes each, not a hundred."""
+
+    __slots__ = ("_packed",)
+    _ENTRY = struct.Struct("<HQ")
+
+    def __init__(self, offsets: Mapping[int, int]) -> None:
+        self._packed = b"".join(self._ENTRY.pack(*entry) for entry in offsets.items())
+
+    def __len__(self) -> int:
+        return len(self._packed) // self._ENTRY.size
+
+    def items(self) -> Iterator[tuple[Any, ...]]:
+        return self._ENTRY.iter_unpack(self._packed)
 
 
 @dataclass(frozen=True, slots=True)

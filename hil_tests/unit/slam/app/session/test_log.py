@@ -3,8 +3,10 @@
 import cmath
 import dataclasses
 import json
+import struct
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from slam.app.records import LogLine
 from slam.app.session import messages as ros
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
+from xethru_protocol.recordings.mcap import McapWriter
 
 N_SCANS = 300
 
@@ -282,6 +285,7 @@ from pathlib import Path
 from hil_tests.unit.slam.app.sessions import feed, session_info
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
+from xethru_protocol.recordings.mcap import McapWriter
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))  # as a disk with that much room
 log = SessionLog(Path(sys.argv[1]), session_info(), clock_ns=lambda: 0)
@@ -315,3 +319,39 @@ def test_a_disk_that_fills_up_keeps_every_whole_chunk(tmp_path: Path) -> None:
     last_s = [taken[-1].t_ns / 1e9, scan(len(taken)).t_ns / 1e9]
     assert any(f"its first {t_s:.1f} s are kept" in line for t_s in last_s)
     assert session.cut_at_byte == path.stat().st_size  # not within a chunk: that room was freed
+
+
+def test_the_index_leads_to_the_messages_of_every_channel(finished: Path) -> None:
+    """What programs seek by: each offset of a chunk's index is a record of that channel."""
+    content = finished.read_bytes()
+    chunks = summary_of(finished).chunk_indexes
+    assert len(chunks) > 3
+    for chunk in chunks:
+        assert len(chunk.message_index_offsets) > 3
+        for channel, at in chunk.message_index_offsets.items():
+            # opcode and length of the record, and its channel
+            assert struct.unpack_from("<BQH", content, at)[::2] == (0x07, channel)
+
+
+def test_a_chunk_leaves_little_in_memory(tmp_path: Path) -> None:
+    """An hour has thousands of chunks, and the index of each is written at the end."""
+    with (tmp_path / "s.mcap").open("wb") as stream:
+        writer = McapWriter(stream)
+        channels = [writer.add_channel(f"/{n}", "std_msgs/msg/Empty", b"", {}) for n in range(40)]
+
+        def write(n_chunks: int) -> None:
+            for _ in range(n_chunks):
+                for channel in channels:
+                    writer.add_message(channel, 1, b"\0" * 5, 1)
+                writer.end_chunk()
+
+        write(10)  # what is there once
+        tracemalloc.start()
+        try:
+            write(500)
+            kept = tracemalloc.get_traced_memory()[0]
+        finally:
+            tracemalloc.stop()
+        writer.finish()
+    # a dictionary of 40 offsets alone takes 3 kB
+    assert kept / 500 < 1500
