@@ -63,6 +63,9 @@ DEVICE_TIME, HOST_TIME, FRAME = "device_time", "host_time", "frame"
 
 _STATIC = " (static)"
 
+_FILE_BATCHES = rr.ChunkBatcherConfig(flush_tick=10.0, flush_num_bytes=4 << 20)
+"""Rerun keeps an entry of every chunk of a file until its end, so chunks are few."""
+
 _FILE_LIMIT_S = 20.0
 """Longest wait for Rerun to begin or to finish a file."""
 _VIEWER_CLOSE_LIMIT_S = 5.0
@@ -152,7 +155,9 @@ class Recording:
         self.sent: dict[str, int] = defaultdict(int)
         # Never `with` this stream: leaving the block closes the file and drops what follows.
         self._stream: rr.RecordingStream | None = rr.RecordingStream(
-            application_id, recording_id=recording_id
+            application_id,
+            recording_id=recording_id,
+            batcher_config=_FILE_BATCHES if isinstance(target, Path) else None,
         )
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
