@@ -13,6 +13,7 @@ import select
 import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -155,6 +156,11 @@ class StopRequestedError(BaseException):
         return 128 + int(self.received)
 
 
+_TWICE_S = 0.5
+"""A signal that comes again sooner is the same request: a wrapper around a command passes on what
+the terminal sent to both."""
+
+
 class StopFlag:
     """Catches SIGINT, SIGTERM and SIGHUP while it is entered.
 
@@ -165,13 +171,15 @@ class StopFlag:
     Parameters
     ----------
     second
-        What a second signal of the same kind gets: ``"default"``, the system's handler, which
-        ends the process where it stands (SIGHUP is ignored then: a closing terminal sends two);
+        What a second signal of the same kind gets: ``"default"``, half a second after the first or
+        later, the system's handler, which ends the process where it stands (a second SIGHUP is
+        ignored: a closing terminal sends two);
         ``"previous"``, the handler of before; ``"same"``, the same as the first.
     """
 
     def __init__(self, second: Literal["default", "previous", "same"] = "default") -> None:
         self.received: signal.Signals | None = None  # the last that arrived
+        self._received_s = 0.0
         self.requested = False  # by a signal or by `request`
         self._second = second
         self._previous: dict[signal.Signals, Any] = {}
@@ -259,16 +267,22 @@ class StopFlag:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         which = signal.Signals(number)
-        self.received = which
+        if self._second == "default" and self.received is which:
+            self._on_second(which)
+            return
+        self.received, self._received_s = which, time.monotonic()
         if self._leave is not None:
             self._leave(which)
-        if self._second == "default":
-            signal.signal(which, signal.SIG_IGN if which is signal.SIGHUP else signal.SIG_DFL)
-        elif self._second == "previous":
+        if self._second == "previous":
             signal.signal(which, self._previous[which])
         self.request()
         if self._at_once:
             self.check()
+
+    def _on_second(self, which: signal.Signals) -> None:
+        if which is not signal.SIGHUP and time.monotonic() - self._received_s >= _TWICE_S:
+            signal.signal(which, signal.SIG_DFL)
+            os.kill(os.getpid(), which)
 
 
 def open_closed_streams(*, replace: bool = True) -> None:

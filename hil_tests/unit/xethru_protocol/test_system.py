@@ -52,21 +52,33 @@ def test_while_waiting_a_signal_raises_where_it_arrives() -> None:
             pytest.fail(f"it waited to the end: {threading.Event().wait(seconds(10))}")
 
 
+_TWICE = """\
+import os, sys
+from signal import Signals
+from xethru_protocol import system
+which, system._TWICE_S = Signals[sys.argv[1]], float(sys.argv[2])
+with system.StopFlag() as stop:
+    os.kill(os.getpid(), which)
+    os.kill(os.getpid(), which)
+    try:
+        stop.check()
+    except system.StopRequestedError as stopped:
+        sys.exit(stopped.exit_code)
+"""
+
+
 @pytest.mark.parametrize(
-    ("which", "handler"),
-    [(signal.SIGINT, signal.SIG_DFL), (signal.SIGHUP, signal.SIG_IGN)],
+    ("which", "after_s", "code"),
+    [
+        ("SIGINT", "0", -signal.SIGINT),  # whoever waited and asks again wants an end at once
+        ("SIGINT", "60", 130),  # a wrapper passed on the one of the terminal
+        ("SIGTERM", "0", -signal.SIGTERM),
+        ("SIGHUP", "0", 129),  # a terminal that closes sends two
+    ],
 )
-def test_a_second_signal_gets_the_systems_default(
-    which: signal.Signals, handler: signal.Handlers
-) -> None:
-    """But for a terminal that closes: it sends two SIGHUP, and the stop stays clean."""
-    before = signal.getsignal(which)
-    with StopFlag() as stop:
-        os.kill(os.getpid(), which)
-        assert signal.getsignal(which) is handler
-        with pytest.raises(StopRequestedError):
-            stop.check()
-    assert signal.getsignal(which) is before
+def test_a_second_signal_gets_the_systems_default(which: str, after_s: str, code: int) -> None:
+    command = [sys.executable, "-c", _TWICE, which, after_s]
+    assert subprocess.run(command, check=False).returncode == code
 
 
 def test_a_second_signal_gets_the_previous_handler() -> None:
