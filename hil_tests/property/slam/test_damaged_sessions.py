@@ -83,7 +83,9 @@ def is_readable_after_repair(path: Path, *, with_rosbags: bool = True) -> list[t
 
 
 @pytest.mark.parametrize(
-    "n_places", [60, pytest.param(None, marks=[pytest.mark.thorough])], ids=["some", "all"]
+    "n_places",
+    [60, pytest.param(None, marks=[pytest.mark.thorough, pytest.mark.timeout(1800)])],
+    ids=["some", "all"],
 )
 def test_a_damaged_byte_in_the_head_loses_nothing(
     whole: bytes, tmp_path: Path, n_places: int | None

@@ -109,6 +109,7 @@ def test_a_session_of_an_older_version_shows_what_it_has(session: Path, tmp_path
     assert "/consistency/nis/band" not in rows
 
 
+@pytest.mark.thorough  # a whole run of SLAM
 def test_frames_without_states_go_through_slam(session: Path, tmp_path: Path) -> None:
     """Those of an imported session."""
     frames = without(session, tmp_path, "/slam/step", "/slam/state")

@@ -264,7 +264,9 @@ def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path
         assert not out.exists()
 
 
-@pytest.mark.parametrize(("name", "at_check"), [("s.mcap", 220), ("folder", 20)])
+@pytest.mark.parametrize(
+    ("name", "at_check"), [("s.mcap", 220), pytest.param("folder", 20, marks=pytest.mark.thorough)]
+)
 def test_a_killed_conversion_leaves_nothing_under_its_name(
     name: str, at_check: int, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
