@@ -237,7 +237,7 @@ class _Measurements:
 
 
 def _no_ranges() -> _Measurements:
-    whose = [(name, np.int32) for name in ("pose", "radar", "landmark")]
+    whose = [("pose", np.int32), ("radar", np.int16), ("landmark", np.int32)]
     where = [("antenna", np.float64, 2), ("range_m", np.float64), ("sigma_m", np.float64)]
     return _Measurements(np.dtype([*whose, *where, ("alone", np.bool_)]))
 
