@@ -110,7 +110,7 @@ def run_demo(
             stack.callback(log.close)
             view = RerunView(out / "session.rrd", info)
             sinks: list[SessionObserver] = [
-                Progress(info, trajectory.duration_ns, source.lost_frames),
+                Progress(info, source.lost_frames, end_ns=trajectory.duration_ns),
                 log,  # closed before the views: the record must not wait for them
                 *([live.observer(info)] if live is not None else []),
                 view,

@@ -151,7 +151,7 @@ def run_rig(
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [
-                Progress(info, None, source.lost_frames, also=lambda: _dropped_text(live))
+                Progress(info, source.lost_frames, also=lambda: _dropped_text(live))
             ]
             if view is not None:
                 sinks.append(view.observer(info))

@@ -228,7 +228,7 @@ def play(session: RecordedSession, sinks: Sequence[SessionObserver], stop: StopF
         The file is damaged other than by being cut, or has no state and cannot be replayed.
     """
     lost = LostFrames()
-    progress = Progress(session.info, None, lambda: lost.n_lost, end_ns=session.end_ns)
+    progress = Progress(session.info, lambda: lost.n_lost, end_ns=session.end_ns)
     if _has_state(session, stop):
         record = play_states(session, [lost, progress, *sinks], stop)
     else:

@@ -33,26 +33,22 @@ class Progress(SessionObserver):
 
     Parameters
     ----------
-    duration_ns
-        Session time the run will cover; None if unknown.
     lost_frames, also
         Called when a line is shown; `also` returns text to add.
     end_ns
-        Session time at which a recorded run ends; None if unknown.
+        Session time at which the run ends; None if unknown.
     """
 
     def __init__(
         self,
         info: SessionInfo,
-        duration_ns: int | None,
         lost_frames: Callable[[], int],
         *,
-        also: Callable[[], str] = str,
         end_ns: int | None = None,
+        also: Callable[[], str] = str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._end_ns = end_ns
-        self._n_radars, self._duration_ns = max(len(info.radars), 1), duration_ns
+        self._n_radars, self._end_ns = max(len(info.radars), 1), end_ns
         self._lost_frames, self._also, self._clock = lost_frames, also, clock
         self._is_terminal = STDERR.is_terminal
         # carriage return and erase: the live line stays one line
@@ -60,15 +56,13 @@ class Progress(SessionObserver):
         self._period_s = _LIVE_PERIOD_S if self._is_terminal else _PLAIN_PERIOD_S
         self._started = self._shown = clock()
         self._n_frames = self._t_ns = 0
-        self._start_ns: int | None = None
+        self._start_ns: int | None = None  # in the real world session time begins anywhere
         self._snapshot: Snapshot | None = None
 
     def on_scan(self, scan: Scan) -> None:
         self._n_frames += len(scan.frames)
-        if self._start_ns is None:  # in the real world session time begins anywhere
-            self._start_ns = 0 if self._duration_ns is not None else scan.t_ns
-            if self._end_ns is not None:
-                self._duration_ns = self._end_ns - self._start_ns
+        if self._start_ns is None:
+            self._start_ns = scan.t_ns
         self._t_ns = scan.t_ns - self._start_ns
         if self._clock() - self._shown >= self._period_s:
             self._show()
@@ -91,7 +85,10 @@ class Progress(SessionObserver):
         wall_s = max(self._clock() - self._started, 1e-9)
         rate = self._n_frames / self._n_radars / wall_s
         text = f"scene time {self._t_ns / NS_PER_S:6.1f} "
-        text += "s" if self._duration_ns is None else f"of {self._duration_ns / NS_PER_S:.1f} s"
+        if self._end_ns is None:
+            text += "s"
+        else:
+            text += f"of {(self._end_ns - (self._start_ns or 0)) / NS_PER_S:.1f} s"
         text += f"  {rate:5.0f} frames/s per radar"
         if self._snapshot is not None:
             state = self._snapshot

@@ -59,7 +59,8 @@ def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
     source = recorded_source(recorded, stop, comparison)
     with ExitStack() as held:
         hold_folder(out, held)
-        record = execute(source, [comparison, Progress(source.info, None, source.lost_frames)])
+        progress = Progress(source.info, source.lost_frames, end_ns=recorded.end_ns)
+        record = execute(source, [comparison, progress])
         if recorded.cut_at_byte is not None:
             note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")
         note(comparison.verdict())

@@ -62,7 +62,7 @@ def step_row(step: StepResult, wall_spans_m: Array) -> Array:
     Raises
     ------
     ValueError
-        A fix is not of detections of the step, or a rejected one is none of its fixes.
+        A fix was made of detections that the step lacks, or the step lacks a rejected fix.
     """
     report = step.report
     rows_of_detections = {id(detection): row for row, detection in enumerate(step.detections)}

@@ -50,7 +50,7 @@ def test_no_control_character_reaches_the_terminal(
     info = session_info()
     radars = (replace(info.radars[0], name=f"nose{HOSTILE}", serial=HOSTILE), info.radars[1])
     info = replace(info, scene=HOSTILE, radars=radars)
-    progress = Progress(info, None, lambda: 0)
+    progress = Progress(info, lambda: 0)
     progress.on_log(LogLine(t_ns=0, radar=HOSTILE, text=HOSTILE, warning=True))
     note(HOSTILE)
     print_table(HOSTILE, None, [(HOSTILE, HOSTILE, HOSTILE)])

@@ -209,7 +209,7 @@ class Terminal(io.StringIO):
 
 def test_the_line_has_time_rate_error_landmarks_and_losses() -> None:
     now = [0.0]
-    progress = Progress(session_info(), 100 * FRAME_NS, lambda: 3, clock=lambda: now[0])
+    progress = Progress(session_info(), lambda: 3, end_ns=100 * FRAME_NS, clock=lambda: now[0])
     for counter in range(51):
         progress.on_scan(scan(counter))
     progress.on_snapshot(snapshot(50))
@@ -224,7 +224,7 @@ def test_the_line_has_time_rate_error_landmarks_and_losses() -> None:
 def test_plain_lines_come_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     now, stream = [0.0], io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    progress = Progress(session_info(), FRAME_NS, lambda: 0, clock=lambda: now[0])
+    progress = Progress(session_info(), lambda: 0, end_ns=FRAME_NS, clock=lambda: now[0])
     for counter in range(31):
         now[0] = float(counter)
         progress.on_scan(scan(counter))
@@ -237,7 +237,7 @@ def test_plain_lines_come_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_terminal_gets_one_line_rewritten(monkeypatch: pytest.MonkeyPatch) -> None:
     now, stream = [0.0], Terminal()
     monkeypatch.setattr(sys, "stderr", stream)
-    progress = Progress(session_info(), FRAME_NS, lambda: 0, clock=lambda: now[0])
+    progress = Progress(session_info(), lambda: 0, end_ns=FRAME_NS, clock=lambda: now[0])
     for counter in range(20):
         now[0] = counter / 8
         progress.on_scan(scan(counter))
@@ -250,7 +250,7 @@ def test_a_terminal_gets_one_line_rewritten(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_warning_about_a_link_is_shown_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    progress = Progress(session_info(), FRAME_NS, lambda: 0)
+    progress = Progress(session_info(), lambda: 0, end_ns=FRAME_NS)
     progress.on_log(LogLine(t_ns=0, radar="left", warning=False, text="Ping"))
     progress.on_log(LogLine(t_ns=0, radar="left", warning=True, text="checksum"))
     assert stream.getvalue() == "warning: radar left: checksum\n"

@@ -247,7 +247,13 @@ def test_the_end_comes_from_the_index_without_a_pass_over_the_file(
     for n_bytes in (len(whole) - 1, len(whole) - 40, len(whole) // 2):
         cut.write_bytes(whole[:n_bytes])
         assert open_session(cut).end_ns is None
-    for wrong in (0, 1, len(whole) // 2, len(whole) - 20, 2**63):  # where the index is said to be
+    for wrong in (
+        0,
+        1,
+        len(whole) // 2,
+        len(whole) - 20,
+        2**63,
+    ):  # the footer's offset of the index
         cut.write_bytes(whole[:-28] + wrong.to_bytes(8, "little") + whole[-20:])
         open_session(cut)  # whatever it finds there
 
