@@ -194,6 +194,21 @@ class StepResult:
         return tuple(nis / _NIS_DOF for nis in self.nis)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SmoothedRun:
+    """The solution over all states of a run: each has seen all measurements, later ones, too.
+
+    Map frame, errors additive; the landmarks are those of the newest belief.
+    """
+
+    t_ns: NDArray[np.int64]  # shape (n,): session times of the states
+    poses: Array  # shape (n, 3): [x m, y m, heading rad], the heading in [-pi, pi)
+    pose_covariances: Array  # shape (n, 3, 3)
+    landmark_ids: tuple[int, ...]
+    landmarks_m: Array  # shape (m, 2)
+    landmark_covariances_m2: Array  # shape (m, 2, 2)
+
+
 class Slam(Protocol):
     """The paper's pipeline or the robust one; the map frame is the body frame at the first pose."""
 
@@ -222,4 +237,11 @@ class Slam(Protocol):
 
     def wall_spans_m(self) -> Array:
         """Return the ends of the reported stretches of wall, (k, 2, 2) [m], map frame."""
+        ...
+
+    def smoothed(self) -> SmoothedRun | None:
+        """Return the solution over all states until now; None if the pipeline has none.
+
+        What later steps return stays the same, to the last bit.
+        """
         ...

@@ -17,7 +17,7 @@ from slam.paper.association import update_map
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.ekf import motion_noise, predict, start
 from slam.paper.trilateration import NO_MOTIONS, Trilaterator
-from slam.results import Belief, PoseAt, StepResult
+from slam.results import Belief, PoseAt, SmoothedRun, StepResult
 
 Array = NDArray[np.float64]
 
@@ -60,6 +60,10 @@ class UwbRadarSlam:
     def wall_spans_m(self) -> Array:
         """Return none: the paper's map has points only."""
         return np.empty((0, 2, 2))
+
+    def smoothed(self) -> SmoothedRun | None:
+        """Return None: the paper filters only."""
+        return None
 
     def _take(
         self, detect: Callable[[], tuple[Detection, ...]], pose_at: PoseAt, t_ns: int

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slam.geometry import Rig
-from slam.results import PredictedRange, UpdateReport
+from slam.geometry import Rig, wrap_angles
+from slam.results import PredictedRange, SmoothedRun, UpdateReport
 from slam.robust.association import (
     Antennas,
     Continuation,
@@ -43,7 +44,7 @@ from slam.robust.kidnapping import Evidence, Localisation, evidence, forget, mer
 from slam.robust.map import Existence, Roundness
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.run_log import RunLog
-from slam.robust.smoother import is_due, relinearise
+from slam.robust.smoother import is_due, relinearise, solve_whole_run
 from slam.robust.state import Array, State, calibrated_motion, predict
 from slam.robust.walls import WallKeeper
 
@@ -132,6 +133,28 @@ class RobustBackEnd:
             if self._existence.is_reported(id_)
         ]
         return np.concatenate([np.empty((0, 2, 2)), *spans])
+
+    def smoothed(self, stamps_ns: NDArray[np.int64]) -> SmoothedRun | None:
+        """Return the solution over the whole run until now; None if there is none.
+
+        ``stamps_ns``, shape (n,), are the times of the n poses after the first one. The filter
+        stays as it is.
+        """
+        solved = solve_whole_run(self._log, self.state, self.parameters)
+        if solved is None:
+            return None
+        estimate, pose_covariances, covariances_m2 = solved
+        rows = self.reported_rows()
+        poses = estimate.poses[1:].copy()
+        poses[:, 2] = wrap_angles(poses[:, 2])
+        return SmoothedRun(
+            t_ns=stamps_ns,
+            poses=poses,
+            pose_covariances=pose_covariances[1:],
+            landmark_ids=tuple(self.state.landmark_ids[row] for row in rows),
+            landmarks_m=estimate.landmarks_m[rows],
+            landmark_covariances_m2=covariances_m2[rows],
+        )
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.

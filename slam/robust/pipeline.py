@@ -14,7 +14,8 @@ from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.geometry import Rig, between, has_moved
-from slam.results import Belief, PoseAt, StepResult
+from slam.packed import PackedRows
+from slam.results import Belief, PoseAt, SmoothedRun, StepResult
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters, RangeNoise
@@ -43,6 +44,7 @@ class RobustSlam:
         self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels, rules))
         self._detector = detector or make_detector(config)
         self._pose: Array | None = None  # odometry at the last state
+        self._stamps_ns = PackedRows(np.dtype(np.int64))  # of all states
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
@@ -65,6 +67,11 @@ class RobustSlam:
 
     def wall_spans_m(self) -> Array:
         return self.back_end.wall_spans_m()
+
+    def smoothed(self) -> SmoothedRun | None:
+        if not len(self._stamps_ns):
+            return None
+        return self.back_end.smoothed(self._stamps_ns.rows.copy())
 
     def _take(
         self,
@@ -91,6 +98,7 @@ class RobustSlam:
         back_end.predict(between(self._pose, pose))
         report = back_end.update(self._scans(detections, sigmas_m, moved))
         self._pose = pose
+        self._stamps_ns.append(t_ns)
         return (
             StepResult(
                 t_ns=t_ns,

@@ -426,6 +426,33 @@ def solve(equations: NormalEquations) -> tuple[Array, Array]:
     return chain.reshape(-1, left.size), border
 
 
+def covariances(left: Eliminated) -> tuple[Array, Array]:
+    """Return the marginal covariances of the eliminated poses, (k, 3, 3), and of the border.
+
+    With the blocks F of the factor, pose k is -F_kk^-T F_k+1,k^T x_k+1 and noise of covariance
+    F_kk^-T F_kk^-1 while the border is known; what the border adds is A^-1 B S^-1 B^T A^-1.
+    """
+    root = np.linalg.inv(np.linalg.cholesky(left.information))
+    by_border, _ = dtbtrs(left.factor, left.W @ root.T, uplo="L", trans="T")
+    size = left.size
+    by_border = by_border.reshape(-1, size, by_border.shape[1])[:, :3]
+    chain = by_border @ by_border.transpose(0, 2, 1)
+    diagonal, lower = (np.zeros((len(chain), size, size)) for _ in range(2))
+    for i in range(size):
+        for j in range(size):
+            if i >= j:
+                diagonal[:, i, j] = left.factor[i - j, j::size]
+            lower[:-1, i, j] = left.factor[size + i - j, j : -size or None : size]
+    inverses = np.linalg.inv(diagonal)
+    own = inverses.transpose(0, 2, 1) @ inverses
+    back = (lower @ inverses).transpose(0, 2, 1)
+    later = np.zeros((size, size))
+    for k in range(len(chain) - 1, -1, -1):
+        later = own[k] + back[k] @ later @ back[k].T
+        chain[k] += later[:3, :3]
+    return chain, root.T @ root
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
     """The least-squares estimate and its information."""
@@ -490,6 +517,20 @@ class Smoother:
         total += float(np.sum(self._walk_residual(estimate) ** 2))
         n_offsets = len(estimate.offsets_m)
         return total + prior_cost(self._problem.prior, first_values(estimate), n_offsets)
+
+    def covariances(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Return the covariances of all poses (k + 1, 3, 3) and of the border at a solution.
+
+        Errors are additive; residuals beyond the limit of outliers are left out.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            Something is not determined.
+        """
+        left = eliminate(self._equations(estimate, self._rule.outlier_sigmas))
+        chain, border = covariances(left)
+        return np.concatenate([chain, border[None, POSE, POSE]]), border
 
     def condensed(self, estimate: Estimate, n_steps: int, limit: float) -> Prior:
         """Return all measurements before pose ``n_steps`` as a prior on what is left.
@@ -630,6 +671,37 @@ def give_radius(
     return False
 
 
+def solve_whole_run(
+    log: RunLog, state: State, parameters: BackEndParameters
+) -> tuple[Estimate, Array, Array] | None:
+    """Return the solution over all poses since the start, or None if there is none.
+
+    With it the covariances of the poses (k + 1, 3, 3) and of the features (n, 2, 2), errors
+    additive. Nothing is changed.
+    """
+    prior = _start_prior(state, parameters)
+    # A landmark whose ranges are all left out as outliers stays where it is, and is unknown.
+    where = np.arange(len(prior.mean) - 2 * len(state.feature_ids), len(prior.mean))
+    prior.information[where, where] = _UNKNOWN**-2.0
+    prior.mean[where] = state.features.ravel()
+    prior = replace(prior, n_walls=len(state.wall_ids))
+    problem = log.problem(state, prior, whole=True)
+    smoother = Smoother(problem, parameters.relinearisation)
+    found = [smoother.solve(start) for start in log.starts(state, problem)]
+    solutions = [solution for solution in found if solution is not None]
+    if not solutions:
+        return None
+    best = min(solutions, key=lambda solution: solution.cost).estimate
+    try:
+        of_poses, border = smoother.covariances(best)
+    except np.linalg.LinAlgError:
+        return None
+    first, n = BORDER_HEAD + len(best.offsets_m), len(best.landmarks_m)
+    blocks = border[first:, first:].reshape(n, 2, n, 2)
+    each = np.arange(n)
+    return best, of_poses, blocks[each, :, each, :]
+
+
 def is_determined(information: Array) -> bool:
     """Return whether all unknowns of a solution are known to better than 100 m, rad or 1.
 
@@ -644,14 +716,17 @@ def _all_poses(
     log: RunLog, state: State, parameters: BackEndParameters
 ) -> tuple[Smoother, Estimate]:
     """Return the problem of all poses and the better of the values to start from."""
-    prior = start_prior(
+    problem = log.problem(state, _start_prior(state, parameters))
+    smoother = Smoother(problem, parameters.relinearisation)
+    return smoother, min(log.starts(state, problem), key=smoother.cost)
+
+
+def _start_prior(state: State, parameters: BackEndParameters) -> Prior:
+    return start_prior(
         parameters.wheels.calibration_sigmas,
         (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
         len(state.feature_ids),
     )
-    problem = log.problem(state, prior)
-    smoother = Smoother(problem, parameters.relinearisation)
-    return smoother, min(log.starts(state, problem), key=smoother.cost)
 
 
 def _replace(state: State, solution: Solution) -> None:

@@ -189,6 +189,7 @@ class PromptSlam:
         self._cleanup = ExitStack()
         self.config, self.step_detections = slam.config, slam.step_detections
         self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
+        self.smoothed = slam.smoothed
 
     def __enter__(self) -> Self:
         previous = signal.signal(signal.SIGALRM, self._give_up)

@@ -45,6 +45,7 @@ class _RecordedSlam:
         self.config = slam.config
         self.step_detections = slam.step_detections
         self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
+        self.smoothed = slam.smoothed
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.special import chdtri
 
 from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate, step_of
@@ -211,6 +212,56 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(walk: flo
     wanted = np.linalg.inv(J.T @ J)[np.ix_(keep, keep)]
     marginal = np.linalg.inv(solution.information)
     assert np.abs(marginal - wanted).max() <= 1e-4 * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("walk", [0.0, 1e-5])
+def test_covariances_of_all_poses_are_blocks_of_the_dense_inverse(walk: float) -> None:
+    problem, start = short_run(3, walk)
+    solution = Smoother(problem, RULE).solve(start, tolerance=1e-14)
+    assert solution is not None
+    n_cal, n_poses = len(start.calibration), N_STEPS + 1
+    J = complex_step(
+        lambda y: white_residuals(problem, N_STEPS, n_poses, n_cal, y), packed(solution.estimate)
+    )
+    dense = np.linalg.inv(J.T @ J)
+    of_poses, of_border = Smoother(problem, RULE).covariances(solution.estimate)
+    wanted = [dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(n_poses)]
+    assert of_poses.shape == (n_poses, 3, 3)
+    assert np.abs(of_poses - wanted).max() <= 1e-8 * np.abs(wanted).max()
+    keep = newest(n_poses, n_cal, len(dense))
+    assert np.abs(of_border - dense[np.ix_(keep, keep)]).max() <= 1e-8 * np.abs(dense).max()
+
+
+def test_the_smoothed_run_is_asked_for_without_a_trace_and_nearer_to_the_truth() -> None:
+    run = simulate(LAB, 5, 4e-3, laps=2, labelled=True)
+    asked, silent = (RobustBackEnd(paper_rig(), parameters_for(LAB, 4e-3)) for _ in range(2))
+    n_states = 500
+    stamps_ns = 200_000_000 * np.arange(1, n_states + 1)
+    for back_end in (asked, silent):
+        for k, (increment, scans) in enumerate(
+            zip(run.increments[:n_states], run.scans[:n_states], strict=True)
+        ):
+            back_end.predict(increment)
+            back_end.update(scans)
+            if back_end is asked and k in {200, 400}:
+                back_end.smoothed(stamps_ns[: k + 1])
+    assert np.array_equal(asked.pose, silent.pose)
+    assert np.array_equal(asked.pose_covariance, silent.pose_covariance)
+    smoothed = asked.smoothed(stamps_ns)
+    assert smoothed is not None
+    assert len(smoothed.t_ns) == len(smoothed.poses) == len(smoothed.pose_covariances) == n_states
+    rows = asked.reported_rows()
+    assert smoothed.landmark_ids == tuple(asked.state.landmark_ids[row] for row in rows)
+    assert len(rows) > 5
+    # The newest pose has seen no more than the filter's; half a lap back, a loop has been closed.
+    assert np.abs(smoothed.poses[-1] - asked.pose).max() < 3e-3
+    errors = smoothed.poses[:, :2] - run.poses[1 : n_states + 1, :2]
+    assert np.linalg.norm(errors, axis=1).max() < 0.01
+    nees = [
+        float(e @ np.linalg.solve(P, e))
+        for e, P in zip(errors, smoothed.pose_covariances[:, :2, :2], strict=True)
+    ]
+    assert np.mean(nees[20:]) < chdtri(2, 1e-3)
 
 
 @pytest.mark.parametrize("walk", [0.0, 1e-5])

@@ -166,6 +166,9 @@ class StubbornSlam:
         self.n_flushed += 1
         return ()
 
+    def smoothed(self) -> None:
+        return None
+
     def wall_spans_m(self) -> NDArray[np.float64]:
         return np.empty((0, 2, 2))
 

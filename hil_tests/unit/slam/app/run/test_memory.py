@@ -53,6 +53,9 @@ class FullMap:
     def flush(self) -> tuple[StepResult, ...]:
         return ()
 
+    def smoothed(self) -> None:
+        return None
+
     def wall_spans_m(self) -> NDArray[np.float64]:
         return np.empty((0, 2, 2))
 

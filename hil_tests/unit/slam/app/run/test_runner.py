@@ -48,6 +48,9 @@ class LateSlam:
     def flush(self) -> tuple[StepResult, ...]:
         return tuple(self.waiting)
 
+    def smoothed(self) -> None:
+        return None
+
     def wall_spans_m(self) -> NDArray[np.float64]:
         return np.array([[[0.0, 1.0], [2.0, 1.0]]])
 
