@@ -190,7 +190,8 @@ class MatchedFilterConfig(_Model):
     noise_sigma: NonNegative = 0.0
     # Unexplained over expected energy from which ``joint`` looks for several pulses.
     max_single_misfit: Positive = 4.0
-    # Relative amplitude by which a real pulse may differ from the model; less is no second echo.
+    # Relative error of the pulse: energy of its difference from the real one over its own, root. A
+    # width 10 % off is 0.07. Less is no second echo, and five eighths of it are no misfit.
     model_error: NonNegative = 0.08
 
 
@@ -358,11 +359,8 @@ class RobustConfig(_Model):
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
     # How sure a prediction must be for a single range to continue a track, and the standard
     # deviation of every range of a front end that predicts none.
-    range_sigma_m: Positive = 2.8e-3
-    # The variance of a range as a share of what the front end predicts, for no misfit and per
-    # square of the misfit; and what that leaves out, added to it in squares.
-    predicted_share: Positive = 1.0
-    misfit_share: NonNegative = 0.0
+    range_sigma_m: Positive = 5e-3
+    # What the front end's own deviation leaves out (the shape of targets), added in squares.
     range_floor_m: NonNegative = 0.0
     # Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it. The
     # ranges of a tracklet, decided on together, keep it.
@@ -418,6 +416,8 @@ REMOVED_KEYS: Mapping[str, str | float] = {
     "leakage.max_range_m": 0.45,
     "leakage.memory_frames": 50.0,
     "robust.calibrated_offset_sigma_m": 0.0,
+    "robust.misfit_share": 0.0,
+    "robust.predicted_share": 1.0,
     "trilateration.bearing": "ranges",
 }
 """Settings that no longer exist, with their defaults in the last version that had them."""

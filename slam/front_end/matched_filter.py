@@ -25,9 +25,18 @@ Echoes
     is the Cramer-Rao bound of the position with unknown amplitude and phase
     (``PulseModel.position_bound_bins``).
 Misfit
-    Energy of y minus the fitted pulse at nine points within 2 s of the peak (s the envelope's
-    sigma), over what noise leaves there when amplitude, phase and position are fitted: per point
-    2 - (2 + d**2 / (2 s**2)) rho(d)**2 in units of sigma_y**2, d the distance from the peak.
+    Energy of y minus the fitted pulses at nine points within 2 s of the peak (s the envelope's
+    sigma), over what is expected there:
+
+        sigma_y**2 n + m**2 E,   E = sum over points n and echoes k of A_k**2 rho(n - u_k)**2
+
+    n is what noise leaves when amplitude, phase and position are fitted, per point
+    2 - (2 + d**2 / (2 s**2)) rho(d)**2, d the distance from the peak; m is what a wrong pulse
+    leaves near the peak as a share of the echo, ``_NEAR_PEAK`` times the pulse's relative error.
+Deviation
+    The bound above with the noise raised by what the wrong pulse of every other echo leaves at
+    this one: sigma_y**2 + m**2 sum over k of A_k**2 rho(u - u_k)**2. The echo's own wrong pulse
+    shifts every echo of a module alike: that is part of its range offset.
 Joint
     Where peaks overlap or one is not one pulse, and the misfit is more than the pulse's own
     uncertain shape leaves, :mod:`slam.front_end.overlapping` decides how many echoes there are and
@@ -39,7 +48,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +65,7 @@ from slam.front_end.overlapping import (
     fit_echoes,
     fit_whole_echoes,
 )
-from slam.front_end.pulse import ComplexArray, PulseModel
+from slam.front_end.pulse import ComplexArray, ModulePulse, PulseModel
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -92,25 +101,30 @@ _FILTERED_REACH = 8.0
 _POSITION, _AMPLITUDE, _PHASE, _SIGMA = range(4)
 # Most echoes that a group is taken apart into.
 _MAX_ECHOES = 4
-# A second look is worth while where this part of the pulse's own possible error is exceeded.
-_SUSPICIOUS = 0.5
+# What a wrong pulse may leave near the peak of one that is fitted, over its relative error: 0.46 to
+# 0.50 for a wrong width, 0.27 for skew, 0.37 for ringing, 0.45 for all of them; and a quarter more
+_NEAR_PEAK = 0.625
 _NEIGHBOURS = np.array([[-1], [0], [1]])
 # A float32 frame says its samples to this part of the largest; noise is never less.
 _RESOLUTION = float(np.finfo(np.float32).eps)
 
 
 class PulseFilter:
-    """Correlation of frames of one length with one pulse; parameters as in `threshold_sigmas`."""
+    """Correlation of frames of one length with the pulse of one module.
+
+    ``false_alarms`` and ``noise_is_known`` are those of `threshold_sigmas`.
+    """
 
     def __init__(
         self,
-        pulse: PulseModel,
+        module: ModulePulse,
         n_bins: int,
         bin_length_m: float,
         *,
         false_alarms: float,
         noise_is_known: bool,
     ) -> None:
+        pulse, taps = module.model, module.equaliser
         half = pulse.half_length(bin_length_m)
         template = pulse.samples(np.zeros(1), bin_length_m)[0]
         energy = float(np.sum(np.abs(template) ** 2))
@@ -119,16 +133,26 @@ class PulseFilter:
         self.bin_length_m = bin_length_m
         self.sigma_bins = pulse.sigma_bins(bin_length_m)
         self.carrier_rad = pulse.carrier_rad(bin_length_m)
-        self.noise_gain = math.sqrt(2 / energy)
-        """sigma_y over sigma of white noise per RF sample."""
+        reach = n_bins + half + (0 if taps is None else taps.size // 2)
         # The next power of two, or three quarters of it: transforms of other lengths are slower.
-        power_of_two = 1 << (n_bins + half - 1).bit_length()
-        enough = power_of_two // 4 * 3 >= n_bins + half
+        power_of_two = 1 << (reach - 1).bit_length()
+        enough = power_of_two // 4 * 3 >= reach
         self._n_fft = power_of_two // 4 * 3 if enough else power_of_two
-        # The whole spectrum at once is real: the pulse is even but for its carrier.
         placed = np.zeros(self._n_fft, dtype=np.complex128)
         placed[np.arange(-half, half + 1)] = template * (2 / energy)
+        # The whole spectrum at once is real: the pulse is even but for its carrier.
         spectrum = np.fft.fft(placed).real
+        self.noise_gain = math.sqrt(2 / energy)
+        """sigma_y over sigma of white noise per RF sample, behind the equaliser if there is one."""
+        self.told_noise_gain = self.noise_gain
+        """The same before the equaliser."""
+        self._equaliser: ComplexArray | None = None
+        if taps is not None:
+            kernel = np.zeros(self._n_fft)
+            kernel[np.arange(taps.size) - taps.size // 2] = taps
+            self._equaliser = np.fft.rfft(kernel)
+            both = np.abs(spectrum * np.fft.fft(kernel)) ** 2
+            self.told_noise_gain = math.sqrt(0.5 * float(np.mean(both)))
         self._spectrum = spectrum[: self._n_fft // BINS_PER_STEP] / BINS_PER_STEP
         self._n_steps = math.ceil(n_bins / BINS_PER_STEP)
         self._stride = max(1, int(_STRIDE_SIGMAS * self.sigma_bins / BINS_PER_STEP))
@@ -144,6 +168,9 @@ class PulseFilter:
         """Energy of a pulse of amplitude 1 at the probes."""
         self.probe_noise = float(np.sum(2 - (2 + 0.5 * self.probe_sigmas**2) * rho_sq))
         """Energy at the probes, over sigma_y**2, that noise leaves once a pulse is fitted."""
+        self.pulse_error = module.error
+        self.left_near_peak = _NEAR_PEAK * module.error
+        """What a wrong pulse leaves near the peak, relative to the amplitude."""
         self.threshold = threshold_sigmas(
             n_bins / self.sigma_bins, false_alarms, noise_is_known=noise_is_known
         )
@@ -154,6 +181,13 @@ class PulseFilter:
         half = np.fft.rfft(samples, self._n_fft)[..., : self._spectrum.size] * self._spectrum
         y: ComplexArray = fft.ifft(half, overwrite_x=True)[..., : self._n_steps]
         return y
+
+    def equalised(self, samples: Array) -> Array:
+        """Return one frame, shape (n_bins,), as if the module's pulse were the fitted one."""
+        if self._equaliser is None:
+            return samples
+        spectrum = np.fft.rfft(samples, self._n_fft) * self._equaliser
+        return np.fft.irfft(spectrum, self._n_fft)[: self.n_bins]
 
     def noise_power(self, power: Array) -> float:
         """Return sigma_y**2 from ``|y|**2`` of one frame, shape (n_steps,)."""
@@ -370,11 +404,14 @@ def _render(table: Array, pulse_filter: PulseFilter) -> Array:
 
 def _misfit(table: Array, filtered: Filtered) -> Array:
     """Return the misfit of each echo where all echoes together are the model."""
+    if not len(table):
+        return np.empty(0)
     pulse_filter = filtered.pulse_filter
     nearest = np.rint(table[:, _POSITION] / BINS_PER_STEP).astype(np.intp)
     steps = nearest[:, np.newaxis] + pulse_filter.probes
     reach = pulse_filter.pulse.half_length(pulse_filter.bin_length_m)
-    first, last = table[[0, -1], _POSITION] if len(table) else (0.0, 0.0)
+    at = BINS_PER_STEP * steps.astype(np.float64)
+    first, last = table[[0, -1], _POSITION]
     if filtered.usable is None and first >= reach and last < pulse_filter.n_bins - reach:
         steps = steps.ravel()
         left = filtered.y[steps] - _correlated(table, steps, pulse_filter)
@@ -385,7 +422,36 @@ def _misfit(table: Array, filtered: Filtered) -> Array:
             residual *= filtered.usable
         left = pulse_filter.apply(residual).take(steps, mode="clip")
     energy: Array = np.sum(left.real**2 + left.imag**2, axis=1)
-    return energy / (filtered.sigma_y**2 * pulse_filter.probe_noise)
+    return energy / _expected(table[:, _POSITION], table[:, _AMPLITUDE], at, filtered)
+
+
+def _expected(position_bins: Array, amplitude: Array, at: Array, filtered: Filtered) -> Array:
+    """Return the energy that noise and a wrong pulse leave at points (k, n) [bins], shape (k,)."""
+    pulse_filter = filtered.pulse_filter
+    wrong = pulse_filter.left_near_peak**2 * _echo_power(
+        position_bins, amplitude, at, pulse_filter
+    ).sum(axis=1)
+    expected: Array = filtered.sigma_y**2 * pulse_filter.probe_noise + wrong
+    return expected
+
+
+def _echo_power(
+    position_bins: Array, amplitude: Array, at: Array, pulse_filter: PulseFilter
+) -> Array:
+    """Return the sum of A**2 rho**2 of all echoes at positions [bins] of any shape."""
+    away = (at[..., np.newaxis] - position_bins) / pulse_filter.sigma_bins
+    power: Array = np.exp(-0.5 * away**2) @ amplitude**2
+    return power
+
+
+def _raised_by_neighbours(peaks: Peaks, filtered: Filtered) -> Array:
+    """Return by what a wrong pulse of the others raises each deviation, shape (k,)."""
+    at, amplitude = peaks.position_bins, peaks.amplitude
+    others = _echo_power(at, amplitude, at, filtered.pulse_filter)
+    others = np.maximum(others - amplitude**2, 0.0)
+    wrong = (filtered.pulse_filter.left_near_peak / filtered.sigma_y) ** 2 * others
+    raised: Array = np.sqrt(1 + wrong)
+    return raised
 
 
 class MatchedFilterDetector:
@@ -394,12 +460,21 @@ class MatchedFilterDetector:
     def __init__(self, config: SlamConfig) -> None:
         settings = config.matched_filter
         self.config = config
-        self.pulse = PulseModel(carrier_hz=settings.carrier_hz, bandwidth_hz=settings.bandwidth_hz)
-        self._joint = config.detection.front_end is FrontEnd.JOINT
-        self._split = SplitTest(
-            max_echoes=_MAX_ECHOES if self._joint else 1, model_error=settings.model_error
+        self._nominal = ModulePulse(
+            model=PulseModel(carrier_hz=settings.carrier_hz, bandwidth_hz=settings.bandwidth_hz),
+            error=settings.model_error,
         )
-        self._filters: dict[tuple[int, float], PulseFilter] = {}
+        self._pulses: dict[int, ModulePulse] = {}
+        self._joint = config.detection.front_end is FrontEnd.JOINT
+        self._filters: dict[tuple[int, int, float], PulseFilter] = {}
+
+    def set_pulse(self, radar: int, pulse: ModulePulse | None) -> None:
+        """Take the echoes of one radar as this pulse from now on; None: as the configured one."""
+        if pulse is None:
+            self._pulses.pop(radar, None)
+        else:
+            self._pulses[radar] = pulse
+        self._filters = {key: each for key, each in self._filters.items() if key[0] != radar}
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         limits = self.config.detection
@@ -442,29 +517,37 @@ class MatchedFilterDetector:
         are fitted anew.
         """
         filtered = self._filtered(frame)
-        found, unexplained = _single_pulses(filtered)
+        peaks = self._fitted_peaks(filtered, within_m)
+        if not peaks.position_bins.size:
+            return peaks
+        return replace(peaks, sigma_bins=peaks.sigma_bins * _raised_by_neighbours(peaks, filtered))
+
+    def _fitted_peaks(self, filtered: Filtered, within_m: tuple[float, float]) -> Peaks:
+        pulse_filter = filtered.pulse_filter
+        found, several = _single_pulses(filtered, self.config.matched_filter.max_single_misfit)
         again = cut_pulses(found.position_bins, filtered)
         if self._joint:
-            settings = self.config.matched_filter
-            several = found.misfit > settings.max_single_misfit
-            several &= unexplained > (_SUSPICIOUS * settings.model_error) ** 2
             again = several if again is None else again | several
         if again is None:
             return found
-        reach = OVERLAP * filtered.pulse_filter.sigma_bins
-        again &= found.position_bins > within_m[0] / frame.bin_length_m - reach
-        again &= found.position_bins < within_m[1] / frame.bin_length_m + reach
+        reach = OVERLAP * pulse_filter.sigma_bins
+        again &= found.position_bins > within_m[0] / pulse_filter.bin_length_m - reach
+        again &= found.position_bins < within_m[1] / pulse_filter.bin_length_m + reach
         if not again.any():
             return found
-        return refit(found, again, filtered, self._split)
+        split = SplitTest(
+            max_echoes=_MAX_ECHOES if self._joint else 1,
+            model_error=pulse_filter.pulse_error,
+        )
+        return refit(found, again, filtered, split)
 
     def _filter(self, frame: RadarFrame) -> PulseFilter:
-        key = frame.samples.size, frame.bin_length_m
+        key = frame.radar, frame.samples.size, frame.bin_length_m
         if key not in self._filters:
             settings = self.config.matched_filter
             self._filters[key] = PulseFilter(
-                self.pulse,
-                *key,
+                self._pulses.get(frame.radar, self._nominal),
+                *key[1:],
                 false_alarms=settings.false_alarms_per_frame,
                 noise_is_known=settings.noise_sigma > 0,
             )
@@ -481,10 +564,11 @@ class MatchedFilterDetector:
             lowest, highest = float(samples.min()), float(samples.max())
         # A constant frame must come out as nothing, not as the two steps at its ends.
         samples -= np.add.reduce(samples) / samples.size
+        samples = pulse_filter.equalised(samples)
         y = pulse_filter.apply(samples)
         power = y.real**2 + y.imag**2
         configured = self.config.matched_filter.noise_sigma
-        sigma_y = configured * pulse_filter.noise_gain
+        sigma_y = configured * pulse_filter.told_noise_gain
         if not configured:
             sigma_y = math.sqrt(pulse_filter.noise_power(power))
         sigma_y = max(sigma_y, _RESOLUTION * max(highest, -lowest))
@@ -498,8 +582,8 @@ class MatchedFilterDetector:
         )
 
 
-def _single_pulses(filtered: Filtered) -> tuple[Peaks, Array]:
-    """Return every peak as one pulse, and the part of its energy that the pulse leaves."""
+def _single_pulses(filtered: Filtered, max_misfit: float) -> tuple[Peaks, BoolArray]:
+    """Return every peak as one pulse, and which leave more than noise and a wrong pulse would."""
     y, power, sigma_y = filtered.y, filtered.power, filtered.sigma_y
     pulse_filter = filtered.pulse_filter
     at = (power[1:-1] > (pulse_filter.threshold * sigma_y) ** 2).nonzero()[0] + 1
@@ -520,12 +604,19 @@ def _single_pulses(filtered: Filtered) -> tuple[Peaks, Array]:
     away = pulse_filter.probe_sigmas - (offset / s)[:, np.newaxis]
     around -= amplitude[:, np.newaxis] * np.exp(-0.25 * (away * away))
     left = np.vecdot(around, around).real
+    several = left > max_misfit * sigma_y**2 * pulse_filter.probe_noise
+    several &= left > pulse_filter.left_near_peak**2 * pulse_filter.probe_energy * amplitude**2
+
+    position = BINS_PER_STEP * at + offset
+    phase = np.arctan2(at_peak.imag, at_peak.real) + kappa * offset
+    sigma = math.sqrt(2) * s * sigma_y / amplitude
+    probed = BINS_PER_STEP * (at[:, np.newaxis] + pulse_filter.probes).astype(np.float64)
     peaks = Peaks(
-        position_bins=BINS_PER_STEP * at + offset,
+        position_bins=position,
         amplitude=amplitude,
-        phase_rad=np.arctan2(at_peak.imag, at_peak.real) + kappa * offset,
-        sigma_bins=math.sqrt(2) * s * sigma_y / amplitude,
-        misfit=left / (sigma_y**2 * pulse_filter.probe_noise),
+        phase_rad=phase,
+        sigma_bins=sigma,
+        misfit=left / _expected(position, amplitude, probed, filtered),
         saturated=np.zeros(at.size, dtype=np.bool_),
     )
-    return peaks, left / (amplitude**2 * pulse_filter.probe_energy)
+    return peaks, several

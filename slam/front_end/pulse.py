@@ -94,3 +94,20 @@ class PulseModel:
         0.91
         """
         return 2 / snr * math.sqrt(self.sigma_bins(bin_length_m) / math.sqrt(math.pi))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModulePulse:
+    """The pulse of one module as the front end takes it: a Gaussian, its error, and an equaliser.
+
+    ``MatchedFilterDetector.set_pulse`` gives one to a radar; until then the configured one holds.
+    """
+
+    model: PulseModel
+    # Relative error of the model, behind the equaliser if there is one: root of the energy of its
+    # difference from the real pulse, over the energy of the pulse. It scales what a second echo
+    # must explain, the misfit, and the deviation of echoes near others.
+    error: float
+    # Real filter, shape (2 h + 1,), that turns the module's pulse into the model: convolved with
+    # the samples of a frame, its middle at delay zero. None: echoes are the model as they come.
+    equaliser: Array | None = None

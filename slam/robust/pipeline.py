@@ -117,10 +117,7 @@ class RobustSlam:
             return config.range_sigma_m
         if detection.misfit > config.max_misfit or detection.sigma_m > config.max_predicted_sigma_m:
             return math.inf
-        variance = config.predicted_share
-        if not math.isnan(detection.misfit):
-            variance += config.misfit_share * detection.misfit**2
-        return math.hypot(config.range_floor_m, math.sqrt(variance) * detection.sigma_m)
+        return math.hypot(config.range_floor_m, detection.sigma_m)
 
     def _scans(
         self,

@@ -19,7 +19,7 @@ from slam.front_end.overlapping import (
     fit_whole_echoes,
     split_threshold,
 )
-from slam.front_end.pulse import PulseModel
+from slam.front_end.pulse import ModulePulse, PulseModel
 
 Array = NDArray[np.float64]
 
@@ -263,7 +263,9 @@ MODEL_SIGMA = MODEL.sigma_bins(BIN_M)
 MODEL_CARRIER = MODEL.carrier_rad(BIN_M)
 N_WHOLE = 240
 FIRST, LAST = 90.0, 150.0
-FILTER = PulseFilter(MODEL, N_WHOLE, BIN_M, false_alarms=0.1, noise_is_known=True)
+FILTER = PulseFilter(
+    ModulePulse(model=MODEL, error=0.0), N_WHOLE, BIN_M, false_alarms=0.1, noise_is_known=True
+)
 MARGIN = round(1.5 * MODEL_SIGMA)
 
 

@@ -141,19 +141,13 @@ def test_echoes_of_several_targets_are_left_out_and_told() -> None:
     assert result.range_sigmas_m[len(good) :] == (math.inf,) * len(bad)
 
 
-@pytest.mark.parametrize(
-    ("misfit", "variance_mm2"), [(0.0, 4.5), (0.5, 5.0), (1.4, 8.42), (math.nan, 4.5)]
-)
-def test_a_range_is_as_sure_as_its_misfit_tells(misfit: float, variance_mm2: float) -> None:
-    """Variance (share + share of misfit^2) sigma^2 + floor^2, sigma 1 mm, by hand."""
-    told = {"predicted_share": 0.5, "misfit_share": 2.0, "range_floor_m": 2e-3}
-    slam = robust(override(ROBUST, {f"robust.{key}": value for key, value in told.items()}))
+def test_the_floor_is_added_in_squares_to_what_the_front_end_predicts() -> None:
+    """Of 1 mm and 2.4 mm, by hand."""
+    slam = robust(override(ROBUST, {"robust.range_floor_m": 2.4e-3}))
     slam.step_detections((), straight, 0)
-    (result,) = slam.step_detections(
-        echoes(straight(TICK_NS), 0, TICK_NS, misfit=misfit), straight, TICK_NS
-    )
-    expected_m = 1e-3 * math.sqrt(variance_mm2)
-    assert result.range_sigmas_m == pytest.approx([expected_m] * len(result.detections))
+    seen = echoes(straight(TICK_NS), 0, TICK_NS)
+    (result,) = slam.step_detections(seen, straight, TICK_NS)
+    assert result.range_sigmas_m == pytest.approx([2.6e-3] * len(seen))
 
 
 def test_a_blurred_echo_is_no_miss_of_what_it_may_hide_and_an_empty_frame_is() -> None:
