@@ -79,8 +79,10 @@ _SCALE = (151 / 315) ** -0.5 / UNITS_PER_SIGMA
 _FIRST_KNOT = 1 << 40
 
 _JITTER_INSTANTS_PER_KNOT = 16
-_MOST_INSTANTS_KEPT = 64
 _COUNTERS_AT_ONCE = 256
+# What is worked on stays in the processor's cache, a block of frames does not.
+_FRAMES_AT_ONCE = 4
+_VALUES_AT_ONCE = 4096
 
 GRIDS = ((0.054, 0.16), (0.239, 0.24), (1.205, 0.60))
 """Spacing of the clutter's knots in correlation times, and share of the variance, fastest first."""
@@ -132,56 +134,96 @@ class SlowNoise:
             Rng(seed, stream_of(serial, purpose, part)).below(period_ns)
             for part, period_ns in enumerate(periods_ns, len(grids))
         )
-        self._knots = np.empty((len(grids) * _KNOTS, n_values))
-        self._first_knots: list[int | None] = [None] * len(grids)
+        self._n_values = n_values
+        none_yet = _Knots(numbers=np.empty(0, dtype=np.int64), values=np.empty((0, n_values)))
+        self._held = [none_yet] * len(grids)
 
-    def instant_before(self, time_ns: int) -> tuple[int, float]:
-        """Return the instant before a scene time and the fraction of the way to the next.
+    def instants_before(
+        self, times_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the instants before scene times and the fractions of the way to the next.
 
-        Ask `values_at` for it and its successor.
+        Shape (n,) each, like ``times_ns``. Ask `values_at` for them and their successors.
         """
-        instant, rest_ns = divmod(time_ns + self._instants_offset_ns, self._instant_ns)
-        return instant, rest_ns / self._instant_ns
+        instants, rest_ns = np.divmod(times_ns + self._instants_offset_ns, self._instant_ns)
+        return instants, rest_ns / self._instant_ns
 
-    def values_at(self, instant: int) -> NDArray[np.float64]:
-        """Return the values at an instant, shape (n_values,), float64."""
-        weights: list[float] = []
+    def values_at(self, instants: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the values at instants of shape (n,): shape (n, n_values), float64."""
+        knots: list[NDArray[np.float64]] = []
+        weights: list[NDArray[np.float64]] = []
+        places: list[NDArray[np.int64]] = []
+        n_knots = 0
         for member, grid in enumerate(self._grids):
-            since_ns = instant * self._instant_ns + self._offsets_ns[member]
-            first_knot, rest_ns = divmod(since_ns, grid.spacing_ns)
+            since_ns = instants * self._instant_ns + self._offsets_ns[member]
+            first_knot, rest_ns = np.divmod(since_ns, grid.spacing_ns)
             weights += _cubic_weights(rest_ns / grid.spacing_ns, grid.sigma * _SCALE)
-            self._move_to(member, first_knot)
-        # einsum multiplies and adds in loops of its own, never by BLAS
-        values: NDArray[np.float64] = np.einsum("k,kn->n", np.array(weights), self._knots)
+            held, place = self._with_knots(member, first_knot)
+            places += [n_knots + place + row for row in range(_KNOTS)]
+            knots.append(held)
+            n_knots += len(held)
+        weight, place, knot = (
+            np.stack(weights, axis=1),
+            np.stack(places, axis=1),
+            np.concatenate(knots),
+        )
+        values = np.empty((len(instants), self._n_values))
+        at_once = max(_VALUES_AT_ONCE // self._n_values, 1)
+        for first in range(0, len(instants), at_once):
+            part = slice(first, first + at_once)
+            # einsum multiplies and adds in loops of its own, never by BLAS
+            np.einsum("ik,ikn->in", weight[part], knot[place[part]], out=values[part])
         return values
 
-    def _move_to(self, member: int, first_knot: int) -> None:
-        """Hold the four knots of a member that begin with one."""
-        held = self._first_knots[member]
-        if held == first_knot:
-            return
-        rows = self._knots[member * _KNOTS : (member + 1) * _KNOTS]
-        missing = range(_KNOTS)
-        if held is not None and 0 < first_knot - held < _KNOTS:
-            kept = _KNOTS - (first_knot - held)
-            rows[:kept] = rows[_KNOTS - kept :].copy()
-            missing = range(kept, _KNOTS)
-        counters = np.array([_FIRST_KNOT + first_knot + row for row in missing], dtype=np.int64)
-        rows[missing.start :] = frame_noise_units(
-            counters, rows.shape[1], seed=self._seed, stream=self._streams[member]
-        )
-        self._first_knots[member] = first_knot
+    def _with_knots(
+        self, member: int, first_knot: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return knots of a member, and where among them the four that begin with each one are."""
+        held = self._held[member]
+        place = held.numbers.searchsorted(first_knot)
+        if not held.have(first_knot, place):
+            numbers = np.unique(first_knot[:, np.newaxis] + np.arange(_KNOTS))
+            before = held.numbers.searchsorted(numbers)
+            known = np.append(held.numbers, -_FIRST_KNOT)[before] == numbers
+            values = np.empty((len(numbers), self._n_values))
+            values[known] = held.values[before[known]]
+            values[~known] = frame_noise_units(
+                _FIRST_KNOT + numbers[~known],
+                self._n_values,
+                seed=self._seed,
+                stream=self._streams[member],
+            )
+            held = self._held[member] = _Knots(numbers=numbers, values=values)
+            place = numbers.searchsorted(first_knot)
+        return held.values, place
 
 
-def _cubic_weights(u: float, scale: float) -> tuple[float, float, float, float]:
-    """Return the weights of four knots in a row at a fraction u behind the second."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Knots:
+    """Some knots of one grid: their numbers, shape (n,), ascending, and values, (n, n_values)."""
+
+    numbers: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+    def have(self, first: NDArray[np.int64], place: NDArray[np.int64]) -> bool:
+        """Return whether the four that begin with each ``first`` begin at ``place``."""
+        end = place + (_KNOTS - 1)
+        if end.max(initial=0) >= len(self.numbers):
+            return len(first) == 0
+        # numbers ascend without repeats: four in a row are there if both ends are
+        ends_are_there = (self.numbers[place] == first) & (self.numbers[end] == first + _KNOTS - 1)
+        return bool(ends_are_there.all())
+
+
+def _cubic_weights(u: NDArray[np.float64], scale: float) -> list[NDArray[np.float64]]:
+    """Return the weights of four knots in a row at fractions u behind the second."""
     v = 1 - u
-    return (
+    return [
         scale * (v * v * v / 6),
         scale * (2 / 3 - u * u * (2 - u) / 2),
         scale * (2 / 3 - v * v * (2 - v) / 2),
         scale * (u * u * u / 6),
-    )
+    ]
 
 
 class CarrierJitter:
@@ -200,7 +242,6 @@ class CarrierJitter:
             serial=serial,
             purpose=Purpose.JITTER_SLOW,
         )
-        self._slow_rad: dict[int, float] = {}
         self._page = -1
         self._normals: list[float] = []
 
@@ -219,16 +260,14 @@ class CarrierJitter:
         white = [0.0] * len(indices)
         if self._spec.white_rad > 0:
             white = [self._white_at(index) for index in indices.tolist()]
-        slow = [0.0] * len(indices)
+        phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad
         if self._spec.slow_rad > 0:
-            slow = [self._slow_at(time_ns) for time_ns in scene_times_ns.tolist()]
-        phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad + np.array(slow)
+            instants, fractions = self._slow.instants_before(scene_times_ns)
+            before, after = self._slow.values_at(np.concatenate([instants, instants + 1])).reshape(
+                2, -1
+            )
+            phases_rad += before + fractions * (after - before)
         return phases_rad
-
-    def _slow_at(self, time_ns: int) -> float:
-        instant, fraction = self._slow.instant_before(time_ns)
-        before = self._slow_rad_at(instant)
-        return before + fraction * (self._slow_rad_at(instant + 1) - before)
 
     def _white_at(self, index: int) -> float:
         """Return the normal of a frame; made for many at once, since frames come one by one."""
@@ -238,13 +277,6 @@ class CarrierJitter:
             normals = counter_normals(counters, seed=self._seed, stream=self._white)
             self._page, self._normals = page, normals.tolist()
         return self._normals[place]
-
-    def _slow_rad_at(self, instant: int) -> float:
-        if instant not in self._slow_rad:
-            if len(self._slow_rad) > _MOST_INSTANTS_KEPT:
-                self._slow_rad.clear()
-            self._slow_rad[instant] = float(self._slow.values_at(instant)[0])
-        return self._slow_rad[instant]
 
 
 class ClutterField:
@@ -265,7 +297,8 @@ class ClutterField:
             serial=serial,
             purpose=Purpose.CLUTTER,
         )
-        self._answers: dict[tuple[int, _Row], NDArray[np.float64]] = {}
+        self._row: _Row | None = None
+        self._answers: dict[int, NDArray[np.float64]] = {}
 
     def add_to(
         self,
@@ -279,26 +312,31 @@ class ClutterField:
         if strength == 0.0:
             return
         row = _Row.of(capture)
+        instants, fractions = self._scatterers.instants_before(scene_times_ns)
+        answers = self._answers_at(np.unique(np.concatenate([instants, instants + 1])), row)
         at: int | None = None
         clutter = np.empty(capture.n_samples)
         # frame by frame: one stays in the processor's cache, a block does not
-        for frame, time_ns in zip(signal, scene_times_ns.tolist(), strict=True):
-            instant, fraction = self._scatterers.instant_before(time_ns)
+        for frame, instant, fraction in zip(
+            signal, instants.tolist(), fractions.tolist(), strict=True
+        ):
             if instant != at:
-                start, end = self._answers_at(instant, row), self._answers_at(instant + 1, row)
+                start, end = answers[instant], answers[instant + 1]
                 rise, start, at = end - start, start * strength, instant
             np.multiply(rise, strength * fraction, out=clutter)
             np.add(clutter, start, out=clutter)
             np.add(frame, clutter, out=frame)
 
-    def _answers_at(self, instant: int, row: _Row) -> NDArray[np.float64]:
-        """Return the unit clutter at an instant; two are kept for the frames that follow."""
-        key = (instant, row)
-        if key not in self._answers:
-            if len(self._answers) == 2:
-                del self._answers[next(iter(self._answers))]
-            self._answers[key] = row.answers(self._scatterers.values_at(instant))
-        return self._answers[key]
+    def _answers_at(self, instants: NDArray[np.int64], row: _Row) -> dict[int, NDArray[np.float64]]:
+        """Return the unit clutter at instants; the last two are kept for the frames that follow."""
+        answers = dict(self._answers) if row == self._row else {}
+        missing = [instant for instant in instants.tolist() if instant not in answers]
+        if missing:
+            values = self._scatterers.values_at(np.array(missing, dtype=np.int64))
+            answers.update(zip(missing, row.answers(values), strict=True))
+        self._row = row
+        self._answers = {instant: answers[instant] for instant in instants[-2:].tolist()}
+        return answers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -323,18 +361,24 @@ class _Row:
             tx_center_frequency=capture.tx_center_frequency,
         )
 
-    def answers(self, scatterers: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what scatterers answer, shape (n_samples,), of the variance of the scatterers.
+    def answers(self, scatterers: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return what scatterers answer, n frames of the variance of the scatterers.
 
-        ``scatterers`` has the shape (2 * _SCATTERERS,): real parts, then imaginary parts.
+        ``scatterers`` has the shape (n, 2 * _SCATTERERS): real parts, then imaginary parts.
         """
         first_cell, lead = divmod(self.first_sample, _SCATTERER_SAMPLES)
         n_cells = -(-(lead + self.n_samples) // _SCATTERER_SAMPLES)
-        near = np.take(scatterers, _near_scatterers(first_cell % _SCATTERERS, n_cells))
-        # einsum multiplies and adds in loops of its own, never by BLAS
-        answers = np.einsum("kc,kr->rc", near, _KERNELS[self.tx_center_frequency])
-        frame: NDArray[np.float64] = answers.T.ravel()[lead : lead + self.n_samples]
-        return frame
+        places = _near_scatterers(first_cell % _SCATTERERS, n_cells)
+        kernels = _KERNELS[self.tx_center_frequency]
+        near = np.empty(places.shape)
+        by_place = np.empty((_SCATTERER_SAMPLES, n_cells))
+        answers = np.empty((len(scatterers), n_cells, _SCATTERER_SAMPLES))
+        for values, frame in zip(scatterers, answers, strict=True):
+            values.take(places, out=near, mode="clip")  # "raise" would copy
+            # einsum multiplies and adds in loops of its own, never by BLAS
+            np.einsum("kc,kr->rc", near, kernels, out=by_place)
+            frame[:] = by_place.T
+        return list(answers.reshape(len(answers), -1)[:, lead : lead + self.n_samples])
 
 
 @functools.cache
@@ -432,10 +476,17 @@ class Receiver:
         )
         self._clutter.add_to(signal, scene_times_ns, capture, gain)
         units = frame_noise_units(indices, capture.n_samples, seed=self._seed, stream=self._stream)
-        counts: NDArray[np.float64] = units * (noise_sigma(self._noise, capture) / UNITS_PER_SIGMA)
-        counts += signal
-        counts += normalisation.dac_offset
-        counts *= 1 / one_count(capture)
-        np.rint(counts, out=counts)
-        np.clip(counts, 0, normalisation.max_counter, out=counts)
-        return counts.astype(np.int64)
+        per_unit = noise_sigma(self._noise, capture) / UNITS_PER_SIGMA
+        per_count = 1 / one_count(capture)
+        counters = np.empty(signal.shape, dtype=np.int64)
+        # a few frames at a time: they stay in the processor's cache, a block does not
+        for first in range(0, len(signal), _FRAMES_AT_ONCE):
+            part = slice(first, first + _FRAMES_AT_ONCE)
+            counts = units[part] * per_unit
+            counts += signal[part]
+            counts += normalisation.dac_offset
+            counts *= per_count
+            np.rint(counts, out=counts)
+            np.clip(counts, 0, normalisation.max_counter, out=counts)
+            counters[part] = counts
+        return counters

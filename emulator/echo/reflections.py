@@ -53,6 +53,7 @@ HALF_WINDOW = math.ceil(6 * _SIGMA_SAMPLES)
 
 _OFFSETS = np.arange(-HALF_WINDOW, HALF_WINDOW + 1)
 _SHIFT_ORDER = 5
+_PULSES_AT_ONCE = 128
 
 
 def _envelope_series() -> list[NDArray[np.float64]]:
@@ -98,8 +99,8 @@ def sum_of_pulses(
     Parameters
     ----------
     frame
-        Shape (p,), int64: the frame each pulse belongs to. Pulses of one frame are added in the
-        order given, so a frame's rounding does not depend on the other frames.
+        Shape (p,), int64, ascending: the frame each pulse belongs to. Pulses of one frame are added
+        in the order given, so a frame's rounding does not depend on the other frames.
     position
         Shape (p,), float64: where the pulse is centred, in samples from the frame's first; any
         real number, also outside the frame.
@@ -119,7 +120,34 @@ def sum_of_pulses(
     shift = position - nearest
     cycles, samples = CARRIER_CYCLES_PER_SAMPLE[tx_center_frequency]
     centre_phase = phase_rad - math.tau * cycles / samples * shift
+    in_phase, quadrature = amplitude * np.cos(centre_phase), amplitude * np.sin(centre_phase)
+    first = nearest.astype(np.int64) + 2 * HALF_WINDOW
 
+    width = n_samples + 4 * HALF_WINDOW
+    padded = np.empty((n_frames, width))
+    # whole frames at a time: what is added stays in the processor's cache, a block does not
+    ends = np.searchsorted(frame, np.arange(1, n_frames + 1)).tolist()
+    begin = done = 0
+    for n_done, end in enumerate(ends, 1):
+        if end - begin < _PULSES_AT_ONCE and n_done < n_frames:
+            continue
+        part = slice(begin, end)
+        bins = ((frame[part] - done) * width + first[part])[:, np.newaxis] + _OFFSETS
+        waves = _waves(shift[part], in_phase[part], quadrature[part], tx_center_frequency)
+        padded[done:n_done] = np.bincount(
+            bins.ravel(), weights=waves.ravel(), minlength=(n_done - done) * width
+        ).reshape(-1, width)
+        begin, done = end, n_done
+    return padded[:, 2 * HALF_WINDOW : 2 * HALF_WINDOW + n_samples]
+
+
+def _waves(
+    shift: NDArray[np.float64],
+    in_phase: NDArray[np.float64],
+    quadrature: NDArray[np.float64],
+    tx_center_frequency: int,
+) -> NDArray[np.float64]:
+    """Return pulses at `_OFFSETS` from their nearest samples, shape (p, 2 HALF_WINDOW + 1)."""
     h = shift[:, np.newaxis]
     wave = h * _ENVELOPE[-1]
     for coefficients in _ENVELOPE[-2:0:-1]:
@@ -127,18 +155,10 @@ def sum_of_pulses(
         wave *= h
     wave += _ENVELOPE[0]
     cosine, sine = _CARRIER[tx_center_frequency]
-    carrier = (amplitude * np.cos(centre_phase))[:, np.newaxis] * cosine
-    carrier -= (amplitude * np.sin(centre_phase))[:, np.newaxis] * sine
+    carrier = in_phase[:, np.newaxis] * cosine
+    carrier -= quadrature[:, np.newaxis] * sine
     wave *= carrier
-
-    padding = 2 * HALF_WINDOW
-    width = n_samples + 2 * padding
-    first = frame * width + padding + nearest.astype(np.int64)
-    bins = first[:, np.newaxis] + _OFFSETS
-    padded: NDArray[np.float64] = np.bincount(
-        bins.ravel(), weights=wave.ravel(), minlength=n_frames * width
-    ).astype(np.float64, copy=False)  # without any pulse, bincount answers integers
-    return padded.reshape(n_frames, width)[:, padding : padding + n_samples]
+    return wave
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

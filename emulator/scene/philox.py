@@ -41,6 +41,8 @@ LARGEST_UNITS = 2 * int(_TABLE[-1])
 _WORDS_PER_FRAME = 2 * MAX_SAMPLES * _TABLE_BITS // 64
 _BLOCKS_PER_FRAME = _WORDS_PER_FRAME // 4
 
+_FRAMES_AT_ONCE = 16  # their bits stay in the processor's cache
+
 _UNIFORMS_PER_NORMAL = 12  # their sum has variance 1
 
 
@@ -84,13 +86,15 @@ def frame_noise_units(
     if n_samples > MAX_SAMPLES:
         raise ValueError(f"{n_samples} samples: the longest frame has {MAX_SAMPLES}")
     noise = np.empty((len(indices), n_samples), dtype=np.int32)
+    second = np.empty((min(len(indices), _FRAMES_AT_ONCE), n_samples), dtype=np.int32)
     for start, stop in _runs(indices):
         philox = _philox(seed, stream, int(indices[start]) * _BLOCKS_PER_FRAME)
-        halves = _half_words(philox.random_raw((stop - start) * _WORDS_PER_FRAME))
-        halves = halves.reshape(stop - start, 2, MAX_SAMPLES)
-        run = noise[start:stop]
-        np.take(_TABLE, halves[:, 0, :n_samples], out=run, mode="clip")
-        run += np.take(_TABLE, halves[:, 1, :n_samples], mode="clip")
+        for first in range(start, stop, _FRAMES_AT_ONCE):
+            rows = noise[first : min(first + _FRAMES_AT_ONCE, stop)]
+            halves = _half_words(philox.random_raw(len(rows) * _WORDS_PER_FRAME))
+            halves = halves.reshape(len(rows), 2, MAX_SAMPLES)
+            np.take(_TABLE, halves[:, 0, :n_samples], out=rows, mode="clip")
+            rows += np.take(_TABLE, halves[:, 1, :n_samples], out=second[: len(rows)], mode="clip")
     return noise
 
 
