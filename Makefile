@@ -44,7 +44,7 @@ sweep: $(VENV)/installed-sweep
 # Stopped, it goes on where it was; picture and table in out/experiments.
 stress: $(VENV)/installed-demo
 	$(BIN)/uwb-slam sweep --scene lab classroom --seeds 5 --json out/stress.json \
-		--stress outliers dropped skew walk silent all dead offsets carried
+		--stress outliers dropped skew walk silent all dead offsets_20 carried
 	$(BIN)/uwb-slam experiment stress --sweep out/stress.json
 
 # Preset robust in every scene that has wheels and something to map, five seeds each; likewise.

@@ -11,12 +11,18 @@ max)``. Floor, ceiling, elevation, polarisation, and paths of more bounces than 
 out.
 
 Pulse p
-    Gaussian envelope on the carrier (``emulator.echo.reflections``). The real pulse is a little
-    asymmetric.
+    Gaussian envelope on the carrier (``emulator.echo.reflections``). Where the scene's table
+    ``pulse`` of a radar says so, the standard deviation is width (1 - skew) sigma before the peak
+    and width (1 + skew) sigma after it, and ringing times the same pulse follows 3.2 sigma later,
+    its carrier 1 rad ahead. All that this radar receives has this pulse, except for its clutter.
+    The form is assumed; real pulses of the X4 are a little asymmetric and ring.
 Time t
     Nominal time of the frame, made earlier by the module's fast clock and later by its start
-    skew (``emulator.chip.chip``). The robot stands still within a frame: a sweep at 5 cm/s
+    skew (``emulator.chip.chip``), and off by N(0, stamp_sigma_ms), new with every frame, which
+    the reader of the frame cannot see. The robot stands still within a frame: a sweep at 5 cm/s
     moves it by micrometres per pulse.
+Place of a radar
+    Its mount and, beside what its user believes, mount_error_m and mount_error_deg.
 Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
     R is half the length of the path; c = 299 792 458 m/s; offset is the module's range error; L is
     the label of sample 0 in module metres (c_module = 3.0e8 m/s, protocol reference 9.1).
@@ -30,6 +36,16 @@ Amplitude a of rod, point, person (``emulator.echo.reflections``)
 Cylinder
     Its surface, at R - radius, weakened by (1 / s) sqrt((1 + radius) / (s + radius)) over the
     distance s to it: geometric optics of a convex mirror.
+Wander (``emulator.echo.model_error``)
+    Of a target seen under the bearing beta, from target to radar: range + a (0.7 cos(2 beta +
+    phi_1) + 0.5 cos(5 beta + phi_2)) - rho; amplitude times max(0.1, 1 + c cos(3 beta + phi_3) +
+    c/2 cos(9 beta + phi_4)); phase + b cos(4 beta + phi_1) rad; phi_k uniform, per target and
+    seed. Assumed: a few harmonics in place of a body's true signature. Ghosts and shadows are
+    those of the ideal target.
+Echo by way of two targets (``emulator.echo.model_error``)
+    For targets i, j closer than 1 m: at (r_i + r_j + d_ij) / 2, amplitude g sqrt(A_i A_j)
+    sqrt(0.1 m / d_ij), phases added. Assumed, after the wave between two rods, which spreads as a
+    cylinder: amplitude d**-1/2. r and A are those of the direct echoes.
 Wall, face of a box (``emulator.echo.walls``)
     A mirror at the distance R of its line: amplitude_1m / R, phase pi. |reflection| is
     amplitude_1m / (0.06 sqrt(pi)), because an image at 2 R equals a cross section of pi R**2 and
@@ -68,8 +84,11 @@ Clutter c
 Noise w
     White and Gaussian (``emulator.scene.philox``), keyed by seed and the radar's serial, selected
     by the frame's index. sigma is given at a working point and falls with the root of
-    iterations x pulses per step; neither gain nor TX power change it. Flicker and interference
-    are left out.
+    iterations x pulses per step; neither gain nor TX power change it. Flicker is left out.
+Bursts (``emulator.echo.model_error``)
+    Of other modules: echo_share of the frames hold 1 to 3 pulses, equally likely, at uniform
+    ranges and phases, of amplitude times exp N(0, spread) and the module's gain; noise_share hold
+    white noise of noise_sigma more. Assumed; keyed like w. Working points do not change them.
 Count q = 2**dac_step / (iterations pulses_per_step) / 1024, N = dac_max - dac_min + 1
     Protocol reference 9.7; outside the DAC window the counter saturates.
 Smoke
@@ -91,8 +110,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings, EchoSource
+from emulator.echo.model_error import Bursts, Stamps, TargetPairs, Wander
 from emulator.echo.receiver import CarrierJitter, Receiver, one_count
 from emulator.echo.reflections import (
+    PulseShape,
     Reflections,
     direct_reflections,
     person_scatterer,
@@ -123,11 +144,13 @@ _TX_AMPLITUDE = {0: 0.0, 1: math.sqrt(0.5), 2: 1.0, 3: math.sqrt(2.0)}
 class ScenePaths:
     """The paths of one radar of a scene. What does not move is worked out once."""
 
-    def __init__(self, scene: Scene, radar: RadarSpec) -> None:
+    def __init__(self, scene: Scene, radar: RadarSpec, seed: int = 0) -> None:
         self._scene = scene
         self._radar = radar
         self._trajectory = scene.trajectory()
         self._targets = target_scatterers(scene.targets)
+        self._wander = Wander(scene.targets, seed)
+        self._target_pairs = TargetPairs(self._targets, scene.multipath.target_pairs)
         self._leakage_phase_rad = np.array([reflection_phase_rad("leakage")])
         self._walled = bool(scene.walls or scene.objects)
         self._faces = faces_of(scene.walls, scene.objects)
@@ -145,6 +168,8 @@ class ScenePaths:
             *(person_scatterer(person, t_ns) for person in self._scene.people),
         ]
         direct = [direct_reflections(each, view) for each in scatterers]
+        if self._wander:
+            direct[0] = self._wander.applied(direct[0], self._targets, view)
         walls: list[Reflections] = []
         ghosts: list[Reflections] = []
         if self._walled:
@@ -162,8 +187,9 @@ class ScenePaths:
             amplitude=np.full((len(t_ns), 1), self._scene.leakage.amplitude),
             phase_rad=self._leakage_phase_rad,
         )
+        pairs = [self._target_pairs.reflections(direct[0])] if self._target_pairs else []
         # frames are sums in this order, to the last bit
-        return _together([direct[0], leakage, *direct[1:], *walls, *ghosts])
+        return _together([direct[0], leakage, *direct[1:], *walls, *ghosts, *pairs])
 
 
 def _together(terms: list[Reflections]) -> Reflections:
@@ -182,7 +208,10 @@ class SceneEcho:
 
     def __init__(self, scene: Scene, radar: RadarSpec, seed: int) -> None:
         self._radar = radar
-        self._paths = ScenePaths(scene, radar)
+        self._paths = ScenePaths(scene, radar, seed)
+        self._pulse = PulseShape.of(radar.pulse)
+        self._bursts = Bursts(radar, self._pulse, seed)
+        self._stamps = Stamps(radar, seed)
         self._clock = radar.clock
         self._gain = 10.0 ** (radar.gain_db / 20)
         self._jitter = CarrierJitter(scene.jitter, seed=seed, serial=int(radar.serial))
@@ -219,6 +248,7 @@ class SceneEcho:
             phase_rad=phase_rad,
             tx_center_frequency=capture.tx_center_frequency,
             shape=(len(amplitude), capture.n_samples),
+            pulse=self._pulse,
         )
 
     def rf_counters(
@@ -228,10 +258,13 @@ class SceneEcho:
         scene_times_ns: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Return raw RF chip counters, shape (n_frames, n_samples); see ``EchoSource``."""
-        times_ns = self._clock.scene_times_ns(scene_times_ns)
+        taken_ns = self._stamps.taken_ns(scene_times_ns, indices)
+        times_ns = self._clock.scene_times_ns(taken_ns)
         jitter_rad = self._jitter.phases_rad(indices, times_ns)
+        signal = self.echo(capture, taken_ns, jitter_rad)
+        self._bursts.add_to(signal, indices, capture)
         return self._receiver.counters(
-            self.echo(capture, scene_times_ns, jitter_rad),
+            signal,
             indices,
             times_ns,
             capture,
@@ -242,6 +275,6 @@ class SceneEcho:
 def echo_source(scene: Scene, radar_index: int, seed: int) -> EchoSource:
     """Return the echo source of ``scene.radars[radar_index]``.
 
-    The seed, 0 ... 2**64 - 1, selects receiver noise, clutter and jitter.
+    The seed, 0 ... 2**64 - 1, selects receiver noise, clutter, jitter and model error.
     """
     return SceneEcho(scene, scene.radars[radar_index], seed)

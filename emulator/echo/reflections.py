@@ -6,13 +6,14 @@ How long, how strong and in which phase a path is: formulas and sources are on t
 One pulse is ``A exp(-(t - tau)**2 / (2 sigma**2)) cos(2 pi fc (t - tau) + phase)``: a Gaussian
 envelope on a carrier, sampled at 23.328 GHz. The carrier is an exact fraction of the sampling
 rate, 5/16 or 3/8 (protocol reference 9.2). The -10 dB bandwidth of 1.4 GHz is assumed, as that
-reference proposes; the real pulse is not symmetric and rings a little, which is left out.
+reference proposes. `PulseShape` says how a module's own pulse differs from that.
 
 Arithmetic is float64 additions and multiplications per sample; cosines are taken once per pulse.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from emulator.scene.motion import (
     positions_m,
     present,
 )
-from emulator.scene.scene import RadarSpec, TargetSpec
+from emulator.scene.scene import PulseSpec, RadarSpec, TargetSpec
 from xethru_protocol.wire.x4 import CARRIER_HZ, SAMPLING_RATE_HZ
 
 BANDWIDTH_HZ = 1.4e9
@@ -51,7 +52,6 @@ _SIGMA_SAMPLES = SIGMA_S * SAMPLING_RATE_HZ
 HALF_WINDOW = math.ceil(6 * _SIGMA_SAMPLES)
 """Samples evaluated on either side of a pulse; beyond, it is below 1.6e-8 of its amplitude."""
 
-_OFFSETS = np.arange(-HALF_WINDOW, HALF_WINDOW + 1)
 _SHIFT_ORDER = 5
 _PULSES_AT_ONCE = 128
 
@@ -62,7 +62,7 @@ def _envelope_series() -> list[NDArray[np.float64]]:
     ``exp(-(x - h)**2 / 2) = sum_k He_k(x) h**k / k! exp(-x**2 / 2)`` with the probabilists'
     Hermite polynomials. For half a sample, h = 0.062, order 5 leaves 2e-9 of the amplitude.
     """
-    x = _OFFSETS / _SIGMA_SAMPLES
+    x = np.arange(-HALF_WINDOW, HALF_WINDOW + 1) / _SIGMA_SAMPLES
     hermite = [np.ones_like(x), x]
     for k in range(1, _SHIFT_ORDER):
         hermite.append(x * hermite[k] - k * hermite[k - 1])
@@ -75,14 +75,71 @@ def _envelope_series() -> list[NDArray[np.float64]]:
 
 _ENVELOPE = _envelope_series()
 
+RINGING_SIGMAS = 3.2
+"""How much later than the pulse its ringing copy comes, in the nominal pulse's sigma."""
+RINGING_PHASE_RAD = 1.0
+"""How far the carrier of the copy is ahead."""
 
-def _carrier(cycles: int, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PulseShape:
+    """The pulse of one module: standard deviations in those of the nominal one, and its ringing.
+
+    The envelope is that of a Gaussian of ``before`` up to its peak and of ``after`` from there on;
+    a copy of the whole, ``ringing`` times as strong, follows by ``RINGING_SIGMAS``.
+    """
+
+    before: float = 1.0
+    after: float = 1.0
+    ringing: float = 0.0
+
+    @classmethod
+    def of(cls, spec: PulseSpec) -> PulseShape:
+        return cls(
+            before=spec.width * (1 - spec.skew),
+            after=spec.width * (1 + spec.skew),
+            ringing=spec.ringing,
+        )
+
+    @property
+    def half_window(self) -> int:
+        """Samples evaluated on either side; beyond, it is below 1.6e-8 of its amplitude."""
+        return math.ceil(6 * _SIGMA_SAMPLES * max(self.before, self.after))
+
+    def envelope(self, shift: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the envelopes of pulses ``shift`` samples after a whole sample.
+
+        Shape (p, 2 half_window + 1), without the ringing; ``shift`` has the shape (p, 1) and lies
+        within +-0.5.
+        """
+        if self.before == self.after == 1.0:
+            wave = shift * _ENVELOPE[-1]
+            for coefficients in _ENVELOPE[-2:0:-1]:
+                wave += coefficients
+                wave *= shift
+            wave += _ENVELOPE[0]
+            return wave
+        after_peak = _offsets(self.half_window) - shift
+        after_peak /= _SIGMA_SAMPLES * np.where(after_peak < 0, self.before, self.after)
+        bell: NDArray[np.float64] = np.exp(-0.5 * after_peak * after_peak)
+        return bell
+
+
+NOMINAL_PULSE = PulseShape()
+
+
+def _offsets(half_window: int) -> NDArray[np.int64]:
+    return np.arange(-half_window, half_window + 1)
+
+
+@functools.cache
+def _carrier(
+    tx_center_frequency: int, half_window: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return cosine and sine of the carrier at whole samples; the phase is reduced in integers."""
-    phase_rad = math.tau * ((cycles * _OFFSETS) % samples) / samples
+    cycles, samples = CARRIER_CYCLES_PER_SAMPLE[tx_center_frequency]
+    phase_rad = math.tau * ((cycles * _offsets(half_window)) % samples) / samples
     return np.cos(phase_rad), np.sin(phase_rad)
-
-
-_CARRIER = {setting: _carrier(*ratio) for setting, ratio in CARRIER_CYCLES_PER_SAMPLE.items()}
 
 
 def sum_of_pulses(
@@ -93,6 +150,7 @@ def sum_of_pulses(
     phase_rad: NDArray[np.float64],
     tx_center_frequency: int,
     shape: tuple[int, int],
+    pulse: PulseShape = NOMINAL_PULSE,
 ) -> NDArray[np.float64]:
     """Return frames that are sums of pulses, of a shape (n_frames, n_samples), float64.
 
@@ -110,8 +168,15 @@ def sum_of_pulses(
         Shape (p,), float64: phase of the carrier at the pulse's centre.
     """
     n_frames, n_samples = shape
+    half_window = pulse.half_window
+    if pulse.ringing:
+        frame = np.repeat(frame, 2)
+        later = RINGING_SIGMAS * _SIGMA_SAMPLES
+        position = np.column_stack([position, position + later]).ravel()
+        amplitude = np.column_stack([amplitude, pulse.ringing * amplitude]).ravel()
+        phase_rad = np.column_stack([phase_rad, phase_rad + RINGING_PHASE_RAD]).ravel()
     # Half a window of padding on either side takes every pulse that reaches into the frame.
-    touches = (position > -HALF_WINDOW) & (position < n_samples - 1 + HALF_WINDOW)
+    touches = (position > -half_window) & (position < n_samples - 1 + half_window)
     frame, position = frame[touches], position[touches]
     amplitude, phase_rad = amplitude[touches], phase_rad[touches]
 
@@ -121,9 +186,9 @@ def sum_of_pulses(
     cycles, samples = CARRIER_CYCLES_PER_SAMPLE[tx_center_frequency]
     centre_phase = phase_rad - math.tau * cycles / samples * shift
     in_phase, quadrature = amplitude * np.cos(centre_phase), amplitude * np.sin(centre_phase)
-    first = nearest.astype(np.int64) + 2 * HALF_WINDOW
+    first = nearest.astype(np.int64) + 2 * half_window
 
-    width = n_samples + 4 * HALF_WINDOW
+    width = n_samples + 4 * half_window
     padded = np.empty((n_frames, width))
     # whole frames at a time: what is added stays in the processor's cache, a block does not
     ends = np.searchsorted(frame, np.arange(1, n_frames + 1)).tolist()
@@ -132,33 +197,27 @@ def sum_of_pulses(
         if end - begin < _PULSES_AT_ONCE and n_done < n_frames:
             continue
         part = slice(begin, end)
-        bins = ((frame[part] - done) * width + first[part])[:, np.newaxis] + _OFFSETS
-        waves = _waves(shift[part], in_phase[part], quadrature[part], tx_center_frequency)
+        bins = ((frame[part] - done) * width + first[part])[:, np.newaxis] + _offsets(half_window)
+        waves = pulse.envelope(shift[part, np.newaxis])
+        waves *= _on_carrier(in_phase[part], quadrature[part], tx_center_frequency, half_window)
         padded[done:n_done] = np.bincount(
             bins.ravel(), weights=waves.ravel(), minlength=(n_done - done) * width
         ).reshape(-1, width)
         begin, done = end, n_done
-    return padded[:, 2 * HALF_WINDOW : 2 * HALF_WINDOW + n_samples]
+    return padded[:, 2 * half_window : 2 * half_window + n_samples]
 
 
-def _waves(
-    shift: NDArray[np.float64],
+def _on_carrier(
     in_phase: NDArray[np.float64],
     quadrature: NDArray[np.float64],
     tx_center_frequency: int,
+    half_window: int,
 ) -> NDArray[np.float64]:
-    """Return pulses at `_OFFSETS` from their nearest samples, shape (p, 2 HALF_WINDOW + 1)."""
-    h = shift[:, np.newaxis]
-    wave = h * _ENVELOPE[-1]
-    for coefficients in _ENVELOPE[-2:0:-1]:
-        wave += coefficients
-        wave *= h
-    wave += _ENVELOPE[0]
-    cosine, sine = _CARRIER[tx_center_frequency]
-    carrier = in_phase[:, np.newaxis] * cosine
+    """Return carriers about the whole samples nearest to pulses, (p, 2 half_window + 1)."""
+    cosine, sine = _carrier(tx_center_frequency, half_window)
+    carrier: NDArray[np.float64] = in_phase[:, np.newaxis] * cosine
     carrier -= quadrature[:, np.newaxis] * sine
-    wave *= carrier
-    return wave
+    return carrier
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -241,10 +300,12 @@ def viewpoint(radar: RadarSpec, robot_poses: NDArray[np.float64]) -> Viewpoint:
     """Return where a radar is, from robot poses (x [m], y [m], heading [rad]) of shape (n, 3)."""
     x, y, heading = robot_poses.T[:, :, np.newaxis]
     cosine, sine = np.cos(heading), np.sin(heading)
-    yaw_rad = math.radians(radar.yaw_deg)
+    error_x_m, error_y_m = radar.mount_error_m
+    mount_x_m, mount_y_m = radar.x_m + error_x_m, radar.y_m + error_y_m
+    yaw_rad = math.radians(radar.yaw_deg + radar.mount_error_deg)
     return Viewpoint(
-        x_m=x + cosine * radar.x_m - sine * radar.y_m,
-        y_m=y + sine * radar.x_m + cosine * radar.y_m,
+        x_m=x + cosine * mount_x_m - sine * mount_y_m,
+        y_m=y + sine * mount_x_m + cosine * mount_y_m,
         boresight_x=cosine * math.cos(yaw_rad) - sine * math.sin(yaw_rad),
         boresight_y=sine * math.cos(yaw_rad) + cosine * math.sin(yaw_rad),
     )

@@ -46,6 +46,10 @@ _FRAMES_AT_ONCE = 16  # their bits stay in the processor's cache
 _UNIFORMS_PER_NORMAL = 12  # their sum has variance 1
 
 
+TARGET_STREAM = 1 << 60
+"""Added to the number of a target: its stream, the same for all radars."""
+
+
 class Purpose(IntEnum):
     """What a module's random streams are for."""
 
@@ -53,6 +57,8 @@ class Purpose(IntEnum):
     JITTER_WHITE = 1
     JITTER_SLOW = 2
     CLUTTER = 3
+    STAMPS = 4
+    BURSTS = 5
 
 
 def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:
@@ -120,6 +126,15 @@ def counter_normals(counters: NDArray[np.int64], *, seed: int, stream: int) -> N
         units[start:stop] = _TABLE[halves[:, 0]] + _TABLE[halves[:, 1]]
     normals: NDArray[np.float64] = units / UNITS_PER_SIGMA
     return normals
+
+
+def uniforms(count: int, *, seed: int, stream: int, block: int = 0) -> NDArray[np.float64]:
+    """Return numbers in [0, 1) from a block of a stream on, shape (count,).
+
+    A block is four words, and a number takes one: blocks of a caller must not overlap.
+    """
+    words: NDArray[np.uint64] = _philox(seed, stream, block).random_raw(count)
+    return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
 def _runs(counters: NDArray[np.int64]) -> Iterator[tuple[int, int]]:

@@ -42,6 +42,34 @@ Seconds = Annotated[Number, Field(gt=0, le=86_400)]
 CorrelationTime = Annotated[Number, Field(ge=1e-3, le=86_400)]
 
 
+class PulseSpec(Table):
+    """How a module's pulse differs from the nominal one (``emulator.echo.reflections``).
+
+    The envelope's standard deviation is the nominal one times ``width`` (1 - ``skew``) before the
+    peak and ``width`` (1 + ``skew``) after it; ``ringing`` is the amplitude of a copy of the pulse
+    that follows.
+    """
+
+    width: Annotated[Number, Field(ge=0.5, le=2)] = 1.0
+    skew: Annotated[Number, Field(ge=-0.5, le=0.5)] = 0.0
+    ringing: Annotated[Number, Field(ge=0, le=1)] = 0.0
+
+
+class BurstSpec(Table):
+    """What other modules send into a frame now and then (``emulator.echo.model_error``).
+
+    ``echo_share`` of the frames hold one to three of their pulses, of ``amplitude`` times the
+    exponential of a normal number of standard deviation ``spread``; ``noise_share`` of the frames
+    more white noise, ``noise_sigma`` per RF sample.
+    """
+
+    echo_share: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    amplitude: Annotated[Number, Field(ge=0, le=1)] = 0.015
+    spread: Annotated[Number, Field(ge=0, le=3)] = 0.6
+    noise_share: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    noise_sigma: Sigma = 2.5e-3
+
+
 class RadarSpec(Table):
     """One X4M300 on the robot.
 
@@ -51,7 +79,10 @@ class RadarSpec(Table):
     receiver's gain: it scales echoes, leakage and clutter, not the counts. ``start_skew_ms`` is
     how much later than the nominal scene time of a frame this radar samples, and ``clock_ppm`` how
     fast its clock is: its frames come earlier and its bins are shorter
-    (``emulator.chip.chip``).
+    (``emulator.chip.chip``). ``mount_error_m`` (x, y) and ``mount_error_deg`` are added to place
+    and boresight: where the radar truly is, while the robot's user believes the other three
+    numbers. ``stamp_sigma_ms`` is the standard deviation of the time at which a frame is truly
+    taken about the time that its reader believes, new with every frame.
     """
 
     name: Name
@@ -63,10 +94,29 @@ class RadarSpec(Table):
     gain_db: Annotated[Number, Field(ge=-40, le=40)] = 0.0
     start_skew_ms: Annotated[Number, Field(ge=0, le=10_000)] = 0.0
     clock_ppm: Annotated[Number, Field(ge=-1000, le=1000)] = 0.0
+    mount_error_m: tuple[Metres, Metres] = (0.0, 0.0)
+    mount_error_deg: Degrees = 0.0
+    stamp_sigma_ms: Annotated[Number, Field(ge=0, le=1000)] = 0.0
+    pulse: PulseSpec = PulseSpec()
+    bursts: BurstSpec = BurstSpec()
 
     @property
     def clock(self) -> ModuleClock:
         return ModuleClock(skew_ns=round(self.start_skew_ms * 1e6), ppm=self.clock_ppm)
+
+
+class WanderSpec(Table):
+    """How a target's echo changes with the side it is seen from (``emulator.echo.model_error``).
+
+    ``range_m`` scales how the scattering centre wanders along the line of sight, ``inside_m`` is
+    how much nearer than the target's place it lies on average, ``fading`` scales the relative
+    change of amplitude and ``phase_rad`` that of the phase.
+    """
+
+    range_m: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    inside_m: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    fading: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    phase_rad: Annotated[Number, Field(ge=0, le=10)] = 0.0
 
 
 class TargetSpec(Table):
@@ -84,6 +134,7 @@ class TargetSpec(Table):
     y_m: Metres
     amplitude_1m: Annotated[Number, Field(gt=0, le=10)] = 0.015
     radius_m: Annotated[Number, Field(ge=0, le=10)] = 0.0
+    wander: WanderSpec = WanderSpec()
 
     @model_validator(mode="after")
     def _radius_belongs_to_a_cylinder(self) -> TargetSpec:
@@ -152,13 +203,16 @@ class ObjectSpec(_Surface):
 
 
 class MultipathSpec(Table):
-    """Which paths of more than one reflection are received, where there are walls or objects.
+    """Which paths of more than one reflection are received.
 
-    ``double_bounce`` is by way of a wall and a target or a person, ``corners`` of two walls.
+    Where there are walls or objects, ``double_bounce`` is by way of a wall and a target or a
+    person, ``corners`` of two walls. ``target_pairs`` is the strength of what goes by way of two
+    targets that are close together, 0 for none (``emulator.echo.model_error``).
     """
 
     double_bounce: StrictBool = True
     corners: StrictBool = True
+    target_pairs: Annotated[Number, Field(ge=0, le=1)] = 0.0
 
 
 class ClutterSpec(Table):
@@ -237,7 +291,8 @@ class OdometrySpec(Table):
     """How the wheels drift: standard deviations of the model in ``emulator.scene.wheels``.
 
     ``walk_per_sqrt_s`` lets scale, turn scale and curvature wander during a run: by this many of
-    their own standard deviations per square root of a second.
+    their own standard deviations per square root of a second. ``slips_per_s`` is how often the
+    wheels slip; a slip is of ``slip_sigma_m`` and ``slip_sigma_deg``.
     """
 
     rate_hz: Annotated[Number, Field(ge=0.1, le=1000)] = 5.0
@@ -249,6 +304,9 @@ class OdometrySpec(Table):
     heading_sigma_rad_per_sqrt_m: Sigma = 0.0
     heading_sigma_rad_per_rad: Sigma = 0.0
     walk_per_sqrt_s: Sigma = 0.0
+    slips_per_s: Annotated[Number, Field(ge=0, le=10)] = 0.0
+    slip_sigma_m: Sigma = 0.0
+    slip_sigma_deg: Annotated[Number, Field(ge=0, le=90)] = 0.0
 
 
 class NoiseSpec(Table):

@@ -10,9 +10,14 @@ frame at its start is (dx, dy) and a, with D = hypot(dx, dy), is reported as
 and the reported pose is the composition of the reported increments, starting at zero. White noise
 of a leg composes over steps (variance proportional to length), so it does not depend on the step;
 that of a turn is proportional to each step's angle, so it belongs to the scene's step rate. Where
-the scene has it, the three constants perform independent random walks from there. Wheel slip is
-left out. While the robot is carried its wheels stand still and report so. Source: the project's
-odometry model for this robot class; the scene holds its standard deviations.
+the scene has it, the three constants perform independent random walks from there. While the robot
+is carried its wheels stand still and report so. Source: the project's odometry model for this robot
+class; the scene holds its standard deviations.
+
+Slip
+    Where the scene has it, wheels slip at each sample with the probability slips_per_s / rate_hz:
+    they report |N(0, slip_sigma_m)| forward and a turn of N(0, slip_sigma_deg) more than the robot
+    did. Wheels that hang in the air do not slip. Assumed: the law is the project's, not measured.
 
 The TUM lines are canonical: every reader, live or later, computes with the same floats.
 """
@@ -25,11 +30,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scene.philox import standard_normals
+from emulator.scene.philox import counter_normals, standard_normals, uniforms
 from emulator.scene.scene import OdometrySpec, Scene
 
 ODOMETRY_STREAM = 1 << 63
 """Noise stream of the wheels; the radars' streams are their serial numbers, below 10**12."""
+_SLIPS_STREAM = ODOMETRY_STREAM + 1
+_SLIP_SIZES_STREAM = ODOMETRY_STREAM + 2
 
 
 def odometry_times_ns(duration_ns: int, rate_hz: float) -> NDArray[np.int64]:
@@ -78,11 +85,14 @@ def drift(
     true_steps = np.diff(true_poses, axis=0)
     if unseen is not None:
         true_steps[unseen] = 0.0
+    slips = slips_of(n_steps, model, seed=seed)
+    if unseen is not None:
+        slips[unseen] = 0.0
     steps = true_steps.tolist()
     headings = true_poses[:, 2].tolist()
     white = normals[3:n_white].reshape(n_steps, 3).tolist()
-    for (step_x, step_y, turn), true_heading, (scale, turn_scale, curvature), noise in zip(
-        steps, headings[:-1], errors, white, strict=True
+    for (step_x, step_y, turn), true_heading, (scale, turn_scale, curvature), noise, slip in zip(
+        steps, headings[:-1], errors, white, slips.tolist(), strict=True
     ):
         n_along, n_across, n_turn = noise
         cosine, sine = math.cos(true_heading), math.sin(true_heading)
@@ -95,12 +105,27 @@ def drift(
         turn_sigma = (
             model.heading_sigma_rad_per_sqrt_m * root + model.heading_sigma_rad_per_rad * abs(turn)
         )
+        along += slip[0]
         cosine, sine = math.cos(heading), math.sin(heading)
         x += cosine * along - sine * across
         y += sine * along + cosine * across
-        heading += (1 + turn_scale) * turn + curvature * distance + turn_sigma * n_turn
+        heading += (1 + turn_scale) * turn + curvature * distance + turn_sigma * n_turn + slip[1]
         reported.append((x, y, heading))
     return np.array(reported, dtype=np.float64)
+
+
+def slips_of(n_steps: int, model: OdometrySpec, *, seed: int) -> NDArray[np.float64]:
+    """Return what wheels report too much at each step, shape (n_steps, 2): [m forward, rad]."""
+    slips = np.zeros((n_steps, 2))
+    if model.slips_per_s == 0.0:
+        return slips
+    chances = uniforms(n_steps, seed=seed, stream=_SLIPS_STREAM)
+    steps = np.flatnonzero(chances < model.slips_per_s / model.rate_hz)
+    for kind, sigma in enumerate((model.slip_sigma_m, math.radians(model.slip_sigma_deg))):
+        sizes = counter_normals(2 * steps + kind, seed=seed, stream=_SLIP_SIZES_STREAM)
+        slips[steps, kind] = sigma * sizes
+    slips[:, 0] = np.abs(slips[:, 0])
+    return slips
 
 
 def tum_line(t_ns: int, pose: Sequence[float]) -> str:

@@ -39,7 +39,7 @@ TARGETS = {
     **dict.fromkeys(("outliers", "dropped", "skew", "walk", "silent"), 1.5),
     "all": 2.5,
     "dead": 2.0,
-    "offsets": 2.0,
+    "offsets_20": 2.0,
 }
 """How many times the clean error each stress may cost."""
 

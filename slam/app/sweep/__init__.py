@@ -7,9 +7,12 @@ Importing this package loads nothing heavy, since ``--help`` lists the stresses;
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 CLEAN = "clean"
+
+Table = Mapping[str, object]
+"""Keys of a table of a scene, and their values."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,11 +32,33 @@ class Stress:
     silent_share: float = 0.0  # of the run, in one piece that begins between 15 and 75 % of it
     dead_radars: frozenset[int] = frozenset()  # indices of radars that never send a frame
     offset_sigma_m: float = 0.0  # of every radar's own constant range error
+    # of where every radar truly is about where SLAM believes it, per axis and in yaw
+    mount_sigma_m: float = 0.0
+    mount_sigma_deg: float = 0.0
+    # what every table of a kind says in this stress beside what the scene has: keys of `RadarSpec`,
+    # `TargetSpec`, `MultipathSpec` and `OdometrySpec` (`emulator.scene.scene`)
+    radars: Table = field(default_factory=dict)
+    targets: Table = field(default_factory=dict)
+    multipath: Table = field(default_factory=dict)
+    odometry: Table = field(default_factory=dict)
     carried_at: float = 0.0  # part of the drive at which the robot is picked up
     carried_skips: float = 0.0  # part of its course that it misses
 
 
 _SKEWS_MS = (0.0, 190.0, 100.0, 150.0)
+
+# Of model error, each with the strength of the project's laws (`emulator.echo.model_error`).
+_OFFSET_SIGMA_M, _MOUNT_SIGMA_M, _MOUNT_SIGMA_DEG = 0.02, 0.005, 1.0
+_SKEWED_PULSE: Table = {"pulse": {"width": 1.15, "skew": 0.15, "ringing": 0.15}}
+_BURSTS: Table = {"bursts": {"echo_share": 0.15, "noise_share": 0.05}}
+_STAMPS: Table = {"stamp_sigma_ms": 20.0}
+_ROD_ROD: Table = {"target_pairs": 0.25}
+_SLIP: Table = {"slips_per_s": 1 / 20, "slip_sigma_m": 0.015, "slip_sigma_deg": 2.0}
+
+
+def _wander(range_m: float) -> Table:
+    return {"wander": {"range_m": range_m, "inside_m": 0.02, "fading": 0.4, "phase_rad": 1.0}}
+
 
 STRESSES: Mapping[str, Stress] = {
     CLEAN: Stress(help="nothing is wrong"),
@@ -56,13 +81,44 @@ STRESSES: Mapping[str, Stress] = {
         silent_share=0.1,
     ),
     "dead": Stress(help="the first radar never sends a frame", dead_radars=frozenset({0})),
-    "offsets": Stress(
+    "offsets_20": Stress(
         help="each radar's ranges off by a constant, 20 mm standard deviation, uncalibrated",
-        offset_sigma_m=0.02,
+        offset_sigma_m=_OFFSET_SIGMA_M,
     ),
     "carried": Stress(
         help="picked up and set down elsewhere on the course; the wheels do not see it",
         carried_at=0.4,
         carried_skips=0.15,
+    ),
+    "pulse_wide": Stress(
+        help="all pulses a tenth wider than SLAM believes", radars={"pulse": {"width": 1.1}}
+    ),
+    "pulse": Stress(help="pulses 1.15 times as wide, skewed and ringing", radars=_SKEWED_PULSE),
+    "wander_3": Stress(
+        help="targets of 2 cm radius, scattering centre, amplitude and phase of which change with "
+        "aspect, the range by 3 mm",
+        targets=_wander(0.003),
+    ),
+    "wander_10": Stress(help="the same, the range by 10 mm", targets=_wander(0.01)),
+    "rod_rod": Stress(help="echoes by way of two targets closer than 1 m", multipath=_ROD_ROD),
+    "bursts": Stress(
+        help="pulses and noise of other modules in a fifth of the frames", radars=_BURSTS
+    ),
+    "slip": Stress(help="wheels slip by 15 mm and 2 degrees, every 20 s", odometry=_SLIP),
+    "mounts": Stress(
+        help="each radar 5 mm per axis and 1 degree off its mount (standard deviations)",
+        mount_sigma_m=_MOUNT_SIGMA_M,
+        mount_sigma_deg=_MOUNT_SIGMA_DEG,
+    ),
+    "stamps": Stress(help="times of frames off by 20 ms (standard deviation)", radars=_STAMPS),
+    "mismatch": Stress(
+        help="pulse, wander_10, rod_rod, bursts, slip, mounts, stamps and offsets_20 together",
+        radars={**_SKEWED_PULSE, **_BURSTS, **_STAMPS},
+        targets=_wander(0.01),
+        multipath=_ROD_ROD,
+        odometry=_SLIP,
+        mount_sigma_m=_MOUNT_SIGMA_M,
+        mount_sigma_deg=_MOUNT_SIGMA_DEG,
+        offset_sigma_m=_OFFSET_SIGMA_M,
     ),
 }

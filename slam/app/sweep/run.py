@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scene.philox import counter_normals
+from emulator.scene.philox import counter_normals, uniforms
 from emulator.scene.scene import CarriedSpec, Scene
+from emulator.scene.tables import TableT
 from emulator.scene.wheels import scene_odometry
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import NS_PER_S, OdometryTrack
@@ -39,7 +40,7 @@ from slam.app.rig.emulated import (
 from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.session.messages import settings_text
-from slam.app.sweep import CLEAN, STRESSES, Stress
+from slam.app.sweep import CLEAN, STRESSES, Stress, Table
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.config import ConfigError, SlamConfig, override
 from slam.evaluation import LANDMARK_MATCH_M
@@ -53,7 +54,7 @@ from xethru_protocol.wire.x4 import FIRST_COUNTER
 # Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the
 # odometry's, 2**63.
 _STREAM = 1 << 62
-_OFFSETS, _SILENCE, _DROPPED, _OUTLIERS = (_STREAM + (part << 32) for part in range(4))
+_OFFSETS, _SILENCE, _DROPPED, _OUTLIERS, _MOUNTS = (_STREAM + (part << 32) for part in range(5))
 
 _SILENCE_FROM, _SILENCE_TO = 0.15, 0.75
 """When a silence may begin, in parts of the run."""
@@ -71,11 +72,11 @@ Key = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
 
 
 def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
-    """Return the scene with what a row plants in it: skews, range offsets, wheels, a lift.
+    """Return the scene with what a row plants in it: its tables, and what is drawn for the run.
 
     A radar beyond those that have a skew in the row takes them from the first again.
     """
-    radars = scene.radars
+    radars = tuple(_with(radar, stress.radars) for radar in scene.radars)
     if stress.start_skews_ms:
         skews_ms = stress.start_skews_ms
         radars = tuple(
@@ -90,8 +91,20 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
             )
             for radar, normal in zip(radars, normals.tolist(), strict=True)
         )
+    if stress.mount_sigma_m or stress.mount_sigma_deg:
+        normals = counter_normals(np.arange(3 * len(radars)), seed=seed, stream=_MOUNTS)
+        radars = tuple(
+            _with(
+                radar,
+                {
+                    "mount_error_m": (stress.mount_sigma_m * x, stress.mount_sigma_m * y),
+                    "mount_error_deg": stress.mount_sigma_deg * yaw,
+                },
+            )
+            for radar, (x, y, yaw) in zip(radars, normals.reshape(-1, 3).tolist(), strict=True)
+        )
     duration_s = scene.trajectory().duration_ns / NS_PER_S
-    odometry = scene.odometry
+    odometry = _with(scene.odometry, stress.odometry)
     if stress.walk_sigmas:
         rate = stress.walk_sigmas / math.sqrt(duration_s)
         odometry = odometry.model_copy(update={"walk_per_sqrt_s": rate})
@@ -101,7 +114,20 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
             at_s=stress.carried_at * duration_s, skips_s=stress.carried_skips * duration_s
         )
         path = path.model_copy(update={"carried": lift})
-    return scene.model_copy(update={"radars": radars, "odometry": odometry, "path": path})
+    return scene.model_copy(
+        update={
+            "radars": radars,
+            "targets": tuple(_with(target, stress.targets) for target in scene.targets),
+            "multipath": _with(scene.multipath, stress.multipath),
+            "odometry": odometry,
+            "path": path,
+        }
+    )
+
+
+def _with(table: TableT, values: Table) -> TableT:
+    """Return a table of a scene with other values of some keys, checked as those of a file."""
+    return type(table).model_validate(table.model_dump() | dict(values)) if values else table
 
 
 def stressed_scans(
@@ -112,12 +138,13 @@ def stressed_scans(
     A scan that lost all stays, empty. Silence is a part of the run's ``duration_ns``.
     """
     share, dead = stress.dropped_share, stress.dead_radars
-    where = float(_uniforms(seed, _SILENCE, 0, 1)[0])
+    where = float(uniforms(1, seed=seed, stream=_SILENCE)[0])
     begin = _SILENCE_FROM + (_SILENCE_TO - _SILENCE_FROM) * where
     silent_ns = (begin * duration_ns, (begin + stress.silent_share) * duration_ns)
 
     def is_dropped(frame: RadarFrame) -> bool:
-        words = _uniforms(seed, _DROPPED + frame.radar, frame.counter - FIRST_COUNTER, 1)
+        block = frame.counter - FIRST_COUNTER
+        words = uniforms(1, seed=seed, stream=_DROPPED + frame.radar, block=block)
         return float(words[0]) < share
 
     for scan in scans:
@@ -156,7 +183,9 @@ class OutlierDetector:
 
     def _mixed(self, frame: RadarFrame, detections: Sequence[Detection]) -> tuple[Detection, ...]:
         block = (frame.counter - FIRST_COUNTER) * _BLOCKS_PER_FRAME
-        words = _uniforms(self.seed, _OUTLIERS + frame.radar, block, 3 * len(detections))
+        words = uniforms(
+            3 * len(detections), seed=self.seed, stream=_OUTLIERS + frame.radar, block=block
+        )
         span_m = self.max_range_m - self.min_range_m
         mixed = [
             replace(
@@ -173,13 +202,6 @@ class OutlierDetector:
             )
         ]
         return tuple(sorted(mixed, key=lambda detection: detection.range_m))
-
-
-def _uniforms(seed: int, stream: int, block: int, count: int) -> NDArray[np.float64]:
-    """Return numbers in [0, 1), selected by stream and block alone; shape (count,)."""
-    philox = np.random.Philox(key=np.array([seed, stream], dtype=np.uint64), counter=block)
-    words: NDArray[np.uint64] = philox.random_raw(count)
-    return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
 def false_landmarks(last: Snapshot, scene: Scene) -> tuple[int, int]:

@@ -11,8 +11,10 @@ from emulator.echo.reflections import (
     CARRIER_CYCLES_PER_SAMPLE,
     HALF_WINDOW,
     SIGMA_S,
+    PulseShape,
     sum_of_pulses,
 )
+from emulator.scene.scene import PulseSpec
 
 SAMPLING_RATE_HZ = 23.328e9
 CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}
@@ -121,3 +123,47 @@ def test_no_pulses_give_zeros_of_the_right_type() -> None:
     assert got.shape == (2, 30)
     assert got.dtype == np.float64
     assert not got.any()
+
+
+@pytest.mark.parametrize("position", [200.0, 199.7, 200.5])
+def test_a_modules_own_pulse_is_two_sided_and_rings(position: float) -> None:
+    """Widths w (1 -+ s) before and after the peak; r of it 3.2 sigma later, 1 rad ahead."""
+    w, s, r, phase_rad = 1.15, 0.2, 0.25, 0.7
+    got = sum_of_pulses(
+        frame=np.array([0]),
+        position=np.array([position]),
+        amplitude=np.array([2.0]),
+        phase_rad=np.array([phase_rad]),
+        tx_center_frequency=3,
+        shape=(1, 400),
+        pulse=PulseShape.of(PulseSpec(width=w, skew=s, ringing=r)),
+    )[0]
+    t = (np.arange(400) - position) / SAMPLING_RATE_HZ
+
+    def pulse(t: NDArray[np.floating], ahead_rad: float) -> NDArray[np.float64]:
+        sigma = np.where(t < 0, w * (1 - s), w * (1 + s)) * SIGMA_S
+        wave: NDArray[np.float64] = np.exp(-(t**2) / (2 * sigma**2)) * np.cos(
+            2 * np.pi * CARRIER_HZ[3] * t + phase_rad + ahead_rad
+        )
+        return wave
+
+    expected = 2.0 * pulse(t, 0.0)
+    expected += 2.0 * r * pulse(t - 3.2 * SIGMA_S, 1.0)
+    np.testing.assert_allclose(got, expected, atol=6e-8)
+
+
+def test_a_wider_pulse_has_a_narrower_band() -> None:
+    """Bandwidth goes with 1 / width: 1.4 GHz / 1.1."""
+    n = 1 << 16
+    frames = sum_of_pulses(
+        frame=np.array([0]),
+        position=np.array([700.0]),
+        amplitude=np.array([1.0]),
+        phase_rad=np.array([0.3]),
+        tx_center_frequency=3,
+        shape=(1, 1400),
+        pulse=PulseShape(before=1.1, after=1.1),
+    )
+    power = np.abs(np.fft.rfft(frames[0], n)) ** 2
+    inside = np.fft.rfftfreq(n, 1 / SAMPLING_RATE_HZ)[power >= power.max() / 10]
+    assert inside[-1] - inside[0] == pytest.approx(BANDWIDTH_HZ / 1.1, abs=2e6)

@@ -199,3 +199,36 @@ def test_wheels_do_not_see_that_the_robot_is_carried() -> None:
     np.testing.assert_array_equal(at_60[1:], at_63[1:])
     driven_m = np.hypot(*(driven[2, :2] - driven[1, :2]))
     assert np.hypot(*(at_73[1:3] - at_63[1:3])) == pytest.approx(driven_m, abs=1e-9)
+
+
+SLIPPERY = OdometrySpec(slips_per_s=0.05, slip_sigma_m=0.015, slip_sigma_deg=2.0)
+
+
+def test_wheels_slip_every_20_s_forwards_and_by_a_turn() -> None:
+    n = 100_000
+    reported = drift(straight(5000.0, n), SLIPPERY, seed=5)
+    turns = np.diff(reported[:, 2])
+    steps = np.hypot(*np.diff(reported[:, :2], axis=0).T) - 0.05
+    slipped = abs(turns) > 1e-12
+    # binomial: 5 samples/s, so a slip in a hundredth of them; 1000 slips
+    assert slipped.sum() == pytest.approx(1000, abs=4 * math.sqrt(1000))
+    assert abs(steps[~slipped]).max() < 1e-9
+    assert (steps[slipped] >= 0).all()
+    assert np.sqrt(np.mean(steps[slipped] ** 2)) == pytest.approx(0.015, rel=4 / math.sqrt(2000))
+    assert turns[slipped].std() == pytest.approx(math.radians(2), rel=4 / math.sqrt(2000))
+    assert abs(turns[slipped].mean()) < 4 * math.radians(2) / math.sqrt(1000)
+
+
+def test_slip_changes_no_other_error_of_the_wheels_and_not_in_the_air() -> None:
+    lab = load_scene("lab").odometry
+    truth = straight(10.0, 500)
+    in_the_air = np.zeros(500, dtype=bool)
+    in_the_air[100:400] = True
+    sizes = SLIPPERY.model_dump(include={"slips_per_s", "slip_sigma_m", "slip_sigma_deg"})
+    both = lab.model_copy(update=sizes)
+    increments = [
+        np.diff(drift(truth, model, seed=6, unseen=in_the_air)[:, 2]) for model in (lab, both)
+    ]
+    apart = np.flatnonzero(abs(increments[0] - increments[1]) > 1e-12)
+    assert 0 < len(apart) < 20
+    assert not in_the_air[apart].any()
