@@ -25,9 +25,9 @@ from slam.robust.association import (
     view,
 )
 from slam.robust.initialisation import (
-    Member,
     RangeBearing,
-    Tracker,
+    Search,
+    Sightings,
     Tracklet,
     UnassignedRanges,
     assign,
@@ -35,9 +35,8 @@ from slam.robust.initialisation import (
     initialise_landmark,
     match,
     named_rows,
-    pair_guesses,
+    point_guesses,
     range_bearing_rows,
-    single_guesses,
     update_with_point,
 )
 from slam.robust.kidnapping import Evidence, Localisation, evidence, forget, merge_landmarks
@@ -94,7 +93,7 @@ class RobustBackEnd:
         scale = rule.drift_share * parameters.wheels.scale_sigma
         window = max(rule.window, rule.single_window)
         self._unassigned = UnassignedRanges(
-            window, parameters.ranges.sigma_m, scale, scale * rule.lever_m
+            window, len(rig.mounts), parameters.ranges.sigma_m, scale, scale * rule.lever_m
         )
         self._existence = Existence(parameters.map)
         self._log = RunLog(parameters.wheels)
@@ -353,34 +352,32 @@ class RobustBackEnd:
 
     def _initialise_landmarks(self) -> None:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""
-        state, rule = self.state, self.parameters.tracklets
-        newest = self._unassigned.newest()
+        rule = self.parameters.tracklets
         for side in self._sides:
             # A radar without frames for long takes no part.
             radars = [radar for radar in side if self._silent[radar] <= rule.partner_silence]
-            if not radars or not all(newest.unused[radar] for radar in radars):
+            if not radars or not all(self._unassigned.newest(radar) for radar in radars):
                 continue
-            window = rule.window if len(radars) > 1 else rule.single_window
-            frames = self._unassigned.slots(radars, window)
-            noise = self.parameters.ranges
-            if len(radars) == 1:
-                guesses = single_guesses(frames[0])
-            else:
-                guesses = pair_guesses(frames[0], noise, rule)
+            is_alone = len(radars) == 1
+            guesses = point_guesses(self._unassigned, radars, self.parameters.ranges, rule)
             if not guesses:
                 continue
             lost = self._localisation.is_lost
             for wall in () if lost else self._walls.find(self._unassigned, radars):
                 wall_id = self._walls.place(wall)
                 if wall_id is not None:
-                    self._use(wall_id, wall.members)
-            offsets = np.arange(state.offsets.start, state.offsets.stop)
-            tracker = Tracker(self.parameters, state.offsets_m, state.P.block(offsets))
-            n_radars = min(len(radars), 2)
-            is_point = self._walls.is_point if n_radars > 1 else None
-            for tracklet in find_tracklets(
-                tracker, guesses, frames, n_radars, rule, is_point=is_point
-            ):
+                    self._use(wall_id, wall.seen)
+            search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
+            if is_alone:
+                search = Search(
+                    radars=radars,
+                    window=rule.single_window,
+                    min_frames=rule.single_min_frames,
+                    most_sigma_m=rule.single_max_sigma_m,
+                )
+            tracker = self._walls.tracker(is_wall=False)
+            is_point = None if is_alone else self._walls.is_point
+            for tracklet in find_tracklets(tracker, guesses, self._unassigned, search, is_point):
                 self._place(tracklet)
 
     def _place(self, tracklet: Tracklet) -> None:
@@ -398,21 +395,28 @@ class RobustBackEnd:
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
-        self._use(landmark_id, tracklet.members)
+        self._use(landmark_id, tracklet.seen)
 
-    def _use(self, landmark_id: int, members: Sequence[Member]) -> None:
+    def _use(self, landmark_id: int, seen: Sightings) -> None:
         """Count and log the ranges of a tracklet as those of a landmark or a wall."""
-        self._existence.hit(landmark_id, len({m.slot.back for m in members}))
-        for member in members:
-            slot = member.slot
+        self._existence.hit(landmark_id, seen.n_frames)
+        for pose, radar, antenna, range_m, sigma_m, alone in zip(
+            seen.poses.tolist(),
+            seen.radars.tolist(),
+            seen.mounts_m.tolist(),
+            seen.measured_m.tolist(),
+            seen.sigmas_m.tolist(),
+            seen.alone.tolist(),
+            strict=True,
+        ):
             self._log.add_range(
-                self._unassigned.pose_index(slot.back),
-                slot.radar,
+                pose,
+                radar,
                 landmark_id,
-                antenna=slot.antenna_then,
-                range_m=member.measured.range_m,
-                sigma_m=member.measured.sigma_m,
-                alone=member.measured.alone,
+                antenna=(antenna[0], antenna[1]),
+                range_m=range_m,
+                sigma_m=sigma_m,
+                alone=alone,
             )
 
     def _delete_vanished(self) -> None:

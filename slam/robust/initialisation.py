@@ -1,12 +1,23 @@
-"""New landmarks: ranges of the last frames that one point at rest explains.
+"""New landmarks: ranges of the last frames that one target at rest explains.
 
-A point is guessed from ranges of the newest frame and followed back through the frames along
-odometry by a small Kalman filter on its position in the newest body frame; each frame gives the
-unused range nearest to the prediction, if it passes the gate. The guess is accepted if enough
-frames hold it and its residuals are as small as those of a point at rest: clutter has no past, and
+A target is guessed from ranges of the newest frame and followed back through the frames along
+odometry by a small Kalman filter on its two coordinates in the newest body frame; each frame gives
+the unused range nearest to the prediction, if it passes the gate. The guess is accepted if enough
+frames hold it and its residuals are as small as those of a target at rest: clutter has no past, and
 a ghost, the fix of two ranges of different targets, does not stay at rest while the robot moves.
 
-A point b with noise n and known dependence D_b on the radars' range offsets measures
+The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in the
+antenna's position a; a point's is a hyperbola::
+
+    point at b:     r = |b - a|
+    wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
+
+For ranges, a corner of two walls is a point. Both laws have two unknowns, so the difference of
+their chi-squares is twice the logarithm of the likelihood ratio (and that of their BIC). Over a
+short displacement, or at a great distance, it is near zero. Source: Leonard and Durrant-Whyte,
+"Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
+
+A point b with noise n and known dependence D_b on the unknowns of the radars measures
 
     y = b - R^T (l - p),   H = [e_p: -R^T, e_l: R^T, e_b: -D_b],   S = H P H^T + C_b,
 
@@ -21,17 +32,18 @@ least Mahalanobis distance, all points of one time together and no landmark twic
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from slam.geometry import compose, wrap_angle
-from slam.robust.association import LONGEST_M, Antennas, RangeScan, fix_of_pair
+from slam.robust import kernels
+from slam.robust.association import LONGEST_M, Antennas, RangeScan
 from slam.robust.parameters import (
     BackEndParameters,
     MapRule,
@@ -51,78 +63,91 @@ _FORBIDDEN = 1e9
 # What one degree of freedom is worth against chi-square, where tracklets compete
 _DOF_WORTH = 4.0
 _LEAST_WAY_M = 1e-6
-# Offsets surer than this share of a range's standard deviation are taken for known.
+# Unknowns of the radars surer than this share of a range's standard deviation are taken for known.
 _KNOWN_SHARE = 0.1
-# Gauss-Newton steps of a fit with offsets, and what keeps its matrices regular
-_STEPS, _PRIOR_FLOOR_M2, _LEAST_INFORMATION = 4, 1e-12, 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class UnassignedRange:
-    """One range that is of no landmark and no tracklet yet."""
-
-    range_m: float
-    label: int | None  # of its target, where known
-    sigma_m: float
-    alone: bool = True  # whether no other echo overlaps its own
+# Label of a range whose target is not known
+_NO_LABEL = -1
+# Room for ranges of one radar in one frame, at first
+_FEWEST_SLOTS = 8
+# Gauss-Newton steps of a fit of a law, its damping, the smallest share of a step that is tried, and
+# the decrease of chi-square that ends a fit; what keeps matrices regular
+_STEPS, _DAMPING, _LEAST_SHARE, _LEAST_DECREASE, _FLOOR = 8, 1e-6, 1e-3, 1e-4, 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenFrame:
-    """One frame: where the antennas were in the odometry frame, and the ranges still unused."""
+class Sightings:
+    """k ranges of one target at rest, newest first."""
 
-    pose_index: int  # index of its pose in the run
-    pose: Array  # shape (3,), odometry frame
-    # Way and turn since the start, always growing
-    path_m: float
-    turned_rad: float
-    antennas: Antennas  # in the odometry frame
-    mounts_m: Array  # shape (r, 2), the antennas in the body frame of the pose
-    unused: tuple[list[UnassignedRange], ...]  # one list per radar; a range that is used is removed
+    antennas_m: Array  # shape (k, 2), in one frame
+    headings_rad: Array  # shape (k,), of the body in that frame
+    ranges_m: Array  # shape (k,), the offsets of the state removed
+    # shape (k,): variances [m^2] of noise and of odometry since then
+    variances: Array
+    radars: Indices  # shape (k,)
+    # As measured, for the log: the pose of each (k,), its antenna in the body frame of that pose
+    # (k, 2), range [m] and standard deviation (k,), and whether no other echo overlapped its own
+    poses: Indices
+    mounts_m: Array
+    measured_m: Array
+    sigmas_m: Array
+    alone: NDArray[np.bool_]
+    n_radars: int  # of the rig
 
-
-@dataclass(frozen=True, slots=True)
-class Slot:
-    """One radar's share of one earlier frame."""
-
-    back: int  # how many frames ago
-    radar: int
-    # The antenna then, in the newest body frame
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    drift: float  # variance [m^2] that odometry since then adds to a range
-    unused: list[UnassignedRange]
-    antenna_then: tuple[float, float]  # in the body frame of then
+    @property
+    def n_frames(self) -> int:
+        return len(set(self.poses.tolist()))
 
 
 class UnassignedRanges:
-    """The unused ranges of the last frames, and the way of the robot between them.
+    """The ranges of the last frames that are of nothing known, and the robot's way between them.
 
     ``sigma_m`` is for ranges whose scan has none; ``drift_per_m`` and ``drift_per_rad_m`` are what
-    the standard deviation of a range gains per metre of way back, and per radian of turn.
+    the standard deviation of a range gains per metre of way back, and per radian of turn. The
+    frames are rows of a ring; a range that is used is NaN.
     """
 
     def __init__(
-        self, capacity: int, sigma_m: float, drift_per_m: float, drift_per_rad_m: float
+        self,
+        capacity: int,
+        n_radars: int,
+        sigma_m: float,
+        drift_per_m: float,
+        drift_per_rad_m: float,
     ) -> None:
         self._sigma_m = sigma_m
-        self._frames: deque[SeenFrame] = deque(maxlen=capacity)
-        self._drift_per_m = drift_per_m
-        self._drift_per_rad_m = drift_per_rad_m
+        self._drifts = (drift_per_m, drift_per_rad_m)
         self._pose = np.zeros(3)
-        self._path_m = 0.0
-        self._turned_rad = 0.0
+        self._way = np.zeros(2)  # metres and radians, always growing
+        self._newest, self._count = -1, 0
+        self._places = np.zeros((capacity, n_radars, 3))
+        self._mounts_m = np.zeros((capacity, n_radars, 2))
+        self._poses, self._ways = np.zeros((capacity, 3)), np.zeros((capacity, 2))
+        self._pose_indices = np.zeros(capacity, dtype=np.intp)
+        self._has_frame = np.zeros((capacity, n_radars), dtype=np.bool_)
+        self._reserve(_FEWEST_SLOTS)
+
+    def _reserve(self, most: int) -> None:
+        """Make room for so many ranges of a radar in a frame."""
+        shape = (*self._has_frame.shape, most)
+        ranges_m, sigmas_m = np.full(shape, np.nan), np.zeros(shape)
+        labels, alone = np.full(shape, _NO_LABEL, dtype=np.intp), np.zeros(shape, dtype=np.bool_)
+        if self._count:
+            k = self._ranges_m.shape[2]
+            ranges_m[..., :k], sigmas_m[..., :k] = self._ranges_m, self._sigmas_m
+            labels[..., :k], alone[..., :k] = self._labels, self._alone
+        self._ranges_m: Array = ranges_m
+        self._sigmas_m: Array = sigmas_m
+        self._labels: Indices = labels
+        self._alone: NDArray[np.bool_] = alone
 
     def move(self, motion: Motion) -> None:
         step = np.array([motion.step_m[0], motion.step_m[1], motion.turn_rad])
         self._pose = compose(self._pose, step)
-        self._path_m += motion.distance_m
-        self._turned_rad += abs(motion.turn_rad)
+        self._way = self._way + np.array([motion.distance_m, abs(motion.turn_rad)])
 
     def clear(self) -> None:
         """Forget all frames: they were taken at another place."""
-        self._frames.clear()
+        self._count = 0
 
     def keep(
         self,
@@ -132,70 +157,102 @@ class UnassignedRanges:
         used: set[tuple[int, int]],
     ) -> None:
         """Store a frame without the ranges used, given as (radar, index)."""
-        unused: tuple[list[UnassignedRange], ...] = tuple([] for _ in antennas.yaw_rad)
-        for scan in scans:
-            unused[scan.radar].extend(
-                UnassignedRange(
-                    range_m,
-                    scan.label(index),
-                    scan.sigma(index, self._sigma_m),
-                    scan.is_alone(index),
-                )
-                for index, range_m in enumerate(scan.ranges_m)
-                if (scan.radar, index) not in used and 0.0 < range_m < LONGEST_M
-            )
+        most = max((len(scan.ranges_m) for scan in scans), default=0)
+        if most > self._ranges_m.shape[2]:
+            self._reserve(2 * most)
+        self._newest = f = (self._newest + 1) % len(self._poses)
+        self._count = min(self._count + 1, len(self._poses))
         turn = rotation(self._pose[2])
-        self._frames.append(
-            SeenFrame(
-                pose_index=pose_index,
-                pose=self._pose,
-                path_m=self._path_m,
-                turned_rad=self._turned_rad,
-                antennas=Antennas(
-                    position_m=antennas.position_m @ turn.T + self._pose[:2],
-                    yaw_rad=antennas.yaw_rad + self._pose[2],
-                    has_frame=antennas.has_frame,
-                ),
-                mounts_m=antennas.position_m,
-                unused=unused,
-            )
+        self._places[f, :, :2] = antennas.position_m @ turn.T + self._pose[:2]
+        self._places[f, :, 2] = antennas.yaw_rad + self._pose[2]
+        self._mounts_m[f], self._has_frame[f] = antennas.position_m, antennas.has_frame
+        self._poses[f], self._ways[f], self._pose_indices[f] = self._pose, self._way, pose_index
+        self._ranges_m[f], self._labels[f] = np.nan, _NO_LABEL
+        for scan in scans:
+            for index, range_m in enumerate(scan.ranges_m):
+                if (scan.radar, index) in used or not 0.0 < range_m < LONGEST_M:
+                    continue
+                at = f, scan.radar, index
+                self._ranges_m[at] = range_m
+                self._sigmas_m[at] = scan.sigma(index, self._sigma_m)
+                self._alone[at] = scan.is_alone(index)
+                if (label := scan.label(index)) is not None:
+                    self._labels[at] = label
+
+    def newest(self, radar: int) -> list[tuple[float, int]]:
+        """Return the ranges of a radar in the newest frame and their labels."""
+        ranges_m, labels = self._ranges_m[self._newest, radar], self._labels[self._newest, radar]
+        pairs = zip(ranges_m.tolist(), labels.tolist(), strict=True)
+        return [(range_m, label) for range_m, label in pairs if not math.isnan(range_m)]
+
+    def antenna(self, radar: int) -> tuple[float, float, float]:
+        """Return place and yaw of an antenna at the newest frame, in its body frame."""
+        x, y = self._mounts_m[self._newest, radar].tolist()
+        return x, y, float(self._places[self._newest, radar, 2] - self._pose[2])
+
+    def n_frames_with_ranges(self, radar: int, window: int) -> int:
+        """Return how many of the last frames hold any range of a radar."""
+        backs = np.arange(min(window, self._count))
+        some = ~np.isnan(self._ranges_m[self._newest - backs, radar]).all(axis=1)
+        return int(np.count_nonzero(some))
+
+    def follow(
+        self,
+        guess: Guess,
+        search: Search,
+        offsets_m: Array,
+        radar_covariance: Array,
+        limits: Sequence[float],
+        *,
+        is_wall: bool,
+    ) -> tuple[Array, Array, Indices, Indices]:
+        """Return what `slam.robust.kernels.follow` does; ``limits`` are its without the drift."""
+        (xx, xy), (_, yy) = guess.covariance.tolist()
+        return kernels.follow(
+            is_wall,
+            np.array([*guess.target, xx, xy, yy]),
+            _NO_LABEL if guess.label is None else guess.label,
+            self._places,
+            self._poses,
+            self._ways,
+            self._has_frame,
+            self._ranges_m,
+            self._sigmas_m,
+            self._labels,
+            self._newest,
+            min(search.window, self._count),
+            np.array(search.radars, dtype=np.intp),
+            offsets_m,
+            radar_covariance,
+            np.array([*limits, *self._drifts]),
         )
 
-    def newest(self) -> SeenFrame:
-        return self._frames[-1]
+    def sightings(self, members: Indices, offsets_m: Array) -> Sightings:
+        """Return ranges given as (back, radar, index), shape (k, 3), in the newest body frame."""
+        back, radars, index = members.T
+        f = (self._newest - back) % len(self._poses)
+        at = f, radars, index
+        way_m, turn_rad = (self._ways[self._newest] - self._ways[f]).T
+        drift = np.square(self._drifts[0] * way_m) + np.square(self._drifts[1] * turn_rad)
+        places = self._places[f, radars, :2] - self._pose[:2]
+        return Sightings(
+            antennas_m=places @ rotation(self._pose[2]),
+            headings_rad=self._poses[f, 2] - self._pose[2],
+            ranges_m=self._ranges_m[at] - offsets_m[radars],
+            variances=np.square(self._sigmas_m[at]) + drift,
+            radars=radars,
+            poses=self._pose_indices[f],
+            mounts_m=self._mounts_m[f, radars],
+            measured_m=self._ranges_m[at],
+            sigmas_m=self._sigmas_m[at],
+            alone=self._alone[at],
+            n_radars=self._has_frame.shape[1],
+        )
 
-    def pose_index(self, back: int) -> int:
-        return self._frames[-1 - back].pose_index
-
-    def slots(self, radars: Sequence[int], window: int) -> list[list[Slot]]:
-        """Return the last frames, newest first, as some radars saw them."""
-        now = self._frames[-1]
-        R = rotation(now.pose[2])
-        frames: list[list[Slot]] = []
-        for back in range(min(window, len(self._frames))):
-            frame = self._frames[-1 - back]
-            way, turn = now.path_m - frame.path_m, now.turned_rad - frame.turned_rad
-            drift = (self._drift_per_m * way) ** 2 + (self._drift_per_rad_m * turn) ** 2
-            places = ((frame.antennas.position_m - now.pose[:2]) @ R).tolist()
-            yaws = (frame.antennas.yaw_rad - now.pose[2]).tolist()
-            then = frame.mounts_m.tolist()
-            frames.append(
-                [
-                    Slot(
-                        back,
-                        radar,
-                        places[radar][0],
-                        places[radar][1],
-                        math.remainder(yaws[radar], math.tau),
-                        drift,
-                        frame.unused[radar],
-                        (then[radar][0], then[radar][1]),
-                    )
-                    for radar in radars
-                    if frame.antennas.has_frame[radar]
-                ]
-            )
-        return frames
+    def use_up(self, members: Indices) -> None:
+        """Take out ranges given as (back, radar, index), shape (k, 3)."""
+        back, radars, index = members.T
+        self._ranges_m[(self._newest - back) % len(self._poses), radars, index] = np.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -204,7 +261,7 @@ class BodyPoint:
 
     point_m: Array  # shape (2,)
     covariance: Array  # shape (2, 2)
-    by_offsets: Array  # shape (2, r), d(point) / d(range offsets)
+    by_offsets: Array  # shape (2, q), d(point) / d(unknowns of the radars)
     # shape (2,): away from where it was seen from, where the axis of a round target lies
     outward: Array | None = None
 
@@ -304,14 +361,6 @@ def initialise_landmark(state: State, point: BodyPoint) -> int:
     return state.augment(state.position_m + R @ point.point_m, cross, (corner + corner.T) / 2)
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
-    """One range of a tracklet and its slot."""
-
-    slot: Slot
-    measured: UnassignedRange
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Guess:
     """Where a target may be, in the newest body frame: mean (2,) and covariance (2, 2)."""
@@ -326,13 +375,13 @@ class Tracklet:
     """A target at rest in the newest body frame, and the ranges that it explains."""
 
     target: Array  # shape (2,): a point [m], or phi [rad] and d [m] of a wall
-    covariance: Array  # shape (2, 2), for the range offsets of the state
-    by_offsets: Array  # shape (2, r), d(target) / d(offsets)
-    members: tuple[Member, ...]  # newest first
+    covariance: Array  # shape (2, 2), for the unknowns of the radars as in the state
+    by_offsets: Array  # shape (2, q), d(target) / d(unknowns of the radars)
+    members: Indices  # shape (k, 3): (back, radar, index), newest first
+    seen: Sightings  # of the members
     # Of the residuals
     chi_square: float
     dof: int
-    share: float  # part of the frames with the target in view that hold a member
     label: int | None
 
     @property
@@ -340,13 +389,8 @@ class Tracklet:
         """Return 4 dof - chi-square, by which tracklets compete for ranges."""
         return _DOF_WORTH * self.dof - self.chi_square
 
-    @property
-    def antennas_m(self) -> Array:
-        """Return where the antennas of the members were, shape (k, 2)."""
-        return np.array([(member.slot.x_m, member.slot.y_m) for member in self.members])
-
     def body_point(self) -> BodyPoint:
-        away = self.target - np.mean(self.antennas_m, axis=0)
+        away = self.target - self.seen.antennas_m.mean(axis=0)
         return BodyPoint(
             point_m=self.target,
             covariance=self.covariance,
@@ -355,253 +399,340 @@ class Tracklet:
         )
 
 
-def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:
-    """Return the fixes of all pairs of unused ranges inside both fields of view."""
+def point_guesses(
+    unassigned: UnassignedRanges, radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
+) -> list[Guess]:
+    """Return the fixes of all pairs of new ranges, or for a radar alone points on their arcs."""
+    if len(radars) == 1:
+        return _guesses_on_arcs(unassigned, radars[0])
     guesses = []
     spread = rule.prior_sigma_m**2 * np.eye(2)
-    for first, second in combinations(newest, 2):
-        ahead = np.array([math.cos(first.yaw_rad), math.sin(first.yaw_rad)])
-        here, there = np.array([first.x_m, first.y_m]), np.array([second.x_m, second.y_m])
-        for a, b in product(first.unused, second.unused):
-            if a.label != b.label:
+    limit = noise.field_of_view_rad / 2 + _SEED_MARGIN_RAD
+    for one, two in combinations(radars, 2):
+        first, second = unassigned.antenna(one), unassigned.antenna(two)
+        for (a, label), (b, other) in product(unassigned.newest(one), unassigned.newest(two)):
+            if label != other:
                 continue
-            for side in (ahead, -ahead):
-                point = fix_of_pair(here, there, a.range_m, b.range_m, side)
-                if point is None:
-                    break
-                if _in_view(point, first, noise) and _in_view(point, second, noise):
-                    guesses.append(Guess(target=point, covariance=spread, label=a.label))
+            for x, y in _fixes(first, second, a, b):
+                if all(
+                    abs(math.remainder(math.atan2(y - at[1], x - at[0]) - at[2], math.tau)) <= limit
+                    for at in (first, second)
+                ):
+                    guesses.append(_guess(x, y, spread, label))
     return guesses
 
 
-def single_guesses(newest: Sequence[Slot]) -> list[Guess]:
-    """Return, for each unused range of a radar without partner, points on its arc."""
+def _guess(x: float, y: float, spread: Array, label: int = _NO_LABEL) -> Guess:
+    known = None if label == _NO_LABEL else label
+    return Guess(target=np.array([x, y]), covariance=spread, label=known)
+
+
+def _fixes(
+    first: tuple[float, float, float], second: tuple[float, float, float], a: float, b: float
+) -> list[tuple[float, float]]:
+    """Return where circles of radii a and b about two antennas meet."""
+    dx, dy = second[0] - first[0], second[1] - first[1]
+    base = math.hypot(dx, dy)
+    if base == 0.0:
+        return []
+    along = (a**2 - b**2 + base**2) / (2.0 * base)
+    square = a**2 - along**2
+    if square <= 0.0:
+        return []
+    dx, dy, across = dx / base, dy / base, math.sqrt(square)
+    x, y = first[0] + along * dx, first[1] + along * dy
+    return [(x - across * dy, y + across * dx), (x + across * dy, y - across * dx)]
+
+
+def _guesses_on_arcs(unassigned: UnassignedRanges, radar: int) -> list[Guess]:
     guesses = []
-    for slot in newest:
-        for measured in slot.unused:
-            for off in _SINGLE_BEARINGS_RAD:
-                u = np.array([math.cos(slot.yaw_rad + off), math.sin(slot.yaw_rad + off)])
-                across = (_SINGLE_SPREAD_RAD * measured.range_m) ** 2
-                along = _SINGLE_RANGE_SIGMA_M**2
-                guesses.append(
-                    Guess(
-                        target=np.array([slot.x_m, slot.y_m]) + measured.range_m * u,
-                        covariance=across * np.eye(2) + (along - across) * np.outer(u, u),
-                        label=measured.label,
-                    )
-                )
+    x, y, yaw = unassigned.antenna(radar)
+    for range_m, label in unassigned.newest(radar):
+        for off in _SINGLE_BEARINGS_RAD:
+            u = np.array([math.cos(yaw + off), math.sin(yaw + off)])
+            across, along = (_SINGLE_SPREAD_RAD * range_m) ** 2, _SINGLE_RANGE_SIGMA_M**2
+            spread = across * np.eye(2) + (along - across) * np.outer(u, u)
+            guesses.append(
+                _guess(x + range_m * float(u[0]), y + range_m * float(u[1]), spread, label)
+            )
     return guesses
 
 
-def _in_view(point: Array, slot: Slot, noise: RangeNoise) -> bool:
-    dx, dy = float(point[0]) - slot.x_m, float(point[1]) - slot.y_m
-    off = math.remainder(math.atan2(dy, dx) - slot.yaw_rad, math.tau)
-    return abs(off) <= noise.field_of_view_rad / 2 + _SEED_MARGIN_RAD
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """Where tracklets are looked for, and what they must hold."""
+
+    radars: Sequence[int]  # those of one side
+    window: int  # frames looked back
+    min_frames: int  # distinct ones
+    most_sigma_m: float = math.inf  # largest standard deviation in any direction
+
+    @property
+    def least_radars(self) -> int:
+        return min(len(self.radars), 2)
 
 
 class Tracker:
-    """Follows guesses back in time.
+    """Follows guesses of points, or of walls, back in time.
 
-    ``offsets_m`` (r,) and ``offset_covariance`` (r, r) are the radars' range offsets in the state.
+    ``offsets_m`` (r,) and ``radar_covariance`` (q, q) are of the unknowns of the radars in the
+    state: r offsets and, where they are unknown, r places of antennas.
     """
 
     def __init__(
-        self, parameters: BackEndParameters, offsets_m: Array, offset_covariance: Array
+        self,
+        parameters: BackEndParameters,
+        offsets_m: Array,
+        radar_covariance: Array,
+        *,
+        is_wall: bool = False,
     ) -> None:
         self._noise, self._rule = parameters.ranges, parameters.tracklets
-        self._offsets: list[float] = offsets_m.tolist()
-        self._offset_covariance = offset_covariance
-        self._offset_variances: list[float] = offset_covariance.diagonal().tolist()
+        self._wheels, self._is_wall = parameters.wheels, is_wall
+        self._offsets_m, self._radar_covariance = offsets_m, np.ascontiguousarray(radar_covariance)
+        half_view = self._noise.field_of_view_rad / 2
+        self._limits = (
+            half_view,
+            half_view + MEMBER_MARGIN_RAD,
+            self._noise.min_range_m,
+            self._noise.max_range_m,
+            self._rule.gate_sigmas**2,
+        )
         least = (_KNOWN_SHARE * self._noise.sigma_m) ** 2
-        self._offsets_known = max(self._offset_variances, default=0.0) <= least
+        self._radars_known = float(radar_covariance.diagonal().max(initial=0.0)) <= least
 
-    def follow(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
-        """Return the ranges that follow a guess; found twice, again from the first result."""
-        first = self._walk(guess, frames)
-        second = self._walk(replace(guess, target=first.target), frames)
-        return second if self._offsets_known else self._with_free_offsets(second)
+    @property
+    def min_hits_per_radar(self) -> int:
+        return self._rule.min_hits_per_radar
 
-    def _sight(self, x: float, y: float, slot: Slot) -> tuple[float, float, float, float]:
-        """Return a target's range, its angle off boresight, and d(range) / d(target)."""
-        dx, dy = x - slot.x_m, y - slot.y_m
-        distance = math.sqrt(dx * dx + dy * dy)
-        if distance == 0.0:
-            return 0.0, math.inf, 0.0, 0.0
-        off = abs(math.remainder(math.atan2(dy, dx) - slot.yaw_rad, math.tau))
-        return distance, off, dx / distance, dy / distance
-
-    def _walk(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
-        """Filter the target backwards; plain floats, the loop is short and runs often."""
-        x, y = float(guess.target[0]), float(guess.target[1])
-        cxx, cxy, cyy = (float(guess.covariance[i]) for i in ((0, 0), (0, 1), (1, 1)))
-        noise, rule = self._noise, self._rule
-        half_view = noise.field_of_view_rad / 2
-        gate_sq = rule.gate_sigmas**2
-        n_radars = len(self._offsets)
-        dx_do, dy_do = [0.0] * n_radars, [0.0] * n_radars
-        members: list[Member] = []
-        chi_square = 0.0
-        in_view, hit = 0, 0
-        for slots in frames:
-            sees = hits = False
-            for slot in slots:
-                distance, off, ux, uy = self._sight(x, y, slot)
-                if off <= half_view and noise.min_range_m <= distance <= noise.max_range_m:
-                    sees = True
-                if off > half_view + MEMBER_MARGIN_RAD or not slot.unused:
-                    continue
-                radar = slot.radar
-                expected = distance + self._offsets[radar]
-                nearest, nu = None, math.inf
-                for measured in slot.unused:
-                    miss = measured.range_m - expected
-                    if abs(miss) < abs(nu) and measured.label == guess.label:
-                        nearest, nu = measured, miss
-                if nearest is None:
-                    continue
-                px, py = cxx * ux + cxy * uy, cxy * ux + cyy * uy
-                variance = nearest.sigma_m**2 + slot.drift
-                s = ux * px + uy * py + variance + self._offset_variances[radar]
-                if nu * nu > gate_sq * s:
-                    continue
-                kx, ky = px / s, py / s
-                x, y = x + kx * nu, y + ky * nu
-                cxx, cxy, cyy = cxx - kx * px, cxy - kx * py, cyy - ky * py
-                for other in range(n_radars):
-                    change = ux * dx_do[other] + uy * dy_do[other] + (other == radar)
-                    dx_do[other] -= kx * change
-                    dy_do[other] -= ky * change
-                chi_square += nu * nu / s
-                members.append(Member(slot, nearest))
-                hits = True
-            in_view += sees or hits
-            hit += hits
-        return Tracklet(
+    def follow(self, guess: Guess, unassigned: UnassignedRanges, search: Search) -> Tracklet | None:
+        """Return the ranges that follow a guess, or None if they do not suffice."""
+        found, by_offsets, members, hits = unassigned.follow(
+            guess,
+            search,
+            self._offsets_m,
+            self._radar_covariance,
+            self._limits,
+            is_wall=self._is_wall,
+        )
+        x, y, xx, xy, yy, chi_square, in_view, hit = found.tolist()
+        least = self._rule.min_hits_per_radar
+        counts = [n for n in hits.tolist() if n]
+        if hit < search.min_frames or len(counts) < search.least_radars or min(counts) < least:
+            return None
+        if hit < self._rule.min_share * in_view:
+            return None
+        tracklet = Tracklet(
             target=np.array([x, y]),
-            covariance=np.array([[cxx, cxy], [cxy, cyy]]),
-            by_offsets=np.array([dx_do, dy_do]),
-            members=tuple(members),
+            covariance=np.array([[xx, xy], [xy, yy]]),
+            by_offsets=by_offsets,
+            members=members,
+            seen=unassigned.sightings(members, self._offsets_m),
             chi_square=chi_square,
             dof=len(members) - 2,
-            share=hit / max(in_view, 1),
             label=guess.label,
         )
+        if not self._radars_known:
+            tracklet = self._with_free_radars(tracklet, guess.covariance)
+        if tracklet.chi_square > chi_square_limit(tracklet.dof, self._rule.excess_sigmas):
+            return None
+        if float(np.linalg.eigvalsh(tracklet.covariance)[-1]) > search.most_sigma_m**2:
+            return None
+        if self._is_wall:
+            tracklet.covariance[0, 0] += self._turned(tracklet.seen)
+        return tracklet
 
-    def _with_free_offsets(self, walked: Tracklet) -> Tracklet:
-        """Judge the members by a point *and* the radars' common offsets, which are uncertain.
+    def _with_free_radars(self, tracklet: Tracklet, spread: Array) -> Tracklet:
+        """Judge the members by a target *and* the radars' common unknowns, which are uncertain.
 
-        Least squares over point and offset errors o ~ N(0, offset covariance). The point is
-        returned for the offsets of the state, moved along d(point) / d(offsets) from the
-        least-squares solution, where the linearisation is right.
+        For the filter, the uncertainty of an offset is noise of each range. It is one number: a
+        target may miss all ranges alike. The target is returned for the unknowns of the state,
+        moved along d(target) / d(unknowns) from the least-squares solution.
         """
-        if walked.dof < 1:
-            return walked
-        radars = sorted({member.slot.radar for member in walked.members})
-        place = np.array([radars.index(member.slot.radar) for member in walked.members])
-        antennas = walked.antennas_m
-        z = np.array([m.measured.range_m - self._offsets[m.slot.radar] for m in walked.members])
-        variance = np.array([m.measured.sigma_m**2 + m.slot.drift for m in walked.members])
-        offset_part = np.zeros((len(z), len(radars)))
-        offset_part[np.arange(len(z)), place] = 1.0
-        prior = self._offset_covariance[np.ix_(radars, radars)]
-        prior = np.asarray(np.linalg.inv(prior + _PRIOR_FLOOR_M2 * np.eye(len(radars))))
-        point, offsets = walked.target.copy(), np.zeros(len(radars))
-        for _ in range(_STEPS):
-            away = point - antennas
-            distance = np.hypot(away[:, 0], away[:, 1])
-            u = away / distance[:, None]
-            residual = z - distance - offset_part @ offsets
-            J = np.hstack([u, offset_part])
-            information = (J.T / variance) @ J
-            information[2:, 2:] += prior
-            gradient = (J.T / variance) @ residual
-            gradient[2:] -= prior @ offsets
-            change = np.linalg.solve(
-                information + _LEAST_INFORMATION * np.eye(len(information)), gradient
-            )
-            point, offsets = point + change[:2], offsets + change[2:]
-        covariance = np.linalg.inv((u.T / variance) @ u + np.eye(2) / self._rule.prior_sigma_m**2)
-        by_offsets = np.zeros((2, len(self._offsets)))
-        by_offsets[:, radars] = -covariance @ (u.T / variance) @ offset_part
+        law = wall_law if self._is_wall else point_law
+        fit = fit_law(tracklet.seen, tracklet.target, law, self._free_covariance)
+        weighted = fit.by_law.T / tracklet.seen.variances
+        covariance = np.asarray(np.linalg.inv(weighted @ fit.by_law + np.linalg.inv(spread)))
+        by_offsets = np.zeros((2, len(self._radar_covariance)))
+        by_offsets[:, fit.columns] = -covariance @ weighted @ fit.extra
         return replace(
-            walked,
-            target=point - by_offsets[:, radars] @ offsets,
+            tracklet,
+            target=fit.target - by_offsets[:, fit.columns] @ fit.unknowns,
             covariance=covariance,
             by_offsets=by_offsets,
-            chi_square=float(residual @ (residual / variance) + offsets @ prior @ offsets),
+            chi_square=fit.chi_square,
         )
 
+    @property
+    def _free_covariance(self) -> Array | None:
+        return None if self._radars_known else self._radar_covariance
 
-def is_believable(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool:
-    """Return whether a tracklet is evidence of a point at rest; ``n_radars`` is 1 or 2."""
-    frames = {member.slot.back for member in tracklet.members}
-    alone = n_radars == 1
-    if len(frames) < (rule.single_min_frames if alone else rule.min_frames):
-        return False
-    if not is_consistent(tracklet, n_radars, rule):
-        return False
-    if alone:
-        spread = float(np.linalg.eigvalsh(tracklet.covariance)[-1])
-        if spread > rule.single_max_sigma_m**2:
-            return False
-    return True
+    def _turned(self, seen: Sightings) -> float:
+        """Return the variance of the heading over the way of the members."""
+        way_m = math.hypot(*(seen.antennas_m[0] - seen.antennas_m[-1]).tolist())
+        return self._wheels.heading_rad_per_sqrt_m**2 * way_m / 3.0
 
-
-def is_consistent(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool:
-    """Return whether enough radars and frames hold it, with residuals as small as their noise."""
-    hits = Counter(member.slot.radar for member in tracklet.members)
-    if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
-        return False
-    limit = chi_square_limit(tracklet.dof, rule.excess_sigmas)
-    return tracklet.share >= rule.min_share and tracklet.chi_square <= limit
+    def excess_of_wall(self, tracklet: Tracklet) -> float:
+        """Return by how much chi-square is larger under the law of a wall than under a point's."""
+        if self._is_wall:
+            phi = float(tracklet.target[0])
+        else:
+            x, y = tracklet.target - tracklet.seen.antennas_m.mean(axis=0)
+            phi = math.atan2(y, x)
+        point, wall = compare(tracklet.seen, phi, self._free_covariance)
+        return wall - point
 
 
-def best_first(
-    tracker: Tracker,
-    guesses: Sequence[Guess],
-    frames: Sequence[Sequence[Slot]],
-    accepts: Callable[[Tracklet], bool],
-) -> list[Tracklet]:
-    """Return the accepted tracklets, best first; their ranges are taken out of the frames."""
-    found: list[Tracklet] = []
-    waiting = list(guesses)
-    while waiting:
-        followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
-        accepted = [pair for pair in followed if accepts(pair[0])]
-        if not accepted:
+Law: TypeAlias = Callable[[Array, Array], tuple[Array, Array, Array]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """A law of least chi-square."""
+
+    target: Array  # shape (2,)
+    unknowns: Array  # shape (p,), errors of those of the radars that took part
+    columns: Indices  # shape (p,): which these are
+    chi_square: float  # of the residuals and of the unknowns
+    # d(range) / d(target), shape (k, 2), and d(range) / d(unknowns), shape (k, p)
+    by_law: Array
+    extra: Array
+
+
+def point_law(target: Array, antennas_m: Array) -> tuple[Array, Array, Array]:
+    """Return ranges (k,), their derivatives by the point (k, 2), and directions (k, 2)."""
+    away = target - antennas_m
+    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_WAY_M)
+    u = away / distance[:, None]
+    return distance, u, u
+
+
+def wall_law(target: Array, antennas_m: Array) -> tuple[Array, Array, Array]:
+    """Return ranges (k,), their derivatives by phi and d (k, 2), and directions (k, 2)."""
+    c, s = math.cos(float(target[0])), math.sin(float(target[0]))
+    by_angle = s * antennas_m[:, 0] - c * antennas_m[:, 1]
+    distance = float(target[1]) - c * antennas_m[:, 0] - s * antennas_m[:, 1]
+    directions = np.broadcast_to(np.array([c, s]), antennas_m.shape)
+    return distance, np.column_stack([by_angle, np.ones(len(antennas_m))]), directions
+
+
+def fit_law(seen: Sightings, start: Array, law: Law, radar_covariance: Array | None = None) -> Fit:
+    """Return a law at its least chi-square: Gauss-Newton, steps halved until it falls.
+
+    ``radar_covariance`` is of the unknowns of the radars; None where they are known.
+    """
+    target = start
+    by_target, directions = law(target, seen.antennas_m)[1:]
+    columns, extra, prior = _radar_part(seen, directions, radar_covariance)
+    unknowns = np.zeros(len(columns))
+
+    def chi_square(target: Array, unknowns: Array) -> float:
+        residual = seen.ranges_m - law(target, seen.antennas_m)[0] - extra @ unknowns
+        return float(residual @ (residual / seen.variances) + unknowns @ prior @ unknowns)
+
+    best = chi_square(target, unknowns)
+    for _ in range(_STEPS):
+        distance, by_target, _ = law(target, seen.antennas_m)
+        residual = seen.ranges_m - distance - extra @ unknowns
+        J = np.hstack([by_target, extra])
+        weighted = J.T / seen.variances
+        information, gradient = weighted @ J, weighted @ residual
+        information[2:, 2:] += prior
+        gradient[2:] -= prior @ unknowns
+        information += _DAMPING * np.diag(information.diagonal() + 1.0)
+        change = np.linalg.solve(information, gradient)
+        share = 1.0
+        while share > _LEAST_SHARE:
+            moved = target + share * change[:2], unknowns + share * change[2:]
+            value = chi_square(*moved)
+            if value <= best:
+                break
+            share *= 0.5
+        else:
             break
-        best, chosen = max(accepted, key=lambda pair: pair[0].score)
-        for member in best.members:
-            member.slot.unused.remove(member.measured)
-        found.append(best)
-        # What is left may have lost its ranges: follow it again.
-        waiting = [guess for _, guess in accepted if guess is not chosen]
-    return found
+        decrease, best = best - value, value
+        target, unknowns = moved
+        if decrease < _LEAST_DECREASE:
+            break
+    return Fit(
+        target=target,
+        unknowns=unknowns,
+        columns=columns,
+        chi_square=best,
+        by_law=law(target, seen.antennas_m)[1],
+        extra=extra,
+    )
+
+
+def compare(
+    seen: Sightings, toward_rad: float, radar_covariance: Array | None = None
+) -> tuple[float, float]:
+    """Return the least chi-square of the same ranges under the law of a point, and of a wall.
+
+    ``toward_rad`` is roughly the direction of the target, in the frame of the antennas.
+    """
+    middle, range_m = seen.antennas_m.mean(axis=0), float(seen.ranges_m.mean())
+    n = np.array([math.cos(toward_rad), math.sin(toward_rad)])
+    point = fit_law(seen, middle + range_m * n, point_law, radar_covariance)
+    start = np.array([toward_rad, range_m + float(n @ middle)])
+    return point.chi_square, fit_law(seen, start, wall_law, radar_covariance).chi_square
+
+
+def _radar_part(
+    seen: Sightings, directions: Array, covariance: Array | None
+) -> tuple[Indices, Array, Array]:
+    """Return columns (p,), d(range) / d(unknowns) (k, p) and information (p, p) of the radars.
+
+    Directions from antenna to target, (k, 2), are those of the first guess: over a few frames they
+    hardly change.
+    """
+    k = len(seen.ranges_m)
+    if covariance is None:
+        return np.zeros(0, dtype=np.intp), np.zeros((k, 0)), np.zeros((0, 0))
+    used = np.unique(seen.radars)
+    is_of = (seen.radars[:, None] == used).astype(np.float64)
+    columns, extra, n_radars = used, is_of, seen.n_radars
+    if len(covariance) > n_radars:
+        c, s = np.cos(seen.headings_rad), np.sin(seen.headings_rad)
+        x, y = directions.T
+        by_x, by_y = is_of * -(x * c + y * s)[:, None], is_of * (x * s - y * c)[:, None]
+        columns = np.concatenate([used, n_radars + 2 * used, n_radars + 2 * used + 1])
+        extra = np.hstack([is_of, by_x, by_y])
+    known = covariance[np.ix_(columns, columns)] + _FLOOR * np.eye(len(columns))
+    return columns, extra, np.asarray(np.linalg.inv(known))
 
 
 def find_tracklets(
     tracker: Tracker,
     guesses: Sequence[Guess],
-    frames: Sequence[Sequence[Slot]],
-    n_radars: int,
-    rule: TrackletRule,
-    *,
-    is_point: Callable[[Tracklet], bool] | None = None,
+    unassigned: UnassignedRanges,
+    search: Search,
+    accepts: Callable[[Tracklet], bool] | None = None,
 ) -> list[Tracklet]:
-    """Return the tracklets of points, as `best_first` does; ``is_point`` is the last test."""
-    available: dict[int, int] = {}
-    for slots in frames:
-        for slot in slots:
-            available[slot.radar] = available.get(slot.radar, 0) + bool(slot.unused)
-    if len(available) < n_radars or min(available.values()) < rule.min_hits_per_radar:
+    """Return the tracklets of some guesses, best first; their ranges are used up.
+
+    ``accepts`` is the last test of each.
+    """
+    least = tracker.min_hits_per_radar
+    held = [unassigned.n_frames_with_ranges(radar, search.window) for radar in search.radars]
+    if min(held) < least:
         return []
-
-    def accepts(tracklet: Tracklet) -> bool:
-        if not is_believable(tracklet, n_radars, rule):
-            return False
-        return is_point is None or tracklet.label is not None or is_point(tracklet)
-
-    return best_first(tracker, guesses, frames, accepts)
+    found: list[Tracklet] = []
+    waiting = list(guesses)
+    while waiting:
+        followed = []
+        for guess in waiting:
+            tracklet = tracker.follow(guess, unassigned, search)
+            if tracklet is not None and (accepts is None or accepts(tracklet)):
+                followed.append((tracklet, guess))
+        if not followed:
+            break
+        best, chosen = max(followed, key=lambda pair: pair[0].score)
+        unassigned.use_up(best.members)
+        found.append(best)
+        # What is left may have lost its ranges: follow it again.
+        waiting = [guess for _, guess in followed if guess is not chosen]
+    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -31,7 +31,7 @@ Round targets
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -271,119 +271,6 @@ def _joint_merge(state: State, fair: list[Merge], floor: float, rule: MapRule) -
 def _share_landmark(one: Merge, other: Merge) -> bool:
     mine = {row for pair in one.pairs for row in pair}
     return any(row in mine for pair in other.pairs for row in pair)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sightings:
-    """Ranges of one reflector from several places."""
-
-    antennas_m: Array  # shape (k, 2), in one frame
-    # shape (k,): measured, the offsets of the state removed, and their variances [m^2]
-    ranges_m: Array
-    variances: Array
-    radars: Array  # shape (k,): index into the offsets
-    # shape (r, r), of the radars' offsets; None where they are known
-    offset_covariance: Array | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
-    """A law of least chi-square."""
-
-    unknown: Array  # shape (2,): the law's own two
-    # shape (q,): errors of the offsets of these radars
-    offsets_m: Array
-    radars: tuple[int, ...]
-    chi_square: float  # of the residuals and of the offsets
-    # d(range) / d(unknown), shape (k, 2), and d(range) / d(offset), shape (k, q)
-    by_law: Array
-    extra: Array
-
-
-def compare(sightings: Sightings, toward_rad: float) -> tuple[float, float]:
-    """Return the least chi-square of the same ranges under the law of a point, and of a wall.
-
-    ``toward_rad`` is roughly the direction of the reflector, in the frame of the antennas.
-    """
-    middle = sightings.antennas_m.mean(axis=0)
-    range_m = float(sightings.ranges_m.mean())
-    n = np.array([math.cos(toward_rad), math.sin(toward_rad)])
-    point = _least(sightings, np.array([*(middle + range_m * n)]), _point_law)
-    wall = _least(sightings, np.array([toward_rad, range_m + float(n @ middle)]), _wall_law)
-    return point.chi_square, wall.chi_square
-
-
-def fit_wall(sightings: Sightings, start: Array) -> Fit:
-    return _least(sightings, start, _wall_law)
-
-
-def _point_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
-    away = unknown - antennas
-    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_WAY_M)
-    return distance, away / distance[:, None]
-
-
-def _wall_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
-    c, s = math.cos(float(unknown[0])), math.sin(float(unknown[0]))
-    by_angle = s * antennas[:, 0] - c * antennas[:, 1]
-    distance = float(unknown[1]) - c * antennas[:, 0] - s * antennas[:, 1]
-    return distance, np.column_stack([by_angle, np.ones(len(antennas))])
-
-
-def _least(
-    sightings: Sightings, start: Array, predict: Callable[[Array, Array], tuple[Array, Array]]
-) -> Fit:
-    """Return a law at its least chi-square: Gauss-Newton, steps halved until it falls."""
-    extra, prior, radars = _offset_part(sightings)
-    unknown, offsets = start, np.zeros(extra.shape[1])
-
-    def chi_square(unknown: Array, offsets: Array) -> float:
-        residual = sightings.ranges_m - predict(unknown, sightings.antennas_m)[0] - extra @ offsets
-        return float(residual @ (residual / sightings.variances) + offsets @ prior @ offsets)
-
-    best = chi_square(unknown, offsets)
-    for _ in range(_STEPS):
-        distance, J = predict(unknown, sightings.antennas_m)
-        residual = sightings.ranges_m - distance - extra @ offsets
-        J = np.hstack([J, extra])
-        weighted = J.T / sightings.variances
-        information, gradient = weighted @ J, weighted @ residual
-        information[2:, 2:] += prior
-        gradient[2:] -= prior @ offsets
-        information += _DAMPING * np.diag(information.diagonal() + 1.0)
-        change = np.linalg.solve(information, gradient)
-        share = 1.0
-        while share > _LEAST_SHARE:
-            moved = unknown + share * change[:2], offsets + share * change[2:]
-            value = chi_square(*moved)
-            if value <= best:
-                break
-            share *= 0.5
-        else:
-            break
-        decrease, best = best - value, value
-        unknown, offsets = moved
-        if decrease < _LEAST_DECREASE:
-            break
-    return Fit(
-        unknown=unknown,
-        offsets_m=offsets,
-        radars=radars,
-        chi_square=best,
-        by_law=predict(unknown, sightings.antennas_m)[1],
-        extra=extra,
-    )
-
-
-def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
-    """Return d(range) / d(offset), (k, q), the offsets' information, (q, q), and the radars."""
-    k = len(sightings.ranges_m)
-    if sightings.offset_covariance is None:
-        return np.zeros((k, 0)), np.zeros((0, 0)), ()
-    used: Sequence[int] = np.unique(sightings.radars).tolist()
-    part = (sightings.radars[:, None] == np.array(used)[None, :]).astype(np.float64)
-    covariance = sightings.offset_covariance[np.ix_(used, used)] + _FLOOR * np.eye(len(used))
-    return part, np.asarray(np.linalg.inv(covariance)), tuple(used)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,133 +30,48 @@ from slam.robust.initialisation import (
     MEMBER_MARGIN_RAD,
     FeatureRows,
     Guess,
-    Member,
-    Slot,
+    Search,
     Tracker,
     Tracklet,
     UnassignedRanges,
-    best_first,
     clear_match,
-    is_consistent,
+    find_tracklets,
 )
-from slam.robust.map import Sightings, compare, fit_wall
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
 from slam.robust.state import Array, State, rotation
 
 _PRIOR_RAD = 0.3
 
 
-def wall_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:
-    """Return the lines (phi, d) that touch both circles of every pair of unused ranges."""
+def wall_guesses(
+    unassigned: UnassignedRanges, radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
+) -> list[Guess]:
+    """Return the lines (phi, d) that touch both circles of every pair of new ranges."""
     guesses = []
     spread = np.diag([_PRIOR_RAD**2, rule.prior_sigma_m**2])
-    for first, second in combinations(newest, 2):
-        base_x, base_y = second.x_m - first.x_m, second.y_m - first.y_m
-        base = math.hypot(base_x, base_y)
-        for a, b in product(first.unused, second.unused):
-            cosine = (a.range_m - b.range_m) / base if base else 2.0
-            if abs(cosine) > 1.0 or a.label is not None or b.label is not None:
+    limit = noise.field_of_view_rad / 2 + MEMBER_MARGIN_RAD
+    for one, two in combinations(radars, 2):
+        x, y, yaw = unassigned.antenna(one)
+        dx, dy = unassigned.antenna(two)[0] - x, unassigned.antenna(two)[1] - y
+        base, along = math.hypot(dx, dy), math.atan2(dy, dx)
+        for (a, label), (b, other) in product(unassigned.newest(one), unassigned.newest(two)):
+            cosine = (a - b) / base if base else math.inf
+            if abs(cosine) > 1.0 or label >= 0 or other >= 0:
                 continue
-            along, off = math.atan2(base_y, base_x), math.acos(cosine)
-            phi = min(
-                (along + off, along - off),
-                key=lambda angle: abs(math.remainder(angle - first.yaw_rad, math.tau)),
-            )
-            away = abs(math.remainder(phi - first.yaw_rad, math.tau))
-            if away <= noise.field_of_view_rad / 2 + MEMBER_MARGIN_RAD:
-                d = a.range_m + math.cos(phi) * first.x_m + math.sin(phi) * first.y_m
+            angles = (along + math.acos(cosine), along - math.acos(cosine))
+            phi = min(angles, key=lambda angle: abs(math.remainder(angle - yaw, math.tau)))
+            if abs(math.remainder(phi - yaw, math.tau)) <= limit:
+                d = a + math.cos(phi) * x + math.sin(phi) * y
                 guesses.append(Guess(target=np.array([phi, d]), covariance=spread))
     return guesses
 
 
-class WallTracker(Tracker):
-    """Follows guesses of walls, phi and d, back in time."""
-
-    def __init__(
-        self, parameters: BackEndParameters, offsets_m: Array, offset_covariance: Array
-    ) -> None:
-        super().__init__(parameters, offsets_m, offset_covariance)
-        self._walls = parameters.walls
-        self._heading_rad_per_sqrt_m = parameters.wheels.heading_rad_per_sqrt_m
-
-    def _sight(self, x: float, y: float, slot: Slot) -> tuple[float, float, float, float]:
-        cosine, sine = math.cos(x), math.sin(x)
-        distance = y - cosine * slot.x_m - sine * slot.y_m
-        off = abs(math.remainder(x - slot.yaw_rad, math.tau))
-        return distance, off, sine * slot.x_m - cosine * slot.y_m, 1.0
-
-    def _walk(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
-        walked = super()._walk(guess, frames)
-        walked.covariance[0, 0] += self._turned(walked.members)
-        return walked
-
-    def _with_free_offsets(self, walked: Tracklet) -> Tracklet:
-        """Judge the members by a wall *and* the radars' common offsets, which are uncertain.
-
-        For the filter, an offset's uncertainty is noise of each range. It is one number: a wall may
-        miss all ranges alike.
-        """
-        if walked.dof < 1:
-            return walked
-        sightings, rule = self.sightings(walked), self._rule
-        fit = fit_wall(sightings, walked.target)
-        information = (fit.by_law.T / sightings.variances) @ fit.by_law
-        prior = np.diag([_PRIOR_RAD**-2, rule.prior_sigma_m**-2])
-        covariance: Array = np.asarray(np.linalg.inv(information + prior), dtype=np.float64)
-        by_offsets = np.zeros((2, len(self._offsets)))
-        by_offsets[:, fit.radars] = -covariance @ (fit.by_law.T / sightings.variances) @ fit.extra
-        covariance[0, 0] += self._turned(walked.members)
-        return replace(
-            walked,
-            target=fit.unknown - by_offsets[:, fit.radars] @ fit.offsets_m,
-            covariance=covariance,
-            by_offsets=by_offsets,
-            chi_square=fit.chi_square,
-        )
-
-    def _turned(self, members: Sequence[Member]) -> float:
-        """Return the variance of the heading over the way of the members."""
-        if not members:
-            return 0.0
-        first, last = members[-1].slot, members[0].slot
-        way = math.hypot(last.x_m - first.x_m, last.y_m - first.y_m)
-        return self._heading_rad_per_sqrt_m**2 * way / 3.0
-
-    def _way_m(self, tracklet: Tracklet) -> float:
-        """Return how far the echo moved along the wall, the most that a radar has seen."""
-        phi = float(tracklet.target[0])
-        of_radar: dict[int, list[float]] = {}
-        for slot in (member.slot for member in tracklet.members):
-            along = math.cos(phi) * slot.y_m - math.sin(phi) * slot.x_m
-            of_radar.setdefault(slot.radar, []).append(along)
-        return max(max(places) - min(places) for places in of_radar.values())
-
-    def is_wall(self, tracklet: Tracklet) -> bool:
-        if len({member.slot.back for member in tracklet.members}) < self._walls.min_frames:
-            return False
-        if self._way_m(tracklet) < self._walls.min_way_m:
-            return False
-        if not is_consistent(tracklet, 2, self._rule):
-            return False
-        point, wall = compare(self.sightings(tracklet), float(tracklet.target[0]))
-        return point - wall >= self._walls.wall_margin
-
-    def is_point(self, tracklet: Tracklet) -> bool:
-        """Return whether the ranges of a point follow its law, not a wall's."""
-        x, y = tracklet.target - np.mean(tracklet.antennas_m, axis=0)
-        point, wall = compare(self.sightings(tracklet), math.atan2(y, x))
-        return wall - point >= self._walls.point_margin
-
-    def sightings(self, tracklet: Tracklet) -> Sightings:
-        members = tracklet.members
-        offsets = np.array([self._offsets[member.slot.radar] for member in members])
-        return Sightings(
-            antennas_m=tracklet.antennas_m,
-            ranges_m=np.array([m.measured.range_m for m in members]) - offsets,
-            variances=np.array([m.measured.sigma_m**2 + m.slot.drift for m in members]),
-            radars=np.array([m.slot.radar for m in members]),
-            offset_covariance=None if self._offsets_known else self._offset_covariance,
-        )
+def way_along_m(tracklet: Tracklet) -> float:
+    """Return how far the echo of a wall moved along it, the most that a radar has seen."""
+    phi = float(tracklet.target[0])
+    along = tracklet.seen.antennas_m @ np.array([-math.sin(phi), math.cos(phi)])
+    radars = tracklet.seen.radars
+    return max(float(np.ptp(along[radars == radar])) for radar in np.unique(radars))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -165,7 +80,7 @@ class BodyWall:
 
     wall: Array  # shape (2,): phi [rad], d [m]
     covariance: Array  # shape (2, 2)
-    by_offsets: Array  # shape (2, r), d(phi, d) / d(range offsets)
+    by_offsets: Array  # shape (2, q), d(phi, d) / d(unknowns of the radars)
     feet_m: Array  # shape (k, 2), where its echoes came from
 
     def in_map(self, state: State) -> Array:
@@ -319,52 +234,56 @@ class WallKeeper:
         What goes on where a mapped wall does is not known to be a point yet: over a few frames both
         laws fit.
         """
-        tracker = self._tracker()
-        return tracker.is_point(tracklet) and not self._is_on_a_wall(tracklet, tracker)
+        if tracklet.label is not None:
+            return True
+        excess = self.tracker(is_wall=False).excess_of_wall(tracklet)
+        return excess >= self._rule.point_margin and not self._is_on_a_wall(tracklet)
 
-    def _is_on_a_wall(self, tracklet: Tracklet, tracker: WallTracker) -> bool:
+    def _is_on_a_wall(self, tracklet: Tracklet) -> bool:
         """Return whether a mapped wall nearby explains the ranges, too."""
-        state, rule = self._state, self._rule
-        if not state.wall_ids:
-            return False
-        sightings = tracker.sightings(tracklet)
+        state, rule, seen = self._state, self._rule, tracklet.seen
         for row, wall_id in enumerate(state.wall_ids):
             phi, d = (float(value) for value in state.walls[row])
             n = np.array([np.cos(phi - state.heading_rad), np.sin(phi - state.heading_rad)])
             depth = d - float(state.position_m @ np.array([np.cos(phi), np.sin(phi)]))
-            ranges = depth - sightings.antennas_m @ n
-            away = sightings.ranges_m - ranges
-            if np.abs(away).max() > rule.resolution_m:
+            ranges = depth - seen.antennas_m @ n
+            if np.abs(seen.ranges_m - ranges).max() > rule.resolution_m:
                 continue
-            feet = sightings.antennas_m + ranges[:, None] * n
+            feet = seen.antennas_m + ranges[:, None] * n
             places = state.position_m + feet @ rotation(state.heading_rad).T
             along = along_wall(state, row, places).tolist()
             if min(self.cells.distance_m(wall_id, place) for place in along) <= rule.reach_m:
                 return True
         return False
 
-    def _tracker(self) -> WallTracker:
+    def tracker(self, *, is_wall: bool) -> Tracker:
         state = self._state
-        offsets = np.arange(state.offsets.start, state.offsets.stop)
-        return WallTracker(self._parameters, state.offsets_m, state.P.block(offsets))
+        block = state.P.block(np.arange(state.offsets.start, state.offsets.stop))
+        return Tracker(self._parameters, state.offsets_m, block, is_wall=is_wall)
 
     def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[Tracklet]:
         """Return the walls among the unassigned ranges of one side, and use these up."""
         if len(radars) < 2:
             return []
-        frames = unassigned.slots(radars, self._rule.window)
-        guesses = wall_guesses(frames[0], self._parameters.ranges, self._parameters.tracklets)
-        if not guesses:
-            return []
-        tracker = self._tracker()
-        return best_first(tracker, guesses, frames, tracker.is_wall)
+        rule, tracker = self._rule, self.tracker(is_wall=True)
+
+        def is_wall(tracklet: Tracklet) -> bool:
+            if way_along_m(tracklet) < rule.min_way_m:
+                return False
+            return -tracker.excess_of_wall(tracklet) >= rule.wall_margin
+
+        guesses = wall_guesses(
+            unassigned, radars, self._parameters.ranges, self._parameters.tracklets
+        )
+        search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
+        return find_tracklets(tracker, guesses, unassigned, search, is_wall)
 
     def place(self, tracklet: Tracklet) -> int | None:
         """Bring a wall into the map; return its id, or None if it is too near to another one."""
         state = self._state
         phi, d = tracklet.target
         n = np.array([np.cos(phi), np.sin(phi)])
-        antennas = tracklet.antennas_m
+        antennas = tracklet.seen.antennas_m
         seen = BodyWall(
             wall=tracklet.target,
             covariance=tracklet.covariance,

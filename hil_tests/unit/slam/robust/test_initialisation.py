@@ -19,12 +19,13 @@ from slam.robust.association import RangeScan, antennas_of
 from slam.robust.back_end import RobustBackEnd, huber_weighted_sigmas_m
 from slam.robust.initialisation import (
     BodyPoint,
+    Search,
     Tracker,
     Tracklet,
     UnassignedRanges,
     find_tracklets,
     initialise_landmark,
-    pair_guesses,
+    point_guesses,
 )
 from slam.robust.map import Existence, find_merge
 from slam.robust.parameters import BackEndParameters, MapRule, RangeNoise, TrackletRule
@@ -35,12 +36,13 @@ SIGMA_M = 5e-3
 NOISE, RULE = RangeNoise(sigma_m=SIGMA_M), TrackletRule()
 PARAMETERS = BackEndParameters(ranges=NOISE, tracklets=RULE)
 LEFT = (0, 1)
+SEARCH = Search(radars=LEFT, window=15, min_frames=RULE.min_frames)
 
 
 def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> UnassignedRanges:
     """Return 15 frames of 2 cm past targets on the left; moving ones go with the robot."""
     rng = np.random.default_rng(1)
-    unassigned = UnassignedRanges(15, SIGMA_M, 0.005, 0.0015)
+    unassigned = UnassignedRanges(15, 4, SIGMA_M, 0.005, 0.0015)
     step = calibrated_motion(np.array([0.02, 0.0, 0.0]), np.zeros(3), WheelNoise())
     mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
     for k in range(15):
@@ -63,9 +65,9 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Unassig
 
 
 def tracklets(unassigned: UnassignedRanges, offset_sigma_m: float = 0.0) -> list[Tracklet]:
-    frames = unassigned.slots(LEFT, 15)
     tracker = Tracker(PARAMETERS, np.zeros(4), offset_sigma_m**2 * np.eye(4))
-    return find_tracklets(tracker, pair_guesses(frames[0], NOISE, RULE), frames, 2, RULE)
+    guesses = point_guesses(unassigned, LEFT, NOISE, RULE)
+    return find_tracklets(tracker, guesses, unassigned, SEARCH)
 
 
 def test_a_tracklet_is_a_point_at_rest_and_uses_its_ranges_up() -> None:
@@ -75,7 +77,7 @@ def test_a_tracklet_is_a_point_at_rest_and_uses_its_ranges_up() -> None:
     miss = found.target - (target[0] - [0.28, 0.0])
     assert miss @ np.linalg.solve(found.covariance, miss) < 13.8
     assert len(found.members) == 30
-    assert all(not slot.unused for slots in unassigned.slots(LEFT, 15) for slot in slots)
+    assert all(unassigned.n_frames_with_ranges(radar, 15) == 0 for radar in LEFT)
     assert tracklets(unassigned) == []
 
 
@@ -88,8 +90,7 @@ def test_what_goes_with_the_robot_is_no_tracklet() -> None:
 def test_of_two_points_four_fixes_and_two_tracklets() -> None:
     targets = np.array([[0.1, 0.8], [0.25, 0.9]])
     unassigned = driven(targets, np.zeros(4))
-    frames = unassigned.slots(LEFT, 15)
-    assert len(pair_guesses(frames[0], NOISE, RULE)) > 2
+    assert len(point_guesses(unassigned, LEFT, NOISE, RULE)) > 2
     found = sorted(tracklets(unassigned), key=lambda tracklet: float(tracklet.target[1]))
     assert len(found) == 2
     for tracklet, target in zip(found, targets, strict=True):

@@ -158,9 +158,11 @@ def test_a_radius_that_the_whole_run_contradicts_is_not_given() -> None:
 def test_echoes_that_overlap_tell_no_radius() -> None:
     scan = RangeScan(radar=0, ranges_m=(0.5, 0.58, 0.9, 1.2), blurred_m=(1.25,))
     assert [scan.is_alone(i) for i in range(4)] == [False, False, True, False]
-    unassigned = UnassignedRanges(3, SIGMA_M, 0.0, 0.0)
+    unassigned = UnassignedRanges(3, 4, SIGMA_M, 0.0, 0.0)
     unassigned.keep(0, antennas_of(paper_rig(), [scan], np.zeros(3)), [scan], {(0, 1)})
-    assert [left.alone for left in unassigned.newest().unused[0]] == [False, True, False]
+    left = unassigned.sightings(np.array([(0, 0, 0), (0, 0, 2), (0, 0, 3)]), np.zeros(4))
+    assert left.alone.tolist() == [False, True, False]
+    assert len(unassigned.newest(0)) == 3
 
 
 def test_one_landmark_that_is_not_seen_is_no_reason_for_suspicion() -> None:

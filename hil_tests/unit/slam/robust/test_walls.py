@@ -20,16 +20,22 @@ from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
 from slam.robust.association import Antennas, RangeScan, antennas_of, rows_of, view
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import Slot, Tracklet, UnassignedRange
-from slam.robust.map import Sightings, compare
+from slam.robust.initialisation import (
+    Search,
+    Sightings,
+    Tracker,
+    Tracklet,
+    UnassignedRanges,
+    compare,
+    find_tracklets,
+)
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.run_log import Estimate, RunLog, start_prior
 from slam.robust.smoother import measurement_residuals, prior_about, prior_cost, prior_terms
-from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion, predict
+from slam.robust.state import Array, Indices, State, SymmetricMatrix, calibrated_motion, predict
 from slam.robust.walls import (
     BodyWall,
     WallCells,
-    WallTracker,
     initialise_wall,
     is_unresolved,
     match_wall,
@@ -348,38 +354,37 @@ def test_the_edge_of_a_wall_turns_neither_wall_nor_robot(seed: int) -> None:
     assert back_end.wall_spans_m()[:, :, 0].max() < WALL_END_M + 0.2
 
 
-def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, Tracklet]:
-    """Return what a wall tracker makes of ranges that miss a wall by a shape, front and rear."""
+def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[list[Tracklet], Array]:
+    """Return the walls found in ranges that miss a wall by a shape, newest first."""
     parameters = BackEndParameters(ranges=RangeNoise(sigma_m=SIGMA_M, offset_sigma_m=0.02))
-    frames = []
-    for back, miss in enumerate(shape.tolist()):
-        slots = []
-        for radar, mount in enumerate(paper_rig().mounts[:2]):
-            range_m = WALL_Y_M - mount.y_m + OFFSET_M + miss
-            x = mount.x_m - back * STEP_M
-            heard = [UnassignedRange(range_m, None, SIGMA_M)]
-            slots.append(
-                Slot(back, radar, x, mount.y_m, mount.yaw_rad, 0.0, heard, (mount.x_m, mount.y_m))
-            )
-        frames.append(slots)
-    tracker = WallTracker(parameters, np.zeros(2), offset_sigma_m**2 * np.ones((2, 2)))
-    (first, *_) = wall_guesses(frames[0], parameters.ranges, parameters.tracklets)
+    unassigned = UnassignedRanges(len(shape), 2, SIGMA_M, 0.0, 0.0)
+    step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
+    mounts = paper_rig().mounts[:2]
+    for k, miss in enumerate(shape[::-1].tolist()):
+        unassigned.move(step)
+        ranges_m = [WALL_Y_M - mount.y_m + OFFSET_M + miss for mount in mounts]
+        scans = [RangeScan(radar=r, ranges_m=(range_m,)) for r, range_m in enumerate(ranges_m)]
+        seen_from = antennas_of(replace(paper_rig(), mounts=mounts), scans, np.zeros(3))
+        unassigned.keep(k, seen_from, scans, set())
+    covariance = offset_sigma_m**2 * np.ones((2, 2))
+    tracker = Tracker(parameters, np.zeros(2), covariance, is_wall=True)
+    (first, *_) = wall_guesses(unassigned, (0, 1), parameters.ranges, parameters.tracklets)
     guess = replace(first, target=np.array([math.pi / 2, WALL_Y_M + OFFSET_M]))
-    return tracker, tracker.follow(guess, frames)
+    search = Search(radars=(0, 1), window=len(shape), min_frames=25)
+    return find_tracklets(tracker, [guess], unassigned, search), covariance
 
 
 def test_an_unknown_offset_is_one_number_and_no_noise_of_each_range() -> None:
     """A wall is found under an offset of 20 mm; ranges that scatter by half as much are none."""
     rng = np.random.default_rng(1)
-    tracker, wall = tracklet_of(SIGMA_M * rng.standard_normal(40), OFFSET_M)
-    assert tracker.is_wall(wall)
+    (wall,), covariance = tracklet_of(SIGMA_M * rng.standard_normal(40), OFFSET_M)
+    by_point, by_wall = compare(wall.seen, math.pi / 2, covariance)
+    assert by_point - by_wall >= WallRule().wall_margin
     assert wall.target == pytest.approx([math.pi / 2, WALL_Y_M + OFFSET_M], abs=2e-3)
     # d is right for the offsets of the state, zero; as they are corrected, so is d.
     assert wall.by_offsets[1].sum() == pytest.approx(-1.0, abs=1e-3)
     assert wall.covariance[1, 1] < SIGMA_M**2
-    tracker, none = tracklet_of(5 * SIGMA_M * rng.standard_normal(40), OFFSET_M)
-    assert len(none.members) > 60
-    assert not tracker.is_wall(none)
+    assert tracklet_of(5 * SIGMA_M * rng.standard_normal(40), OFFSET_M)[0] == []
 
 
 SHARP_SIGMA_M = 1e-3
@@ -392,13 +397,20 @@ def places(n: int = 301, reach_m: float = REACH_M) -> Array:
     return np.column_stack([np.linspace(-reach_m, reach_m, n), np.zeros(n)])
 
 
-def sightings(antennas: Array, ranges: Array, radars: Array | None = None) -> Sightings:
+def sightings(antennas: Array, ranges: Array, radars: Indices | None = None) -> Sightings:
+    k = len(ranges)
     return Sightings(
         antennas_m=antennas,
+        headings_rad=np.zeros(k),
         ranges_m=ranges,
-        variances=np.full(len(ranges), SHARP_SIGMA_M**2),
-        radars=np.zeros(len(ranges), dtype=np.intp) if radars is None else radars,
-        offset_covariance=None if radars is None else 0.02**2 * np.eye(2),
+        variances=np.full(k, SHARP_SIGMA_M**2),
+        radars=np.zeros(k, dtype=np.intp) if radars is None else radars,
+        poses=np.arange(k),
+        mounts_m=np.zeros((k, 2)),
+        measured_m=ranges,
+        sigmas_m=np.full(k, SHARP_SIGMA_M),
+        alone=np.ones(k, dtype=np.bool_),
+        n_radars=2,
     )
 
 
@@ -444,7 +456,8 @@ def test_unknown_offsets_of_two_radars_turn_a_wall_but_make_no_point_of_it() -> 
     antennas = np.vstack([np.subtract(along, [0.1, 0.0]), np.add(along, [0.1, 0.0])])
     radars = np.repeat([0, 1], len(along))
     ranges_m = DISTANCE_M + np.array([0.015, -0.02])[radars]
-    point, wall = compare(sightings(antennas, ranges_m, radars), math.pi / 2)
+    covariance = 0.02**2 * np.eye(2)
+    point, wall = compare(sightings(antennas, ranges_m, radars), math.pi / 2, covariance)
     assert wall < 2.0  # what the prior of the offsets asks for 15 and 20 of 20 mm
     assert point - wall > 30.0
 
