@@ -67,13 +67,13 @@ def follow(
 ) -> tuple[Array, Array, Indices, Indices]:
     """Filter a target back through the frames, twice, the second time from the first result.
 
-    ``guess`` is target and covariance, (x, y, cxx, cxy, cyy), in the newest body frame. Of a ring of
-    frames, the newest in row ``newest`` and ``count`` of them, are given in the odometry frame the
-    antennas ``places`` (f, r, 3), bodies ``poses`` (f, 3), way and turn so far ``ways`` (f, 2);
-    ``ranges`` (f, r, k) is NaN where there is none. ``radar_covariance`` is that of the q unknowns of the
-    radars: the r offsets and, if they are unknown, the r places of antennas in the body frame.
-    ``limits`` are half the field of view, that of members, the limits of range, the gate squared,
-    and the drift of a range per way and per turn.
+    ``guess`` is target and covariance, (x, y, cxx, cxy, cyy), in the newest body frame. Of a ring
+    of frames, the newest in row ``newest`` and ``count`` of them, are given in the odometry frame
+    the antennas ``places`` (f, r, 3), bodies ``poses`` (f, 3), way and turn so far ``ways`` (f, 2);
+    ``ranges`` (f, r, k) is NaN where there is none. ``radar_covariance`` is that of the q unknowns
+    of the radars: the r offsets and, if they are unknown, the r places of antennas in the body
+    frame. ``limits`` are half the field of view, that of members, the limits of range, the gate
+    squared, and the drift of a range per way and per turn.
 
     Returns (x, y, cxx, cxy, cyy, chi-square, frames in view, frames hit), d(target) / d(unknowns of
     the radars) (2, q), the members (back, radar, index), newest first, and the hits of each radar.
