@@ -279,6 +279,15 @@ class Viewpoint:
     boresight_x: NDArray[np.float64]
     boresight_y: NDArray[np.float64]
 
+    def take(self, frame: NDArray[np.int64]) -> Viewpoint:
+        """Return where the radar is in some frames, shape (m,) each."""
+        return Viewpoint(
+            x_m=self.x_m[frame, 0],
+            y_m=self.y_m[frame, 0],
+            boresight_x=self.boresight_x[frame, 0],
+            boresight_y=self.boresight_y[frame, 0],
+        )
+
 
 def reflection_phase_rad(name: str) -> float:
     """Return the fixed reflection phase of a named reflector, in [0, 2 pi).

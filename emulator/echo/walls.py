@@ -44,7 +44,7 @@ WEAKEST_LEG = 1e-3
 """A leg by way of a mirror counts from this share of a free one on boresight: -60 dB."""
 _RIGHT_ANGLE_TOLERANCE = math.sin(math.radians(1.0))
 _PARALLEL = math.sin(math.radians(5.0))
-_LEGS_TIMES_FACES = 200_000  # of one block of `passing`: bounds its memory
+_LEGS_TIMES_FACES = 16_000  # of one block of `passing`: stays in the processor's cache
 _WEAKEST_CORNER = 1e-2  # of one whose edges are far: the rest is deep in Fresnel's shadow
 
 
@@ -72,10 +72,13 @@ def past_edge(
     beyond
         Whether the straight way is on the open side of the edge, so that v is negative.
     """
-    v = _parameter(detour_m, wavelength_m)
-    sine, cosine = fresnel(v)
-    dark = ((0.5 - cosine) - 1j * (0.5 - sine)) / (1 - 1j)
-    return np.where(beyond, 1 - dark, dark)
+    sine, cosine = fresnel(_parameter(detour_m, wavelength_m))
+    s, c = 0.5 - sine, 0.5 - cosine
+    dark_re, dark_im = 0.5 * (c + s), 0.5 * (c - s)  # (c - j s) / (1 - j)
+    passes = np.empty(dark_re.shape, dtype=np.complex128)
+    passes.real = np.where(beyond, 1 - dark_re, dark_re)
+    passes.imag = np.where(beyond, -dark_im, dark_im)
+    return passes
 
 
 def _parameter(detour_m: Array, wavelength_m: float) -> Array:
@@ -152,7 +155,12 @@ class Faces:
         return (x - self.a_x) * self.t_x + (y - self.a_y) * self.t_y
 
     def height(self, x: Array, y: Array) -> Array:
-        return (y - self.a_y) * self.t_x - (x - self.a_x) * self.t_y
+        height: Array = y - self.a_y
+        height *= self.t_x
+        across = x - self.a_x
+        across *= self.t_y
+        height -= across
+        return height
 
     def at(self, along_m: Array) -> tuple[Array, Array]:
         """Return x and y of points on the faces' lines."""
@@ -420,61 +428,62 @@ def corner_reflections(
     exists = (height_once * height2 > 0) & open1 & open2 & (near1 != far1) & (near2 != far2)
     exists &= np.minimum(np.abs(height1), np.abs(height2)) > ON_THE_FACE_M
 
-    share2 = height_once / np.where(exists, height_once + height2, 1.0)
+    # From here on in lists, shape (m,): first those that exist, then those before the antenna.
+    amplitude = np.zeros_like(path_m)
+    half_m = path_m / 2
+    frame, pair = np.nonzero(exists)
+    one, two, seen_from = one.take(pair), two.take(pair), view.take(frame)
+    x, y = seen_from.x_m, seen_from.y_m
+    height1, height2, height_once, near1, far1, near2, far2, once_x, once_y, path_m = (
+        each[frame, pair]
+        for each in (
+            *(height1, height2, height_once, near1, far1, near2, far2),
+            *(once_x, once_y, path_m),
+        )
+    )
     along_once = two.along(once_x, once_y)
+    share2 = height_once / (height_once + height2)
     bounce2 = along_once + (two.along(x, y) - along_once) * share2
-    held2 = _between(bounce2, near2, far2)
-    x2, y2 = two.at(held2)
+    x2, y2 = two.at(_between(bounce2, near2, far2))
     # Bounce 2 is held on the radar's side of the first face, so the way to it bounces there.
     rise = np.abs(one.height(x2, y2))
     share1 = np.abs(height1) / np.maximum(np.abs(height1) + rise, 1e-12)
     start1 = one.along(x, y)
     bounce1 = start1 + (one.along(x2, y2) - start1) * share1
     x1, y1 = one.at(_between(bounce1, near1, far1))
+    gain1 = np.sqrt(beam_gain(_cos_angle(seen_from, x1, y1)))
+    gain2 = np.sqrt(beam_gain(_cos_angle(seen_from, x2, y2)))
 
     # Edges, one by one: the way over the edge against the way of the mirrors.
+    window = np.where((gain1 > 0) & (gain2 > 0), 1.0, 0.0)
     back_x, back_y = two.mirrored(x, y)
-    window = np.ones_like(path_m)
-    for face, edge, inwards, counts, start, stop in (
-        (two, near2, (bounce2 - near2) * np.sign(far2 - near2), exists, (once_x, once_y), (x, y)),
-        (two, far2, (far2 - bounce2) * np.sign(far2 - near2), exists, (once_x, once_y), (x, y)),
-        (one, far1, (far1 - bounce1) * np.sign(far1 - near1), exists, (x, y), (back_x, back_y)),
-        (
-            one,
-            near1,
-            (bounce1 - near1) * np.sign(far1 - near1),
-            exists & ~(apex1 & apex2),  # the apex is one edge, not two
-            (x, y),
-            (back_x, back_y),
-        ),
+    apex = (apex1 & apex2)[frame, pair]  # one edge, not two
+    for face, edge, inwards, start, stop, counts in (
+        (two, near2, (bounce2 - near2) * np.sign(far2 - near2), (once_x, once_y), (x, y), True),
+        (two, far2, (far2 - bounce2) * np.sign(far2 - near2), (once_x, once_y), (x, y), True),
+        (one, far1, (far1 - bounce1) * np.sign(far1 - near1), (x, y), (back_x, back_y), True),
+        (one, near1, (bounce1 - near1) * np.sign(far1 - near1), (x, y), (back_x, back_y), ~apex),
     ):
         edge_x, edge_y = face.at(edge)
-        over_m = length(edge_x - start[0], edge_y - start[1]) + length(
-            stop[0] - edge_x, stop[1] - edge_y
-        )
-        passes = np.abs(past_edge(over_m - path_m, inwards > 0, wavelength_m))
-        window *= np.where(counts, passes, 1.0)
+        over_m = length(edge_x - start[0], edge_y - start[1])
+        over_m += length(stop[0] - edge_x, stop[1] - edge_y)
+        lit = np.flatnonzero((window > 0) & counts)
+        window[lit] *= np.abs(past_edge((over_m - path_m)[lit], inwards[lit] > 0, wavelength_m))
 
-    half_m = path_m / 2
-    amplitude = MIRROR_AMPLITUDE_1M * one.reflection * two.reflection * window
-    amplitude *= exists & (window > _WEAKEST_CORNER)
-    amplitude /= np.maximum(half_m, NEAREST_M)
-    amplitude *= np.sqrt(beam_gain(_cos_angle(view, x1, y1)))
-    amplitude *= np.sqrt(beam_gain(_cos_angle(view, x2, y2)))
-    frame, pair = np.nonzero(amplitude)
-    here_x, here_y = x[frame, 0], y[frame, 0]
-    body1, body2 = one.body[pair], two.body[pair]
-    at1 = x1[frame, pair], y1[frame, pair]
-    at2 = x2[frame, pair], y2[frame, pair]
-    both = (body1, body2)
+    strength = MIRROR_AMPLITUDE_1M * one.reflection * two.reflection * window
+    strength /= np.maximum(path_m / 2, NEAREST_M)
+    strength *= gain1
+    strength *= gain2
+    lit = np.flatnonzero(window > _WEAKEST_CORNER)
+    body1, body2 = one.body[lit], two.body[lit]
+    x, y, x1, y1, x2, y2, strength = (each[lit] for each in (x, y, x1, y1, x2, y2, strength))
     for a_x, a_y, b_x, b_y, but in (
-        (here_x, here_y, *at1, (body1,)),
-        (*at1, *at2, both),
-        (*at2, here_x, here_y, (body2,)),
+        (x, y, x1, y1, (body1,)),
+        (x1, y1, x2, y2, (body1, body2)),
+        (x2, y2, x, y, (body2,)),
     ):
-        amplitude[frame, pair] *= passing(
-            faces, a_x, a_y, b_x, b_y, but=but, wavelength_m=wavelength_m
-        )
+        strength *= passing(faces, a_x, a_y, b_x, b_y, but=but, wavelength_m=wavelength_m)
+    amplitude[frame[lit], pair[lit]] = strength
     return Reflections(range_m=half_m, amplitude=amplitude, phase_rad=np.zeros(half_m.shape[1]))
 
 
@@ -636,18 +645,22 @@ def _legs(
     height_t = np.abs(target_height[frame, target, number])
     start = face.along(radar_x, radar_y)
     bounce = start + (face.along(target_x, target_y) - start) * height_r / (height_r + height_t)
-    closed = closed_ends(faces, radar_height)[frame, number]
-    over_a = length(face.a_x - radar_x, face.a_y - radar_y)
-    over_a += length(face.a_x - target_x, face.a_y - target_y)
-    over_b = length(face.b_x - radar_x, face.b_y - radar_y)
-    over_b += length(face.b_x - target_x, face.b_y - target_y)
-    lost = past_edge(over_a - length_m, bounce < 0, wavelength_m) * ~closed[:, 0]
-    lost += past_edge(over_b - length_m, bounce > face.length_m, wavelength_m) * ~closed[:, 1]
     bounce_x, bounce_y = face.at(np.clip(bounce, 0.0, face.length_m))
     dx, dy = bounce_x - radar_x, bounce_y - radar_y
     cos_angle = dx * view.boresight_x[frame, 0] + dy * view.boresight_y[frame, 0]
     cos_angle /= np.maximum(length(dx, dy), NEAREST_M)
-    gain = face.reflection * np.abs(1 - lost) * np.sqrt(beam_gain(cos_angle))
+    gain = np.sqrt(beam_gain(cos_angle))
+    closed = closed_ends(faces, radar_height)[frame, number]
+    lost = np.zeros(len(gain), dtype=np.complex128)
+    for end, end_x, end_y, beyond in (
+        (0, face.a_x, face.a_y, bounce < 0),
+        (1, face.b_x, face.b_y, bounce > face.length_m),
+    ):
+        over_m = length(end_x - radar_x, end_y - radar_y)
+        over_m += length(end_x - target_x, end_y - target_y)
+        lit = np.flatnonzero((gain > 0) & ~closed[:, end])
+        lost[lit] += past_edge((over_m - length_m)[lit], beyond[lit], wavelength_m)
+    gain *= face.reflection * np.abs(1 - lost)
 
     kept = np.flatnonzero(gain > WEAKEST_LEG)
     for end_x, end_y in ((radar_x, radar_y), (target_x, target_y)):
