@@ -6,6 +6,7 @@ before it sends a command, ``xethru doctor`` names what a module lacks, and the 
 version as its place in the table says.
 """
 
+import functools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ Key = tuple[int, int, int, bool, str, int]
 Concerns = Callable[[Any], bool]
 
 
+@functools.lru_cache(maxsize=64)  # the emulator asks with every frame
 def version_key(text: str) -> Key | None:
     """Return what orders versions, a pre-release before its release; None for no version.
 
