@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
 from slam.geometry import PAPERS_FIELD, FieldOfView
-from slam.results import StepResult
+from slam.results import SmoothedRun, StepResult
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 """True poses, shape (n, 3), world frame, at n session times [ns]; NaN if unknown."""
@@ -249,6 +249,12 @@ class SessionObserver:
     def on_scan(self, scan: Scan) -> None: ...
 
     def on_snapshot(self, snapshot: Snapshot) -> None: ...
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        """Get the solution over all states so far: at the end of a run, and when it is asked for.
+
+        A run that has none, as the paper's, does not call it.
+        """
 
     def on_log(self, line: LogLine) -> None: ...
 

@@ -450,7 +450,7 @@ def covariances(left: Eliminated) -> tuple[Array, Array]:
     for k in range(len(chain) - 1, -1, -1):
         later = own[k] + back[k] @ later @ back[k].T
         chain[k] += later[:3, :3]
-    return chain, root.T @ root
+    return (chain + chain.transpose(0, 2, 1)) / 2, root.T @ root
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

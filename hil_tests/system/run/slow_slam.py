@@ -19,6 +19,7 @@ class SlowSlam:
         self._slam = slam
         self.config, self.step_detections = slam.config, slam.step_detections
         self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
+        self.smoothed = slam.smoothed
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int

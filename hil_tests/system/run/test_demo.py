@@ -53,6 +53,7 @@ def test_stdout_is_one_table_of_simulated_numbers_and_stderr_is_progress(demo: F
     assert [line.split("  ")[0] for line in lines[2:-1]] == [
         "odometry ATE",
         "SLAM ATE",
+        "smoothed ATE",
         "SLAM ATE, ICP",
         "final error",
         "landmarks",
@@ -72,6 +73,7 @@ def test_exactly_the_promised_files(demo: Finished) -> None:
         "map.png",
         "summary.json",
         "estimate.tum",
+        "smoothed.tum",
         "truth.tum",
         "odometry.tum",
     }
@@ -87,9 +89,14 @@ def test_the_session_has_the_time_of_day(demo: Finished) -> None:
 def test_summary_agrees_with_the_trajectory_files(demo: Finished) -> None:
     summary = json.loads((demo.out / "summary.json").read_text())
     assert summary["landmarks"]["true"] > 0
-    assert len(summary["nees_pose"]) == 10
+    assert len(summary["nees_pose"]) == len(summary["smoothed_nees_pose"]) == 10
+    assert summary["smoothed_ate_rmse_m"] < summary["ate_rmse_m"]
     truth = demo.out / "truth.tum"
-    for name, field in (("estimate", "ate_rmse_m"), ("odometry", "odometry_ate_rmse_m")):
+    for name, field in (
+        ("estimate", "ate_rmse_m"),
+        ("smoothed", "smoothed_ate_rmse_m"),
+        ("odometry", "odometry_ate_rmse_m"),
+    ):
         result = evaluate(demo.out / f"{name}.tum", truth)
         assert result["ate_rmse_m"] == pytest.approx(summary[field], rel=1e-9)
         assert result["pairs"] == result["reference_poses"]

@@ -80,6 +80,9 @@ def test_the_numbers_are_those_of_a_replay(reported: Reported, tmp_path: Path) -
     ate_m = float(re.findall(r'"ate_rmse_m": ([0-9.e-]+)', told)[0])
     shown = re.findall(r'<td>SLAM ATE</td><td class="value">([0-9.]+) mm</td>', reported.text)
     assert shown == [f"{1e3 * ate_m:.1f}"]
+    smoothed_m = float(re.findall(r'"smoothed_ate_rmse_m": ([0-9.e-]+)', told)[0])
+    shown = re.findall(r'<td>smoothed ATE</td><td class="value">([0-9.]+) mm</td>', reported.text)
+    assert shown == [f"{1e3 * smoothed_m:.1f}"]
     assert f"{reported.n_landmarks} for " in reported.text
     assert "simulated data" in reported.text
 

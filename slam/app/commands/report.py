@@ -40,6 +40,7 @@ from slam.app.run.pictures import (
     NARROW_IN,
     ODOMETRY,
     PALE_INK,
+    SMOOTHED,
     draw_map,
     label,
     svg_of,
@@ -252,7 +253,9 @@ _BAR = 0.7
 _TIME = "time since the first scan [s]"
 
 
-def _draw_errors(figure: Figure, series: _Series) -> None:
+def _draw_errors(
+    figure: Figure, series: _Series, smoothed_error_m: NDArray[np.float64] | None
+) -> None:
     """Draw the position errors in mm, where the truth is known, and the number of landmarks."""
     has_truth = bool(np.isfinite(series.slam_error_m).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
@@ -260,6 +263,9 @@ def _draw_errors(figure: Figure, series: _Series) -> None:
         axes = panels[0]
         axes.plot(series.t_s, 1e3 * series.odometry_error_m, color=ODOMETRY, label="wheel odometry")
         axes.plot(series.t_s, 1e3 * series.slam_error_m, color=ESTIMATE, label="radar SLAM")
+        if smoothed_error_m is not None:
+            smoothed_mm = 1e3 * smoothed_error_m
+            axes.plot(series.t_s, smoothed_mm, color=SMOOTHED, label="smoothed at the end")
         label(axes, "Position error, from the start pose, not aligned", "", "error [mm]")
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False, loc="upper left")
@@ -383,6 +389,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         "position errors and number of landmarks over time",
         _draw_errors,
         series,
+        _smoothed_error_m(record),
         height_in=4.4,
         narrow_height_in=4.6,
     )
@@ -402,6 +409,15 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     _write_links(page, info, data)
     _write_parameters(page, info)
     return page.text()
+
+
+def _smoothed_error_m(record: RunRecord) -> NDArray[np.float64] | None:
+    """Return the distance of the smoothed path to the truth, from the start pose, not aligned."""
+    smoothed = record.whole_smoothed
+    if smoothed is None:
+        return None
+    path = transform(record.world_from_map, smoothed.poses[:, :2])
+    return np.asarray(np.linalg.norm(path - record.states.truth[:, :2], axis=1))
 
 
 def _write_numbers(

@@ -34,7 +34,14 @@ from slam.app.run.live_source import (
     reading,
 )
 from slam.app.run.output import Progress, Row, note
-from slam.app.run.results import RESULTS, finish, hold_folder, remove_earlier
+from slam.app.run.results import (
+    RESULTS,
+    SMOOTHED,
+    finish,
+    hold_folder,
+    remove_earlier,
+    write_smoothed,
+)
 from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, execute, make_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
@@ -42,7 +49,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.frames import RadarFrame
-from slam.results import PoseAt, Slam, StepResult
+from slam.results import PoseAt, Slam, SmoothedRun, StepResult
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 _SESSION = "session.mcap"
@@ -92,6 +99,7 @@ def run_rig(
                 "choose another --out, or move it away"
             )
         hold_folder(out, held)
+        requests = held.enter_context(SmoothingRequests(out))
         view = held.enter_context(LiveView(rerun, stop)) if rerun is not None else None
         links = open_rig(
             rig_file,
@@ -145,13 +153,15 @@ def run_rig(
                 odometry=live_odometry,
                 lost_frames=lambda: live.lost_frames,
                 link_log=log,
+                smoothing_asked=requests.asked,
             )
             remove_earlier(out, (*RESULTS, *_STALE))
             session_log = SessionLog(out / _SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [
-                Progress(info, source.lost_frames, also=lambda: _dropped_text(live))
+                Progress(info, source.lost_frames, also=lambda: _dropped_text(live)),
+                requests,
             ]
             if view is not None:
                 sinks.append(view.observer(info))
@@ -218,6 +228,54 @@ class PromptSlam:
         if self._in_step:
             self.n_given_up += 1
             raise StepGivenUpError
+
+
+class SmoothingRequests(SessionObserver):
+    """Answers SIGUSR1 with the path smoothed so far: `smoothed.tum` in a folder.
+
+    Other sinks, as the session and a live view, get it, too. The scans wait for the solution. The
+    signal is caught while this is entered, in the main thread.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self._out = out
+        self._is_asked = False
+        self._asked_s: float | None = None
+
+    def __enter__(self) -> Self:
+        self._previous = signal.signal(signal.SIGUSR1, self._ask)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGUSR1, self._previous)
+
+    def close(self) -> None:
+        """Leave the signal caught: results are written after the sinks are closed."""
+
+    def asked(self) -> bool:
+        """Return whether a signal came since the last call."""
+        is_asked, self._is_asked = self._is_asked, False
+        if self._asked_s is not None:
+            self._asked_s = None
+            note("SIGUSR1: there is no smoothed path")
+        if is_asked:
+            self._asked_s = time.monotonic()
+        return is_asked
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        if self._asked_s is None:
+            return  # the end of the run, whose results are written by others
+        path, took_s = self._out / SMOOTHED, time.monotonic() - self._asked_s
+        self._asked_s = None
+        try:
+            write_smoothed(self._out, smoothed)
+        except AppError as error:
+            note(str(error))
+        else:
+            note(f"{path} has {len(smoothed.t_ns)} states, solved for in {took_s:.2f} s")
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self._is_asked = True
 
 
 def parse_clock(text: str, source: LineSource) -> ClockLine | None:

@@ -44,7 +44,8 @@ class Summary:
     paper's number, without time, and flatters; `final_error_m` is that of the last state, not
     aligned; `nees_pose` holds (time of the state [s], NEES) pairs of the unaligned pose in the
     start frame, of the last state at or before each of ten times; `nis_mean` is divided by its
-    degrees of freedom.
+    degrees of freedom. Smoothed numbers are of the solution over the whole run at its end, None
+    where there is none; its landmarks are those of the last map, where the solution has them.
     """
 
     scene: str
@@ -55,11 +56,14 @@ class Summary:
     duration_s: float
     realtime_factor: float
     ate_rmse_m: float
+    smoothed_ate_rmse_m: float | None = None
     ate_icp_rmse_m: float
     odometry_ate_rmse_m: float
     final_error_m: float
     landmarks: LandmarkScore
+    smoothed_landmarks: LandmarkScore | None = None
     nees_pose: tuple[tuple[float, float], ...]
+    smoothed_nees_pose: tuple[tuple[float, float], ...] | None = None
     nis_mean: float | None
     """None where nothing was associated."""
     nis_times: tuple[tuple[float, float, int], ...] = ()
@@ -70,6 +74,12 @@ class Summary:
     def ate_ratio(self) -> float:
         """SLAM's ATE in units of odometry's."""
         return ratio(self.ate_rmse_m, self.odometry_ate_rmse_m)
+
+    @property
+    def smoothed_ate_ratio(self) -> float | None:
+        if self.smoothed_ate_rmse_m is None:
+            return None
+        return ratio(self.smoothed_ate_rmse_m, self.odometry_ate_rmse_m)
 
     def to_json(self) -> str:
         """Return the text of summary.json: exactly these fields, no NaN."""
@@ -158,11 +168,16 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     truth_xy = states.truth[:, :2]
     truth_in_map = np.array([between(record.world_from_map, pose) for pose in states.truth])
     estimate, odometry = states.estimate, states.odometry
-    alignment = align_se2(estimate[:, :2], truth_xy)
     observable = observable_landmarks(rig, states.truth, true_landmarks_m, info.field_of_view)
-    landmarks = landmark_metrics(last.landmarks_m, true_landmarks_m, alignment, observable)
-    if not info.simulated and not len(true_landmarks_m):
-        landmarks = replace(landmarks, true=None, observable=None, precision=None, recall=None)
+
+    def score(landmarks_m: NDArray[np.float64], poses: NDArray[np.float64]) -> LandmarkScore:
+        alignment = align_se2(poses[:, :2], truth_xy)
+        score = landmark_metrics(landmarks_m, true_landmarks_m, alignment, observable)
+        if info.simulated or len(true_landmarks_m):
+            return score
+        return replace(score, true=None, observable=None, precision=None, recall=None)
+
+    smoothed = record.whole_smoothed
     return Summary(
         scene=info.scene,
         preset=info.preset,
@@ -171,22 +186,36 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
         duration_s=record.duration_ns / NS_PER_S,
         realtime_factor=record.duration_ns / NS_PER_S / record.wall_s,
         ate_rmse_m=ate_rmse_m(estimate[:, :2], truth_xy),
+        smoothed_ate_rmse_m=None
+        if smoothed is None
+        else ate_rmse_m(smoothed.poses[:, :2], truth_xy),
         ate_icp_rmse_m=icp_ate_rmse_m(estimate[:, :2], truth_in_map[:, :2]),
         odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
         final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
-        landmarks=landmarks,
-        nees_pose=_nees(record, truth_in_map),
+        landmarks=score(last.landmarks_m, estimate),
+        smoothed_landmarks=None
+        if smoothed is None
+        else score(smoothed.landmarks_m, smoothed.poses),
+        nees_pose=_nees(record, truth_in_map, estimate, states.pose_covariances),
+        smoothed_nees_pose=None
+        if smoothed is None
+        else _nees(record, truth_in_map, smoothed.poses, smoothed.pose_covariances),
         nis_mean=sum(states.nis.tolist()) / dof if (dof := int(states.nis_dof.sum())) else None,
         nis_times=_nis_times(record),
     )
 
 
-def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+def _nees(
+    record: RunRecord,
+    truth_in_map: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+) -> tuple[tuple[float, float], ...]:
     """Return (time [s], NEES) of the last state at or before each of the ten times."""
     states = record.states
     values = []
     for row in _rows_at(record, range(len(states))):
-        nees = nees_pose(states.estimate[row], states.pose_covariances[row], truth_in_map[row])
+        nees = nees_pose(poses[row], covariances[row], truth_in_map[row])
         values.append((int(states.t_ns[row]) / NS_PER_S, nees))
     return tuple(values)
 

@@ -38,6 +38,7 @@ from slam.app.rig.sources import RadarLink, radar_frame
 from slam.app.run.runner import LinkLog
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
+from slam.results import SmoothedRun
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.system import StopFlag, StopRequestedError
@@ -404,6 +405,9 @@ class LiveLog(LinkLog):
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         self._write(lambda log: log.on_snapshot(snapshot))
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        self._write(lambda log: log.on_smoothed(smoothed))
 
     def pass_on(self, line: LogLine) -> None:
         if self._sinks is not None:

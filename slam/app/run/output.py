@@ -198,6 +198,7 @@ def summary_rows(
             mm_text(summary.ate_rmse_m),
             f"{summary.ate_ratio:.2f} of odometry's, SE(2)-aligned, {lag}",
         ),
+        *_smoothed_row(summary),
         (
             "SLAM ATE, ICP",
             mm_text(summary.ate_icp_rmse_m),
@@ -211,6 +212,14 @@ def summary_rows(
             f"{summary.frames} frames in {wall_s:.1f} s, {lost_frames} lost",
         ),
     ]
+
+
+def _smoothed_row(summary: Summary) -> list[Row]:
+    share = summary.smoothed_ate_ratio
+    if share is None:
+        return []
+    note = f"{share:.2f} of odometry's, SE(2)-aligned, all states solved for at the end"
+    return [("smoothed ATE", mm_text(summary.smoothed_ate_rmse_m), note)]
 
 
 def _landmark_rows(landmarks: LandmarkScore) -> list[Row]:
@@ -252,6 +261,11 @@ def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Row
         float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
         for path in (states.estimate, states.odometry)
     ]
+    if (smoothed := record.whole_smoothed) is not None:
+        apart_m = np.linalg.norm(smoothed.poses[:, :2] - states.estimate[:, :2], axis=1)
+        rms_m = float(np.sqrt(np.mean(apart_m**2)))
+        note = "RMS distance of the causal path from the one solved for at the end"
+        rows.append(("smoothed", mm_text(rms_m), note))
     sigma_m = float(np.sqrt(np.trace(last.pose_covariance[:2, :2])))
     spread = [float(np.sqrt(np.trace(each))) for each in last.landmark_covariances_m2]
     rows += [

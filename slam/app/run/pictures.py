@@ -30,6 +30,7 @@ from xethru_protocol.system import each_line, written_whole
 
 # What is drawn alike differs also for those who see two colours only.
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#9aa0a8", "#e08a2c", "#1f6fd0", "#c2255c"
+SMOOTHED = "#0a9d7e"
 LINK_COLOURS = {
     LinkState.SETTING_UP: "#9fc9e8",
     LinkState.STREAMING: "#0072b2",
@@ -240,7 +241,8 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     axes.plot(*odometry.T, color=ODOMETRY, linewidth=1.1, alpha=0.9, label="wheel odometry")
     if summary is not None:
         axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=4.0, alpha=0.6, label="true path")
-    axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.3, label="radar SLAM")
+    axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.7, label="radar SLAM")
+    _draw_smoothed(axes, record)
     _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
     _draw_robot(axes, compose(place, states.estimate[-1]))
     if len(info.true_landmarks_m):
@@ -275,6 +277,8 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
             f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
             f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm"
         )
+        if summary.smoothed_ate_rmse_m is not None:
+            title += f"; smoothed {1e3 * summary.smoothed_ate_rmse_m:.1f} mm"
         remark = (
             "drawn from the start pose, while the ATE is after SE(2) alignment; "
             f"last state {1e3 * summary.final_error_m:.0f} mm off"
@@ -307,6 +311,26 @@ def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
         label="start",
         zorder=7,
     )
+
+
+def _draw_smoothed(axes: Axes, record: RunRecord) -> None:
+    smoothed, place = record.smoothed, record.world_from_map
+    if smoothed is None:
+        return
+    path = transform(place, smoothed.poses[:, :2])
+    axes.plot(*path.T, color=SMOOTHED, linewidth=0.9, label="smoothed at the end")
+    if len(smoothed.landmark_ids):
+        axes.plot(
+            *transform(place, smoothed.landmarks_m).T,
+            linestyle="none",
+            marker="D",
+            markersize=8,
+            markerfacecolor="none",
+            markeredgewidth=1.2,
+            color=SMOOTHED,
+            label="smoothed landmark",
+            zorder=5,
+        )
 
 
 def _draw_robot(axes: Axes, pose: NDArray[np.float64]) -> None:

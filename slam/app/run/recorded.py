@@ -12,6 +12,7 @@ from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.runner import LinkLog, LostFrames, RunRecord, RunRecorder
 from slam.app.session.reader import RecordedScan, RecordedSession
 from slam.packed import RowsByTime
+from slam.results import SmoothedRun
 from xethru_protocol.system import StopFlag
 
 
@@ -42,7 +43,7 @@ class RecordedScans:
 def play_states(
     session: RecordedSession, sinks: Sequence[SessionObserver], stop: StopFlag
 ) -> RunRecord:
-    """Give the recorded scans, log lines and states to sinks in the order of the file.
+    """Give recorded scans, log lines, states and smoothed runs to sinks in the order of the file.
 
     The sinks are closed in their order at the end, also after a failure. Of a file without
     `/slam/step`, states have no `step` and no walls.
@@ -63,6 +64,8 @@ def play_states(
                     sink.on_scan(record.scan)
                 elif isinstance(record, Snapshot):
                     sink.on_snapshot(record)
+                elif isinstance(record, SmoothedRun):
+                    sink.on_smoothed(record)
                 elif isinstance(record, LogLine):
                     sink.on_log(record)
     return recorder.record()

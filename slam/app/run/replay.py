@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from slam.app.errors import AppError, OdometryError
@@ -24,12 +25,12 @@ from slam.app.run.recorded import RecordedScans
 from slam.app.run.results import finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.session.constants import different_constants, recorded_rules
-from slam.app.session.messages import state_row
+from slam.app.session.messages import smoothed_row, state_row
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
 from slam.packed import RowsByTime
-from slam.results import PoseAt, Slam, StepResult
+from slam.results import PoseAt, Slam, SmoothedRun, StepResult
 from xethru_protocol.system import StopFlag
 from xethru_protocol.validation import problem_text
 
@@ -93,7 +94,7 @@ def recorded_source(
 ) -> RunSource:
     """Return a session as the source of a run that steps SLAM as the recorded one did.
 
-    `comparison` gets every recorded state, before the replay begins.
+    `comparison` gets every recorded state and smoothed run, before the replay begins.
 
     Raises
     ------
@@ -132,13 +133,15 @@ def recorded_source(
 def _samples(
     session: RecordedSession, stop: StopFlag, comparison: Comparison | None
 ) -> Iterator[TumSample]:
-    """Yield the odometry; `comparison` gets the states and gaps between it."""
+    """Yield the odometry; `comparison` gets states, smoothed runs and gaps between it."""
     for record in session.records():
         stop.check()
         if isinstance(record, TumSample):
             yield record
         elif isinstance(record, Snapshot) and comparison is not None:
             comparison.expect(record)
+        elif isinstance(record, SmoothedRun) and comparison is not None:
+            comparison.expect_smoothed(record)
         elif isinstance(record, Gap) and comparison is not None:
             comparison.expect_gap(record)
 
@@ -147,7 +150,7 @@ _DIGEST_BYTES = 16
 
 
 class Comparison(SessionObserver):
-    """Compares every state with the recorded one, to the last bit.
+    """Compares every state and the last smoothed run with the recorded ones, to the last bit.
 
     `different` are the numbers in which the recorded run and this one differ, a text each.
     """
@@ -160,9 +163,14 @@ class Comparison(SessionObserver):
         self._gaps: list[Gap] = []
         self._n_before_gap: int | None = None
         self._first_other_ns: int | None = None
+        self._smoothed: tuple[int, bytes] | None = None  # of the last one its last time, and digest
+        self._smoothed_again: tuple[int, bytes] | None = None
 
     def expect(self, snapshot: Snapshot) -> None:
-        self._expected.put(snapshot.t_ns, (_digest(snapshot), False))
+        self._expected.put(snapshot.t_ns, (_digest(state_row(snapshot)), False))
+
+    def expect_smoothed(self, smoothed: SmoothedRun) -> None:
+        self._smoothed = int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))
 
     def expect_gap(self, gap: Gap) -> None:
         """Take it that what is expected from now on was recorded behind a gap."""
@@ -174,10 +182,13 @@ class Comparison(SessionObserver):
         expected = self._expected.at(snapshot.t_ns)
         if expected is None:
             return
-        if expected["digest"].tobytes() == _digest(snapshot):
+        if expected["digest"].tobytes() == _digest(state_row(snapshot)):
             expected["same"] = True
         elif self._first_other_ns is None:
             self._first_other_ns = snapshot.t_ns
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        self._smoothed_again = int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))
 
     def verdict(self) -> str:
         """Return one line: how many states came again, and why others did not."""
@@ -185,7 +196,7 @@ class Comparison(SessionObserver):
         if not n_expected:
             return "no states are recorded, so there are none to compare with"
         if self._n_same(n_expected) == n_expected:
-            return f"all {n_expected} recorded states came again, to the last bit"
+            return f"all {n_expected} recorded states {self._smoothed_verdict()}"
         if self._n_before_gap is None:
             return self._verdict_on(n_expected, "") + self._reason()
         n_before = self._n_before_gap
@@ -203,6 +214,14 @@ class Comparison(SessionObserver):
                 f"{behind}"
             )
         return f"{self._verdict_on(n_before, ' before the first gap')}{self._reason()}; {behind}"
+
+    def _smoothed_verdict(self) -> str:
+        expected, found = self._smoothed, self._smoothed_again
+        if expected is None or found is None or expected[0] != found[0]:
+            return "came again, to the last bit"  # of a run that was killed, or smooths nothing
+        if expected == found:
+            return "and the smoothed path came again, to the last bit"
+        return f"came again, to the last bit, the smoothed path did not; {self._reason()}"
 
     def _n_same(self, n_first: int) -> int:
         return int(self._expected.rows["same"][:n_first].sum())
@@ -226,6 +245,5 @@ class Comparison(SessionObserver):
 _MOST_SHOWN = 10
 
 
-def _digest(snapshot: Snapshot) -> bytes:
-    row = state_row(snapshot).tobytes()
-    return hashlib.blake2b(row, digest_size=_DIGEST_BYTES).digest()
+def _digest(row: NDArray[np.float64]) -> bytes:
+    return hashlib.blake2b(row.tobytes(), digest_size=_DIGEST_BYTES).digest()

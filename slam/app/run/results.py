@@ -19,6 +19,7 @@ from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.output import Row, print_result, print_text
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
+from slam.results import SmoothedRun
 from xethru_protocol.system import (
     PathInUseError,
     StopFlag,
@@ -27,7 +28,8 @@ from xethru_protocol.system import (
     written_whole,
 )
 
-RESULTS = ("map.png", "summary.json", "estimate.tum", "truth.tum", "odometry.tum")
+SMOOTHED = "smoothed.tum"
+RESULTS = ("map.png", "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "odometry.tum")
 
 
 def finish(
@@ -69,14 +71,24 @@ def _write(
 
 
 def write_trajectories(out: Path, record: RunRecord) -> None:
-    """Write estimate, odometry and, if known, truth at the stamps of SLAM's states."""
+    """Write estimate, odometry and, if known, smoothed path and truth at the stamps of states."""
     states = record.states
     paths = {"estimate": states.estimate, "odometry": states.odometry}
     if states.has_truth:
         paths["truth"] = states.truth
     for name, poses in paths.items():
-        with naming(path := out / f"{name}.tum"), written_whole(path) as fresh:
-            write_tum(fresh, Trajectory(stamps_ns=states.t_ns, poses=poses))
+        _write_tum(out / f"{name}.tum", states.t_ns, poses)
+    if record.smoothed is not None:
+        write_smoothed(out, record.smoothed)
+
+
+def write_smoothed(out: Path, smoothed: SmoothedRun) -> None:
+    _write_tum(out / SMOOTHED, smoothed.t_ns, smoothed.poses)
+
+
+def _write_tum(path: Path, t_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    with naming(path), written_whole(path) as fresh:
+        write_tum(fresh, Trajectory(stamps_ns=t_ns, poses=poses))
 
 
 def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:

@@ -32,7 +32,7 @@ from slam.frames import Detector, RadarFrame
 from slam.geometry import Rig
 from slam.packed import PackedRows, RowsByTime
 from slam.paper.pipeline import UwbRadarSlam
-from slam.results import Slam, StepResult
+from slam.results import Slam, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.conversation import ProtocolRecord
@@ -128,6 +128,8 @@ class RunSource:
         Gets the lines about links while scans are drawn.
     close
         Called before sinks are closed: what it logs is still recorded.
+    smoothing_asked
+        Called after every scan: whether sinks shall get the smoothed run so far.
     """
 
     info: SessionInfo
@@ -139,6 +141,7 @@ class RunSource:
     lost_frames: Callable[[], int] = int
     link_log: LinkLog = field(default_factory=LinkLog)
     close: Callable[[], None] = lambda: None
+    smoothing_asked: Callable[[], bool] = lambda: False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -185,6 +188,9 @@ class RunRecord:
         Numbers of every state.
     last
         The last state with its map; None if there is none.
+    smoothed
+        The newest solution over all states until then; None if there is none. That of a run which
+        ended covers all its states.
     n_frames
         Radar frames used, over all radars.
     start_ns
@@ -199,6 +205,15 @@ class RunRecord:
     duration_ns: int
     wall_s: float
     start_ns: int = 0
+    smoothed: SmoothedRun | None = None
+
+    @property
+    def whole_smoothed(self) -> SmoothedRun | None:
+        """Return the smoothed run if it covers every state."""
+        smoothed = self.smoothed
+        if smoothed is None or not np.array_equal(smoothed.t_ns, self.states.t_ns):
+            return None
+        return smoothed
 
     @property
     def world_from_map(self) -> NDArray[np.float64]:
@@ -224,6 +239,7 @@ class RunRecorder(SessionObserver):
         self._covariances = PackedRows(_FLOAT, 3, 3)
         self._nis, self._nis_dof = PackedRows(_FLOAT), PackedRows(np.dtype(np.int32))
         self._last: Snapshot | None = None
+        self._smoothed: SmoothedRun | None = None
         self._start_ns: int | None = None
         self._n_frames = self._duration_ns = 0
         self._started = time.monotonic()
@@ -245,6 +261,9 @@ class RunRecorder(SessionObserver):
         self._nis_dof.append(dof)
         self._last = snapshot
 
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        self._smoothed = smoothed
+
     def record(self) -> RunRecord:
         """Return the record of the run until now."""
         return RunRecord(
@@ -262,6 +281,7 @@ class RunRecorder(SessionObserver):
             duration_ns=self._duration_ns,
             start_ns=self._start_ns or 0,
             wall_s=time.monotonic() - self._started,
+            smoothed=self._smoothed,
         )
 
     def _true_nis(self, snapshot: Snapshot) -> tuple[float, int]:
@@ -297,6 +317,7 @@ def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunReco
             [source.link_log, *sinks],
             gains_db=[radar.gain_db for radar in source.info.radars],
             true_landmarks_m=source.info.true_landmarks_m,
+            smoothing_asked=source.smoothing_asked,
         )
 
 
@@ -309,14 +330,16 @@ def run_slam(
     *,
     gains_db: Sequence[float] = (),
     true_landmarks_m: NDArray[np.float64] = _NO_LANDMARKS_M,
+    smoothing_asked: Callable[[], bool] = lambda: False,
 ) -> RunRecord:
     """Feed scans to SLAM as they come, and scans and states to the observers.
 
     A scan that is not `used` goes to the observers only, and so does the truth. One whose step SLAM
-    gave up, at the end of a run, counts as not used. BLAS runs on one
-    thread, as everywhere else, so that results are the same bits. Observers get frames as received,
-    SLAM gets them without each radar's gain, if `gains_db` has any. `true_landmarks_m`, shape
-    (m, 2), world frame, is for the record only.
+    gave up, at the end of a run, counts as not used, and nothing is smoothed then. Observers get
+    the smoothed run at the end, and after a scan when `smoothing_asked` returns True. BLAS runs on
+    one thread, as everywhere else, so that results are the same bits. Observers get frames as
+    received, SLAM gets them without each radar's gain, if `gains_db` has any. `true_landmarks_m`,
+    shape (m, 2), world frame, is for the record only.
 
     Raises
     ------
@@ -341,6 +364,12 @@ def run_slam(
             for observer in observers:
                 observer.on_snapshot(snapshot)
 
+    def smooth() -> None:
+        smoothed = slam.smoothed()
+        if smoothed is not None:
+            for observer in observers:
+                observer.on_smoothed(smoothed)
+
     with threadpool_limits(limits=1):
         given_up = False
         for scan in scans:
@@ -360,8 +389,11 @@ def run_slam(
                 for observer in observers:
                     observer.on_scan(scan)
             take(results)
+            if not given_up and smoothing_asked():
+                smooth()
         if not given_up:  # SLAM is in the middle of a step then
             take(slam.flush())
+            smooth()
     return recorder.record()
 
 

@@ -12,6 +12,8 @@ neither float arrays nor covariances. Topics:
 `/odom/path`, `/estimate/path`, `/truth/path` and each with `_points`
     The same path as poses and as a point cloud. The wheels' one is in the map frame, as if the
     wheels had been right until the first state.
+`/slam/smoothed_path`, `/slam/smoothed_path_points`, `/slam/smoothed_landmarks`
+    The solution over all states, where there is one: as poses, as points; and its landmarks.
 `/landmarks/markers`
     Landmarks, their 95 % ellipses, and the stretches of wall that answered.
 `/scene`, `/fields_of_view`
@@ -39,6 +41,7 @@ from slam.app.session.cdr import Marker, Shape
 from slam.config import WheelNoise
 from slam.frames import RadarFrame
 from slam.geometry import between, compose
+from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import STRING, pack_string
 
 Array = NDArray[np.float64]
@@ -66,6 +69,7 @@ class Drawings:
         self._newest_ns = start_ns
         self._map_from_odom: Array | None = None
         self._last: Snapshot | None = None
+        self._smoothed: tuple[_PathChannels, int] | None = None
         self._markers_ns = self._paths_ns = start_ns
         self._bscans = {
             index: _Bscan(file, radar, self._field.max_range_m, start_ns)
@@ -127,6 +131,18 @@ class Drawings:
             self._paths_ns = t_ns
             for path in self._paths.values():
                 path.write(t_ns, most=_SHOWN_POSES)
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        if not self._smoothed:
+            self._smoothed = (
+                _PathChannels(self._file, "/slam/smoothed_path", "map"),
+                self._file.channel("/slam/smoothed_landmarks", ros.POINT_CLOUD),
+            )
+        path, landmarks = self._smoothed
+        t_ns, step = int(smoothed.t_ns[-1]), -(-len(smoothed.t_ns) // (_KEPT_POSES - 1))
+        # counted from the end, whose pose is the newest
+        path.write(t_ns, smoothed.t_ns[::-step][::-1], smoothed.poses[::-step][::-1])
+        self._file.write(landmarks, t_ns, ros.serialise(ros.landmark_cloud(t_ns, smoothed)))
 
     def close(self) -> None:
         """Write the last rows of the B-scans, the whole paths and the last map."""
@@ -297,13 +313,25 @@ _SHOWN_POSES = 256
 _KEPT_POSES = 3600
 
 
-class _Path:
-    """A path that grows: all poses up to 3600, then every second, every fourth, and so on."""
+class _PathChannels:
+    """A path as poses in one channel, and as points in another, named after it."""
 
     def __init__(self, file: Channels, topic: str, frame: str) -> None:
         self._file, self._frame = file, frame
         self._path = file.channel(topic, "nav_msgs/msg/Path")
         self._points = file.channel(f"{topic}_points", ros.POINT_CLOUD)
+
+    def write(self, t_ns: int, stamps_ns: NDArray[np.int64], poses: Array) -> None:
+        self._file.write(self._path, t_ns, cdr.path(t_ns, self._frame, stamps_ns, poses))
+        cloud = ros.serialise(ros.path_cloud(t_ns, self._frame, poses))
+        self._file.write(self._points, t_ns, cloud)
+
+
+class _Path:
+    """A path that grows: all poses up to 3600, then every second, every fourth, and so on."""
+
+    def __init__(self, file: Channels, topic: str, frame: str) -> None:
+        self._channels = _PathChannels(file, topic, frame)
         self._stamps: list[int] = []
         self._poses: list[tuple[float, ...]] = []
         self._every, self._n_added = 1, 0
@@ -327,11 +355,7 @@ class _Path:
         stamps, poses = self._stamps[::step], self._poses[::step]
         if stamps[-1] != self._newest[0]:
             stamps, poses = [*stamps, self._newest[0]], [*poses, self._newest[1]]
-        rows = np.array(poses)
-        message = cdr.path(t_ns, self._frame, np.array(stamps), rows)
-        self._file.write(self._path, t_ns, message)
-        cloud = ros.serialise(ros.path_cloud(t_ns, self._frame, rows))
-        self._file.write(self._points, t_ns, cloud)
+        self._channels.write(t_ns, np.array(stamps), np.array(poses))
 
 
 _ROWS = 128

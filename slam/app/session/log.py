@@ -40,10 +40,12 @@ from slam.app.session.messages import (
     radar_text,
     schema_text,
     session_table,
+    smoothed_row,
     state_row,
 )
 from slam.app.session.steps import step_row
 from slam.geometry import between, compose
+from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,
     CHUNK_BYTES,
@@ -217,7 +219,8 @@ class SessionLog(SessionObserver):
     every stream but number 0; `/scan` after the frames of each scan, with their counters and the
     true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`,
     `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`state_row`),
-    `/slam/step`, what led to each (`step_row`); where there are such, raw bytes in
+    `/slam/step`, what led to each (`step_row`); `/slam/smoothed`, the solution over all states, at
+    the end and when it was asked for (`smoothed_row`); where there are such, raw bytes in
     `/radar/<name>/rx` and `tx`, and ranges that another program found in
     `/radar/<name>/detections`.
 
@@ -261,6 +264,7 @@ class SessionLog(SessionObserver):
         self._truth_at = truth_at
         self._t_ns = start_ns
         self._rare_channels: dict[str, int] = {}
+        self._smoothed: int | None = None
         self._names = [radar.name for radar in info.radars]
         self._streams = [0] * len(self._names)
         self._frame_channels: list[int] = []
@@ -353,7 +357,7 @@ class SessionLog(SessionObserver):
         if np.all(np.isfinite(snapshot.truth)):
             self._write(self._truth, t_ns, ros.pose_stamped(t_ns, "world", snapshot.truth))
         self._write(self._estimate, t_ns, ros.pose_stamped(t_ns, "map", snapshot.estimate))
-        self._write(self._landmarks, t_ns, ros.landmark_cloud(snapshot))
+        self._write(self._landmarks, t_ns, ros.landmark_cloud(t_ns, snapshot))
         links = {
             ("map", "odom"): compose(snapshot.estimate, between(snapshot.odometry, _ORIGIN)),
             ("odom", "base_link"): snapshot.odometry,
@@ -367,6 +371,14 @@ class SessionLog(SessionObserver):
         self._file.write(self._states, t_ns, state, sequence=snapshot.counter)
         if self._drawings is not None:
             self._drawings.on_snapshot(snapshot)
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        if self._smoothed is None:
+            self._smoothed = self._file.channel("/slam/smoothed", DOUBLE_ARRAY)
+        message = pack_array(DOUBLE_ARRAY, smoothed_row(smoothed), "smoothed")
+        self._file.write(self._smoothed, int(smoothed.t_ns[-1]), message)
+        if self._drawings is not None:
+            self._drawings.on_smoothed(smoothed)
 
     def on_log(self, line: LogLine) -> None:
         t_ns = max(line.t_ns, self._start_ns)

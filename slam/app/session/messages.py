@@ -8,7 +8,14 @@ The row of a state, float64, in /slam/state::
     n_landmarks times: id, x, y, cov_xx, cov_xy, cov_yx, cov_yy,
     n_nis times: NIS per degree of freedom
 
-in the units and frames of `Snapshot`; an unknown truth is NaN. What led to the state is in
+in the units and frames of `Snapshot`; an unknown truth is NaN. The row of a smoothed run, float64,
+in /slam/smoothed, at the time of its last state::
+
+    n_states, n_landmarks,
+    n_states times: dt_ns, x, y, heading, covariance (9, row by row),
+    n_landmarks times: id, x, y, cov_xx, cov_xy, cov_yx, cov_yy
+
+in the map frame; dt_ns is a time less that of the last state. What led to the state is in
 /slam/step, see `slam.app.session.steps`.
 
 Composite messages are made and serialised by the rosbags library.
@@ -34,6 +41,7 @@ from slam.app.records import RadarInfo, SessionInfo, Snapshot
 from slam.app.session.constants import slam_constants
 from slam.config import SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount
+from slam.results import SmoothedRun
 from xethru_protocol.validation import reason_of, shown
 
 _COUNTS = 2
@@ -91,6 +99,53 @@ def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
         landmarks_m=table[:, 1:3],
         landmark_covariances_m2=table[:, 3:].reshape(-1, 2, 2),
         nis_per_dof=tuple(nis.tolist()),
+    )
+
+
+_PER_STATE = 13
+
+
+def smoothed_row(smoothed: SmoothedRun) -> NDArray[np.float64]:
+    """Return the row of a smoothed run, shape (2 + 13 n_states + 7 n_landmarks,)."""
+    states = np.column_stack(
+        [
+            smoothed.t_ns - smoothed.t_ns[-1],
+            smoothed.poses,
+            smoothed.pose_covariances.reshape(-1, 9),
+        ]
+    )
+    landmarks = np.column_stack(
+        [
+            np.array(smoothed.landmark_ids, dtype=np.float64),
+            smoothed.landmarks_m.reshape(-1, 2),
+            smoothed.landmark_covariances_m2.reshape(-1, 4),
+        ]
+    )
+    head = [float(len(states)), float(len(landmarks))]
+    return np.concatenate([head, states.ravel(), landmarks.ravel()])
+
+
+def smoothed_of(t_ns: int, row: NDArray[np.float64]) -> SmoothedRun:
+    """Return the smoothed run that a row holds.
+
+    Raises
+    ------
+    ValueError
+        The row's length does not fit its first two numbers.
+    """
+    n_states, n_landmarks = (int(value) for value in row[:_COUNTS])
+    ends = np.cumsum([_COUNTS, _PER_STATE * n_states, _PER_LANDMARK * n_landmarks])
+    if min(n_states - 1, n_landmarks) < 0 or ends[-1] != len(row):
+        raise ValueError(f"a smoothed run of {len(row)} numbers says it has {ends[-1]}")
+    _, states, landmarks, _ = np.split(row, ends)
+    states, landmarks = states.reshape(-1, _PER_STATE), landmarks.reshape(-1, _PER_LANDMARK)
+    return SmoothedRun(
+        t_ns=t_ns + states[:, 0].astype(np.int64),
+        poses=states[:, 1:4],
+        pose_covariances=states[:, 4:].reshape(-1, 3, 3),
+        landmark_ids=tuple(landmarks[:, 0].astype(np.int64).tolist()),
+        landmarks_m=landmarks[:, 1:3],
+        landmark_covariances_m2=landmarks[:, 3:].reshape(-1, 2, 2),
     )
 
 
@@ -188,16 +243,16 @@ def transforms(t_ns: int, links: Mapping[tuple[str, str], NDArray[np.float64]]) 
     return _type(TRANSFORMS)(transforms=rows)
 
 
-def landmark_cloud(snapshot: Snapshot) -> Message:
-    """Wrap the landmarks of a state, with id and covariance, in the map frame."""
-    points = np.zeros(len(snapshot.landmark_ids), dtype=LANDMARK_DTYPE)
-    points["x"] = snapshot.landmarks_m[:, 0]
-    points["y"] = snapshot.landmarks_m[:, 1]
-    points["id"] = snapshot.landmark_ids
-    points["cov_xx"] = snapshot.landmark_covariances_m2[:, 0, 0]
-    points["cov_xy"] = snapshot.landmark_covariances_m2[:, 0, 1]
-    points["cov_yy"] = snapshot.landmark_covariances_m2[:, 1, 1]
-    return _cloud(snapshot.t_ns, "map", points)
+def landmark_cloud(t_ns: int, of: Snapshot | SmoothedRun) -> Message:
+    """Wrap the landmarks of a state or a smoothed run, with id and covariance, in the map frame."""
+    points = np.zeros(len(of.landmark_ids), dtype=LANDMARK_DTYPE)
+    points["x"] = of.landmarks_m[:, 0]
+    points["y"] = of.landmarks_m[:, 1]
+    points["id"] = of.landmark_ids
+    points["cov_xx"] = of.landmark_covariances_m2[:, 0, 0]
+    points["cov_xy"] = of.landmark_covariances_m2[:, 0, 1]
+    points["cov_yy"] = of.landmark_covariances_m2[:, 1, 1]
+    return _cloud(t_ns, "map", points)
 
 
 def path_cloud(t_ns: int, frame: str, poses: NDArray[np.float64]) -> Message:

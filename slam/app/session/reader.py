@@ -34,11 +34,13 @@ from slam.app.session.messages import (
     check_format,
     read_radar_text,
     read_session_table,
+    smoothed_of,
     snapshot_of,
 )
 from slam.app.session.steps import with_step
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Mount, Rig
+from slam.results import SmoothedRun
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,
@@ -200,7 +202,7 @@ class RecordedScan:
     truth: NDArray[np.float64] | None
 
 
-SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot | Gap
+SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot | SmoothedRun | Gap
 """What `RecordedSession.records` yields; a TumSample is odometry."""
 
 
@@ -268,6 +270,10 @@ def _log_line(message: Message) -> LogLine:
     )
 
 
+def _smoothed(message: Message) -> SmoothedRun:
+    return smoothed_of(message.t_ns, unpack_array(DOUBLE_ARRAY, message.data))
+
+
 def _gap(message: Message) -> Gap:
     return read_gap(unpack_string(message.data))
 
@@ -278,6 +284,7 @@ _READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
     "/scan_unused": _scan_end,
     "/odom": _odometry,
     "/log": _log_line,
+    "/slam/smoothed": _smoothed,
 }
 
 
@@ -347,7 +354,7 @@ class RecordedSession:
             if isinstance(record, RecordedScan):
                 yield record.scan, record.truth
 
-    def played(self) -> Iterator[RecordedScan | TumSample | LogLine | Snapshot | Gap]:
+    def played(self) -> Iterator[RecordedScan | TumSample | LogLine | Snapshot | SmoothedRun | Gap]:
         """Yield what `records` does, with the frames put together into scans as in `scans`."""
         held: list[tuple[RadarFrame, int]] = []
         for message, record in self._records():

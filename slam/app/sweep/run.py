@@ -416,6 +416,9 @@ def finite(run: SweepRun) -> SweepRun:
     capped = replace(
         run,
         nees_pose=tuple((t_s, min(nees, LARGEST)) for t_s, nees in run.nees_pose),
+        smoothed_nees_pose=None
+        if run.smoothed_nees_pose is None
+        else tuple((t_s, min(nees, LARGEST)) for t_s, nees in run.smoothed_nees_pose),
         nis_mean=None if run.nis_mean is None else min(run.nis_mean, LARGEST),
         nis_times=tuple((t_s, min(nis, LARGEST), dof) for t_s, nis, dof in run.nis_times),
     )

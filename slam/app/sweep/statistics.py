@@ -12,7 +12,7 @@ from scipy.special import gammaincinv
 from slam.app.run.evaluation import ratio
 from slam.app.run.output import mm_text, share_text
 from slam.app.sweep import CLEAN
-from slam.app.sweep.run import SweepRun
+from slam.app.sweep.run import LARGEST, SweepRun
 
 _POSE_DOF = 3
 
@@ -24,7 +24,8 @@ def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
     odometry, `median` and `p90` of the errors, medians of the landmarks' scores, the share of runs
     without a duplicate, false landmarks (per run, and how many were claimed to be known), the mean
     NEES over runs (ANEES) and the mean NIS per degree of freedom at each of the ten times with
-    their 95 % bands, and the same errors of the known-association bound where it was computed.
+    their 95 % bands, ATE and mean NEES of the `smoothed` paths where there are any, and the same
+    errors of the known-association bound where it was computed.
     """
     keys = list(dict.fromkeys(run.key[:-1] for run in runs))
     return [_group([run for run in runs if run.key[:-1] == key]) for key in keys]
@@ -54,11 +55,19 @@ def group_line(group: dict[str, Any]) -> str:
             for path in ("filtered", "smoothed")
         )
         beside = f"; known association: filtered median {filtered}, smoothed {smoothed}"
+    at_the_end = ""
+    if group["smoothed"] is not None:
+        ate, share = group["smoothed"]["ate_rmse_m"], group["smoothed"]["ratio"]
+        at_the_end = (
+            f", smoothed median {mm_text(ate['median'])} ({share['median']:.2f} of odometry's), "
+            f"p90 {mm_text(ate['p90'])}"
+        )
     return (
         f"{group_name(group)}, {group['runs']} seeds (simulated): "
         f"SLAM ATE median {mm_text(estimate['median'])} "
         f"({ratio(estimate['median'], wheels['median']):.2f} of odometry's), "
-        f"p90 {mm_text(estimate['p90'])}; odometry median {mm_text(wheels['median'])}{beside}; "
+        f"p90 {mm_text(estimate['p90'])}{at_the_end}; "
+        f"odometry median {mm_text(wheels['median'])}{beside}; "
         f"landmark medians: precision {share_text(found['precision'])}, "
         f"recall {share_text(found['recall'])}, rmse {mm_text(found['rmse_m'])}; "
         f"no duplicate in {group['without_duplicates']:.0%}, "
@@ -90,6 +99,7 @@ def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
         "confident_false": sum(run.confident_false for run in runs),
         "realtime_factor": spread([run.realtime_factor for run in runs]),
         **_anees([run.nees_pose for run in runs]),
+        "smoothed": _smoothed(runs),
         "nis_mean": statistics.fmean(nis) if nis else None,
         "nis_times": _nis_times(runs),
         "bound": _bound(runs),
@@ -121,6 +131,23 @@ def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
         else:
             rows.append([time_s, None, None, None])
     return rows
+
+
+def _smoothed(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
+    """Return the numbers of the smoothed paths; None where no run has one.
+
+    `ratio` is of the runs' ATE in units of their own odometry's.
+    """
+    ates = [run.smoothed_ate_rmse_m for run in runs if run.smoothed_ate_rmse_m is not None]
+    if not ates:
+        return None
+    ratios = [share for run in runs if (share := run.smoothed_ate_ratio) is not None]
+    return {
+        "runs": len(ates),
+        "ate_rmse_m": spread(ates),
+        "ratio": spread([min(share, LARGEST) for share in ratios]),
+        **_anees([run.smoothed_nees_pose for run in runs if run.smoothed_nees_pose is not None]),
+    }
 
 
 def _bound(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
@@ -194,6 +221,10 @@ def stress_table(
         "stress": [row["stress"] for row in rows],
         "ATE median": [mm_text(ate["median"]) for ate in ates],
         "p90": [mm_text(ate["p90"]) for ate in ates],
+        "smoothed": [
+            mm_text(row["smoothed"]["ate_rmse_m"]["median"]) if row["smoothed"] else "-"
+            for row in rows
+        ],
         "x clean": [f"{times_clean(row, clean, 'median'):.2f}" for row in rows],
         "p90 x clean": [f"{times_clean(row, clean, 'p90'):.2f}" for row in rows],
         "of odometry": [

@@ -347,10 +347,12 @@ def _remove_empty(path: Path) -> None:
 
 
 def _run_line(run: SweepRun) -> str:
+    smoothed_m = run.smoothed_ate_rmse_m
+    smoothed = "" if smoothed_m is None else f", smoothed {1e3 * smoothed_m:.1f} mm"
     return (
         f"{run.scene}, {run.preset}{settings_text(run.settings, run.stress)}, seed {run.seed}: "
         f"ATE {1e3 * run.ate_rmse_m:.1f} mm "
-        f"({run.ate_ratio:.2f} of odometry's {1e3 * run.odometry_ate_rmse_m:.1f} mm)"
+        f"({run.ate_ratio:.2f} of odometry's {1e3 * run.odometry_ate_rmse_m:.1f} mm){smoothed}"
     )
 
 

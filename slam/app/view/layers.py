@@ -32,6 +32,7 @@ from slam.app.view.rerun_recording import (
     RADAR_RGB,
     REJECTED_RGB,
     ROBOT_RGB,
+    SMOOTHED_RGB,
     TICK_RGB,
     TRUTH_RGB,
     UNUSED_RGB,
@@ -51,7 +52,7 @@ from slam.app.view.rerun_recording import (
 from slam.frames import RadarFrame
 from slam.geometry import compose, transform
 from slam.packed import PackedRows
-from slam.results import Fix, Observation, StepResult
+from slam.results import Fix, Observation, SmoothedRun, StepResult
 
 # What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
 # sample, so an envelope of -62 dB) to a near rod.
@@ -419,6 +420,28 @@ class MapLayer:
             lasted_ns = snapshot.t_ns - self._first_ns
             self._next_path_ns = snapshot.t_ns + max(_PATH_PERIOD_NS, lasted_ns // 100)
             self._send_paths(snapshot, host_ns)
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        """Send the solution over all states so far, at the last one."""
+        if self._last is None:
+            return
+        snapshot, host_ns = self._last
+        stamps = Stamps()
+        stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+        place = snapshot.world_from_map
+        path = transform(place, smoothed.poses[:, :2])
+        thinned = screen(np.concatenate([path[::_PATH_STEP], path[-1:]]))
+        line = rr.LineStrips2D([thinned], colors=SMOOTHED_RGB, radii=0.007, draw_order=33.0)
+        self._recording.row("map/smoothed/path", stamps, line)
+        dots = rr.Points2D(
+            screen(transform(place, smoothed.landmarks_m)),
+            colors=SMOOTHED_RGB,
+            radii=0.018,
+            labels=[str(number) for number in smoothed.landmark_ids],
+            show_labels=False,
+            draw_order=36.0,
+        )
+        self._recording.row("map/smoothed/landmarks", stamps, dots)
 
     def send(self, rows: Sequence[Snapshot], stamps: Stamps) -> None:
         """Send poses and echoes of some states."""

@@ -54,6 +54,7 @@ from slam.app.view.rerun_recording import (
     rrb,
     screen,
 )
+from slam.results import SmoothedRun
 
 _ABOUT = """\
 # What you see
@@ -63,7 +64,7 @@ only. {data}
 
 * **Map** (left, metres, y up). {truth}Orange: where its *wheels* alone say it went. Blue: where
   *radar SLAM* says, with the robot as a disk with an arrow. Red: *landmarks* and walls it found,
-  with 95 % ellipses, enlarged as the map says.
+  with 95 % ellipses, enlarged as the map says. {smoothed}
 * **Around the robot**: a grey wedge is what one radar can see. An echo has a distance but no
   direction, so it is an arc: **green** if it moved the estimate, **dim** if not. {points}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, constant part removed. A
@@ -88,6 +89,7 @@ _NO_ERRORS = """\
   their own covariance; inside the grey 95 % band most of the time if consistent, below if the
   covariance is too large."""
 _TRUTH = "Grey: the *true* path, and crosses where the landmarks truly are. "
+_SMOOTHED = "Pale yellow, at the end: path and landmarks *smoothed*, all states solved for at once."
 _POINTS = (
     "Yellow points are where two arcs cross (trilateration), of the last {states} states; red "
     "those that no cluster confirmed, large green ones what the clusters pass on."
@@ -101,15 +103,15 @@ def is_world_known(info: SessionInfo) -> bool:
 
 def about(info: SessionInfo) -> str:
     """Return the text about a run."""
+    is_robust = info.settings.get("back_end") == "robust"
     return _ABOUT.format(
         n_radars=len(info.radars),
         block=BLOCK_FRAMES,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
         truth=_TRUTH if is_world_known(info) else "",
         numbers=_ERRORS if is_world_known(info) else _NO_ERRORS,
-        points=""
-        if info.settings.get("back_end") == "robust"
-        else _POINTS.format(states=TRAIL_STATES),
+        points="" if is_robust else _POINTS.format(states=TRAIL_STATES),
+        smoothed=_SMOOTHED if is_robust else "",
     )
 
 
@@ -488,6 +490,9 @@ class RerunView(SessionObserver):
         if len(self._waiting) == _BLOCK_STATES:
             self._send_states()
             self._link.send()
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        self._map.on_smoothed(smoothed)
 
     def on_log(self, line: LogLine) -> None:
         """Draw a line of the log; after `close` it is ignored."""

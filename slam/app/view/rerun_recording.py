@@ -41,6 +41,7 @@ Rgb = tuple[int, int, int]
 TRUTH_RGB: Rgb = (165, 165, 165)
 ODOMETRY_RGB: Rgb = (240, 150, 40)
 ESTIMATE_RGB: Rgb = (70, 140, 255)
+SMOOTHED_RGB: Rgb = (245, 235, 150)
 LANDMARK_RGB: Rgb = (225, 50, 120)
 WALL_RGB: Rgb = (95, 95, 95)
 GRID_RGB: Rgb = (38, 40, 44)

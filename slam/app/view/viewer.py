@@ -27,6 +27,7 @@ from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapsh
 from slam.app.rig.emulated import signal_at_parents_death
 from slam.app.run.output import note
 from slam.app.view import SERVE_WEB, SPAWN
+from slam.results import SmoothedRun
 from xethru_protocol.system import StopFlag
 
 _HERE = "127.0.0.1"
@@ -291,6 +292,10 @@ class _WhileWatched(SessionObserver):
     def on_snapshot(self, snapshot: Snapshot) -> None:
         if self._is_watched:
             self._view.on_snapshot(snapshot)
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        if self._is_watched:
+            self._view.on_smoothed(smoothed)
 
     def on_log(self, line: LogLine) -> None:
         if self._is_watched:

@@ -14,7 +14,7 @@ from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObser
 from slam.app.run.runner import RunRecord, RunRecorder, snapshot_of_step
 from slam.app.session.log import SessionLog
 from slam.frames import RadarFrame
-from slam.results import StepResult
+from slam.results import SmoothedRun, StepResult
 
 FRAME_NS = 199_261_498
 N_BINS = 1431
@@ -89,6 +89,19 @@ def snapshot(counter: int) -> Snapshot:
         landmarks_m=np.array([[1.01, 0.5], [-0.5, 2.02]]),
         landmark_covariances_m2=np.array([np.diag([4e-4, 1e-4]), [[2e-4, 1e-4], [1e-4, 2e-4]]]),
         nis_per_dof=(0.5, 1.5) if counter % 2 else (),
+    )
+
+
+def smoothed_run(n_states: int) -> SmoothedRun:
+    """Return a solution over the first states of `feed`, its numbers no short decimals."""
+    k = np.arange(1.0, n_states + 1)
+    return SmoothedRun(
+        t_ns=FRAME_NS * np.arange(n_states),
+        poses=np.column_stack([k / 90, k / 700, k / 1100]),
+        pose_covariances=np.diag([1e-4, 2e-4, 3e-5]) + 1e-5 / k[:, None, None],
+        landmark_ids=(3, 8),
+        landmarks_m=np.array([[1.0, 0.5], [-0.5, 2.0]]) + 1 / 300,
+        landmark_covariances_m2=np.array([np.diag([4e-4, 1e-4]), [[2e-4, 1e-4], [1e-4, 2e-4]]]),
     )
 
 

@@ -13,12 +13,13 @@ import pytest
 from numpy.typing import NDArray
 
 from hil_tests.patience import seconds
-from hil_tests.unit.slam.app.sessions import Listener, scan, session_info
+from hil_tests.unit.slam.app.sessions import Listener, scan, session_info, smoothed_run
 from slam.app.cli import CSV_TO_TUM, main
-from slam.app.commands.run import PromptSlam, parse_clock
+from slam.app.commands import run
+from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
-from slam.app.odometry.track import OdometryTrack, TumSample, parse_tum_line
+from slam.app.odometry.track import OdometryTrack, TumSample, parse_tum_line, read_tum
 from slam.app.records import Scan
 from slam.app.run.live_source import LiveLog
 from slam.app.run.runner import run_slam, unknown_truth
@@ -28,7 +29,7 @@ from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
 from slam.config import load_preset
 from slam.frames import Detection, RadarFrame
-from slam.results import PoseAt
+from slam.results import PoseAt, SmoothedRun
 from xethru_protocol.system import StopFlag
 
 
@@ -166,11 +167,49 @@ class StubbornSlam:
         self.n_flushed += 1
         return ()
 
-    def smoothed(self) -> None:
+    def smoothed(self) -> SmoothedRun | None:
         return None
 
     def wall_spans_m(self) -> NDArray[np.float64]:
         return np.empty((0, 2, 2))
+
+
+def test_sigusr1_writes_the_path_smoothed_so_far(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twice: before there is a smoothed path, and after; the end of the run is no answer."""
+    made, notes = smoothed_run(6), list[str]()
+    monkeypatch.setattr(run, "note", notes.append)
+
+    class Smooths(StubbornSlam):
+        def step(self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int) -> tuple[()]:
+            self.n_steps += 1
+            return ()
+
+        def smoothed(self) -> SmoothedRun | None:
+            return made if self.n_steps > 3 else None
+
+    def scans() -> Iterator[Scan]:
+        for number in range(6):
+            if number in {1, 4}:
+                os.kill(os.getpid(), signal.SIGUSR1)
+            yield scan(number)
+
+    before = signal.getsignal(signal.SIGUSR1)
+    with SmoothingRequests(tmp_path) as requests:
+        track = OdometryTrack([pose(0), pose(10**10)])
+        asked = requests.asked
+        record = run_slam(
+            scans(), track, Smooths(0.0), unknown_truth, [requests], smoothing_asked=asked
+        )
+    assert signal.getsignal(signal.SIGUSR1) is before
+    assert record.smoothed is made
+    written = read_tum(tmp_path / "smoothed.tum")
+    assert np.array_equal(written.stamps_ns, made.t_ns)
+    np.testing.assert_allclose(written.poses, made.poses, rtol=1e-12)
+    none, whole = notes
+    assert none.endswith("there is no smoothed path")
+    assert "smoothed.tum has 6 states, solved for in" in whole
 
 
 @pytest.mark.parametrize(("slow_s", "used"), [(0.0, True), (seconds(60), False)])

@@ -3,7 +3,15 @@
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from hil_tests.unit.slam.app.sessions import odometry, session_info, snapshot, write_session
+import pytest
+
+from hil_tests.unit.slam.app.sessions import (
+    odometry,
+    session_info,
+    smoothed_run,
+    snapshot,
+    write_session,
+)
 from slam.app.records import Gap
 from slam.app.run.replay import Comparison, recorded_source
 from slam.app.session.constants import different_constants, recorded_rules, slam_constants
@@ -60,6 +68,26 @@ def test_states_that_differ_before_a_gap_are_still_named() -> None:
 def test_a_gap_that_cost_no_state_costs_no_verdict() -> None:
     verdict = compared(expecting(Comparison(), gap_at=6), other_from=99)
     assert verdict == "all 10 recorded states came again, to the last bit"
+
+
+@pytest.mark.parametrize(
+    ("n_again", "is_same", "verdict"),
+    [
+        (10, True, "all 10 recorded states and the smoothed path came again, to the last bit"),
+        (10, False, "the smoothed path did not; another version, or"),
+        # recorded on request, before the run was killed
+        (12, False, "all 10 recorded states came again, to the last bit"),
+    ],
+)
+def test_the_last_smoothed_path_is_compared_where_it_ends_at_the_same_state(
+    n_again: int, is_same: bool, verdict: str
+) -> None:
+    comparison = expecting(Comparison())
+    comparison.expect_smoothed(smoothed_run(4))
+    comparison.expect_smoothed(smoothed_run(10))
+    again = smoothed_run(n_again)
+    comparison.on_smoothed(again if is_same else replace(again, poses=again.poses + 1e-13))
+    assert verdict in compared(comparison, other_from=99)
 
 
 def test_numbers_that_differ_are_the_reason() -> None:

@@ -21,7 +21,7 @@ from slam.app.session.messages import settings_text
 from slam.config import BackEnd, DetectionConfig, RobustConfig, SlamConfig, TrilaterationConfig
 from slam.evaluation import LandmarkScore
 from slam.geometry import Mount, Rig
-from slam.results import Association, Belief, Observation, StepResult
+from slam.results import Association, Belief, Observation, SmoothedRun, StepResult
 
 N = 201
 PERIOD_NS = 200_000_000
@@ -98,6 +98,48 @@ def test_landmarks_are_judged_after_the_trajectorys_alignment_and_expected_only_
     assert score.rmse_m == pytest.approx(0.0, abs=1e-9)
     # the path is right, the map is 30 mm off
     assert run(offset_m=0.0, drift=0.0, variance=0.01).landmarks.rmse_m == pytest.approx(0.03)
+
+
+def smoothed_of(record: RunRecord, poses: np.ndarray, sigma: float) -> SmoothedRun:
+    n = len(poses)
+    return SmoothedRun(
+        t_ns=record.states.t_ns[:n],
+        poses=poses,
+        pose_covariances=np.tile(np.eye(3) * sigma**2, (n, 1, 1)),
+        landmark_ids=(0, 1),
+        landmarks_m=LANDMARKS[:2] + np.array([[0.0, 0.01], [0.0, -0.01]]),
+        landmark_covariances_m2=np.tile(np.eye(2) * sigma**2, (2, 1, 1)),
+    )
+
+
+def test_the_smoothed_numbers_are_those_of_the_smoothed_run() -> None:
+    """It zigzags by 4 mm about the truth, and its landmarks are 10 mm off on either side."""
+    truth = np.zeros((N, 3))
+    truth[:, 0] = np.linspace(0, 3, N)
+    belief = Belief(mean=np.zeros(3), covariance=np.eye(3))
+    results = [
+        StepResult(t_ns=k * PERIOD_NS, odometry_pose=pose, belief=belief, detections=())
+        for k, pose in enumerate(truth)
+    ]
+    record = record_of(results, truth, np.zeros(3))
+    zigzag = np.zeros((N, 3))
+    zigzag[:, 1] = 0.004 * np.where(np.arange(N) % 2, 1.0, -1.0)
+    smoothed = smoothed_of(record, truth + zigzag, sigma=0.002)
+    whole = dataclasses.replace(record, smoothed=smoothed)
+    summary, without = (summarise(one, INFO, RIG) for one in (whole, record))
+    assert summary is not None
+    assert without is not None
+    assert summary.smoothed_ate_rmse_m == pytest.approx(0.004, rel=1e-3)
+    assert summary.smoothed_nees_pose is not None
+    assert [value for _, value in summary.smoothed_nees_pose] == pytest.approx([4.0] * 10)
+    assert summary.smoothed_landmarks is not None
+    assert summary.smoothed_landmarks.rmse_m == pytest.approx(0.01, rel=1e-2)
+    assert (summary.ate_rmse_m, summary.nees_pose) == (without.ate_rmse_m, without.nees_pose)
+    # of a run that was killed after a request: not a number of the run
+    early = dataclasses.replace(record, smoothed=smoothed_of(record, truth[:-1], sigma=0.002))
+    assert summarise(early, INFO, RIG) == without
+    assert without.smoothed_ate_rmse_m is None
+    assert without.smoothed_nees_pose is None
 
 
 @pytest.mark.parametrize(
@@ -306,8 +348,9 @@ SUMMARY = Summary(
 def test_the_fields_are_those_of_the_contract() -> None:
     data = json.loads(SUMMARY.to_json())
     assert " ".join(data) == (
-        "scene preset seed frames duration_s realtime_factor ate_rmse_m ate_icp_rmse_m "
-        "odometry_ate_rmse_m final_error_m landmarks nees_pose nis_mean"
+        "scene preset seed frames duration_s realtime_factor ate_rmse_m smoothed_ate_rmse_m "
+        "ate_icp_rmse_m odometry_ate_rmse_m final_error_m landmarks smoothed_landmarks nees_pose "
+        "smoothed_nees_pose nis_mean"
     )
     assert (
         " ".join(data["landmarks"])
@@ -331,6 +374,18 @@ def test_the_table_gives_the_ratio() -> None:
     assert "70 x real time" in text
     assert "0 lost" in text
     assert max(map(len, text.splitlines())) <= 100
+    assert "smoothed" not in text
+    rows = summary_rows(
+        dataclasses.replace(SUMMARY, smoothed_ate_rmse_m=5.64e-3),
+        lag_states=0,
+        wall_s=9.9,
+        lost_frames=0,
+    )
+    (row,) = (row for row in rows if row[0] == "smoothed ATE")
+    assert row[1:] == (
+        "5.6 mm",
+        "0.10 of odometry's, SE(2)-aligned, all states solved for at the end",
+    )
 
 
 def test_a_map_without_a_match_has_dashes() -> None:

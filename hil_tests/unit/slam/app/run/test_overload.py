@@ -71,6 +71,7 @@ class SlowSlam:
         self.config = slam.config
         self.step_detections = slam.step_detections
         self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
+        self.smoothed = slam.smoothed
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
@@ -275,7 +276,9 @@ def test_the_session_of_an_overloaded_run_replays_to_the_last_bit(
     comparison = Comparison()
     again = execute(recorded_source(session, StopFlag(), comparison), [comparison])
     n_states = len(run.record.states)
-    assert comparison.verdict() == f"all {n_states} recorded states came again, to the last bit"
+    assert comparison.verdict() == (
+        f"all {n_states} recorded states and the smoothed path came again, to the last bit"
+    )
     assert again.states.estimate.tobytes() == run.record.states.estimate.tobytes()
 
 

@@ -23,6 +23,7 @@ from hil_tests.unit.slam.app.sessions import (
     odometry,
     scan,
     session_info,
+    smoothed_run,
     snapshot,
 )
 from slam.app.odometry.track import TumSample
@@ -30,6 +31,7 @@ from slam.app.records import Scan, SessionInfo, Snapshot
 from slam.app.session import cdr
 from slam.app.session.drawings import Drawings
 from slam.app.session.log import SessionLog
+from slam.app.session.messages import LANDMARK_DTYPE
 
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
 Messages = dict[str, list[tuple[int, Any]]]
@@ -72,6 +74,9 @@ DRAWN = {
     "/odom/path_points": "sensor_msgs/msg/PointCloud2",
     "/rerun/tf_static": "tf2_msgs/msg/TFMessage",
     "/scene": "visualization_msgs/msg/MarkerArray",
+    "/slam/smoothed_landmarks": "sensor_msgs/msg/PointCloud2",
+    "/slam/smoothed_path": "nav_msgs/msg/Path",
+    "/slam/smoothed_path_points": "sensor_msgs/msg/PointCloud2",
     "/truth/path": "nav_msgs/msg/Path",
     "/truth/path_points": "sensor_msgs/msg/PointCloud2",
 } | {
@@ -92,6 +97,7 @@ def test_lean_leaves_out_what_is_drawn_and_nothing_else(tmp_path: Path) -> None:
         log = SessionLog(path, session_info(), odometry(20), drawn=drawn)
         feed(log, 40)
         log.on_snapshot(robust_state(41 * FRAME_NS))
+        log.on_smoothed(smoothed_run(40))
         log.close()
         with AnyReader([path]) as reader:
             # a set, as copies of the latched messages are between chunks
@@ -217,6 +223,28 @@ def test_paths_begin_together_and_end_where_the_robot_is(tmp_path: Path) -> None
         assert (points.header.frame_id, last.header.frame_id) == (
             ("world",) * 2 if topic == "/truth" else ("map",) * 2
         )
+
+
+def test_the_smoothed_run_is_a_path_with_its_landmarks_in_the_map_frame() -> None:
+    kept, made = Kept(), smoothed_run(5000)
+    drawings = Drawings(kept, session_info(), 0)
+    drawings.on_smoothed(smoothed_run(3))
+    drawings.on_smoothed(made)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    found: Any = store.deserialize_cdr(kept.messages["/slam/smoothed_path"][1], "nav_msgs/msg/Path")
+    assert found.header.frame_id == "map"
+    # every second pose, from the newest one backwards
+    np.testing.assert_allclose(positions(found), made.poses[1::2, :2], atol=1e-5)
+    last = found.poses[-1]
+    t_ns = last.header.stamp.sec * 1_000_000_000 + last.header.stamp.nanosec
+    assert t_ns == made.t_ns[-1]
+    cloud: Any = store.deserialize_cdr(
+        kept.messages["/slam/smoothed_landmarks"][1], "sensor_msgs/msg/PointCloud2"
+    )
+    points = cloud.data.view(LANDMARK_DTYPE)
+    assert points["id"].tolist() == [3, 8]
+    np.testing.assert_allclose(points["y"], made.landmarks_m[:, 1], rtol=1e-6)
+    np.testing.assert_allclose(points["cov_xy"], [0.0, 1e-4], rtol=1e-6)
 
 
 class Kept:
@@ -484,6 +512,7 @@ def test_the_views_that_ship_show_what_sessions_have(tmp_path: Path) -> None:
     log = SessionLog(tmp_path / "s.mcap", info, odometry(3))
     log.on_scan(scan(1, 4))
     log.on_snapshot(robust_state())
+    log.on_smoothed(smoothed_run(3))
     log.close()
     found = read(tmp_path / "s.mcap")
     whole = types_of(tmp_path / "s.mcap")
@@ -506,7 +535,7 @@ def test_the_views_that_ship_show_what_sessions_have(tmp_path: Path) -> None:
         re.sub(r"(?s)\A.*?Show Names", "", rviz),
         re.DOTALL,
     )
-    assert len(displays) == 15
+    assert len(displays) == 16
     for display, durability, topic in displays:
         kind = whole[re.sub(r"^/radar/[^/]+/", "/radar/<name>/", topic)]
         assert kind.rsplit("/", 1)[1] in {display, f"{display}Stamped"}

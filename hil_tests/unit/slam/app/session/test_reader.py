@@ -1,6 +1,6 @@
 """A recorded session comes back as it was; damaged and foreign files are one line."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from hil_tests.unit.slam.app.sessions import (
     odometry,
     scan,
     session_info,
+    smoothed_run,
     snapshot,
     write_scans,
     write_session,
@@ -21,15 +22,19 @@ from hil_tests.unit.slam.app.sessions import (
 from slam.app.errors import AppError
 from slam.app.odometry.track import TumSample
 from slam.app.records import LogLine, Scan, Snapshot
+from slam.app.run.recorded import play_states
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
     settings_text,
+    smoothed_of,
     snapshot_of,
     state_row,
 )
 from slam.app.session.reader import open_session
 from slam.config import SlamConfig, load_preset
 from slam.frames import RadarFrame
+from slam.results import SmoothedRun
+from xethru_protocol.system import StopFlag
 
 N_SCANS = 60
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
@@ -166,6 +171,35 @@ def test_a_state_as_a_row_of_doubles_and_back(
     for wrong in (row[:-1], np.append(row, 0.0)):
         with pytest.raises(ValueError, match="says it has"):
             snapshot_of(4, 5, wrong)
+
+
+def test_smoothed_runs_come_back_to_the_last_bit(tmp_path: Path) -> None:
+    path, first_ns = tmp_path / "session.mcap", 1_700_000_000_123_456_789
+    log = SessionLog(path, session_info())
+    made = [smoothed_run(2), smoothed_run(5)]
+    made = [replace(one, t_ns=one.t_ns + first_ns) for one in made]
+    for counter in range(5):
+        log.on_snapshot(replace(snapshot(counter), t_ns=int(made[1].t_ns[counter])))
+        if counter in {1, 4}:
+            log.on_smoothed(made[counter == 4])
+    log.close()
+    session = open_session(path)
+    found = [record for record in session.records() if isinstance(record, SmoothedRun)]
+    assert len(found) == 2
+    for one, wanted in zip(found, made, strict=True):
+        assert one.landmark_ids == wanted.landmark_ids
+        for part in fields(SmoothedRun):
+            ours, theirs = getattr(one, part.name), getattr(wanted, part.name)
+            assert np.array_equal(ours, theirs), part.name
+    record = play_states(session, [], StopFlag())
+    assert record.whole_smoothed is not None
+    assert np.array_equal(record.whole_smoothed.poses, made[1].poses)
+
+
+@pytest.mark.parametrize("row", [[0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 2.0, 0.0]])
+def test_a_smoothed_run_of_another_length_than_it_says_is_refused(row: list[float]) -> None:
+    with pytest.raises(ValueError, match="numbers says it has"):
+        smoothed_of(0, np.array(row))
 
 
 def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ RUN = replace(
     run_of(make_case("lab", "paper", 0)),
     scene="a",
     ate_rmse_m=0.01,
+    smoothed_ate_rmse_m=None,
+    smoothed_nees_pose=None,
     landmarks=LandmarkScore(
         true=4, observable=4, estimated=4, precision=1.0, recall=1.0, duplicates=0, rmse_m=0.01
     ),
@@ -129,6 +131,24 @@ def test_the_bound_has_the_same_statistics() -> None:
     assert group["bound"]["anees_pose"] == [[1.0, pytest.approx(4.0)]]
     assert "known association: filtered median 20.0 mm, smoothed 5.0 mm" in group_line(group)
     assert summarise_groups([RUN])[0]["bound"] is None
+
+
+def test_smoothed_paths_have_median_ratio_and_mean_nees() -> None:
+    """Wheels of RUN, and ratios by hand."""
+    wheels_m = RUN.odometry_ate_rmse_m
+    runs = [
+        replace(RUN, seed=i, smoothed_ate_rmse_m=share * wheels_m, smoothed_nees_pose=((1.0, n),))
+        for i, (share, n) in enumerate(((0.1, 2.0), (0.2, 4.0), (0.3, 6.0)))
+    ]
+    (group,) = summarise_groups([*runs, replace(RUN, seed=9)])
+    smoothed = group["smoothed"]
+    assert smoothed["runs"] == 3
+    assert smoothed["ate_rmse_m"]["median"] == pytest.approx(0.2 * wheels_m)
+    assert smoothed["ratio"] == {"median": pytest.approx(0.2), "p90": pytest.approx(0.28)}
+    assert smoothed["anees_pose"] == [[1.0, pytest.approx(4.0)]]
+    text = group_line(group)
+    assert f"smoothed median {200 * wheels_m:.1f} mm (0.20 of odometry's)" in text
+    assert summarise_groups([RUN])[0]["smoothed"] is None
 
 
 def test_a_stress_table_compares_with_its_own_clean_group() -> None:

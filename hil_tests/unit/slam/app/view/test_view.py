@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from hil_tests.unit.slam.app.sessions import feed, scan, session_info, snapshot
+from hil_tests.unit.slam.app.sessions import feed, scan, session_info, smoothed_run, snapshot
 from slam.app.errors import AppError
 from slam.app.records import LogLine, Scan, SessionInfo, Snapshot
 from slam.app.view.layers import bscan_picture
@@ -277,6 +277,22 @@ def test_the_robot_lies_above_its_path_and_is_larger(finished: Path) -> None:
     (forwards,) = next(v for _, v in rows(finished, "/map/robot", "Arrows2D:vectors") if v)
     assert forwards[0] > radius
     assert forwards[1] == 0.0
+
+
+def test_the_smoothed_path_is_drawn_at_the_last_state(tmp_path: Path) -> None:
+    view, made = RerunView(tmp_path / "s.rrd", session_info()), smoothed_run(12)
+    feed(view, 12)
+    view.on_smoothed(made)
+    view.close()
+    (line,) = (
+        v for _, v in rows(tmp_path / "s.rrd", "/map/smoothed/path", "LineStrips2D:strips") if v
+    )
+    (points,) = line
+    np.testing.assert_allclose(points[0], made.poses[0, :2] * [1, -1], rtol=1e-6)
+    np.testing.assert_allclose(points[-1], made.poses[-1, :2] * [1, -1], rtol=1e-6)
+    dots = rows(tmp_path / "s.rrd", "/map/smoothed/landmarks", "Points2D:positions")
+    (places,) = (v for _, v in dots if v)
+    np.testing.assert_allclose(places, made.landmarks_m * [1, -1], rtol=1e-6)
 
 
 def test_wall_clock_is_nowhere_in_the_data(finished: Path) -> None:
