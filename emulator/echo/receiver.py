@@ -52,7 +52,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,9 +76,13 @@ from xethru_protocol.wire.x4 import RF_BIN_M, SAMPLING_RATE_HZ
 SPACINGS_PER_E_FOLD = 1.185
 """Lag at which B7(lag) / B7(0) is 1/e, in knot spacings."""
 _KNOTS = 4
+_FOUR = np.arange(_KNOTS)
+_KNOTS_AHEAD = 8
 _SCALE = (151 / 315) ** -0.5 / UNITS_PER_SIGMA
 # Knot indices must not be negative, while a clock that is early may ask for a time before 0.
 _FIRST_KNOT = 1 << 40
+
+_T = TypeVar("_T")
 
 _JITTER_INSTANTS_PER_KNOT = 16
 _COUNTERS_AT_ONCE = 256
@@ -150,23 +156,20 @@ class SlowNoise:
 
     def values_at(self, instants: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the values at instants of shape (n,): shape (n, n_values), float64."""
+        weight = np.empty((len(instants), len(self._grids) * _KNOTS))
+        place = np.empty(weight.shape, dtype=np.int64)
         knots: list[NDArray[np.float64]] = []
-        weights: list[NDArray[np.float64]] = []
-        places: list[NDArray[np.int64]] = []
         n_knots = 0
         for member, grid in enumerate(self._grids):
             since_ns = instants * self._instant_ns + self._offsets_ns[member]
             first_knot, rest_ns = np.divmod(since_ns, grid.spacing_ns)
-            weights += _cubic_weights(rest_ns / grid.spacing_ns, grid.sigma * _SCALE)
-            held, place = self._with_knots(member, first_knot)
-            places += [n_knots + place + row for row in range(_KNOTS)]
+            columns = slice(member * _KNOTS, (member + 1) * _KNOTS)
+            weight[:, columns] = _cubic_weights(rest_ns / grid.spacing_ns, grid.sigma * _SCALE)
+            held, first_place = self._with_knots(member, first_knot)
+            place[:, columns] = (n_knots + first_place)[:, np.newaxis] + _FOUR
             knots.append(held)
             n_knots += len(held)
-        weight, place, knot = (
-            np.stack(weights, axis=1),
-            np.stack(places, axis=1),
-            np.concatenate(knots),
-        )
+        knot = np.concatenate(knots)
         values = np.empty((len(instants), self._n_values))
         at_once = max(_VALUES_AT_ONCE // self._n_values, 1)
         for first in range(0, len(instants), at_once):
@@ -182,9 +185,13 @@ class SlowNoise:
         held = self._held[member]
         place = held.numbers.searchsorted(first_knot)
         if not held.have(first_knot, place):
-            numbers = np.unique(first_knot[:, np.newaxis] + np.arange(_KNOTS))
+            numbers = np.unique(first_knot[:, np.newaxis] + _FOUR)
             before = held.numbers.searchsorted(numbers)
             known = np.append(held.numbers, -_FIRST_KNOT)[before] == numbers
+            if known.any():  # frames follow each other: make some for those to come
+                numbers = np.append(numbers, numbers[-1] + 1 + np.arange(_KNOTS_AHEAD))
+                before = held.numbers.searchsorted(numbers)
+                known = np.append(held.numbers, -_FIRST_KNOT)[before] == numbers
             values = np.empty((len(numbers), self._n_values))
             values[known] = held.values[before[known]]
             values[~known] = frame_noise_units(
@@ -215,15 +222,34 @@ class _Knots:
         return bool(ends_are_there.all())
 
 
-def _cubic_weights(u: NDArray[np.float64], scale: float) -> list[NDArray[np.float64]]:
-    """Return the weights of four knots in a row at fractions u behind the second."""
+def _cubic_weights(u: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    """Return the weights of four knots in a row at fractions u behind the second, (n, 4)."""
     v = 1 - u
-    return [
-        scale * (v * v * v / 6),
-        scale * (2 / 3 - u * u * (2 - u) / 2),
-        scale * (2 / 3 - v * v * (2 - v) / 2),
-        scale * (u * u * u / 6),
-    ]
+    weights = np.empty((len(u), _KNOTS))
+    weights[:, 0] = scale * (v * v * v / 6)
+    weights[:, 1] = scale * (2 / 3 - u * u * (2 - u) / 2)
+    weights[:, 2] = scale * (2 / 3 - v * v * (2 - v) / 2)
+    weights[:, 3] = scale * (u * u * u / 6)
+    return weights
+
+
+def _at_ends(
+    instants: NDArray[np.int64],
+    kept: Mapping[int, _T],
+    make: Callable[[NDArray[np.int64]], Iterable[_T]],
+) -> dict[int, _T]:
+    """Return what belongs to instants and their successors, in order: kept, or made now."""
+    wanted = sorted({*instants.tolist(), *(instants + 1).tolist()})
+    missing = [instant for instant in wanted if instant not in kept]
+    made = (
+        dict(zip(missing, make(np.array(missing, dtype=np.int64)), strict=True)) if missing else {}
+    )
+    return {instant: made[instant] if instant in made else kept[instant] for instant in wanted}
+
+
+def _last_two(made: Mapping[int, _T]) -> dict[int, _T]:
+    """Return the part of `_at_ends` that the frames to come need, too."""
+    return dict(list(made.items())[-2:])
 
 
 class CarrierJitter:
@@ -242,6 +268,7 @@ class CarrierJitter:
             serial=serial,
             purpose=Purpose.JITTER_SLOW,
         )
+        self._slow_rad: dict[int, float] = {}
         self._page = -1
         self._normals: list[float] = []
 
@@ -263,10 +290,15 @@ class CarrierJitter:
         phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad
         if self._spec.slow_rad > 0:
             instants, fractions = self._slow.instants_before(scene_times_ns)
-            before, after = self._slow.values_at(np.concatenate([instants, instants + 1])).reshape(
-                2, -1
+            slow_rad = _at_ends(
+                instants,
+                self._slow_rad,
+                lambda missing: self._slow.values_at(missing)[:, 0].tolist(),
             )
+            before = np.array([slow_rad[instant] for instant in instants.tolist()])
+            after = np.array([slow_rad[instant + 1] for instant in instants.tolist()])
             phases_rad += before + fractions * (after - before)
+            self._slow_rad = _last_two(slow_rad)
         return phases_rad
 
     def _white_at(self, index: int) -> float:
@@ -313,7 +345,12 @@ class ClutterField:
             return
         row = _Row.of(capture)
         instants, fractions = self._scatterers.instants_before(scene_times_ns)
-        answers = self._answers_at(np.unique(np.concatenate([instants, instants + 1])), row)
+        answers = _at_ends(
+            instants,
+            self._answers if row == self._row else {},
+            lambda missing: row.answers(self._scatterers.values_at(missing)),
+        )
+        self._row, self._answers = row, _last_two(answers)
         at: int | None = None
         clutter = np.empty(capture.n_samples)
         # frame by frame: one stays in the processor's cache, a block does not
@@ -326,17 +363,6 @@ class ClutterField:
             np.multiply(rise, strength * fraction, out=clutter)
             np.add(clutter, start, out=clutter)
             np.add(frame, clutter, out=frame)
-
-    def _answers_at(self, instants: NDArray[np.int64], row: _Row) -> dict[int, NDArray[np.float64]]:
-        """Return the unit clutter at instants; the last two are kept for the frames that follow."""
-        answers = dict(self._answers) if row == self._row else {}
-        missing = [instant for instant in instants.tolist() if instant not in answers]
-        if missing:
-            values = self._scatterers.values_at(np.array(missing, dtype=np.int64))
-            answers.update(zip(missing, row.answers(values), strict=True))
-        self._row = row
-        self._answers = {instant: answers[instant] for instant in instants[-2:].tolist()}
-        return answers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
