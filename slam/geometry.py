@@ -124,6 +124,21 @@ PAPERS_FIELD = FieldOfView()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ReceivedPulse:
+    """The envelope of the pulse that one module receives, as its rig file keeps it.
+
+    Samples are complex, real and imaginary part apart: the carrier is turned back, so a Gaussian
+    pulse has no imaginary part. There is an odd number of them, ``step_m`` of range apart, the
+    middle one where the range of an echo is. Zero beyond.
+    """
+
+    step_m: float
+    real: tuple[float, ...]
+    imaginary: tuple[float, ...]
+    relative_error: float  # norm of the error that is expected of the samples, over their norm
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
     """Where one radar sits on the robot and how its range zero is off."""
 
@@ -137,6 +152,8 @@ class Mount:
     # What this module and its antennas add to an echo's carrier phase. Rig files and sessions keep
     # it; SLAM does not use it.
     phase_offset_rad: float = 0.0
+    # What the front end begins with; None: the pulse of the data sheet
+    pulse: ReceivedPulse | None = None
 
 
 def mount_at(mount: Mount, motion: Array) -> Mount:

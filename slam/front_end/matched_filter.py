@@ -66,6 +66,8 @@ from slam.front_end.overlapping import (
     fit_whole_echoes,
 )
 from slam.front_end.pulse import ComplexArray, ModulePulse, PulseModel
+from slam.front_end.pulse_estimation import PulseEstimator, module_pulse
+from slam.geometry import ReceivedPulse
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -457,24 +459,17 @@ def _raised_by_neighbours(peaks: Peaks, filtered: Filtered) -> Array:
 class MatchedFilterDetector:
     """Echoes by correlation; under ``joint``, overlapping ones fitted together."""
 
-    def __init__(self, config: SlamConfig) -> None:
+    def __init__(self, config: SlamConfig, received: Sequence[ReceivedPulse | None] = ()) -> None:
+        """Take each radar's pulse from its rig file to begin with, and learn it from then on."""
         settings = config.matched_filter
         self.config = config
         self._nominal = ModulePulse(
             model=PulseModel(carrier_hz=settings.carrier_hz, bandwidth_hz=settings.bandwidth_hz),
             error=settings.model_error,
         )
-        self._pulses: dict[int, ModulePulse] = {}
+        self.estimator = PulseEstimator(self._nominal.model, received)
         self._joint = config.detection.front_end is FrontEnd.JOINT
         self._filters: dict[tuple[int, int, float], PulseFilter] = {}
-
-    def set_pulse(self, radar: int, pulse: ModulePulse | None) -> None:
-        """Take the echoes of one radar as this pulse from now on; None: as the configured one."""
-        if pulse is None:
-            self._pulses.pop(radar, None)
-        else:
-            self._pulses[radar] = pulse
-        self._filters = {key: each for key, each in self._filters.items() if key[0] != radar}
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         limits = self.config.detection
@@ -517,14 +512,17 @@ class MatchedFilterDetector:
         are fitted anew.
         """
         filtered = self._filtered(frame)
-        peaks = self._fitted_peaks(filtered, within_m)
+        peaks = self._fitted_peaks(frame, filtered, within_m)
         if not peaks.position_bins.size:
             return peaks
         return replace(peaks, sigma_bins=peaks.sigma_bins * _raised_by_neighbours(peaks, filtered))
 
-    def _fitted_peaks(self, filtered: Filtered, within_m: tuple[float, float]) -> Peaks:
+    def _fitted_peaks(
+        self, frame: RadarFrame, filtered: Filtered, within_m: tuple[float, float]
+    ) -> Peaks:
         pulse_filter = filtered.pulse_filter
         found, several = _single_pulses(filtered, self.config.matched_filter.max_single_misfit)
+        self._learn(frame, filtered, found)
         again = cut_pulses(found.position_bins, filtered)
         if self._joint:
             again = several if again is None else again | several
@@ -541,12 +539,32 @@ class MatchedFilterDetector:
         )
         return refit(found, again, filtered, split)
 
+    def _learn(self, frame: RadarFrame, filtered: Filtered, peaks: Peaks) -> None:
+        """Let the pulse be estimated from this frame, too; a change holds from the next one on."""
+        if filtered.usable is not None or not self.estimator.is_due(frame.radar):
+            return
+        samples = frame.samples.astype(np.float64)
+        samples -= np.add.reduce(samples) / samples.size
+        has_changed = self.estimator.take(
+            frame.radar,
+            samples,
+            frame.bin_length_m,
+            position_bins=peaks.position_bins,
+            amplitude=peaks.amplitude,
+            sigma_y=filtered.sigma_y,
+        )
+        if has_changed:
+            self._filters.clear()
+
     def _filter(self, frame: RadarFrame) -> PulseFilter:
         key = frame.radar, frame.samples.size, frame.bin_length_m
         if key not in self._filters:
             settings = self.config.matched_filter
+            received = self.estimator.pulse(frame.radar)
             self._filters[key] = PulseFilter(
-                self._pulses.get(frame.radar, self._nominal),
+                self._nominal
+                if received is None
+                else module_pulse(received, self._nominal.model, frame.bin_length_m),
                 *key[1:],
                 false_alarms=settings.false_alarms_per_frame,
                 noise_is_known=settings.noise_sigma > 0,

@@ -100,7 +100,7 @@ class PulseModel:
 class ModulePulse:
     """The pulse of one module as the front end takes it: a Gaussian, its error, and an equaliser.
 
-    ``MatchedFilterDetector.set_pulse`` gives one to a radar; until then the configured one holds.
+    The configured one, or what :mod:`slam.front_end.pulse_estimation` makes of echoes.
     """
 
     model: PulseModel

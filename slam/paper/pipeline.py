@@ -31,7 +31,7 @@ class UwbRadarSlam:
         self.belief: Belief = start()
         sensor = config.observation
         self._Q = np.diag([sensor.sigma_range_m**2, sensor.sigma_bearing_rad**2])
-        self._detector = detector or make_detector(config)
+        self._detector = detector or make_detector(config, rig)
         limits = config.detection
         self._trilaterator = Trilaterator(
             config.trilateration, rig, (limits.min_range_m, limits.max_range_m)

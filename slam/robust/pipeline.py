@@ -42,7 +42,7 @@ class RobustSlam:
         self.config = config
         self.rig = rig
         self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels, rules))
-        self._detector = detector or make_detector(config)
+        self._detector = detector or make_detector(config, rig)
         self._pose: Array | None = None  # odometry at the last state
         self._stamps_ns = PackedRows(np.dtype(np.int64))  # of all states
 

@@ -364,7 +364,7 @@ def source_of(case: Case, stop: StopFlag = NO_STOP) -> RunSource:
     stress, front_end = STRESSES[case.stress], None
     if stress.outlier_share:
         front_end = OutlierDetector(
-            detector=make_detector(case.config),
+            detector=make_detector(case.config, rig_of(case.scene)),
             share=stress.outlier_share,
             min_range_m=case.config.detection.min_range_m,
             max_range_m=case.config.detection.max_range_m,

@@ -1,0 +1,348 @@
+"""The pulse of each module, estimated from the echoes that it receives.
+
+An echo of amplitude and phase in one complex number a, at position u, is Re{a q(n - u)} with
+q(x) = T(x) exp(j kappa x): carrier, and complex envelope T, which the pulse model takes for a
+Gaussian and which filters and antennas of a module widen, skew and let ring. T is estimated from
+strong echoes that stand alone, and a frame is then equalised: behind the filter
+
+    G(f) = F_Gauss(f) conj F_T(f) / (|F_T(f)|**2 + delta max |F_T|**2)
+
+(Wiener deconvolution; Gonzalez and Woods, Digital Image Processing, 5.8) an echo is a Gaussian
+pulse again, of the width nearest to that of T, and all closed forms of the front end hold.
+
+Echoes
+    The strongest peak of a frame that has no other one of ``_LARGEST_NEIGHBOUR`` of its height
+    within reach, each radar's at most every third frame and not twice from the same distance. Its
+    samples within 9 sigma of the peak are kept as baseband at steps of 0.75 sigma, which hold all
+    of the band. At most ``_CAPACITY`` per radar.
+Estimate
+    Every window is a T + b T' + rest, where b moves the echo. Given T, the two numbers of each
+    window are a regression; given them, T is a weighted mean over the windows. The rest is other
+    echoes more than noise, so each sample has the weight 1 / (1 + (|rest| / (|a| s))**2) of a
+    Cauchy distribution (iteratively reweighted least squares; Holland and Welsch 1977), s the
+    median of |rest / a|. The first T is the median of windows turned to amplitude 1.
+Error
+    The grouped jackknife: windows of a radar that follow on each other see the same neighbours, so
+    blocks of them are left out in turn (Efron 1982, chapter 2). Relative to the norm of T.
+Choice
+    An estimate is used where it differs from the pulse used so far by more than ``_LEAST_CHANGE``
+    and by ``_ERRORS`` times its own error; so it at least halves the error, and a nominal pulse
+    stays what it is. That of all radars together replaces the nominal pulse, that of one radar
+    replaces theirs: modules of one kind differ less from each other than from the data sheet.
+Origin
+    Echoes do not tell delay from range. Zero of T is where the nominal filter has its peak, so an
+    echo alone keeps its range when the pulse changes.
+
+All of it depends on the frames alone, in their order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.front_end.pulse import ComplexArray, ModulePulse, PulseModel
+from slam.geometry import ReceivedPulse
+
+Array = NDArray[np.float64]
+
+# Samples of an envelope, in envelope sigmas of the nominal pulse: spacing, and how far from zero
+_STEP_SIGMAS, _STEPS = 0.75, 12
+# Beyond the first distance an envelope is faded out, to nothing at the second [steps].
+_FADE_STEPS = 9.5, 12.5
+# Half the length of a window in sigmas: no stronger peak is nearer.
+_REACH_SIGMAS = _STEP_SIGMAS * _STEPS
+# What may be looked at: heights over sigma_y and over that of the nearest other peaks
+_LEAST_SNR, _LARGEST_NEIGHBOUR = 30.0, 0.4
+# Frames of one radar from one echo to the next, bins that it must have moved, echoes kept
+_FRAMES_APART, _BINS_APART, _CAPACITY = 3, 1.0, 150
+# First number of echoes of an estimate, and by what share more it takes for the next
+_FIRST, _MORE = 60, 1.5
+_ROUNDS, _GROUPS = 10, 8
+# Real errors are so many times those of the jackknife, and at least the second: neighbours last
+# longer than its blocks.
+_ERROR_SHARE, _LEAST_ERROR = 2.5, 0.015
+# Least difference from the pulse used so far, relative, and in standard deviations of the estimate
+_LEAST_CHANGE, _ERRORS = 0.05, 2.0
+# Noise that the equaliser allows for, as a part of the largest power of the pulse
+_REGULARISATION = 3e-3
+# Widths of the Gaussian that a pulse is turned into, as a share of the nominal one
+_WIDTHS = np.linspace(0.7, 1.5, 161)
+# Newton steps towards the peak of a pulse behind the nominal filter
+_PEAK_STEPS = 20
+# Half the length of an equaliser in sigmas, and the length of the transform that it comes from
+_TAPS_SIGMAS, _N_TAPS = 16.0, 1024
+_AT_STEPS = np.arange(-_STEPS, _STEPS + 1)
+_NOMINAL = np.exp(-0.5 * (_STEP_SIGMAS * _AT_STEPS) ** 2)
+# Transforms of envelopes are of this length, so they do not wrap round.
+_N_FFT = 64
+_RAD_PER_STEP = math.tau * np.fft.fftfreq(_N_FFT)
+_FADE = 0.5 + 0.5 * np.cos(
+    math.pi
+    * np.clip((np.abs(_AT_STEPS) - _FADE_STEPS[0]) / (_FADE_STEPS[1] - _FADE_STEPS[0]), 0, 1)
+)
+# Added to a scale that may be zero, of windows without noise
+_TINY = 1e-9
+
+
+def baseband(
+    samples: Array, position_bins: float, pulse: PulseModel, bin_length_m: float
+) -> ComplexArray:
+    """Return the samples around a position as an envelope at 25 steps, carrier turned back.
+
+    ``samples`` (n_bins,) are of one frame. Their band within half the rate of the steps is kept.
+    """
+    n_fft = 1 << (samples.size - 1).bit_length()
+    step_bins = _STEP_SIGMAS * pulse.sigma_bins(bin_length_m)
+    carrier = pulse.carrier_rad(bin_length_m) / math.tau
+    first = math.ceil((carrier - 0.5 / step_bins) * n_fft)
+    last = math.floor((carrier + 0.5 / step_bins) * n_fft)
+    cycles = np.arange(max(first, 1), min(last, n_fft // 2 - 1) + 1) / n_fft
+    spectrum = np.fft.rfft(samples, n_fft)[np.rint(cycles * n_fft).astype(np.intp)]
+    spectrum *= np.exp(2j * math.pi * cycles * position_bins) * (2 / n_fft)
+    turns = np.exp(2j * math.pi * step_bins * np.outer(_AT_STEPS, cycles - carrier))
+    window: ComplexArray = turns @ spectrum
+    return window
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Envelope:
+    """An envelope at the 25 steps, 1 behind the nominal filter and there at its peak."""
+
+    samples: ComplexArray  # shape (25,)
+    relative_error: float  # norm of its expected error over its own
+
+
+def estimate_envelope(windows: ComplexArray) -> Envelope:
+    """Return the envelope that windows (n, 25) of `baseband` have in common, n >= 3.
+
+    Those with the same neighbours follow on each other.
+    """
+    first = windows @ _NOMINAL / (_NOMINAL @ _NOMINAL)
+    turned = windows / first[:, np.newaxis]
+    envelope = _placed(np.median(turned.real, axis=0) + 1j * np.median(turned.imag, axis=0))
+    weights = np.ones(windows.shape)
+    for _ in range(_ROUNDS):
+        slope = _slope(envelope)
+        basis = np.stack([envelope, slope])
+        crossed = basis.conj()[:, np.newaxis] * basis
+        normal = np.einsum("nk,abk->nab", weights, crossed)
+        seen = np.einsum("nk,ak->na", weights * windows, basis.conj())
+        factors = np.linalg.solve(normal, seen[..., np.newaxis])[..., 0]
+        height = np.abs(factors[:, :1])
+        rest = np.abs(windows - factors @ basis) / height
+        scale = float(np.median(rest)) + _TINY
+        weights = 1 / (1 + (rest / scale) ** 2)
+        cleared = (windows - factors[:, 1:] * slope) / factors[:, :1]
+        weighted = weights * height**2
+        envelope = _placed((weighted * cleared).sum(axis=0) / weighted.sum(axis=0))
+    blocks = np.array_split(np.arange(len(windows)), min(_GROUPS, len(windows)))
+    total, norm = (weighted * cleared).sum(axis=0), weighted.sum(axis=0)
+    others = np.array(
+        [
+            _placed(
+                (total - (weighted[b] * cleared[b]).sum(axis=0)) / (norm - weighted[b].sum(axis=0))
+            )
+            for b in blocks
+        ]
+    )
+    spread = np.sum(np.abs(others - others.mean(axis=0)) ** 2)
+    variance = (len(blocks) - 1) / len(blocks) * spread / np.sum(np.abs(envelope) ** 2)
+    error = _ERROR_SHARE * math.sqrt(float(variance))
+    return Envelope(samples=envelope, relative_error=max(error, _LEAST_ERROR))
+
+
+def relative_difference(one: ComplexArray, other: ComplexArray) -> float:
+    """Return the norm of the difference of two envelopes (25,) over that of the second."""
+    return float(np.linalg.norm(one - other) / np.linalg.norm(other))
+
+
+def _placed(envelope: ComplexArray) -> ComplexArray:
+    """Return an envelope faded out at the ends, moved and scaled: see ``Origin`` above."""
+    spectrum = _spectrum(envelope * _FADE)
+    filtered = spectrum * _spectrum(_NOMINAL).real
+    at = 0.0
+    for _ in range(_PEAK_STEPS):
+        terms = filtered * np.exp(1j * _RAD_PER_STEP * at)
+        value, slope, bend = (complex((terms * (1j * _RAD_PER_STEP) ** k).sum()) for k in range(3))
+        climb = (value.conjugate() * slope).real
+        fall = abs(slope) ** 2 + (value.conjugate() * bend).real
+        if fall >= 0.0:  # not near a peak
+            break
+        at -= climb / fall
+    moved = np.fft.ifft(spectrum * np.exp(1j * _RAD_PER_STEP * at))[_AT_STEPS]
+    height = complex((filtered * np.exp(1j * _RAD_PER_STEP * at)).mean())
+    placed: ComplexArray = moved * (_NOMINAL @ _NOMINAL / height) * _FADE
+    return placed
+
+
+def _slope(envelope: ComplexArray) -> ComplexArray:
+    """Return the derivative of an envelope by steps."""
+    slope: ComplexArray = np.fft.ifft(1j * _RAD_PER_STEP * _spectrum(envelope))[_AT_STEPS]
+    return slope
+
+
+def _spectrum(envelope: ComplexArray | Array) -> ComplexArray:
+    placed = np.zeros(_N_FFT, dtype=np.complex128)
+    placed[_AT_STEPS] = envelope
+    spectrum: ComplexArray = np.fft.fft(placed)
+    return spectrum
+
+
+def module_pulse(received: ReceivedPulse, nominal: PulseModel, bin_length_m: float) -> ModulePulse:
+    """Return what the front end needs to take the echoes of a module with this pulse."""
+    envelope = np.array(received.real) + 1j * np.array(received.imaginary)
+    at_m = received.step_m * (np.arange(envelope.size) - envelope.size // 2)
+    gaussians = np.exp(-0.5 * (at_m / (_WIDTHS[:, np.newaxis] * nominal.sigma_m)) ** 2)
+    explained = np.abs(gaussians @ envelope) ** 2 / np.sum(gaussians**2, axis=1)
+    width = float(_WIDTHS[np.argmax(explained)])
+    model = replace(nominal, bandwidth_hz=nominal.bandwidth_hz / width)
+
+    s = model.sigma_bins(bin_length_m)
+    cycles = np.fft.rfftfreq(_N_TAPS) - nominal.carrier_rad(bin_length_m) / math.tau
+    in_band = np.abs(cycles) < 0.5 * bin_length_m / received.step_m
+    turns = np.exp(-2j * math.pi * np.outer(cycles[in_band], at_m / bin_length_m))
+    spectrum = received.step_m / bin_length_m * turns @ envelope
+    wanted = math.sqrt(math.tau) * s * np.exp(-2 * (math.pi * s * cycles[in_band]) ** 2)
+    power = np.abs(spectrum) ** 2
+    transfer = np.zeros(cycles.size, dtype=np.complex128)
+    transfer[in_band] = wanted * spectrum.conj() / (power + _REGULARISATION * power.max())
+    half = math.ceil(_TAPS_SIGMAS * nominal.sigma_bins(bin_length_m))
+    taps = np.fft.irfft(transfer, _N_TAPS)[np.arange(-half, half + 1)]
+    return ModulePulse(model=model, error=received.relative_error, equaliser=taps)
+
+
+class PulseEstimator:
+    """The pulses of the modules of a rig, learnt from their frames.
+
+    ``told`` are those to begin with, by radar; where there is none, or None, the nominal one.
+    """
+
+    def __init__(self, nominal: PulseModel, told: Sequence[ReceivedPulse | None] = ()) -> None:
+        self._nominal = nominal
+        self._told = tuple(told)
+        self._common: ReceivedPulse | None = None
+        self._own: dict[int, ReceivedPulse | None] = {}
+        self._windows: dict[int, list[ComplexArray]] = {}
+        self._waits: dict[int, int] = {}  # frames until the next echo is looked for
+        self._last: dict[int, float] = {}  # position of the last one [bins]
+        self._needed: dict[int | None, int] = {}  # echoes for the next estimate, by radar or of all
+
+    def pulse(self, radar: int) -> ReceivedPulse | None:
+        """Return the pulse of a radar as far as it is known; None: the nominal one."""
+        return self._own.get(radar) or self._begun(radar)
+
+    def is_due(self, radar: int) -> bool:
+        """Return whether `take` would use an echo of the next frame of a radar; it counts them."""
+        wait = self._waits.get(radar, 0)
+        self._waits[radar] = max(0, wait - 1)
+        return not wait and len(self._windows.get(radar, ())) < _CAPACITY
+
+    def take(
+        self,
+        radar: int,
+        samples: Array,
+        bin_length_m: float,
+        *,
+        position_bins: Array,
+        amplitude: Array,
+        sigma_y: float,
+    ) -> bool:
+        """Take the best echo of a frame, if it has one, and return whether a pulse has changed.
+
+        ``samples`` (n_bins,) are without their mean and not equalised, all usable;
+        ``position_bins`` and ``amplitude`` (k,) are its peaks behind the filter, ``sigma_y`` the
+        noise there.
+        """
+        at = _lone_peak(
+            position_bins,
+            amplitude,
+            _LEAST_SNR * sigma_y,
+            _REACH_SIGMAS * self._nominal.sigma_bins(bin_length_m),
+            samples.size,
+        )
+        if at is None:
+            return False
+        position = float(position_bins[at])
+        if abs(position - self._last.get(radar, -math.inf)) < _BINS_APART:
+            return False
+        self._last[radar] = position
+        self._waits[radar] = _FRAMES_APART - 1
+        windows = self._windows.setdefault(radar, [])
+        windows.append(baseband(samples, position, self._nominal, bin_length_m))
+        return self._learn(None) | self._learn(radar)
+
+    def _learn(self, radar: int | None) -> bool:
+        """Estimate the pulse of one radar, or of all, once there are enough new echoes."""
+        radars = sorted(self._windows) if radar is None else [radar]
+        windows = [window for each in radars for window in self._windows[each]]
+        if len(windows) < self._needed.get(radar, _FIRST):
+            return False
+        self._needed[radar] = math.ceil(_MORE * len(windows))
+        envelope = estimate_envelope(np.array(windows))
+        step_m = _STEP_SIGMAS * self._nominal.sigma_m
+        estimate = ReceivedPulse(
+            step_m=step_m,
+            real=tuple(envelope.samples.real.tolist()),
+            imaginary=tuple(envelope.samples.imag.tolist()),
+            relative_error=envelope.relative_error,
+        )
+        if radar is None:
+            before, self._common = self._common, self._unless_near(estimate, None)
+            return self._common is not before
+        before = self._own.get(radar)
+        own = self._unless_near(estimate, self._begun(radar))
+        self._own[radar] = own
+        return own is not before
+
+    def _unless_near(
+        self, estimate: ReceivedPulse, begun: ReceivedPulse | None
+    ) -> ReceivedPulse | None:
+        """Return the estimate if it differs from what was begun with, None otherwise."""
+        doubt = math.hypot(estimate.relative_error, begun.relative_error if begun else 0.0)
+        change = relative_difference(
+            envelope_at_steps(estimate, self._nominal), envelope_at_steps(begun, self._nominal)
+        )
+        return estimate if change > max(_LEAST_CHANGE, _ERRORS * doubt) else None
+
+    def _begun(self, radar: int) -> ReceivedPulse | None:
+        told = self._told[radar] if radar < len(self._told) else None
+        return told or self._common
+
+
+def envelope_at_steps(pulse: ReceivedPulse | None, nominal: PulseModel) -> ComplexArray:
+    """Return the envelope of a pulse at the 25 steps; None: the nominal one."""
+    if pulse is None:
+        return _NOMINAL + 0j
+    samples = np.array(pulse.real) + 1j * np.array(pulse.imaginary)
+    half = samples.size // 2
+    # band-limited interpolation, from samples that are as many steps of their own apart
+    at = _STEP_SIGMAS * nominal.sigma_m / pulse.step_m * _AT_STEPS
+    found: ComplexArray = np.sinc(at[:, np.newaxis] - np.arange(-half, half + 1)) @ samples
+    return found
+
+
+def difference_from_nominal(pulse: ReceivedPulse, nominal: PulseModel) -> float:
+    """Return the norm of the difference of a pulse from the nominal one, relative to that."""
+    return relative_difference(envelope_at_steps(pulse, nominal), _NOMINAL + 0j)
+
+
+def _lone_peak(
+    position_bins: Array, amplitude: Array, least_amplitude: float, reach: float, n_bins: int
+) -> int | None:
+    """Return the strongest peak that stands alone and whole; None where none does."""
+    for at in np.argsort(-amplitude, kind="stable"):
+        if amplitude[at] < least_amplitude:
+            return None
+        position = position_bins[at]
+        if not reach <= position <= n_bins - 1 - reach:
+            continue
+        near = np.abs(position_bins - position) < reach
+        near[at] = False
+        if not near.any() or amplitude[near].max() <= _LARGEST_NEIGHBOUR * amplitude[at]:
+            return int(at)
+    return None
