@@ -23,6 +23,7 @@ from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
 from slam.app.rig.files import RigFile, RigRadar, write_rig
 from slam.app.session.reader import open_session
+from slam.results import SmoothedRun
 
 pytestmark = pytest.mark.slow
 
@@ -175,6 +176,34 @@ def test_a_signal_leaves_a_session_that_replays(
     assert n_again > 5
 
 
+def test_sigusr1_writes_the_smoothed_path_while_it_runs(robot: Robot, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with subprocess.Popen(
+        run_command(robot, out, "--odometry", robot.odometry),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        session = out / "session.mcap"
+        wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
+        wait_until(lambda: len(list(open_session(session).scans())) > 25, process)
+        process.send_signal(signal.SIGUSR1)
+        wait_until((out / "smoothed.tum").exists, process)
+        n_early = len((out / "smoothed.tum").read_text().splitlines())
+        wait_until(lambda: len(list(open_session(session).scans())) > n_early + 15, process)
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=seconds(30))[1]
+    assert f"smoothed.tum has {n_early} states, solved for in" in said
+    stamps = {
+        name: [line.split()[0] for line in (out / f"{name}.tum").read_text().splitlines()]
+        for name in ("estimate", "smoothed")
+    }
+    assert stamps["smoothed"] == stamps["estimate"]
+    assert len(stamps["smoothed"]) > n_early > 0
+    found = [r for r in open_session(session).records() if isinstance(r, SmoothedRun)]
+    assert [len(one.t_ns) for one in found] == [n_early, len(stamps["estimate"])]
+
+
 @pytest.mark.thorough
 def test_a_run_whose_slam_is_too_slow_ends_at_once_with_all_results(
     robot: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -201,7 +230,8 @@ def test_a_run_whose_slam_is_too_slow_ends_at_once_with_all_results(
     assert took_s < seconds(2)
     assert "SLAM cannot keep up with the radars" in said
     names = {"session.mcap", "map.png", "summary.json", "estimate.tum", "odometry.tum"}
-    assert {path.name for path in out.iterdir()} == names
+    # no smoothed path where the last step was given up
+    assert {path.name for path in out.iterdir()} - {"smoothed.tum"} == names
     rows = {line.split("  ")[0]: line.split() for line in printed.splitlines()}
     scans = [scan for scan, _ in open_session(session).scans()]
     unused = sum(not scan.used for scan in scans)

@@ -196,7 +196,8 @@ class Comparison(SessionObserver):
         if not n_expected:
             return "no states are recorded, so there are none to compare with"
         if self._n_same(n_expected) == n_expected:
-            return f"all {n_expected} recorded states {self._smoothed_verdict()}"
+            states = f"all {n_expected} recorded states came again, to the last bit"
+            return f"{states}{self._smoothed_verdict()}"
         if self._n_before_gap is None:
             return self._verdict_on(n_expected, "") + self._reason()
         n_before = self._n_before_gap
@@ -218,10 +219,10 @@ class Comparison(SessionObserver):
     def _smoothed_verdict(self) -> str:
         expected, found = self._smoothed, self._smoothed_again
         if expected is None or found is None or expected[0] != found[0]:
-            return "came again, to the last bit"  # of a run that was killed, or smooths nothing
+            return ""  # of a run that was killed, or smooths nothing
         if expected == found:
-            return "and the smoothed path came again, to the last bit"
-        return f"came again, to the last bit, the smoothed path did not; {self._reason()}"
+            return ", and so did the smoothed path"
+        return f"; the smoothed path did not: {self._reason()}"
 
     def _n_same(self, n_first: int) -> int:
         return int(self._expected.rows["same"][:n_first].sum())

@@ -276,9 +276,8 @@ def test_the_session_of_an_overloaded_run_replays_to_the_last_bit(
     comparison = Comparison()
     again = execute(recorded_source(session, StopFlag(), comparison), [comparison])
     n_states = len(run.record.states)
-    assert comparison.verdict() == (
-        f"all {n_states} recorded states and the smoothed path came again, to the last bit"
-    )
+    same = f"all {n_states} recorded states came again, to the last bit"
+    assert comparison.verdict() == f"{same}, and so did the smoothed path"
     assert again.states.estimate.tobytes() == run.record.states.estimate.tobytes()
 
 
