@@ -357,7 +357,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         description=_SERVE_HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    serve.add_argument("scene", nargs="?", metavar="SCENE", help="name or .toml file of a scene")
+    serve.add_argument(
+        "scene", nargs="?", metavar="SCENE", help="name or .toml file of a scene, or pillars:3"
+    )
     serve.add_argument("--bare", action="store_true", help="stock modules in an empty room")
     serve.add_argument(
         "--count",

@@ -26,7 +26,8 @@ from emulator.scene.motion import (
     carried,
     drive,
 )
-from emulator.scene.tables import Number, SerialNumber, Table, load_table
+from emulator.scene.rooms import FAMILIES, MOST_ROOMS, room_of, room_tables
+from emulator.scene.tables import Number, SerialNumber, Table, is_name, load_table
 from xethru_protocol.validation import shown
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
@@ -426,9 +427,10 @@ def empty_room(count: int = 1) -> Scene:
 
 
 def load_scene(path_or_name: str | Path) -> Scene:
-    """Return the scene in a TOML file, or a shipped one by its name ("lab").
+    """Return the scene in a TOML file, a shipped one by its name ("lab"), or a random room.
 
-    A string without a path separator and without ``.toml`` is a name.
+    A string without a path separator and without ``.toml`` is a name; that of a room is family and
+    number ("pillars:3", see ``emulator.scene.rooms``), and the scene's own name is ``pillars_3``.
 
     Raises
     ------
@@ -437,6 +439,14 @@ def load_scene(path_or_name: str | Path) -> Scene:
     SceneError
         File missing or unreadable, TOML broken, key unknown, or value refused.
     """
+    room = room_of(path_or_name) if is_name(path_or_name) else None
+    if room is not None:
+        return Scene.model_validate(room_tables(*room))
+    if is_name(path_or_name) and ":" in path_or_name:
+        raise UnknownSceneError(
+            f"{path_or_name}: no such room; the families are {', '.join(FAMILIES)}, and each has "
+            f"the rooms 0 to {MOST_ROOMS - 1}: pillars:3"
+        )
     return load_table(
         Scene,
         path_or_name,

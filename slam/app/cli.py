@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
-from slam.app.sweep import STRESSES
+from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
 from xethru_protocol.system import (
     STDERR,
@@ -129,7 +129,9 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
         default=_TYPICAL_SEED,
         help="seed of noise and odometry drift (default: %(default)s, a typical run)",
     )
-    demo.add_argument("--scene", default="lab", help="name of a scene, or a scene file")
+    demo.add_argument(
+        "--scene", default="lab", help="name of a scene or a random room (pillars:3), or a file"
+    )
     demo.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")
     demo.add_argument(
         "--wire", action="store_true", help="keep the raw bytes of all ports in the session, too"
@@ -290,7 +292,8 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
         metavar="SCENE",
         nargs="+",
         action="extend",
-        help="names or files (default: lab)",
+        help="names or files; pillars:3 is room 3 of the random rooms of family pillars, "
+        "pillars:0-9 are ten of them (default: lab)",
     )
     sweep.add_argument(
         "--preset",
@@ -306,7 +309,11 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
         metavar="SEEDS",
         type=count,
         default=20,
-        help="number of seeds, from 0",
+        help="number of runs of each scene, with seeds from 0; the first seed of a random room is "
+        "its number (default: %(default)s)",
+    )
+    sweep.add_argument(
+        "--laps", type=count, help="drive the first laps of each scene only, so many"
     )
     sweep.add_argument(
         "--set",
@@ -436,7 +443,7 @@ _COMMANDS = (
         "prints that result again. All numbers are simulated.",
         "STRESS is one of: "
         + "; ".join(f"{name}: {stress.help}" for name, stress in STRESSES.items())
-        + ".",
+        + f". The families of random rooms are {', '.join(FAMILIES)}; statistics are of families.",
     ),
 )
 

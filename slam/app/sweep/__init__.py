@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 
 CLEAN = "clean"
 
+FAMILIES = ("pillars", "office", "dense", "loop", "sparse", "people", "rig")
+"""Of random rooms (`emulator.scene.rooms`, which loads NumPy)."""
+
 Table = Mapping[str, object]
 """Keys of a table of a scene, and their values."""
 

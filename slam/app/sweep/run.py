@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scene.philox import counter_normals, uniforms
+from emulator.scene.rooms import MOST_ROOMS, room_of
 from emulator.scene.scene import CarriedSpec, Scene
-from emulator.scene.tables import TableT
+from emulator.scene.tables import TableT, is_name
 from emulator.scene.wheels import scene_odometry
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import NS_PER_S, OdometryTrack
@@ -249,10 +250,19 @@ class Case:
     stress: str = CLEAN
     seed: int = 0
     bound: bool = False
+    room: tuple[str, int] | None = None  # family and number of a random room
 
     @property
     def key(self) -> Key:
         return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
+
+    def with_seeds(self, count: int) -> list[Case]:
+        """Return so many runs: seeds from 0, those of a random room from its number.
+
+        Wheels and noise of two rooms of a family are never alike.
+        """
+        first, step = (0, 1) if self.room is None else (self.room[1], MOST_ROOMS)
+        return [replace(self, seed=first + step * run) for run in range(count)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -261,7 +271,8 @@ class SweepRun(Summary):
 
     ``settings`` are those of the preset that were replaced, dotted keys; ``false`` and
     ``confident_false`` count the landmarks of the map where nothing stands, and those of them that
-    claim to be known to 5 cm; ``bound`` is on the same data, where it was asked for.
+    claim to be known to 5 cm; ``bound`` is on the same data, where it was asked for; ``family`` is
+    that of a random room.
     """
 
     settings: dict[str, str] = field(default_factory=dict)
@@ -269,10 +280,16 @@ class SweepRun(Summary):
     false: int = 0
     confident_false: int = 0
     bound: BoundSummary | None = None
+    family: str = ""
 
     @property
     def key(self) -> Key:
         return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
+
+    @property
+    def group(self) -> Key:
+        """What it has in common with the runs that its statistics are of."""
+        return (self.family or self.scene, *self.key[1:-1], None)
 
 
 def make_case(
@@ -283,8 +300,9 @@ def make_case(
     settings: Mapping[str, str] | None = None,
     stress: str = CLEAN,
     bound: bool = False,
+    laps: int | None = None,
 ) -> Case:
-    """Load what a run needs by its names.
+    """Load what a run needs by its names; ``laps`` leaves out all but the first.
 
     Raises AppError if a name or a setting is not known, or a file cannot be used.
     """
@@ -295,13 +313,14 @@ def make_case(
     except ConfigError as error:
         raise UsageError(f"--set: {error}") from None
     return Case(
-        scene=loaded,
+        scene=loaded if laps is None else first_laps(loaded, laps),
         config=config,
         preset=preset,
         settings=named,
         stress=stress,
         seed=seed,
         bound=bound,
+        room=room_of(scene) if is_name(scene) else None,
     )
 
 
@@ -399,6 +418,7 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
         **{row.name: getattr(summary, row.name) for row in fields(summary)},
         settings=dict(case.settings),
         stress=case.stress,
+        family="" if case.room is None else case.room[0],
         false=false,
         confident_false=confident,
         bound=bound_of(record, ranges, case.scene, case.config) if case.bound else None,

@@ -20,15 +20,16 @@ _POSE_DOF = 3
 def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
     """Return the statistics of each cell but its seeds, in the order they first appear.
 
-    A cell is scene, preset, settings and stress. Every group has its number of runs, how many beat
-    odometry, `median` and `p90` of the errors, medians of the landmarks' scores, the share of runs
-    without a duplicate, false landmarks (per run, and how many were claimed to be known), the mean
-    NEES over runs (ANEES) and the mean NIS per degree of freedom at each of the ten times with
-    their 95 % bands, ATE and mean NEES of the `smoothed` paths where there are any, and the same
-    errors of the known-association bound where it was computed.
+    A cell is scene or family of random rooms, preset, settings and stress. Every group has its
+    number of runs, how many beat odometry, `median` and `p90` of the errors, medians of the
+    landmarks' scores, the share of runs without a duplicate, false landmarks (per run, and how many
+    were claimed to be known), the mean NEES over runs (ANEES) and the mean NIS per degree of
+    freedom at each of the ten times with their 95 % bands, ATE and mean NEES of the `smoothed`
+    paths where there are any, and the same errors of the known-association bound where it was
+    computed.
     """
-    keys = list(dict.fromkeys(run.key[:-1] for run in runs))
-    return [_group([run for run in runs if run.key[:-1] == key]) for key in keys]
+    groups = dict.fromkeys(run.group for run in runs)
+    return [_group([run for run in runs if run.group == group]) for group in groups]
 
 
 def group_name(group: dict[str, Any]) -> str:
@@ -63,7 +64,7 @@ def group_line(group: dict[str, Any]) -> str:
             f"p90 {mm_text(ate['p90'])}"
         )
     return (
-        f"{group_name(group)}, {group['runs']} seeds (simulated): "
+        f"{group_name(group)}, {group['runs']} runs (simulated): "
         f"SLAM ATE median {mm_text(estimate['median'])} "
         f"({ratio(estimate['median'], wheels['median']):.2f} of odometry's), "
         f"p90 {mm_text(estimate['p90'])}{at_the_end}; "
@@ -80,7 +81,7 @@ def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
     first = runs[0]
     nis = [run.nis_mean for run in runs if run.nis_mean is not None]
     return {
-        "scene": first.scene,
+        "scene": first.group[0],
         "preset": first.preset,
         "settings": first.settings,
         "stress": first.stress,
@@ -237,5 +238,7 @@ def stress_table(
         "false per run": [f"{row['false_per_run']:.2f}" for row in rows],
         "confident": [str(row["confident_false"]) for row in rows],
     }
-    title = f"{group_name(clean)}, {clean['runs']} seeds, the same in every row: simulated"
+    title = (
+        f"{group_name(clean)}, {clean['runs']} runs, with the same seeds in every row: simulated"
+    )
     return title, list(columns), list(zip(*columns.values(), strict=True))

@@ -10,11 +10,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 
@@ -177,6 +178,7 @@ def run_sweep(
     settings: Sequence[tuple[str, tuple[str, ...]]] = (),
     stresses: Sequence[str] = (),
     bound: bool = False,
+    laps: int | None = None,
     jobs: int | None = None,
     dask: str | None = None,
 ) -> None:
@@ -184,8 +186,9 @@ def run_sweep(
 
     OUT.part holds the runs done so far, and the same command goes on with it. A command whose
     result is there already prints it again. The scene is the lab and the preset robust, if none is
-    given; ``settings`` are dotted keys of a preset and the values to try. ``jobs`` is the number of
-    processes, None for one per core; ``dask`` the address of a scheduler that runs them instead.
+    given; ``laps`` leaves out all but the first; ``settings`` are dotted keys of a preset and the
+    values to try. ``jobs`` is the number of processes, None for one per core; ``dask`` the address
+    of a scheduler that runs them instead.
 
     Raises AppError before the first run for a wrong name, or a file that cannot be written, is not
     this sweep's, or is no sweep's; later for a scene too short, a full disk, or a worker process
@@ -194,7 +197,9 @@ def run_sweep(
     """
     presets = presets or ["robust"]
     # a wrong name ends the command before any run
-    cases = _cases(scenes or ["lab"], presets, n_seeds, settings, stresses, bound=bound)
+    cases = _cases(
+        rooms_named(scenes or ["lab"]), presets, n_seeds, settings, stresses, bound=bound, laps=laps
+    )
     if bound:
         load_gtsam(PURPOSE)
     if out.is_dir():
@@ -242,12 +247,13 @@ def _cases(
     stresses: Sequence[str],
     *,
     bound: bool,
+    laps: int | None,
 ) -> list[Case]:
     """Return the runs in their order: seeds innermost, so that groups are done one by one."""
     values = [[(key, value) for value in of_key] for key, of_key in settings]
     rows = dict.fromkeys((CLEAN, *stresses))
     cells = [
-        make_case(scene, preset, 0, settings=dict(chosen), stress=stress, bound=bound)
+        make_case(scene, preset, 0, settings=dict(chosen), stress=stress, bound=bound, laps=laps)
         for scene, preset, chosen, stress in product(scenes, presets, product(*values), rows)
     ]
     if len({cell.key for cell in cells}) < len(cells):
@@ -257,7 +263,26 @@ def _cases(
             if names
             else "--preset, --set: one of them is given twice; give each once"
         )
-    return [replace(cell, seed=seed) for cell in cells for seed in range(n_seeds)]
+    return [case for cell in cells for case in cell.with_seeds(n_seeds)]
+
+
+def rooms_named(scenes: Sequence[str]) -> list[str]:
+    """Return names of scenes, each range of random rooms as its rooms.
+
+    >>> rooms_named(["lab", "pillars:0-2"])
+    ['lab', 'pillars:0', 'pillars:1', 'pillars:2']
+    """
+    names: list[str] = []
+    for scene in scenes:
+        found = re.fullmatch(r"([a-z]+):([0-9]{1,4})-([0-9]{1,4})", scene, re.ASCII)
+        if found is None:
+            names.append(scene)
+            continue
+        first, last = int(found[2]), int(found[3])
+        if first > last:
+            raise UsageError(f"--scene {scene}: the first room must not lie behind the last")
+        names += [f"{found[1]}:{number}" for number in range(first, last + 1)]
+    return names
 
 
 def _command(

@@ -8,6 +8,7 @@ import pytest
 
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
+from slam.app.errors import UsageError
 from slam.app.records import Snapshot
 from slam.app.sweep.bound import BoundSummary
 from slam.app.sweep.run import SweepRun, distance_m, false_landmarks, make_case
@@ -19,6 +20,7 @@ from slam.app.sweep.statistics import (
     summarise_groups,
     times_clean,
 )
+from slam.app.sweep.sweep import rooms_named
 from slam.evaluation import LandmarkScore
 
 RUN = replace(
@@ -82,10 +84,32 @@ def stressed(stress: str, seed: int, ate_m: float) -> SweepRun:
     return replace(RUN, stress=stress, seed=seed, ate_rmse_m=ate_m)
 
 
+def test_rooms_of_a_family_are_one_group() -> None:
+    cases = [
+        case
+        for name in rooms_named(["rig:3-4"])
+        for case in make_case(name, "paper", 0).with_seeds(2)
+    ]
+    assert [(case.scene.name, case.seed) for case in cases] == [
+        ("rig_3", 3),
+        ("rig_3", 10_003),
+        ("rig_4", 4),
+        ("rig_4", 10_004),
+    ]
+    runs = [replace(run_of(case), family="rig") for case in cases]
+    (group,) = summarise_groups([*runs])
+    assert (group["scene"], group["runs"]) == ("rig", 4)
+    lab = make_case("lab", "paper", 0, laps=2)
+    assert [case.seed for case in lab.with_seeds(3)] == [0, 1, 2]
+    assert lab.scene.path.laps == ("forward", "forward")
+    with pytest.raises(UsageError, match="rig:4-3: the first room must not lie behind the last"):
+        rooms_named(["rig:4-3"])
+
+
 def test_settings_and_stresses_are_groups_named_by_them() -> None:
     runs = [RUN, replace(RUN, settings={"a.b": "1"}), stressed("skew", 0, 0.02)]
     lines = [group_line(group) for group in summarise_groups(runs)]
-    assert [line.partition(", 1 seeds")[0] for line in lines] == [
+    assert [line.partition(", 1 runs")[0] for line in lines] == [
         "a, preset paper",
         "a, preset paper, a.b=1",
         "a, preset paper, stress skew",
@@ -171,7 +195,7 @@ def test_a_stress_table_compares_with_its_own_clean_group() -> None:
     assert in_band(groups[0]) == 2
     printed = [stress_table(*table) for table in stress_tables(groups)]
     assert [[row[0] for row in rows] for _, _, rows in printed] == [["clean", "skew"]] * 2
-    assert "a, preset robust, 1 seeds" in printed[1][0]
+    assert "a, preset robust, 1 runs" in printed[1][0]
 
 
 ROOM: Scene = empty_room().model_copy(

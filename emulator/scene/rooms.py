@@ -1,0 +1,273 @@
+"""Random rooms: families of scenes that differ in course, targets and rig, a room for each number.
+
+``pillars:3`` names room 3 of the family ``pillars`` wherever a scene is named. Nothing about SLAM
+may be chosen by looking at single rooms; they show what a method does where nobody tuned it. The
+same name gives the same room as long as NumPy keeps the streams of its generators.
+
+A room is the tables of a scene file as plain values; `emulator.scene.scene` checks them. Lengths
+are metres, angles degrees; the robot drives its closed course twice, with the lab's noise and, but
+for ``sparse``, the lab's wheels.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Row = dict[str, Any]
+Point = Sequence[float] | NDArray[np.float64]
+Way = list[tuple[float, float]]
+
+MOST_ROOMS = 10_000
+"""Of a family: numbers run from 0 to one less."""
+
+_DIGITS = 4
+_MOST_TRIES = 100_000
+
+_WHEELS = {
+    "scale_sigma": 0.007,
+    "turn_scale_sigma": 0.007,
+    "curvature_sigma_rad_per_m": 0.0042,
+    "along_sigma_m_per_sqrt_m": 0.002,
+    "across_sigma_m_per_sqrt_m": 0.0006,
+    "heading_sigma_rad_per_sqrt_m": 0.0042,
+    "heading_sigma_rad_per_rad": 0.01,
+}
+"""The lab's."""
+_RIG = ((-0.1, 0.2, 90.0), (0.1, 0.2, 90.0), (-0.1, -0.2, -90.0), (0.1, -0.2, -90.0))
+"""The paper's: place and yaw of each radar."""
+_SENSORS: Row = {
+    "noise": {"rf_sigma": 5e-4, "iterations": 16, "pulses_per_step": 300},
+    "clutter": {"sigma": 2.25e-4, "correlation_s": 4.8},
+    "jitter": {"white_rad": 0.0056, "slow_rad": 0.032, "slow_correlation_s": 4.0},
+    "leakage": {"amplitude": 0.06, "range_m": 0.05},
+}
+"""The lab's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Room:
+    """What a family draws; everything else is the same in all of them."""
+
+    way: Way
+    targets: list[Row] = field(default_factory=list)
+    walls: list[Row] = field(default_factory=list)
+    objects: list[Row] = field(default_factory=list)
+    people: list[Row] = field(default_factory=list)
+    rig: Sequence[tuple[float, float, float]] = _RIG
+    wheels_factor: float = 1.0  # on every standard deviation of the wheels
+
+
+def _off_course_m(point: NDArray[np.float64], way: Way) -> float:
+    """Return how far a point is from the nearest place of a closed course."""
+    corners = np.array([*way, way[0]])
+    nearest = math.inf
+    for start, end in pairwise(corners):
+        along = end - start
+        part = np.clip((point - start) @ along / max(along @ along, 1e-12), 0.0, 1.0)
+        nearest = min(nearest, float(np.hypot(*(point - start - part * along))))
+    return nearest
+
+
+def _beside(
+    rng: np.random.Generator, count: int, way: Way, *, off: tuple[float, float], apart: float
+) -> list[NDArray[np.float64]]:
+    """Return up to ``count`` places within two distances from the course, apart from each other."""
+    nearest, farthest = off
+    low, high = np.min(way, axis=0) - farthest, np.max(way, axis=0) + farthest
+    places: list[NDArray[np.float64]] = []
+    for _ in range(_MOST_TRIES):
+        if len(places) == count:
+            break
+        place = rng.uniform(low, high)
+        free = all(float(np.hypot(*(place - other))) >= apart for other in places)
+        if free and nearest <= _off_course_m(place, way) <= farthest:
+            places.append(place)
+    return places
+
+
+def _rod(place: Point, amplitude: float = 0.015) -> Row:
+    return {"kind": "rod", "x_m": place[0], "y_m": place[1], "amplitude_1m": amplitude}
+
+
+def _rods(places: Sequence[Point]) -> list[Row]:
+    return [_rod(place) for place in places]
+
+
+def _rectangle(rng: np.random.Generator, shortest: float, longest: float) -> Way:
+    width, depth = rng.uniform(shortest, longest, 2)
+    return [(0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth)]
+
+
+def pillars(rng: np.random.Generator) -> Room:
+    """18 round pillars of 0 to 15 cm radius along an L-shaped course."""
+    length, depth = rng.uniform(3.2, 4.4), rng.uniform(3.0, 4.0)
+    arm, foot = rng.uniform(1.4, 1.9), rng.uniform(1.4, 1.9)
+    way = [(0.0, 0.0), (length, 0.0), (length, arm), (foot, arm), (foot, depth), (0.0, depth)]
+    targets = []
+    for place in _beside(rng, 18, way, off=(0.5, 1.15), apart=0.45):
+        radius = float(rng.choice([0.0, 0.02, 0.05, 0.08, 0.12, 0.15]))
+        target = _rod(place, rng.uniform(0.008, 0.03))
+        targets.append(target | ({"kind": "cylinder", "radius_m": radius} if radius else {}))
+    return Room(way=way, targets=targets)
+
+
+def office(rng: np.random.Generator) -> Room:
+    """Four walls, two or three desks, two or three chairs of four legs."""
+    way = _rectangle(rng, 2.4, 3.6)
+    width, depth = way[2]
+    gap = rng.uniform(1.1, 1.5)
+    left, right, front, back = -gap, width + gap, -gap, depth + gap
+    corners = [(left, front), (right, front), (right, back), (left, back), (left, front)]
+    walls = [
+        {"from_m": start, "to_m": end, "amplitude_1m": 0.05, "transmission": 0.5}
+        for start, end in pairwise(corners)
+    ]
+    most = 2 if width < 3 else 3
+    desks = [
+        {
+            "x_m": width * part + rng.normal(0, 0.05),
+            "y_m": depth / 2 + rng.normal(0, 0.1),
+            "width_m": 0.8,
+            "depth_m": 0.6,
+            "yaw_deg": rng.uniform(-10, 10),
+            "amplitude_1m": 0.03,
+            "transmission": 0.7,
+        }
+        for part in np.linspace(0.3, 0.7, rng.integers(2, 4))[:most]
+    ]
+    legs = []
+    for part in rng.permutation([0.2, 0.5, 0.8])[: rng.integers(2, 4)]:
+        x, y = width * part, -rng.uniform(0.7, 0.8)
+        legs += [_rod((x + i * 0.2, y + j * 0.2), 0.01) for i in (-1, 1) for j in (-1, 1)]
+    return Room(way=way, targets=legs, walls=walls, objects=desks)
+
+
+def dense(rng: np.random.Generator) -> Room:
+    """About thirty rods 0.25 m apart, outside a square course."""
+    side = rng.uniform(2.0, 2.4)
+    targets = []
+    for row in range(4):
+        for number in range(9 - row):
+            x, y = 0.25 * number + rng.normal(0, 0.03), -0.75 + rng.normal(0, 0.03)
+            for _ in range(row):  # turned to the next side
+                x, y = side - y, x
+            targets.append(_rod((x, y)))
+    return Room(way=[(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)], targets=targets)
+
+
+def loop(rng: np.random.Generator) -> Room:
+    """25 rods along a long loop."""
+    length, depth = rng.uniform(8, 11), rng.uniform(5, 7)
+    way = [(0.0, 0.0), (length, 0.0), (length, depth), (0.0, depth)]
+    return Room(way=way, targets=_rods(_beside(rng, 25, way, off=(0.5, 1.15), apart=0.7)))
+
+
+def sparse(rng: np.random.Generator) -> Room:
+    """Six rods, wheels three times as bad."""
+    way = _rectangle(rng, 2.5, 4.0)
+    rods = _rods(_beside(rng, 6, way, off=(0.5, 1.0), apart=1.2))
+    return Room(way=way, targets=rods, wheels_factor=3.0)
+
+
+def people(rng: np.random.Generator) -> Room:
+    """Twelve rods, two walkers."""
+    way = _rectangle(rng, 2.0, 2.8)
+    width, depth = way[2]
+    round_the_course: Way = [
+        (-1.0, -0.7),
+        (width + 1, -0.6),
+        (width + 0.9, depth + 0.7),
+        (-0.9, depth + 0.6),
+    ]
+    inside: Way = [(width / 2, 0.3 * depth), (width / 2, 0.7 * depth)]
+    walkers: list[Row] = [
+        {"waypoints_m": round_the_course, "speed_mps": 0.6, "walk": "round", "rcs_m2": 0.5},
+        {"waypoints_m": inside, "speed_mps": 0.3, "walk": "to_and_fro", "rcs_m2": 0.5},
+    ]
+    rods = _rods(_beside(rng, 12, way, off=(0.55, 1.1), apart=0.4))
+    return Room(way=way, targets=rods, people=walkers)
+
+
+def rig(rng: np.random.Generator) -> Room:
+    """14 rods; three to six radars at random places and angles, at least one to each side."""
+    way = _rectangle(rng, 1.8, 2.4)
+    left, right = rng.uniform(60, 120), rng.uniform(-120, -60)
+    yaws = [left, right, *rng.uniform(-180, 180, rng.integers(1, 5))]
+    mounts = [(rng.uniform(-0.2, 0.2), 0.2 * math.sin(math.radians(yaw)), yaw) for yaw in yaws]
+    rods = _rods(_beside(rng, 14, way, off=(0.5, 1.1), apart=0.38))
+    return Room(way=way, targets=rods, rig=mounts)
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], Room]] = {
+    family.__name__: family for family in (pillars, office, dense, loop, sparse, people, rig)
+}
+
+
+def room_of(name: str) -> tuple[str, int] | None:
+    """Return family and number of a room by its name; None if no room has this name.
+
+    >>> room_of("pillars:3"), room_of("lab"), room_of("cellar:3"), room_of("rig:10000")
+    (('pillars', 3), None, None, None)
+    """
+    found = re.fullmatch(r"([a-z]+):([0-9]{1,4})", name, re.ASCII)
+    return (found[1], int(found[2])) if found and found[1] in FAMILIES else None
+
+
+def room_tables(family: str, number: int) -> Row:
+    """Return the tables of the scene of a room; numbers have four decimals."""
+    index = list(FAMILIES).index(family)
+    room = FAMILIES[family](np.random.default_rng([index, number]))
+    wheels = {key: sigma * room.wheels_factor for key, sigma in _WHEELS.items()}
+    radars = [
+        {
+            "name": f"radar_{place}",
+            "serial": f"2024{index:02d}{number:04d}{place:02d}",
+            "x_m": x,
+            "y_m": y,
+            "yaw_deg": yaw,
+        }
+        for place, (x, y, yaw) in enumerate(room.rig, 1)
+    ]
+    drawn = {
+        "path": {
+            "waypoints_m": room.way,
+            "laps": ["forward", "forward"],
+            "speed_mps": 0.05,
+            "turn_rate_deg_per_s": 28.125,
+        },
+        "odometry": {"rate_hz": 5.0, **wheels},
+        "radars": radars,
+        "targets": _named("target", room.targets),
+        "walls": _named("wall", room.walls),
+        "objects": _named("object", room.objects),
+        "people": _named("person", room.people),
+    }
+    description = FAMILIES[family].__doc__ or ""
+    tables: Row = {
+        "name": f"{family}_{number}",
+        "environment": "lab",
+        "description": f"random room: {description}",
+        **_rounded(drawn),
+        **_SENSORS,
+    }
+    return tables
+
+
+def _named(kind: str, rows: Sequence[Row]) -> list[Row]:
+    return [{"name": f"{kind}_{number}", **row} for number, row in enumerate(rows)]
+
+
+def _rounded(value: Any) -> Any:  # noqa: ANN401 - a table, a list, a number or text
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return tuple(_rounded(each) for each in value)
+    return value if isinstance(value, str) else round(float(value), _DIGITS)

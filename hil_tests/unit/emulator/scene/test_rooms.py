@@ -1,0 +1,98 @@
+"""Random rooms are what their families promise, the same every time, and scenes like any other."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from emulator.scene.rooms import FAMILIES
+from emulator.scene.scene import Scene, UnknownSceneError, load_scene
+from slam.app.sweep import FAMILIES as NAMED
+
+ROOMS = [(family, number) for family in FAMILIES for number in range(10)]
+
+# third corner of the course and last target of room 9, from another program with the same laws
+PUBLISHED = {
+    "pillars": ((3.8805, 1.5176), (4.1734, -0.9614)),
+    "office": ((3.2158, 3.0066), (0.8432, -0.5907)),
+    "dense": ((2.2042, 2.2042), (-0.6944, 0.9818)),
+    "loop": ((10.9331, 5.7985), (0.6814, 4.9011)),
+    "sparse": ((3.0895, 2.9883), (-0.6095, -0.0249)),
+    "people": ((2.5321, 2.6141), (1.8622, 1.0772)),
+    "rig": ((1.8969, 2.3444), (1.6473, -0.9668)),
+}
+
+
+def off_course_m(scene: Scene, x: float, y: float) -> float:
+    """Return the distance from a point to the closed course, by points 1 mm apart."""
+    corners = [*scene.path.waypoints_m, scene.path.waypoints_m[0]]
+    nearest = math.inf
+    for (ax, ay), (bx, by) in pairwise(corners):
+        parts = np.linspace(0, 1, math.ceil(math.dist((ax, ay), (bx, by)) / 1e-3) + 1)
+        distances = np.hypot(ax + parts * (bx - ax) - x, ay + parts * (by - ay) - y)
+        nearest = min(nearest, float(distances.min()))
+    return nearest
+
+
+@pytest.mark.parametrize(("family", "number"), ROOMS)
+def test_a_room_is_a_scene_that_can_be_driven(family: str, number: int) -> None:
+    scene = load_scene(f"{family}:{number}")
+    assert scene == load_scene(f"{family}:{number}")
+    assert scene.name == f"{family}_{number}"
+    assert scene.path.laps == ("forward", "forward")
+    for target in scene.targets:
+        assert off_course_m(scene, target.x_m, target.y_m) > 0.34  # chairs stand within the gap
+
+
+@pytest.mark.parametrize(
+    ("family", "count", "near_m", "far_m", "apart_m"),
+    [
+        ("pillars", 18, 0.5, 1.15, 0.45),
+        ("loop", 25, 0.5, 1.15, 0.7),
+        ("sparse", 6, 0.5, 1.0, 1.2),
+        ("people", 12, 0.55, 1.1, 0.4),
+        ("rig", 14, 0.5, 1.1, 0.38),
+    ],
+)
+def test_targets_stand_beside_the_course_and_apart(
+    family: str, count: int, near_m: float, far_m: float, apart_m: float
+) -> None:
+    for number in range(10):
+        scene = load_scene(f"{family}:{number}")
+        assert len(scene.targets) == count
+        places = [(target.x_m, target.y_m) for target in scene.targets]
+        for place in places:
+            assert near_m - 2e-4 <= off_course_m(scene, *place) <= far_m + 2e-4
+        apart = min(math.dist(a, b) for a in places for b in places if a is not b)
+        assert apart >= apart_m - 2e-4
+
+
+def test_families_differ_in_what_they_say() -> None:
+    radii = {t.radius_m for number in range(10) for t in load_scene(f"pillars:{number}").targets}
+    assert radii == {0.0, 0.02, 0.05, 0.08, 0.12, 0.15}
+    lab, sparse = load_scene("lab").odometry, load_scene("sparse:4").odometry
+    assert sparse.scale_sigma == pytest.approx(3 * lab.scale_sigma)
+    assert load_scene("loop:4").odometry == lab
+    assert len(load_scene("office:1").walls) == 4
+    assert len(load_scene("dense:0").targets) == 30
+    assert len(load_scene("people:0").people) == 2
+    for number in range(10):
+        yaws = [radar.yaw_deg for radar in load_scene(f"rig:{number}").radars]
+        assert 3 <= len(yaws) <= 6
+        assert 60 <= yaws[0] <= 120
+        assert -120 <= yaws[1] <= -60
+
+
+def test_rooms_are_those_that_results_were_published_for() -> None:
+    for family, (corner, place) in PUBLISHED.items():
+        scene = load_scene(f"{family}:9")
+        last = scene.targets[-1]
+        assert (scene.path.waypoints_m[2], (last.x_m, last.y_m)) == (corner, place)
+    assert tuple(FAMILIES) == NAMED
+
+
+@pytest.mark.parametrize("name", ["cellar:3", "pillars:", "pillars:-1", "pillars:10000", "lab:1"])
+def test_what_is_no_room_is_refused_by_name(name: str) -> None:
+    with pytest.raises(UnknownSceneError, match=r"no such room; the families are pillars, office"):
+        load_scene(name)
