@@ -31,10 +31,17 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import chdtri
 
 from slam.geometry import Rig, wrap_angles
 from slam.results import PredictedRange
-from slam.robust.parameters import ContinuationRule, RangeNoise
+from slam.robust.parameters import (
+    MARGIN_NATS,
+    TAIL_PROBABILITY,
+    ContinuationRule,
+    RangeNoise,
+)
 from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end says.
@@ -453,6 +460,66 @@ def cheapest(options: Sequence[Sequence[Option]]) -> list[Option]:
 
     branch(0, 0.0)
     return best
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Identity:
+    """The statement that things seen or mapped are one and the same, in pairs."""
+
+    pairs: tuple[tuple[int, int], ...]  # of keys of things
+    mahalanobis_sq: float  # of all residuals
+    evidence: float  # nats against all pairs being two things each: ln N(residuals; 0, S) - ln beta
+
+    @property
+    def is_possible(self) -> bool:
+        limit = float(chdtri(2 * len(self.pairs), TAIL_PROBABILITY))
+        return self.mahalanobis_sq <= limit and self.evidence > 0.0
+
+    def contradicts(self, other: Identity) -> bool:
+        """Return whether not both can be true: one thing would be two others."""
+        return any(
+            mine != theirs and not set(mine).isdisjoint(theirs)
+            for mine in self.pairs
+            for theirs in other.pairs
+        )
+
+
+def identity(
+    pairs: tuple[tuple[int, int], ...], residual: Array, S: Array, density: float
+) -> Identity:
+    """Judge pairs of things by their residuals (2 k,), with covariance S (2 k, 2 k).
+
+    ``density`` is that of all things of the kind: how likely a chance neighbour is.
+    """
+    distance = float(residual @ np.linalg.solve(S, residual))
+    log_det = float(np.linalg.slogdet(math.tau * S)[1])
+    evidence = -0.5 * (distance + log_det) - len(pairs) * math.log(density)
+    return Identity(pairs=pairs, mahalanobis_sq=distance, evidence=evidence)
+
+
+def certain(identities: Sequence[Identity]) -> Identity | None:
+    """Return the likeliest of those that are possible and that nothing speaks against.
+
+    What contradicts it must be less likely by `MARGIN_NATS`, possible or not.
+    """
+    ranked = sorted(identities, key=lambda one: -one.evidence)
+    for one in ranked:
+        rivals = [other for other in ranked if other is not one and one.contradicts(other)]
+        if one.is_possible and all(one.evidence - r.evidence > MARGIN_NATS for r in rivals):
+            return one
+    return None
+
+
+def density_per_m2(points_m: Array, reach_m: float) -> float:
+    """Return how many landmarks a square metre has where there are some; points (n, 2) [m].
+
+    That is the mean number of others within reach of each, so that the emptiness between the arms
+    of a course does not count, and not less than that of a single one.
+    """
+    others = 0.0
+    if len(points_m) > 1:
+        others = 2.0 * len(cKDTree(points_m).query_pairs(reach_m)) / len(points_m)
+    return max(others, 1.0) / (math.pi * reach_m**2)
 
 
 def predicted_ranges(state: State, sure: SureLandmarks, antennas: Antennas) -> list[PredictedRange]:

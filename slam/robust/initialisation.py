@@ -43,7 +43,14 @@ from scipy.optimize import linear_sum_assignment
 
 from slam.geometry import compose, wrap_angle
 from slam.robust import kernels
-from slam.robust.association import LONGEST_M, Antennas, RangeScan
+from slam.robust.association import (
+    LONGEST_M,
+    Antennas,
+    RangeScan,
+    certain,
+    density_per_m2,
+    identity,
+)
 from slam.robust.parameters import (
     BackEndParameters,
     MapRule,
@@ -67,6 +74,8 @@ _LEAST_WAY_M = 1e-6
 _KNOWN_SHARE = 0.1
 # Label of a range whose target is not known
 _NO_LABEL = -1
+# Stands for what is seen now where it is compared with rows of the map
+SEEN = -1
 # Room for ranges of one radar in one frame, at first
 _FEWEST_SLOTS = 8
 # Gauss-Newton steps of a fit of a law, its damping, the smallest share of a step that is tried, and
@@ -279,10 +288,6 @@ class FeatureRows:
     def mahalanobis_sq(self) -> float:
         return float(self.residual @ np.linalg.solve(self.S, self.residual))
 
-    @property
-    def log_det(self) -> float:
-        return math.log(float(np.linalg.det(self.S)))
-
 
 def point_rows(state: State, row: int, point: BodyPoint) -> FeatureRows:
     R = rotation(state.heading_rad)
@@ -311,36 +316,18 @@ def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp
 def match(
     state: State, point: BodyPoint, rule: MapRule, old_map: Collection[int] = ()
 ) -> int | None:
-    """Return the row of the landmark that a point is, or None where no match is clear.
+    """Return the row of the landmark that a point certainly is, or None.
 
-    A match must pass the gate, be likelier than a landmark not yet in the map,
-    ``N(residual; 0, S) > beta``, and beat the next best in ``d^2 + ln det S``. Landmarks of the
-    ``old_map``, by id, are not considered.
+    Landmarks of the ``old_map``, by id, are not considered.
     """
-    scored = []
-    for row in near_rows(state, point, rule.merge_reach_m):
-        if state.landmark_ids[row] in old_map:
-            continue
-        rows = point_rows(state, int(row), point)
-        scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, int(row)))
-    return clear_match(scored, rule.match_gate, rule.unmapped_per_m2, rule.match_margin)
-
-
-def clear_match(
-    scored: list[tuple[float, float, int]], gate: float, density: float, margin: float
-) -> int | None:
-    """Return the row of the best (d^2 + ln det S, d^2, row), or None where no match is clear."""
-    if not scored:
-        return None
-    scored.sort()
-    score, distance, best = scored[0]
-    if distance > gate:
-        return None
-    if -0.5 * score - math.log(math.tau) <= math.log(density):
-        return None
-    if len(scored) > 1 and scored[1][0] - score < margin:
-        return None
-    return best
+    beta = density_per_m2(state.landmarks_m, rule.merge_reach_m)
+    found = []
+    for row in near_rows(state, point, rule.merge_reach_m).tolist():
+        if state.landmark_ids[row] not in old_map:
+            rows = point_rows(state, row, point)
+            found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
+    best = certain(found)
+    return None if best is None else best.pairs[0][1]
 
 
 def update_with_point(state: State, row: int, point: BodyPoint) -> float:

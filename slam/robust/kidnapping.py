@@ -35,7 +35,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam.geometry import align_se2, between, compose, transform
-from slam.robust.association import RangeScan, SureLandmarks, View
+from slam.robust.association import RangeScan, SureLandmarks, View, density_per_m2
 from slam.robust.map import Existence, apply_merge, find_merge
 from slam.robust.parameters import BackEndParameters, MapRule, RelocationRule, SurpriseRule
 from slam.robust.run_log import RunLog
@@ -275,7 +275,7 @@ def _judged(
             targets = state.landmarks_m[np.array(old_map)]
             area = float(np.prod(np.ptp(targets, axis=0) + 2 * _SURROUNDINGS_M))
             evidence = -0.5 * (distance + log_det) - math.log(math.tau * area)
-            evidence -= len(pairs) * math.log(rule.unmapped_per_m2)
+            evidence -= len(pairs) * math.log(density_per_m2(targets, rule.merge_reach_m))
             return Join(motion=motion, pairs=pairs, evidence=evidence)
         apart = residual.reshape(-1, 2)
         blocks = [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(pairs))]

@@ -33,13 +33,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Set
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import chdtri
 
 from slam.config import WheelNoise
 from slam.geometry import between, transform
-from slam.robust.parameters import BackEndParameters, MapRule, RoundnessRule, chi_square_limit
+from slam.robust.association import Identity, certain, density_per_m2, identity
+from slam.robust.parameters import (
+    MARGIN_NATS,
+    TAIL_PROBABILITY,
+    BackEndParameters,
+    MapRule,
+    RoundnessRule,
+    chi_square_limit,
+)
 from slam.robust.run_log import LoggedSightings, RunLog
 from slam.robust.smoother import give_radius
 from slam.robust.state import Array, Indices, State, quarter_turn
@@ -51,8 +61,6 @@ _DAMPING = 1e-6
 _LEAST_SHARE, _LEAST_DECREASE = 1e-3, 1e-4
 # What keeps matrices regular, and the direction to what stands at an antenna finite
 _FLOOR, _LEAST_WAY_M = 1e-12, 1e-6
-# What rounding may add to d^2, as a share
-_ROUNDING = 1e-6
 # A radius off by e misses ranges up to 30 degrees from the middle one by e (1 - cos 30 deg), all
 # alike: to the hundred of one passage that is as noise ten times as large.
 _SHAPE_SIGMA_PER_RADIUS_SIGMA = 1.3
@@ -128,15 +136,6 @@ class Existence:
         self.forget(gone)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Merge:
-    """Pairs of landmarks that may be one, and how likely that is."""
-
-    pairs: tuple[tuple[int, int], ...]  # by row, the older first
-    mahalanobis_sq: float
-    log_likelihood: float  # ln N(l_i - l_j; 0, S), of several pairs the joint one
-
-
 def merge_rows(
     state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
 ) -> tuple[Indices, Array, Array, Array]:
@@ -149,17 +148,12 @@ def merge_rows(
     return at, H, -np.concatenate(apart), sigma_m**2 * np.eye(2 * len(pairs))
 
 
-def judge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> Merge:
+def judge(
+    state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float, density: float
+) -> Identity:
+    """Judge whether landmarks, by row, are one, in pairs."""
     at, H, residual, R = merge_rows(state, pairs, sigma_m)
-    S = H @ state.P.block(at) @ H.T + R
-    distance = float(residual @ np.linalg.solve(S, residual))
-    log_det = float(np.linalg.slogdet(S)[1])
-    k = len(residual)
-    return Merge(
-        pairs=pairs,
-        mahalanobis_sq=distance,
-        log_likelihood=-0.5 * (distance + log_det + k * math.log(math.tau)),
-    )
+    return identity(pairs, residual, H @ state.P.block(at) @ H.T + R, density)
 
 
 def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> None:
@@ -182,45 +176,43 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
 
 def find_merge(
     state: State, existence: Existence, rule: MapRule, old_map: Set[int] = frozenset()
-) -> Merge | None:
-    """Return the merge to be made now, one or two disjoint ones, or None."""
-    candidates = _candidates(state, existence, rule, old_map)
-    floor = math.log(rule.unmapped_per_m2)
-    fair = [merge for merge in candidates if merge.log_likelihood > floor]
-    best: Merge | None = None
-    for merge in fair:
-        rivals = [
-            other.log_likelihood
-            for other in candidates
-            if other is not merge and _share_landmark(other, merge)
-        ]
-        stands_out = merge.log_likelihood - max(rivals, default=-math.inf) > rule.merge_margin
-        if stands_out and (best is None or merge.log_likelihood > best.log_likelihood):
-            best = merge
+) -> Identity | None:
+    """Return the merge to be made now, of one pair or two, or None."""
+    density = density_per_m2(state.landmarks_m, rule.merge_reach_m)
+    single = _candidates(state, existence, rule, density, old_map)
+    best = certain(single)
     if best is not None:
         return best
-    return _joint_merge(state, fair, 2.0 * floor, rule)
+    likely = [one for one in single if one.is_possible]
+    return certain(
+        [
+            judge(state, one.pairs + other.pairs, rule.merge_sigma_m, density)
+            for one, other in combinations(likely, 2)
+            if not one.contradicts(other)
+        ]
+    )
 
 
 def _candidates(
-    state: State, existence: Existence, rule: MapRule, old_map: Set[int]
-) -> list[Merge]:
-    """Return all merges of two landmarks within reach that pass the gate, none of the old map."""
+    state: State, existence: Existence, rule: MapRule, density: float, old_map: Set[int]
+) -> list[Identity]:
+    """Return all merges of two landmarks within reach, none of the old map.
+
+    Those far from passing the test are left out.
+    """
     if len(state.landmark_ids) < 2:
         return []
     near = cKDTree(state.landmarks_m).query_pairs(rule.merge_reach_m, output_type="ndarray")
     near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.intp)
     distances = _distances_sq(state, near, rule.merge_sigma_m)
-    # The last word is the judge's: here, rounding must not leave out what it would accept.
-    found = []
-    for first, second in near[distances <= (1.0 + _ROUNDING) * rule.merge_gate].tolist():
-        ids = state.landmark_ids[first], state.landmark_ids[second]
-        if existence.are_apart(*ids) or not old_map.isdisjoint(ids):
-            continue
-        merge = judge(state, ((first, second),), rule.merge_sigma_m)
-        if merge.mahalanobis_sq <= rule.merge_gate:
-            found.append(merge)
-    return found
+    # What contradicts a possible one and comes within the margin of it is kept, too.
+    limit = float(chdtri(2, TAIL_PROBABILITY)) + 2.0 * MARGIN_NATS
+    return [
+        judge(state, ((first, second),), rule.merge_sigma_m, density)
+        for first, second in near[distances <= limit].tolist()
+        if not existence.are_apart(state.landmark_ids[first], state.landmark_ids[second])
+        and old_map.isdisjoint((state.landmark_ids[first], state.landmark_ids[second]))
+    ]
 
 
 def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
@@ -241,36 +233,6 @@ def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
     numerator = yy * x**2 - 2.0 * xy * x * y + xx * y**2
     spread_out = determinant > _FLOOR * xx * yy
     return np.where(spread_out, numerator / np.where(spread_out, determinant, 1.0), 0.0)
-
-
-def _joint_merge(state: State, fair: list[Merge], floor: float, rule: MapRule) -> Merge | None:
-    """Return two disjoint merges that together beat every other two that contradict them."""
-    joint = []
-    for place, one in enumerate(fair):
-        for other in fair[place + 1 :]:
-            if _share_landmark(one, other):
-                continue
-            both = judge(state, one.pairs + other.pairs, rule.merge_sigma_m)
-            if both.mahalanobis_sq <= rule.merge_gate_joint and both.log_likelihood > floor:
-                joint.append(both)
-    joint.sort(key=lambda merge: -merge.log_likelihood)
-    if not joint:
-        return None
-    best = joint[0]
-    for rival in joint[1:]:
-        contradicts = any(
-            mine != theirs and set(mine) & set(theirs)
-            for mine in best.pairs
-            for theirs in rival.pairs
-        )
-        if contradicts and best.log_likelihood - rival.log_likelihood <= rule.merge_margin:
-            return None
-    return best
-
-
-def _share_landmark(one: Merge, other: Merge) -> bool:
-    mine = {row for pair in one.pairs for row in pair}
-    return any(row in mine for pair in other.pairs for row in pair)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,11 @@ from dataclasses import dataclass, field
 from slam.config import WheelNoise
 from slam.geometry import FieldOfView
 
+# Of what is true, one in so many is thrown away by a test.
+TAIL_PROBABILITY = 1e-3
+# How many times likelier than any other an explanation must be to be acted upon, in nats: twenty
+MARGIN_NATS = 3.0
+
 
 def chi_square_limit(dof: int, excess_sigmas: float) -> float:
     """Return the limit that lies some standard deviations of chi-square above its mean."""
@@ -87,19 +92,8 @@ class TrackletRule:
 class MapRule:
     """When a point is a known landmark, two landmarks are one, or a landmark is none."""
 
-    # Density beta of landmarks not yet in the map: the likelihood of a match must exceed it
-    unmapped_per_m2: float = 1.0
-    # Bound on d^2 of a point and a landmark (2 dof), and by how much ``d^2 + ln det S`` must beat
-    # the next
-    match_gate: float = 13.8
-    match_margin: float = 6.0
-    # Frames between looks, largest distance, bounds on d^2 of one merge and of two together (2 and
-    # 4 dof), and by how many nats a merge must beat its competitors
-    merge_every: int = 5
-    merge_reach_m: float = 1.5
-    merge_gate: float = 11.8
-    merge_gate_joint: float = 18.5
-    merge_margin: float = 3.0
+    merge_every: int = 5  # frames between looks
+    merge_reach_m: float = 1.5  # largest distance of two that may be one
     merge_sigma_m: float = 1e-5  # noise of the statement that two landmarks are one
     apart_frames: int = 3  # two landmarks seen whole in this many common frames are two
     # Steps, ceiling and floor of a landmark's existence score
@@ -124,12 +118,6 @@ class WallRule:
     # By how much chi-square must be less under a law for a wall, or a point, to be believed
     wall_margin: float = 30.0
     point_margin: float = 0.0
-    # Bound on d^2 of a wall seen and one mapped (2 dof), and by how much ``d^2 + ln det S`` must
-    # beat the next
-    match_gate: float = 13.8
-    match_margin: float = 6.0
-    # Density of walls not yet in the map: the likelihood of a match must exceed it
-    unmapped_per_rad_m: float = 0.3
     # Walls are known in cells of this length; how far from one of them what looks like the same
     # wall may be that
     cell_m: float = 0.1

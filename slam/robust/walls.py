@@ -25,16 +25,16 @@ from itertools import combinations, product
 import numpy as np
 
 from slam.geometry import wrap_angle
-from slam.robust.association import Antennas, View
+from slam.robust.association import Antennas, View, certain, identity
 from slam.robust.initialisation import (
     MEMBER_MARGIN_RAD,
+    SEEN,
     FeatureRows,
     Guess,
     Search,
     Tracker,
     Tracklet,
     UnassignedRanges,
-    clear_match,
     find_tracklets,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
@@ -150,20 +150,24 @@ def wall_rows(state: State, wall_row: int, seen: BodyWall) -> FeatureRows:
     return FeatureRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
 
 
-def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> int | None:
-    """Return the row of the wall that a wall seen is, or None where no match is clear.
+def match_wall(
+    state: State, seen: BodyWall, cells: WallCells, parameters: BackEndParameters
+) -> int | None:
+    """Return the row of the wall that a wall seen certainly is, or None.
 
-    The rules are those of points; and the two must come within reach of each other along the line.
+    The rule is that of points; and the two must come within reach of each other along the line. The
+    walls of the map are spread over all directions and the distances that a radar sees.
     """
-    feet = seen.in_map(state)
-    scored = []
+    feet, reach_m = seen.in_map(state), parameters.walls.reach_m
+    beta = max(len(state.wall_ids), 1) / (math.tau * parameters.ranges.max_range_m)
+    found = []
     for row, wall_id in enumerate(state.wall_ids):
         along = along_wall(state, row, feet)
-        if min(cells.distance_m(wall_id, float(place)) for place in along) > rule.reach_m:
-            continue
-        rows = wall_rows(state, row, seen)
-        scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, row))
-    return clear_match(scored, rule.match_gate, rule.unmapped_per_rad_m, rule.match_margin)
+        if min(cells.distance_m(wall_id, float(place)) for place in along) <= reach_m:
+            rows = wall_rows(state, row, seen)
+            found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
+    best = certain(found)
+    return None if best is None else best.pairs[0][1]
 
 
 def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> bool:
@@ -290,7 +294,7 @@ class WallKeeper:
             by_offsets=tracklet.by_offsets,
             feet_m=antennas + np.outer(d - antennas @ n, n),
         )
-        row = match_wall(state, seen, self.cells, self._rule)
+        row = match_wall(state, seen, self.cells, self._parameters)
         if row is None:
             if is_unresolved(state, seen, self.cells, self._rule):
                 return None

@@ -38,6 +38,8 @@ from slam.robust.initialisation import (
     range_bearing_rows,
 )
 from slam.robust.parameters import (
+    MARGIN_NATS,
+    TAIL_PROBABILITY,
     BackEndParameters,
     ContinuationRule,
     MapRule,
@@ -180,9 +182,6 @@ def test_the_brute_force_has_work_to_do() -> None:
         (PointRule().gate, 2, 0.99),
         (RULE.gates[0], 1, 0.9973),
         (RULE.gates[1], 2, 0.999),
-        (MapRule().match_gate, 2, 0.999),
-        (MapRule().merge_gate, 2, 0.9973),
-        (MapRule().merge_gate_joint, 4, 0.999),
     ],
 )
 def test_gates_are_quantiles_of_chi_square(gate: float, dof: int, share: float) -> None:
@@ -290,8 +289,11 @@ def test_a_point_is_matched_by_the_rule_written_out(seed: int, n: int) -> None:
         scores.append((squared + math.log(np.linalg.det(rows.S)), squared, density, row))
     scores.sort()
     _, squared, density, best = scores[0]
-    clear = len(scores) == 1 or scores[1][0] - scores[0][0] >= rule.match_margin
-    wanted = squared <= rule.match_gate and density > rule.unmapped_per_m2 and clear
+    clear = len(scores) == 1 or scores[1][0] - scores[0][0] > 2.0 * MARGIN_NATS
+    apart = state.landmarks_m[:, None] - state.landmarks_m[None, :]
+    others = int((np.hypot(apart[..., 0], apart[..., 1]) <= rule.merge_reach_m).sum()) - n
+    per_m2 = max(others / n, 1.0) / (math.pi * rule.merge_reach_m**2)
+    wanted = squared <= chi2.isf(TAIL_PROBABILITY, 2) and density > per_m2 and clear
     assert match(state, point, rule) == (best if wanted else None)
 
 
@@ -308,18 +310,18 @@ def sure_point(sigma_m: float, *landmarks_m: tuple[float, float]) -> tuple[State
     return state, point
 
 
-@pytest.mark.parametrize(("sigma_m", "row"), [(0.39, 0), (0.41, None)])
+@pytest.mark.parametrize(("sigma_m", "row"), [(1.06, 0), (1.07, None)])
 def test_a_point_that_is_likelier_new_is_no_match(sigma_m: float, row: int | None) -> None:
-    """1 / (2 pi sigma^2) exceeds one landmark per square metre below 0.399 m."""
+    """1 / (2 pi sigma^2) exceeds one landmark on a disc of 1.5 m for sigma < 1.061 m."""
     state, point = sure_point(sigma_m, (1.0, 0.0))
-    assert match(state, point, MapRule(unmapped_per_m2=1.0)) == row
+    assert match(state, point, MapRule()) == row
 
 
 @pytest.mark.parametrize(("apart_m", "row"), [(0.244, None), (0.246, 1)])
 def test_a_point_between_two_landmarks_is_neither(apart_m: float, row: int | None) -> None:
     """(0.245 m / 0.1 m)^2 = 6 is the likelihood margin."""
     state, point = sure_point(0.1, (1.0, apart_m), (1.0, 0.0))
-    assert match(state, point, MapRule(match_margin=6.0)) == row
+    assert match(state, point, MapRule()) == row
 
 
 # --- what is left alone ---------------------------------------------------------------------------

@@ -147,8 +147,8 @@ def test_a_merge_must_stand_out_from_its_rivals() -> None:
     [
         (0.069, 0.02, False),
         (0.070, 0.02, True),  # 12^0.5 sigma: 3 nats less likely, as each is unsure by sigma
-        (9.0, 0.284, False),
-        (9.0, 0.280, True),  # below (4 pi)^-0.5 m the density exceeds 1 per square metre
+        (9.0, 0.751, False),
+        (9.0, 0.749, True),  # below 0.75 m, 1 / (4 pi sigma^2) exceeds one on a disc of 1.5 m
     ],
 )
 def test_a_merge_is_made_from_the_likelihood_margin_and_the_density_on(

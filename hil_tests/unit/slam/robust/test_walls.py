@@ -163,10 +163,10 @@ def test_walls_match_only_where_they_were_seen() -> None:
     row = state.wall_ids.index(wall_id)
     along = seen.in_map(state) @ np.array([-math.sin(1.9), math.cos(1.9)])
     cells.add(wall_id, along)
-    assert match_wall(state, seen, cells, rule) == row
+    assert match_wall(state, seen, cells, BackEndParameters()) == row
     elsewhere = WallCells(0.1)
     elsewhere.add(wall_id, along + 5.0)
-    assert match_wall(state, seen, elsewhere, rule) is None
+    assert match_wall(state, seen, elsewhere, BackEndParameters()) is None
     beside = replace(seen, wall=np.add(seen.wall, [0.02, 0.03]), feet_m=1.02 * seen.feet_m)
     sure = replace(beside, covariance=1e-8 * np.eye(2))
     assert is_unresolved(state, sure, cells, rule)
@@ -178,8 +178,8 @@ def test_walls_match_only_where_they_were_seen() -> None:
 @pytest.mark.parametrize(
     ("others_m", "sigmas", "row"),
     [
-        ((), (0.52, 1.0), 0),
-        ((), (0.54, 1.0), None),  # 1 / (2 pi 0.531) is 0.3 walls per rad and metre
+        ((), (1.49, 1.0), 0),
+        ((), (1.51, 1.0), None),  # 1 / (2 pi 1.5) is one wall in all directions and up to 1.5 m
         ((1.244,), (0.01, 0.1), None),
         ((1.246,), (0.01, 0.1), 0),  # (0.245 m / 0.1 m)^2 is the likelihood margin, 6
     ],
@@ -188,7 +188,7 @@ def test_a_wall_that_is_likelier_new_or_another_is_no_match(
     others_m: tuple[float, ...], sigmas: tuple[float, float], row: int | None
 ) -> None:
     """The state is sure of everything; the wall is seen where the first one of the map is."""
-    state, cells, rule = State((0.0,) * 3, (0.0,) * 4), WallCells(0.1), WallRule()
+    state, cells = State((0.0,) * 3, (0.0,) * 4), WallCells(0.1)
     state.walls = np.array([[math.pi / 2, d_m] for d_m in (1.0, *others_m)])
     state.wall_ids = list(range(len(state.walls)))
     state.P = SymmetricMatrix(1e-18 * np.eye(10 + 2 * len(state.walls)))
@@ -200,7 +200,7 @@ def test_a_wall_that_is_likelier_new_or_another_is_no_match(
         by_offsets=np.zeros((2, 4)),
         feet_m=np.array([[0.0, 1.0]]),
     )
-    assert match_wall(state, seen, cells, rule) == row
+    assert match_wall(state, seen, cells, BackEndParameters()) == row
 
 
 def test_cells_tell_where_a_wall_answered() -> None:
