@@ -155,10 +155,18 @@ class UpdateReport:
     dof: int
     # Every range of a landmark, not of walls, that took part, measured or not
     predicted: tuple[PredictedRange, ...] = ()
+    # What each range of a landmark, and each landmark that had none, says for the pose: its id, and
+    # the logarithm of how much likelier that is where the map has the robot than elsewhere
+    evidence: tuple[tuple[int, float], ...] = ()
     # Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
     # and covariance say nothing but that
     carried: bool = False
     lost: bool = False
+
+    @property
+    def log_likelihood(self) -> float:
+        """Return the sum of all evidence, in nats."""
+        return math.fsum(nats for _, nats in self.evidence)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

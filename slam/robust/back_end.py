@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from slam.geometry import Rig, wrap_angles
 from slam.results import PredictedRange, SmoothedRun, UpdateReport
@@ -15,6 +18,7 @@ from slam.robust.association import (
     Antennas,
     Continuation,
     RangeScan,
+    SureLandmarks,
     View,
     antennas_of,
     continue_tracks,
@@ -25,6 +29,7 @@ from slam.robust.association import (
     view,
 )
 from slam.robust.initialisation import (
+    BodyPoint,
     RangeBearing,
     Search,
     Sightings,
@@ -39,13 +44,17 @@ from slam.robust.initialisation import (
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.kidnapping import Evidence, Localisation, evidence, forget, merge_landmarks
-from slam.robust.map import Existence, Roundness
+from slam.robust.map import Existence, Roundness, apply_merge, find_merge
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import is_due, relinearise, solve_whole_run
-from slam.robust.state import Array, State, calibrated_motion, predict
+from slam.robust.state import Array, Motion, State, calibrated_motion, predict
 from slam.robust.walls import WallKeeper
+
+# Standard deviations of a step that the wheels did not measure, and far more than what is left to
+# know of the pose it leads to; the latter set nothing.
+_CARRIED_M, _CARRIED_RAD = 100.0, 10.0
+_FREE_M, _FREE_RAD = 1.0, 1.0
 
 
 def huber_weighted_sigmas_m(
@@ -73,7 +82,8 @@ class Matches:
     continued: list[Continuation] = field(default_factory=list)
     # The ranges of every landmark that took part, measured or not
     predicted: list[PredictedRange] = field(default_factory=list)
-    evidence: list[Evidence] = field(default_factory=list)  # for or against the present pose
+    # Landmarks well in view, one entry per radar, that have no range near their prediction
+    missed: list[int] = field(default_factory=list)
 
 
 class RobustBackEnd:
@@ -102,7 +112,6 @@ class RobustBackEnd:
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
-        self._localisation = Localisation(parameters)
 
     @property
     def pose(self) -> Array:
@@ -111,18 +120,24 @@ class RobustBackEnd:
 
     @property
     def pose_covariance(self) -> Array:
-        if self._localisation.is_lost:
-            return self._localisation.lost_covariance
         return self.state.pose_covariance()
 
+    def copy(self) -> RobustBackEnd:
+        """Return a back end that goes on from here by itself; what never changes is shared."""
+        rules = [getattr(self.parameters, rule.name) for rule in fields(self.parameters)]
+        shared = [self.rig, self.parameters, *rules]
+        return copy.deepcopy(self, {id(one): one for one in shared})
+
+    def with_empty_map(self) -> RobustBackEnd:
+        """Return a back end at the origin of a map of its own, that has learned the calibration."""
+        other = RobustBackEnd(self.rig, self.parameters)
+        other.state.take_calibration(self.state)
+        return other
+
     def reported_rows(self) -> list[int]:
-        """Return the rows of landmarks hit often enough; of a submap, none."""
-        old_map, lost = self._localisation.old_map, self._localisation.is_lost
-        return [
-            row
-            for row, id_ in enumerate(self.state.landmark_ids)
-            if self._existence.is_reported(id_) and (id_ in old_map or not lost)
-        ]
+        """Return the rows of landmarks hit often enough."""
+        ids = self.state.landmark_ids
+        return [row for row, id_ in enumerate(ids) if self._existence.is_reported(id_)]
 
     def wall_spans_m(self) -> Array:
         """Return the ends of the reported stretches of wall, (k, 2, 2) [m], map frame."""
@@ -166,19 +181,43 @@ class RobustBackEnd:
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
 
-    def update(self, scans: Sequence[RangeScan]) -> UpdateReport:
-        """Take in the scans of one time; a radar without a frame is absent, not empty."""
+    def step_covariance(self, increment: Array, covariance: Array | None = None) -> Array:
+        """Return the covariance (3, 3) that ``predict`` takes the noise of an increment to have."""
+        wheels, calibration = self.parameters.wheels, self.state.calibration
+        return calibrated_motion(increment, calibration, wheels, covariance).covariance
+
+    def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
+        """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
+
+        ``points`` are ids of landmarks with where they lie, (2,) [m] in the body frame of the pose,
+        and the covariances of that: the pose becomes as certain as they make it.
+        """
+        increment = np.zeros(3)
+        free = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
+        motion = Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=free, walk_variance=0.0)
+        self._log.add_motion(increment, motion)
+        self._unassigned.clear()
+        state = self.state
+        state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
+        for landmark_id, point_m, covariance in points:
+            by_offsets = np.zeros((2, len(state.offsets_m)))
+            point = BodyPoint(point_m=point_m, covariance=covariance, by_offsets=by_offsets)
+            update_with_point(state, state.landmark_ids.index(landmark_id), point)
+        self._log.set_causal(state.pose)
+
+    def update(self, scans: Sequence[RangeScan], *, sure_m: float | None = None) -> UpdateReport:
+        """Take in the scans of one time; a radar without a frame is absent, not empty.
+
+        ``sure_m`` replaces how sure a prediction must be for a range to continue a track.
+        """
         antennas = antennas_of(self.rig, scans, self.state.calibration)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         widened = [
             scan.with_added_sigma(self.parameters.ranges.association_sigma_m) for scan in scans
         ]
-        matches, seen = self._associate(scans, widened, antennas)
-        continued, nis = self._correct(matches.continued, seen, scans, antennas)
-        carried = self._localisation.surprise.is_carried
-        if carried:
-            self._localisation.begin_submap(self.state, self._existence, self._log)
-            self._unassigned.clear()
+        matches, seen = self._associate(scans, widened, antennas, sure_m)
+        continued, nis, likelihoods = self._correct(matches.continued, seen, scans, antennas)
+        miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
@@ -191,8 +230,7 @@ class RobustBackEnd:
             nis=nis,
             dof=len(continued),
             predicted=tuple(matches.predicted),
-            carried=carried,
-            lost=self._localisation.is_lost,
+            evidence=(*likelihoods, *((id_, miss) for id_ in matches.missed)),
         )
 
     def update_points(self, points: Sequence[RangeBearing]) -> tuple[int | None, ...]:
@@ -230,46 +268,43 @@ class RobustBackEnd:
         return landmark_id
 
     def relinearise(self) -> bool:
-        """Solve for all poses and replace the belief; return whether that worked.
-
-        Not while the robot is lost or evidence speaks against its pose: a wrong measurement would
-        be spread over the whole run.
-        """
-        if not self._is_located():
-            return False
+        """Solve for all poses and replace the belief; return whether that worked."""
         return relinearise(self._log, self.state, self.parameters)
 
-    def _is_located(self) -> bool:
-        return not (self._localisation.is_lost or self._localisation.surprise.is_suspicious)
-
     def _smooth_if_due(self) -> None:
-        gave_radii = self._is_located() and self._roundness.give(
-            self.state, self._log, self.parameters, self._existence
-        )
+        gave_radii = self._roundness.give(self.state, self._log, self.parameters, self._existence)
         if gave_radii or is_due(self._log, self.state, self.parameters):
             self.relinearise()
 
     def _associate(
-        self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
+        self,
+        scans: Sequence[RangeScan],
+        widened: Sequence[RangeScan],
+        antennas: Antennas,
+        sure_m: float | None,
     ) -> tuple[Matches, View]:
-        """Find the ranges of known landmarks among the ``widened`` scans, and judge the pose."""
+        """Find the ranges of known landmarks among the ``widened`` scans."""
         state, matches = self.state, Matches()
         seen = view(state, antennas)
         if not state.feature_ids:
             return matches, seen
         seen = self._walls.look(seen, antennas)
-        seen = self._localisation.without_old_map(seen, state)
+        if sure_m is None:
+            sure_m = self.parameters.continuation.tight_sigmas * self.parameters.ranges.sigma_m
         for side in self._sides:
             if of_side := [scan for scan in widened if scan.radar in side]:
-                self._match_known_landmarks(of_side, seen, antennas, matches)
+                self._match_known_landmarks(of_side, seen, antennas, sure_m, matches)
         if any(scan.labels is not None for scan in scans):
             matches.continued = labelled(scans, state, self._landmark_of_label)
-        else:
-            self._localisation.look(matches.evidence, state, self._log)
         return matches, seen
 
     def _match_known_landmarks(
-        self, scans: Sequence[RangeScan], seen: View, antennas: Antennas, matches: Matches
+        self,
+        scans: Sequence[RangeScan],
+        seen: View,
+        antennas: Antennas,
+        sure_m: float,
+        matches: Matches,
     ) -> None:
         """Add the ranges of known landmarks on one side; count hits and misses."""
         state, existence = self.state, self._existence
@@ -279,10 +314,10 @@ class RobustBackEnd:
         near = landmarks_in_view(state, seen, radars, noise, rule)
         if near is None:
             return
-        sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
+        sure = near.surer_than(sure_m)
         shape_sigmas_m, ids = state.feature_shape_sigmas_m, state.feature_ids
         near = near.with_added_sigma(shape_sigmas_m)
-        matches.evidence += evidence(near, seen, scans, state, self.parameters)
+        self._find_missed(near, seen, scans, matches)
         inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
         known = () if sure is None else sure.landmarks
         # Too unsure for single ranges: a miss only where no echo at all is near the prediction.
@@ -304,19 +339,40 @@ class RobustBackEnd:
         whole = max(len(scans), 2)
         existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
 
+    def _find_missed(
+        self, near: SureLandmarks, seen: View, scans: Sequence[RangeScan], matches: Matches
+    ) -> None:
+        """Add the landmarks, one entry per radar, that are surely in view and have no range."""
+        noise, limits = self.parameters.ranges, self.parameters.map
+        branches, rows, ids = self.parameters.branches, near.rows, self.state.landmark_ids
+        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)
+        variances = near.prior.diagonal()
+        counts = inside[rows.radars, rows.landmarks] & (variances <= limits.view_inset_m**2)
+        counts &= rows.landmarks < len(ids)  # a wall may end before it comes into view
+        by_radar = {scan.radar: scan for scan in scans}
+        for k in np.flatnonzero(counts).tolist():
+            scan, predicted_m = by_radar[int(rows.radars[k])], float(rows.predicted_m[k])
+            reach_m = branches.miss_sigmas * math.sqrt(
+                float(variances[k]) + noise.sigma_m**2 + branches.model_sigma_m**2
+            )
+            if not scan.answers(predicted_m, reach_m):
+                matches.missed.append(ids[int(rows.landmarks[k])])
+
     def _correct(
         self,
         found: Sequence[Continuation],
         seen: View,
         scans: Sequence[RangeScan],
         antennas: Antennas,
-    ) -> tuple[tuple[tuple[int, int, int], ...], float]:
+    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
         """Correct the state with all ranges found at once, weighted by Huber; log them.
 
-        Returns (radar, index, landmark id) of each range, and the NIS before the weights.
+        Returns (radar, index, landmark id) of each range, the NIS before the weights, and of each
+        range the landmark and ln(Pd p / lambda), where p is its density given those before it, and
+        lambda that of ranges in its scan, whatever they are of.
         """
-        if not found or self._localisation.surprise.is_carried:
-            return (), 0.0
+        if not found:
+            return (), 0.0, []
         state, ids = self.state, self.state.feature_ids
         continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
         of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
@@ -332,7 +388,22 @@ class RobustBackEnd:
         shape_sigmas_m = state.feature_shape_sigmas_m[[c.row for c in found]]
         by_state = rows.H @ state.P.block(rows.at)
         S = by_state @ rows.H.T + np.diag(np.square(sigmas) + np.square(shape_sigmas_m))
-        nis = float(innovations_m @ np.linalg.solve(S, innovations_m))
+        L = np.linalg.cholesky(S)
+        white = solve_triangular(L, innovations_m, lower=True)
+        nis = float(white @ white)
+        span_m = noise.max_range_m - noise.min_range_m
+        likelihoods = [
+            (
+                id_,
+                math.log(noise.detection_probability / max(noise.clutter_per_m, n_ranges / span_m))
+                - 0.5 * (square + math.log(math.tau))
+                - math.log(scale_m),
+            )
+            for (radar, _, id_), square, scale_m in zip(
+                continued, np.square(white).tolist(), L.diagonal().tolist(), strict=True
+            )
+            if (n_ranges := len(of_radar[radar].ranges_m))
+        ]
         prior = np.vecdot(by_state, rows.H) + np.square(shape_sigmas_m)
         sigmas = huber_weighted_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
         for (radar, at, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
@@ -348,7 +419,7 @@ class RobustBackEnd:
             )
         variances = np.square(sigmas) + np.square(shape_sigmas_m)
         state.update(rows.at, rows.H, innovations_m, variances)
-        return continued, nis
+        return continued, nis, likelihoods
 
     def _initialise_landmarks(self) -> None:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""
@@ -362,8 +433,7 @@ class RobustBackEnd:
             guesses = point_guesses(self._unassigned, radars, self.parameters.ranges, rule)
             if not guesses:
                 continue
-            lost = self._localisation.is_lost
-            for wall in () if lost else self._walls.find(self._unassigned, radars):
+            for wall in self._walls.find(self._unassigned, radars):
                 wall_id = self._walls.place(wall)
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
@@ -387,7 +457,7 @@ class RobustBackEnd:
             known = self._landmark_of_label.get(tracklet.label)
             row = None if known is None else state.landmark_ids.index(known)
         else:
-            row = match(state, point, self.parameters.map, self._localisation.old_map)
+            row = match(state, point, self.parameters.map)
         if row is None:
             landmark_id = initialise_landmark(state, point)
             if tracklet.label is not None:
@@ -420,24 +490,27 @@ class RobustBackEnd:
             )
 
     def _delete_vanished(self) -> None:
-        if self._localisation.surprise.is_suspicious:
-            return
         vanished = self._existence.lost()
         for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
-            forget(landmark_id, self.state, self._existence, self._log)
+            self.state.remove(self.state.feature_ids.index(landmark_id))
+            self._existence.forget(landmark_id)
+            self._log.drop(landmark_id)
         if vanished:
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
 
     def _merge(self) -> None:
-        """Merge landmarks, or a submap with the old map, where that is certain."""
+        """Merge landmarks where that is certain."""
         self._n_updates += 1
         rule = self.parameters.map
         if self._landmark_of_label or self._n_updates % rule.merge_every:
             return
-        localisation = self._localisation
-        if localisation.is_lost and localisation.join(self.state, self._existence, self._log):
-            self.relinearise()
-        else:
-            merge_landmarks(self.state, self._existence, self._log, rule, localisation.old_map)
+        merge = find_merge(self.state, self._existence, rule)
+        if merge is None:
+            return
+        ids = [tuple(self.state.landmark_ids[row] for row in pair) for pair in merge.pairs]
+        apply_merge(self.state, merge.pairs, rule.merge_sigma_m)
+        for kept, gone in ids:
+            self._existence.merge(kept, gone)
+            self._log.rename(gone, kept)

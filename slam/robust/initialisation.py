@@ -32,7 +32,7 @@ least Mahalanobis distance, all points of one time together and no landmark twic
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import TypeAlias
@@ -313,19 +313,13 @@ def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp
     return np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) <= reach_m)
 
 
-def match(
-    state: State, point: BodyPoint, rule: MapRule, old_map: Collection[int] = ()
-) -> int | None:
-    """Return the row of the landmark that a point certainly is, or None.
-
-    Landmarks of the ``old_map``, by id, are not considered.
-    """
+def match(state: State, point: BodyPoint, rule: MapRule) -> int | None:
+    """Return the row of the landmark that a point certainly is, or None."""
     beta = density_per_m2(state.landmarks_m, rule.merge_reach_m)
     found = []
     for row in near_rows(state, point, rule.merge_reach_m).tolist():
-        if state.landmark_ids[row] not in old_map:
-            rows = point_rows(state, row, point)
-            found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
+        rows = point_rows(state, row, point)
+        found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
     best = certain(found)
     return None if best is None else best.pairs[0][1]
 

@@ -31,7 +31,7 @@ Round targets
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Set
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -174,12 +174,10 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
         state.remove(row)
 
 
-def find_merge(
-    state: State, existence: Existence, rule: MapRule, old_map: Set[int] = frozenset()
-) -> Identity | None:
+def find_merge(state: State, existence: Existence, rule: MapRule) -> Identity | None:
     """Return the merge to be made now, of one pair or two, or None."""
     density = density_per_m2(state.landmarks_m, rule.merge_reach_m)
-    single = _candidates(state, existence, rule, density, old_map)
+    single = _candidates(state, existence, rule, density)
     best = certain(single)
     if best is not None:
         return best
@@ -194,12 +192,9 @@ def find_merge(
 
 
 def _candidates(
-    state: State, existence: Existence, rule: MapRule, density: float, old_map: Set[int]
+    state: State, existence: Existence, rule: MapRule, density: float
 ) -> list[Identity]:
-    """Return all merges of two landmarks within reach, none of the old map.
-
-    Those far from passing the test are left out.
-    """
+    """Return all merges of two landmarks within reach, those far from passing the test left out."""
     if len(state.landmark_ids) < 2:
         return []
     near = cKDTree(state.landmarks_m).query_pairs(rule.merge_reach_m, output_type="ndarray")
@@ -211,7 +206,6 @@ def _candidates(
         judge(state, ((first, second),), rule.merge_sigma_m, density)
         for first, second in near[distances <= limit].tolist()
         if not existence.are_apart(state.landmark_ids[first], state.landmark_ids[second])
-        and old_map.isdisjoint((state.landmark_ids[first], state.landmark_ids[second]))
     ]
 
 

@@ -171,44 +171,34 @@ class RelinearisationRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SurpriseRule:
-    """When the robot is not where the map has it."""
+class BranchRule:
+    """When the robot may have slipped or been carried, and when that is believed."""
 
-    # A range is near a prediction within so many standard deviations; predictions less sure than
-    # that are no evidence
-    gate_sigmas: float = 3.0
-    most_sigma_m: float = 0.05
-    # How far inside a radar's limits a landmark must lie to give evidence
-    view_inset_rad: float = 0.15
-    view_inset_m: float = 0.1
-    # Least probability that a range lies near a prediction it has nothing to do with
-    least_chance: float = 0.05
-    # Most evidence [nats] that one landmark gives against the pose (it may have been taken away)
-    # and for it (other ranges may lie near its prediction for long)
+    # A landmark is missed if no range lies within so many standard deviations, that of the model
+    # included: what the scattering centre of a body may wander, added in squares
+    miss_sigmas: float = 3.0
+    model_sigma_m: float = 0.01
+    # Over so many steps the errors of the ranges of one target hang together: their evidence counts
+    # as often less
+    correlated_steps: float = 2.0
+    # Most evidence [nats] that one landmark gives against a place (it may have been taken away) and
+    # for it (other ranges may lie near its prediction for long)
     most_against: float = 12.0
     most_for: float = 8.0
-    # Frames between two moments at which the robot may have been carried; how many are tested
-    every: int = 10
-    hypotheses: int = 40
-    # Evidence from which on no decision is final, and from which on the robot counts as carried
-    suspicious: float = 2.0
-    carried: float = 25.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelocationRule:
-    """When a constellation of landmarks tells where on the map a robot was set down."""
-
-    least_landmarks: int = 3  # fewest landmarks a join rests on
-    # Least evidence [nats] of a join against all new landmarks, and over every other join
+    # Evidence [nats] against the pose from which on alternatives are looked for, and by which an
+    # alternative must be likelier to be adopted: a slip is more frequent than a carry
+    suspicious: float = 12.0
+    slip_price: float = 12.0
+    carry_price: float = 25.0
+    # What a slip adds to the standard deviations of a step
+    slip_m: float = 0.015
+    slip_rad: float = 0.035
+    steps: int = 15  # over which a slip is looked for, and an alternative proves itself
+    # Fewest landmarks that say where a map lies on another, least evidence [nats] of that against
+    # new landmarks and against every other place, and how far lengths and places may differ
+    least_landmarks: int = 3
     evidence: float = 8.0
-    margin: float = 8.0
-    # Least distance of two landmarks that a guess is made from, how far lengths and places may
-    # differ in a guess, and by how much two joins differ at least
-    least_base_m: float = 0.3
     reach_m: float = 0.2
-    turn_rad: float = 0.2
-    most_tried: int = 200  # most guesses judged at a time
     # Standard deviation that is stated of the position while it is not known
     lost_position_m: float = 5.0
 
@@ -231,8 +221,7 @@ class BackEndParameters:
     continuation: ContinuationRule = field(default_factory=ContinuationRule)
     tracklets: TrackletRule = field(default_factory=TrackletRule)
     map: MapRule = field(default_factory=MapRule)
-    surprise: SurpriseRule = field(default_factory=SurpriseRule)
-    relocation: RelocationRule = field(default_factory=RelocationRule)
+    branches: BranchRule = field(default_factory=BranchRule)
     walls: WallRule = field(default_factory=WallRule)
     roundness: RoundnessRule = field(default_factory=RoundnessRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)

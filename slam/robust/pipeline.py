@@ -18,6 +18,7 @@ from slam.packed import PackedRows
 from slam.results import Belief, PoseAt, SmoothedRun, StepResult
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
+from slam.robust.branches import Branches
 from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.state import quarter_turn
 
@@ -41,10 +42,15 @@ class RobustSlam:
     ) -> None:
         self.config = config
         self.rig = rig
-        self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels, rules))
+        self._branches = Branches(rig, back_end_parameters(config, wheels, rules))
         self._detector = detector or make_detector(config, rig)
         self._pose: Array | None = None  # odometry at the last state
         self._stamps_ns = PackedRows(np.dtype(np.int64))  # of all states
+
+    @property
+    def back_end(self) -> RobustBackEnd:
+        """Return the back end that is believed now."""
+        return self._branches.main
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
@@ -94,16 +100,16 @@ class RobustSlam:
             radar: None if stamp_ns == t_ns else between(pose, pose_at(stamp_ns))
             for radar, stamp_ns in stamps_ns.items()
         }
-        back_end = self.back_end
-        back_end.predict(between(self._pose, pose))
-        report = back_end.update(self._scans(detections, sigmas_m, moved))
+        branches = self._branches
+        branches.predict(between(self._pose, pose))
+        report = branches.update(self._scans(detections, sigmas_m, moved))
         self._pose = pose
         self._stamps_ns.append(t_ns)
         return (
             StepResult(
                 t_ns=t_ns,
                 odometry_pose=pose,
-                belief=belief_of(back_end, is_lost=report.lost),
+                belief=belief_of(branches.map, branches.lost_covariance),
                 detections=detections,
                 report=report,
                 range_sigmas_m=sigmas_m,
@@ -168,10 +174,10 @@ def back_end_parameters(
     )
 
 
-def belief_of(back_end: RobustBackEnd, *, is_lost: bool = False) -> Belief:
+def belief_of(back_end: RobustBackEnd, lost_covariance: Array | None = None) -> Belief:
     """Return pose and reported landmarks with additive errors, as a belief of its own.
 
-    While the robot is lost the map is as it was, and the pose on it is unknown.
+    While the robot is lost its pose on the map has the covariance ``lost_covariance`` (3, 3).
 
     With e_add = e + t e_th, t = J x for every point x (``State.additive_transform``), the
     covariance is P + t p_th^T + p_th t^T + P_thth t t^T: O(m^2), not a product of matrices.
@@ -186,9 +192,9 @@ def belief_of(back_end: RobustBackEnd, *, is_lost: bool = False) -> Belief:
     )
     along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
     covariance = P + (along + along.T)
-    if is_lost:
+    if lost_covariance is not None:
         covariance[:3], covariance[:, :3] = 0.0, 0.0
-        covariance[:3, :3] = back_end.pose_covariance
+        covariance[:3, :3] = lost_covariance
     return Belief(
         mean=np.concatenate([state.pose, landmarks.ravel()]),
         covariance=covariance,

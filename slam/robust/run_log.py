@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam.config import WheelNoise
-from slam.geometry import compose, wrap_angle
+from slam.geometry import wrap_angle
 from slam.packed import PackedRows
 from slam.robust.state import Array, Indices, Motion, State, rotation
 
@@ -22,8 +22,6 @@ from slam.robust.state import Array, Indices, Motion, State, rotation
 _LEAST_SIGMA = 1e-7
 # Of the first pose [m, rad], where a run's own map begins
 _POSE_SIGMA = 1e-6
-# Standard deviations of a step that the wheels did not measure.
-_CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 # No frame gives more used ranges than that.
 _MOST_RANGES_PER_POSE = 24
 
@@ -314,24 +312,6 @@ class RunLog:
         """Return how far [m], and by what angle [rad], a pose is from the stored trajectory."""
         away = pose - self._stored_pose
         return float(np.hypot(away[0], away[1])), abs(wrap_angle(float(away[2])))
-
-    def forget_from(self, pose: int) -> None:
-        """Forget all measurements from a pose on; the steps stay."""
-        for table in (self._ranges, self._points):
-            table.keep(table.all()["pose"] < pose, self._first)
-
-    def break_odometry(self, pose: Array) -> None:
-        """Make the last step uninformative, and set the newest pose."""
-        self._covariances.rows[-1] = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
-        self._causal.rows[-1] = pose
-        self._stored_pose = pose
-
-    def move_poses(self, first: int, motion: Array) -> None:
-        """Apply a motion (3,) from the left to all poses from one on."""
-        poses = self._causal.rows
-        for k in range(first, len(poses)):
-            poses[k] = compose(motion, poses[k])
-        self._stored_pose = poses[-1].copy()
 
     def add_range(
         self,

@@ -395,6 +395,30 @@ class State:
         T[:2, 2] = quarter_turn(self.position_m)
         return np.asarray(T @ P @ T.T)
 
+    def set_pose(self, pose: Array, covariance: Array) -> None:
+        """Set the pose, x [m], y [m] and heading, and the (3, 3) covariance of its additive error.
+
+        That is independent of all others'; theirs stay what they were.
+        """
+        T = self.additive_transform()
+        P = T @ self.P.full() @ T.T
+        P[:3, :], P[:, :3] = 0.0, 0.0
+        order = np.array([2, 0, 1])
+        P[:3, :3] = covariance[np.ix_(order, order)]
+        self.position_m, self.heading_rad = np.array(pose[:2]), float(pose[2])
+        T = self.additive_transform()
+        T[1:, HEADING] *= -1.0
+        P = T @ P @ T.T
+        self.P = SymmetricMatrix((P + P.T) / 2)
+
+    def take_calibration(self, other: State) -> None:
+        """Take over the calibration and the offsets of a state, in a state without landmarks."""
+        self.calibration, self.offsets_m = other.calibration.copy(), other.offsets_m.copy()
+        known = np.arange(CALIBRATION.start, self.offsets.stop)
+        P = self.P.full()
+        P[np.ix_(known, known)] = other.P.block(known)
+        self.P = SymmetricMatrix(P)
+
     def additive_transform(self) -> Array:
         """Return T with e_additive = T e, shape (m, m), at the present mean."""
         T = np.eye(self.P.size)

@@ -14,14 +14,12 @@ from slam.geometry import paper_rig
 from slam.robust.association import RangeScan, antennas_of, landmarks_in_view, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import UnassignedRanges
-from slam.robust.kidnapping import Evidence, Surprise
 from slam.robust.map import radius_of
 from slam.robust.parameters import (
     BackEndParameters,
     ContinuationRule,
     RangeNoise,
     RoundnessRule,
-    SurpriseRule,
 )
 from slam.robust.run_log import RunLog, start_prior
 from slam.robust.smoother import give_radius
@@ -163,14 +161,3 @@ def test_echoes_that_overlap_tell_no_radius() -> None:
     left = unassigned.sightings(np.array([(0, 0, 0), (0, 0, 2), (0, 0, 3)]), np.zeros(4))
     assert left.alone.tolist() == [False, True, False]
     assert len(unassigned.newest(0)) == 3
-
-
-def test_one_landmark_that_is_not_seen_is_no_reason_for_suspicion() -> None:
-    """A box may hide it; that two are missing is one."""
-    surprise = Surprise(SurpriseRule())
-    for pose in range(40):
-        surprise.look([Evidence(0, 1.0), Evidence(1, -0.5)], pose, (0, 1, 2))
-    assert not surprise.is_suspicious
-    for pose in range(40, 80):
-        surprise.look([Evidence(0, 1.0), Evidence(2, 1.0)], pose, (0, 1, 2))
-    assert surprise.is_suspicious

@@ -1,0 +1,245 @@
+"""A robot that slips or is carried away: both are noticed, and put right from what was measured."""
+
+import math
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.slam.robust.range_world import LAB, Run, parameters_for, reported, scans_of
+from slam.evaluation import nees_pose
+from slam.geometry import between, compose, paper_rig
+from slam.results import UpdateReport
+from slam.robust.association import RangeScan
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.branches import Branches, Tally
+from slam.robust.parameters import BackEndParameters, BranchRule
+from slam.robust.state import Array
+
+SIGMA_M = 7.4e-3
+PLACES = np.array(
+    [[0.1, 0.9], [0.55, 0.7], [0.95, 1.1], [1.5, 0.8], [0.3, -0.8], [0.8, -1.0], [1.25, -0.7]]
+)
+RULE = BranchRule()
+
+
+def led(
+    branches: Branches, increments: Iterable[Array], scans: Iterable[list[RangeScan]]
+) -> Iterator[UpdateReport]:
+    for increment, of_pose in zip(increments, scans, strict=True):
+        branches.predict(increment)
+        yield branches.update(of_pose)
+
+
+def straight(n: int) -> Array:
+    """Return poses there and back again past seven landmarks."""
+    x = np.arange(0.0, 1.5, 0.02)
+    there = np.column_stack([x, np.zeros((len(x), 2))])
+    return np.vstack([there, there[::-1][:n]])
+
+
+def carried_run(seed: int) -> tuple[Run, int]:
+    """Return a drive past seven landmarks and back; the robot is turned by hand and goes on."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(0.0, 1.5, 0.02)
+    there = straight(60)
+    elsewhere = np.column_stack([1.4 - x, np.full(len(x), 0.1), np.full(len(x), math.pi)])
+    poses = np.vstack([there, elsewhere])
+    increments = reported(poses, LAB, rng, 0.0, unaware=len(there))
+    scans = list(scans_of(poses, PLACES, rng, SIGMA_M))
+    return Run(poses=poses, landmarks=PLACES, increments=increments, scans=scans), len(there)
+
+
+def slipped_run(seed: int, slip: Array) -> Run:
+    """Return a drive there and back; halfway back the wheels report a motion that was none."""
+    rng = np.random.default_rng(seed)
+    poses = straight(70)
+    increments = reported(poses, LAB, rng, 0.0)
+    increments[100] = compose(increments[100], slip)
+    scans = list(scans_of(poses, PLACES, rng, SIGMA_M))
+    return Run(poses=poses, landmarks=PLACES, increments=increments, scans=scans)
+
+
+def error_m(pose: Array, truth: Array) -> float:
+    return float(np.hypot(*(pose - truth)[:2]))
+
+
+def test_a_carried_robot_finds_itself_on_the_map() -> None:
+    run, cut = carried_run(0)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    carried, lost = [], []
+    for k, report in enumerate(led(branches, run.increments, run.scans), start=1):
+        if report.carried:
+            carried.append(k)
+        if report.lost:
+            lost.append(k)
+            assert branches.lost_covariance is not None
+            assert math.sqrt(branches.lost_covariance[0, 0]) > 1.0
+    assert len(carried) == 1
+    assert 0 <= carried[0] - cut <= 80
+    assert lost == list(range(carried[0], carried[0] + len(lost)))
+    assert not branches.is_lost
+    back_end = branches.main
+    assert error_m(back_end.pose, run.poses[-1]) < 0.03
+    assert nees_pose(back_end.pose, back_end.pose_covariance, run.poses[-1]) < 16.0
+    assert len(back_end.reported_rows()) == len(PLACES)
+
+
+def test_a_motion_the_wheels_report_is_no_kidnapping() -> None:
+    run, cut = carried_run(1)
+    branches = Branches(paper_rig(), BackEndParameters())
+    for report in led(branches, run.increments[: cut - 1], run.scans[: cut - 1]):
+        assert not report.carried
+        assert not report.lost
+
+
+def test_a_slip_is_taken_back() -> None:
+    """40 mm and 4 degrees, more than twice the sigma of a slip, in one step."""
+    slip = np.array([0.04, 0.0, math.radians(4.0)])
+    run = slipped_run(2, slip)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    alone = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for report, increment, scans in zip(
+        led(branches, run.increments, run.scans), run.increments, run.scans, strict=True
+    ):
+        assert not report.carried
+        assert not report.lost
+        alone.predict(increment)
+        alone.update(scans)
+    end, back_end = run.poses[-1], branches.main
+    assert error_m(back_end.pose, end) < 0.015
+    assert abs(back_end.pose[2]) < math.radians(1.0)
+    assert nees_pose(back_end.pose, back_end.pose_covariance, end) < 16.0
+    assert error_m(back_end.pose, end) < 0.5 * error_m(alone.pose, end)
+
+
+def test_without_slip_or_carry_the_back_end_is_alone() -> None:
+    """Nothing that branches do shows in its numbers."""
+    run, cut = carried_run(3)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    alone = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for _ in led(branches, run.increments[: cut - 1], run.scans[: cut - 1]):
+        pass
+    for increment, scans in zip(run.increments[: cut - 1], run.scans[: cut - 1], strict=True):
+        alone.predict(increment)
+        alone.update(scans)
+    assert np.array_equal(branches.main.pose, alone.pose)
+    assert np.array_equal(branches.main.state.P.full(), alone.state.P.full())
+
+
+def test_the_same_steps_give_the_same_bits() -> None:
+    run, _ = carried_run(4)
+    ends = []
+    for _ in range(2):
+        branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+        reports = list(led(branches, run.increments, run.scans))
+        ends.append((branches.main.pose.tobytes(), branches.main.state.P.full().tobytes(), reports))
+    assert ends[0] == ends[1]
+
+
+def test_a_copy_goes_on_by_itself() -> None:
+    run, cut = carried_run(5)
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    steps = list(zip(run.increments[:cut], run.scans[:cut], strict=True))
+    for increment, scans in steps[:100]:
+        back_end.predict(increment)
+        back_end.update(scans)
+    copied, before = back_end.copy(), back_end.state.P.full()
+    for increment, scans in steps[100:]:
+        copied.predict(increment)
+        copied.update(scans)
+    assert np.array_equal(back_end.state.P.full(), before)
+    for increment, scans in steps[100:]:
+        back_end.predict(increment)
+        back_end.update(scans)
+    assert np.array_equal(back_end.pose, copied.pose)
+    assert np.array_equal(back_end.state.P.full(), copied.state.P.full())
+
+
+def test_a_robot_set_down_is_as_certain_as_the_points_it_sees() -> None:
+    run, cut = carried_run(6)
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for increment, scans in zip(run.increments[: cut - 1], run.scans[: cut - 1], strict=True):
+        back_end.predict(increment)
+        back_end.update(scans)
+    landmarks, ids = back_end.state.landmarks_m.copy(), list(back_end.state.landmark_ids)
+    pose = np.array([0.7, 0.2, 2.0])
+    unknown = back_end.copy()
+    unknown.set_down(pose, [])
+    assert unknown.pose == pytest.approx(pose)
+    assert math.sqrt(unknown.pose_covariance[0, 0]) > 0.5
+    assert np.array_equal(unknown.state.landmarks_m, landmarks)
+    back = between(pose, np.zeros(3))
+    c, s = math.cos(back[2]), math.sin(back[2])
+    seen = landmarks[:4] @ np.array([[c, -s], [s, c]]).T + back[:2]
+    spread = 2.5e-5 * np.eye(2)
+    back_end.set_down(pose, [(id_, p, spread) for id_, p in zip(ids, seen, strict=False)])
+    assert back_end.pose == pytest.approx(pose, abs=1e-6)
+    sigmas = np.sqrt(np.diag(back_end.pose_covariance))
+    assert (sigmas[:2] < 0.015).all()
+    assert (sigmas[:2] > 0.002).all()
+    assert sigmas[2] < 0.02
+
+
+def tally(*evidence: tuple[int, float]) -> Tally:
+    result = Tally(RULE)
+    result.add(evidence)
+    return result
+
+
+def test_ranges_that_lie_near_by_chance_for_long_do_not_make_a_place() -> None:
+    """Two landmarks that seem to be there against three that are missing."""
+    chance = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20, *[(id_, 3.0) for id_ in (4, 5)] * 50)
+    assert chance.total() > RULE.carry_price
+    assert chance.gain(tally(), RULE.most_for) < 0.0
+
+
+def test_one_landmark_alone_says_only_so_much_against_a_place() -> None:
+    gone, most = tally(*[(1, -3.0)] * 100), RULE.most_against
+    assert gone.total() == pytest.approx(-most)
+    several = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 100)
+    assert several.total() == pytest.approx(-3.0 * most)
+
+
+def test_a_place_that_explains_less_is_not_likelier() -> None:
+    """However much the other one misses: a pose of which little is certain misses little."""
+    main = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20, *[(4, 3.0)] * 5)
+    silent, better = tally(), tally(*[(id_, 3.0) for id_ in (1, 2, 3, 5)] * 20)
+    assert silent.total() > main.total()
+    assert silent.gain(main, math.inf) < 0.0
+    assert better.gain(main, RULE.most_for) > RULE.carry_price
+
+
+def test_evidence_is_the_likelihood_of_the_ranges() -> None:
+    """Of one range alone, so that its prediction is all there is to it."""
+    rng, poses = np.random.default_rng(7), straight(70)
+    increments = reported(poses, LAB, rng, 0.0)
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    noise, checked = back_end.parameters.ranges, 0
+    for increment, scans in zip(
+        increments, scans_of(poses, PLACES[[1, 5]], rng, SIGMA_M), strict=True
+    ):
+        back_end.predict(increment)
+        report = back_end.update(scans)
+        hits, missed = report.evidence[: report.dof], report.evidence[report.dof :]
+        assert [id_ for id_, _ in hits] == [id_ for _, _, id_ in report.continued]
+        assert all(
+            nats == pytest.approx(math.log(1 - noise.detection_probability)) for _, nats in missed
+        )
+        assert report.log_likelihood == pytest.approx(sum(nats for _, nats in report.evidence))
+        if report.dof == 1:
+            [(radar, _, landmark_id)] = report.continued
+            [variance] = [
+                p.variance
+                for p in report.predicted
+                if (p.radar, p.landmark_id) == (radar, landmark_id)
+            ]
+            n = next(len(scan.ranges_m) for scan in scans if scan.radar == radar)
+            density = max(n / (noise.max_range_m - noise.min_range_m), noise.clutter_per_m)
+            likelihood = math.exp(-report.nis / 2) / math.sqrt(
+                math.tau * (variance + noise.sigma_m**2)
+            )
+            expected = math.log(noise.detection_probability * likelihood / density)
+            assert hits[0][1] == pytest.approx(expected, abs=1e-6)
+            checked += 1
+    assert checked > 5

@@ -1,0 +1,117 @@
+"""Where one map lies on another, told by the constellation of their landmarks."""
+
+import math
+
+import numpy as np
+import pytest
+
+from slam.geometry import between, transform
+from slam.robust.association import density_per_m2
+from slam.robust.constellation import (
+    Constellation,
+    constellation_of,
+    find_placement,
+)
+from slam.robust.initialisation import BodyPoint, initialise_landmark
+from slam.robust.parameters import BranchRule
+from slam.robust.state import Array, State
+
+PLACES = np.array(
+    [[0.1, 0.9], [0.55, 0.7], [0.95, 1.1], [1.5, 0.8], [0.3, -0.8], [0.8, -1.0], [1.25, -0.7]]
+)
+RULE = BranchRule()
+
+
+def known(places: Array, sigma_m: float = 5e-3) -> Constellation:
+    n = len(places)
+    return Constellation(
+        ids=tuple(range(n)), points_m=places, covariance_m2=sigma_m**2 * np.eye(2 * n)
+    )
+
+
+def seen_from(pose: Array, places: Array) -> Constellation:
+    return known(transform(between(pose, np.zeros(3)), places))
+
+
+def test_a_constellation_tells_where_the_robot_is() -> None:
+    truth = np.array([0.6, 0.1, 2.0])
+    found = find_placement(seen_from(truth, PLACES[[0, 1, 2, 5]]), known(PLACES), RULE)
+    assert found is not None
+    assert set(found.pairs) == {(0, 0), (1, 1), (2, 2), (5, 3)}
+    assert found.motion == pytest.approx(truth, abs=1e-9)
+
+
+def test_a_landmark_that_moved_is_left_out() -> None:
+    truth = np.array([-0.4, 0.3, -1.0])
+    places = PLACES[[0, 1, 2, 5, 6]].copy()
+    places[1] += [0.1, -0.08]
+    found = find_placement(seen_from(truth, places), known(PLACES), RULE)
+    assert found is not None
+    assert set(found.pairs) == {(0, 0), (2, 2), (5, 3), (6, 4)}
+    assert found.motion == pytest.approx(truth, abs=1e-9)
+
+
+def test_a_constellation_that_fits_twice_tells_nothing() -> None:
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    assert find_placement(known(square), known(square), RULE) is None
+    lopsided = np.vstack([square, [0.3, 0.55]])
+    assert find_placement(known(lopsided), known(lopsided), RULE) is not None
+
+
+def test_two_landmarks_or_a_strange_place_tell_nothing() -> None:
+    assert find_placement(known(PLACES[:2]), known(PLACES), RULE) is None
+    assert find_placement(known(PLACES), known(PLACES[:2]), RULE) is None
+    strange = np.array([[0.0, 0.0], [0.61, 0.1], [0.2, 0.47], [1.3, 0.9]])
+    assert find_placement(known(strange), known(PLACES), RULE) is None
+
+
+def test_where_a_map_has_its_origin_does_not_matter() -> None:
+    truth = np.array([0.2, -0.1, 0.7])
+    moved = np.array([3.0, -2.0, 2.5])
+    here = seen_from(truth, PLACES[:4])
+    one = find_placement(here, known(PLACES), RULE)
+    other = find_placement(known(transform(moved, here.points_m)), known(PLACES), RULE)
+    assert one is not None
+    assert other is not None
+    assert other.evidence == pytest.approx(one.evidence)
+    assert other.motion == pytest.approx(
+        [*transform(truth, between(moved, np.zeros(3))[:2]), 0.7 - 2.5], abs=1e-9
+    )
+
+
+def test_evidence_is_the_likelihood_with_the_motion_integrated_out() -> None:
+    """Against the sum over a grid of motions, three landmarks of known places."""
+    sigma_m = 0.02
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [0.2, 0.8]])
+    noisy = places + np.array([[0.01, -0.005], [0.0, 0.012], [-0.008, 0.004]])
+    rule = BranchRule(evidence=-math.inf)
+    found = find_placement(known(noisy, sigma_m), known(places, sigma_m), rule)
+    assert found is not None
+    steps = np.linspace(-0.1, 0.1, 61)
+    total, variance = 0.0, 2 * sigma_m**2
+    for turn in np.linspace(-0.2, 0.2, 61):
+        c, s = math.cos(turn), math.sin(turn)
+        residual = noisy @ np.array([[c, -s], [s, c]]).T - places
+        x = residual[:, 0, None, None] + steps[:, None]
+        y = residual[:, 1, None, None] + steps[None, :]
+        squares = (x**2 + y**2).sum(axis=0)
+        total += float(np.exp(-squares / (2 * variance)).sum()) / (math.tau * variance) ** 3
+    total *= (0.2 / 60) ** 2 * (0.4 / 60)
+    area_m2 = (1.0 + 3.0) * (0.8 + 3.0)
+    expected = math.log(total / (math.tau * area_m2)) - 3 * math.log(density_per_m2(places, 1.5))
+    assert found.evidence == pytest.approx(expected, abs=0.05)
+
+
+def test_a_constellation_has_the_errors_of_its_landmarks() -> None:
+    state = State((0.007, 0.007, 0.0042), (0.0,) * 4)
+    for place in PLACES[:3]:
+        point = BodyPoint(point_m=place, covariance=2.5e-5 * np.eye(2), by_offsets=np.zeros((2, 4)))
+        initialise_landmark(state, point)
+    # A heading that is uncertain by 0.1 rad turns robot and map: additive errors, all alike.
+    turned = np.eye(state.P.size)[0]
+    state.P.add_products(turned, 0.005 * turned)
+    found = constellation_of(state, [0, 2], sigma_m=0.01)
+    assert found.ids == (0, 2)
+    swept = np.array([-PLACES[0, 1], PLACES[0, 0], -PLACES[2, 1], PLACES[2, 0]])
+    expected = 0.01 * np.outer(swept, swept) + (2.5e-5 + 1e-4) * np.eye(4)
+    assert found.covariance_m2 == pytest.approx(expected, abs=1e-12)

@@ -1,0 +1,202 @@
+"""Where one map lies on another, or on itself, told by the constellation of their landmarks.
+
+Two landmarks of either map with equal distances give a motion T that lays one pair on the other;
+all pairs of landmarks that then lie together test it. Its evidence is the likelihood of their
+residuals r with T integrated out, uniform over the surroundings of the map, of area A, and over all
+headings (S covariance of r, N derivative of r by T)::
+
+    ln p = -(r^T S^-1 r + ln det(2 pi S) + ln det(N^T S^-1 N / 2 pi)) / 2 - ln(2 pi A)
+
+against ln beta for each landmark that would otherwise be new, beta the density of the map's own
+landmarks, and against every other T.
+
+A loop is closed by the same search between the landmarks of the last stretch and older ones. There
+the state itself says how uncertain T is, and the likelihood of the residuals is that of the merge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from slam.geometry import align_se2, compose, transform
+from slam.robust.association import density_per_m2
+from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
+from slam.robust.state import HEADING, Array, State, quarter_turn, rotation
+
+Pairs = tuple[tuple[int, int], ...]
+
+# How far around its outermost landmarks, and around each of them, a map reaches
+_SURROUNDINGS_M = 1.5
+# Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
+# that keeps the matrix regular
+_STEPS, _LEAST_CHANGE, _VARIANCE_FLOOR_M2 = 5, 1e-9, 1e-10
+# Least distance of two landmarks that a guess is made from, and most guesses judged at a time
+_LEAST_BASE_M, _MOST_TRIED = 0.3, 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Constellation:
+    """Landmarks of one map, shape (n, 2), and the covariance of their additive errors (2n, 2n)."""
+
+    ids: tuple[int, ...]
+    points_m: Array
+    covariance_m2: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Placement:
+    """A motion that lays one map on another."""
+
+    motion: Array  # shape (3,), from the frame of the one to that of the other
+    pairs: Pairs  # rows: landmark of the other, landmark of the one
+    evidence: float  # in nats, against that all landmarks of the one are new
+
+
+def constellation_of(state: State, rows: Sequence[int], sigma_m: float = 0.0) -> Constellation:
+    """Return the landmarks in some rows; ``sigma_m`` is added to their errors, in squares."""
+    at_rows = np.array(rows, dtype=np.intp)
+    points = state.landmarks_m[at_rows]
+    at = np.concatenate([[HEADING], state.landmark_columns(at_rows)])
+    T = np.hstack([quarter_turn(points).reshape(-1, 1), np.eye(2 * len(at_rows))])
+    return Constellation(
+        ids=tuple(state.landmark_ids[row] for row in rows),
+        points_m=points,
+        covariance_m2=np.asarray(T @ state.P.block(at) @ T.T + sigma_m**2 * np.eye(len(at) - 1)),
+    )
+
+
+def find_placement(here: Constellation, there: Constellation, rule: BranchRule) -> Placement | None:
+    """Return the motion from ``here`` to ``there`` that stands out, or None."""
+    least = rule.least_landmarks
+    if len(here.ids) < least or len(there.ids) < least:
+        return None
+    found: dict[Pairs, Placement] = {}
+    tried: set[Pairs] = set()
+    for _, pairs in _guesses(here.points_m, there.points_m, rule):
+        if pairs in tried:
+            continue
+        tried.add(pairs)
+        placement = _judged(here, there, pairs)
+        if placement is not None and len(placement.pairs) >= least:
+            found[placement.pairs] = placement
+    ranked = sorted(found.values(), key=lambda one: -one.evidence)
+    if not ranked or ranked[0].evidence < rule.evidence:
+        return None
+    best = ranked[0]
+    middle = here.points_m.mean(axis=0)
+    for rival in ranked[1:]:
+        if best.evidence - rival.evidence >= rule.evidence:
+            break
+        if differ(best.motion, rival.motion, middle, rule):
+            return None
+    return best
+
+
+def differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:
+    """Return whether two motions (3,) bring a point to different places, or turn it otherwise."""
+    away = transform(one, point) - transform(other, point)
+    turn = math.remainder(float(one[2] - other[2]), math.tau)
+    return math.hypot(away[0], away[1]) > rule.reach_m or abs(turn) > rule.reach_m / _LEAST_BASE_M
+
+
+def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[tuple[Array, Pairs]]:
+    """Return motions that two landmarks of either map lead to, with the pairs that then agree."""
+    gaps = targets[None, :] - targets[:, None]
+    lengths = np.hypot(gaps[..., 0], gaps[..., 1])
+    angles = np.arctan2(gaps[..., 1], gaps[..., 0])
+    long_enough = lengths >= _LEAST_BASE_M
+    found = []
+    for a in range(len(points)):
+        for b in range(a + 1, len(points)):
+            gap = points[b] - points[a]
+            length = math.hypot(gap[0], gap[1])
+            if length < _LEAST_BASE_M:
+                continue
+            alike = long_enough & (np.abs(lengths - length) <= rule.reach_m)
+            for i, j in np.argwhere(alike).tolist():
+                turn = float(angles[i, j]) - math.atan2(gap[1], gap[0])
+                R = rotation(turn)
+                middle = (targets[i] + targets[j]) / 2 - R @ (points[a] + points[b]) / 2
+                moved = points @ R.T + middle
+                away = np.hypot(*np.moveaxis(targets[:, None] - moved[None, :], -1, 0))
+                pairs = _nearest(away, rule.reach_m)
+                if len(pairs) >= min(rule.least_landmarks, len(points)):
+                    found.append((np.array([middle[0], middle[1], turn]), pairs))
+    found.sort(key=lambda guess: -len(guess[1]))
+    return found[:_MOST_TRIED]
+
+
+def _nearest(away: Array, reach_m: float) -> Pairs:
+    """Return mutual nearest neighbours (row, column) within reach."""
+    best_column, best_row = away.argmin(axis=1), away.argmin(axis=0)
+    return tuple(
+        (row, int(column))
+        for row, column in enumerate(best_column)
+        if best_row[column] == row and away[row, column] <= reach_m
+    )
+
+
+def _judged(here: Constellation, there: Constellation, pairs: Pairs) -> Placement | None:
+    """Return the placement by the pairs, the worst left out until all fit; None below two."""
+    beta = density_per_m2(there.points_m, _SURROUNDINGS_M)
+    spans = np.ptp(there.points_m, axis=0) + 2 * _SURROUNDINGS_M
+    area_m2 = float(spans[0] * spans[1])
+    while len(pairs) >= 2:
+        motion, residual, S, N = _aligned(here, there, pairs)
+        S_inverse = np.linalg.inv(S)
+        distance = float(residual @ S_inverse @ residual)
+        if distance <= chdtri(max(2 * len(pairs) - 3, 1), TAIL_PROBABILITY):
+            information = N.T @ S_inverse @ N
+            log_det = float(np.linalg.slogdet(math.tau * S)[1])
+            log_det += float(np.linalg.slogdet(information / math.tau)[1])
+            evidence = -0.5 * (distance + log_det) - math.log(math.tau * area_m2)
+            evidence -= len(pairs) * math.log(beta)
+            return Placement(motion=motion, pairs=pairs, evidence=evidence)
+        blocks = [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(pairs))]
+        apart = residual.reshape(-1, 2)
+        misfits = [float(r @ np.linalg.solve(B, r)) for r, B in zip(apart, blocks, strict=True)]
+        worst = int(np.argmax(misfits))
+        pairs = pairs[:worst] + pairs[worst + 1 :]
+    return None
+
+
+def _aligned(
+    here: Constellation, there: Constellation, pairs: Pairs
+) -> tuple[Array, Array, Array, Array]:
+    """Return the motion of least squares, residual (2 k,), its covariance and derivative (2 k, 3).
+
+    residual = T l_here - l_there; the two maps are taken to have independent errors.
+    """
+    targets_at = np.array([pair[0] for pair in pairs])
+    points_at = np.array([pair[1] for pair in pairs])
+    points, targets = here.points_m[points_at], there.points_m[targets_at]
+    own = _part(here.covariance_m2, points_at)
+    other = _part(there.covariance_m2, targets_at)
+    motion = align_se2(points, targets)
+    k = 2 * len(pairs)
+    for _ in range(_STEPS):
+        turned = np.kron(np.eye(len(pairs)), rotation(float(motion[2])))
+        S = turned @ own @ turned.T + other
+        S = (S + S.T) / 2 + _VARIANCE_FLOOR_M2 * np.eye(k)
+        moved = transform(motion, points)
+        residual = (moved - targets).ravel()
+        N = np.zeros((k, 3))
+        N[0::2, 0] = N[1::2, 1] = 1.0
+        N[:, 2] = quarter_turn(moved).ravel()
+        weighted = np.linalg.solve(S, N)
+        change = -np.linalg.solve(N.T @ weighted, weighted.T @ residual)
+        motion = compose(np.array([change[0], change[1], change[2]]), motion)
+        if float(np.abs(change).max()) < _LEAST_CHANGE:
+            break
+    residual = (transform(motion, points) - targets).ravel()
+    return motion, residual, S, N
+
+
+def _part(covariance: Array, rows: Array) -> Array:
+    at = np.stack([2 * rows, 2 * rows + 1], axis=-1).ravel()
+    return np.asarray(covariance[np.ix_(at, at)])
