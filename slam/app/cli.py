@@ -45,7 +45,7 @@ CSV_TO_TUM = (
 _RUN_DESCRIPTION = """\
 Opens the modules that a rig file names by their serial numbers, follows the robot's odometry, and
 runs SLAM while frames arrive. Ends with the odometry, after --duration, or by Ctrl-C; writes
-session, map, trajectories and numbers.
+session, map, trajectories and numbers. SIGUSR1: writes smoothed.tum, the path smoothed so far.
 """
 
 _RUN_EPILOG = rf"""

@@ -277,12 +277,15 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
             f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
             f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm"
         )
-        if summary.smoothed_ate_rmse_m is not None:
-            title += f"; smoothed {1e3 * summary.smoothed_ate_rmse_m:.1f} mm"
         remark = (
             "drawn from the start pose, while the ATE is after SE(2) alignment; "
             f"last state {1e3 * summary.final_error_m:.0f} mm off"
         )
+        if summary.smoothed_ate_rmse_m is not None:
+            ate_mm, share = 1e3 * summary.smoothed_ate_rmse_m, summary.smoothed_ate_ratio
+            remark = (
+                f"smoothed at the end: ATE {ate_mm:.1f} mm, {share:.2f} of odometry's\n{remark}"
+            )
     is_narrow = figure.get_figwidth() <= NARROW_IN
     if is_narrow:  # a line each for what was driven, and what came of it
         title = title.replace(": ", ":\n", 1)
@@ -318,7 +321,7 @@ def _draw_smoothed(axes: Axes, record: RunRecord) -> None:
     if smoothed is None:
         return
     path = transform(place, smoothed.poses[:, :2])
-    axes.plot(*path.T, color=SMOOTHED, linewidth=0.9, label="smoothed at the end")
+    axes.plot(*path.T, color=SMOOTHED, linewidth=1.1, label="smoothed at the end")
     if len(smoothed.landmark_ids):
         axes.plot(
             *transform(place, smoothed.landmarks_m).T,
