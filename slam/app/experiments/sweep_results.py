@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
 from typing import Annotated, Any
 
 from matplotlib.axes import Axes
@@ -17,13 +16,13 @@ from pydantic import BaseModel, Field, ValidationError
 
 from slam.app.errors import AppError
 from slam.app.experiments import Result, table
-from slam.app.run.evaluation import ratio
 from slam.app.run.output import mm_text, share_text
 from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.app.sweep import CLEAN
 from slam.app.sweep.statistics import (
     group_name,
     in_band,
+    in_band_text,
     nis_in_band,
     settings_text,
     stress_table,
@@ -75,6 +74,11 @@ class _Anees(BaseModel):
     anees_band_95: tuple[_Nees, _Nees]
 
 
+class _Smoothed(_Anees):
+    ate_rmse_m: _Spread
+    ratio: _Spread
+
+
 class _Group(_Anees):
     """What is shown of a group of `slam.app.sweep.statistics.summarise_groups`."""
 
@@ -84,12 +88,20 @@ class _Group(_Anees):
     stress: str
     runs: Annotated[int, Field(gt=0)]
     runs_below_odometry: _Count
+    runs_above_odometry: _Count
+    runs_lost: _Count
+    runs_lost_at_end: _Count
+    carries: _Count
+    carries_in_time: _Count
+    ratio: _Spread
     ate_rmse_m: _Spread
     odometry_ate_rmse_m: _Spread
     landmark_medians: _Medians
     without_duplicates: _Error
     false_per_run: _Error
     confident_false: _Count
+    anees_mean: _Nees
+    smoothed: _Smoothed | None
     nis_mean: _Number | None
     nis_times: tuple[_NisRow, ...]
     bound: _Anees | None
@@ -214,7 +226,7 @@ def _stress(tables: Sequence[tuple[Group, Sequence[Group]]]) -> Result:
             "runs": group["runs"],
             "ate_rmse_m": group["ate_rmse_m"],
             "times_clean": {of: _finite(times_clean(group, clean, of)) for of in ("median", "p90")},
-            "anees_in_band": in_band(group),
+            **_common(group),
             "without_duplicates": group["without_duplicates"],
             "false_per_run": group["false_per_run"],
             "confident_false": group["confident_false"],
@@ -274,14 +286,9 @@ def _scenes(groups: Sequence[Group]) -> Result:
         {
             "name": group_name(group),
             "runs": group["runs"],
-            "runs_below_odometry": group["runs_below_odometry"],
+            **_common(group),
             "odometry_ate_rmse_m": group["odometry_ate_rmse_m"],
             "ate_rmse_m": group["ate_rmse_m"],
-            "ratio": _finite(
-                ratio(group["ate_rmse_m"]["median"], group["odometry_ate_rmse_m"]["median"])
-            ),
-            "anees_mean": fmean(nees for _, nees in group["anees_pose"]),
-            "anees_in_band": in_band(group),
             "times": len(group["anees_pose"]),
             "nis_mean": group["nis_mean"],
             "landmark_medians": group["landmark_medians"],
@@ -296,10 +303,19 @@ def _scenes(groups: Sequence[Group]) -> Result:
         "wheels": [mm_text(row["odometry_ate_rmse_m"]["median"]) for row in rows],
         "SLAM": [mm_text(row["ate_rmse_m"]["median"]) for row in rows],
         "SLAM p90": [mm_text(row["ate_rmse_m"]["p90"]) for row in rows],
-        "of wheels": ["-" if row["ratio"] is None else f"{row['ratio']:.3f}" for row in rows],
-        "beat wheels": [f"{row['runs_below_odometry']} of {row['runs']}" for row in rows],
+        "of wheels": [f"{row['ratio']['median']:.3f}" for row in rows],
+        "smoothed": [
+            "-" if row["smoothed_ratio"] is None else f"{row['smoothed_ratio']['median']:.3f}"
+            for row in rows
+        ],
+        "worse than wheels": [f"{row['runs_above_odometry']} of {row['runs']}" for row in rows],
+        "lost": [str(row["runs_lost"]) for row in rows],
+        "carries found": [
+            f"{row['carries_in_time']} of {row['carries']}" if row["carries"] else "-"
+            for row in rows
+        ],
         "ANEES": [f"{row['anees_mean']:.1f}" for row in rows],
-        "in band": [f"{row['anees_in_band']} of {row['times']}" for row in rows],
+        "in band": [in_band_text(group) for group in groups],
         "NIS": ["-" if row["nis_mean"] is None else f"{row['nis_mean']:.2f}" for row in rows],
         "precision": [share_text(row["landmark_medians"]["precision"]) for row in rows],
         "recall": [share_text(row["landmark_medians"]["recall"]) for row in rows],
@@ -326,6 +342,19 @@ def _scenes(groups: Sequence[Group]) -> Result:
             )
         ],
     )
+
+
+def _common(group: Group) -> Group:
+    """Return what both tables say of a group: ratios are per run, in units of its own wheels."""
+    keys = ("ratio", "runs_below_odometry", "runs_above_odometry", "runs_lost", "runs_lost_at_end")
+    smoothed = group["smoothed"]
+    return {
+        **{key: group[key] for key in (*keys, "carries", "carries_in_time")},
+        "smoothed_ratio": None if smoothed is None else smoothed["ratio"],
+        "anees_mean": group["anees_mean"],
+        "anees_in_band": in_band(group),
+        "anees_band_95": group["anees_band_95"],
+    }
 
 
 def _finite(value: float) -> float | None:

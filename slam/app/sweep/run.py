@@ -43,6 +43,7 @@ from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.session.messages import settings_text
 from slam.app.sweep import CLEAN, STRESSES, Stress, Table
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
+from slam.app.sweep.places import Carry, LostStates, carry_of
 from slam.config import ConfigError, SlamConfig, override
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
@@ -272,7 +273,8 @@ class SweepRun(Summary):
     ``settings`` are those of the preset that were replaced, dotted keys; ``false`` and
     ``confident_false`` count the landmarks of the map where nothing stands, and those of them that
     claim to be known to 5 cm; ``bound`` is on the same data, where it was asked for; ``family`` is
-    that of a random room.
+    that of a random room; ``lost_share`` is of the states that SLAM reported as lost, and ``carry``
+    what became of a robot that was carried.
     """
 
     settings: dict[str, str] = field(default_factory=dict)
@@ -281,6 +283,9 @@ class SweepRun(Summary):
     confident_false: int = 0
     bound: BoundSummary | None = None
     family: str = ""
+    lost_share: float = 0.0
+    lost_at_end: bool = False
+    carry: Carry | None = None
 
     @property
     def key(self) -> Key:
@@ -408,17 +413,26 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
             "install the same on both"
         )
     source = source_of(case, stop)
-    ranges = StateRanges()
-    record = execute(source, [ranges] if case.bound else [])
+    ranges, lost_states = StateRanges(), LostStates()
+    record = execute(source, [lost_states, ranges] if case.bound else [lost_states])
     summary = summarise(record, source.info, source.rig)
     if summary is None or record.last is None:
         raise AppError(f"{case.scene.name}: too short for SLAM, no state was estimated")
     false, confident = false_landmarks(record.last, case.scene)
+    lost = np.array(lost_states.of_states)
+    carried_ns = (
+        stressed_scene(case.scene, STRESSES[case.stress], case.seed).trajectory().carried_ns
+    )
     run = SweepRun(
         **{row.name: getattr(summary, row.name) for row in fields(summary)},
         settings=dict(case.settings),
         stress=case.stress,
         family="" if case.room is None else case.room[0],
+        lost_share=float(lost.mean()),
+        lost_at_end=bool(lost[-1]),
+        carry=None
+        if carried_ns is None
+        else carry_of(record, lost, carried_ns[1], source.info, source.rig),
         false=false,
         confident_false=confident,
         bound=bound_of(record, ranges, case.scene, case.config) if case.bound else None,

@@ -12,6 +12,7 @@ from scipy.special import gammaincinv
 from slam.app.run.evaluation import ratio
 from slam.app.run.output import mm_text, share_text
 from slam.app.sweep import CLEAN
+from slam.app.sweep.places import FOUND_WITHIN_S
 from slam.app.sweep.run import LARGEST, SweepRun
 
 _POSE_DOF = 3
@@ -26,7 +27,8 @@ def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
     were claimed to be known), the mean NEES over runs (ANEES) and the mean NIS per degree of
     freedom at each of the ten times with their 95 % bands, ATE and mean NEES of the `smoothed`
     paths where there are any, and the same errors of the known-association bound where it was
-    computed.
+    computed. `ratio` is of the runs' ATE in units of their own odometry's, `outcomes` counts what
+    went wrong.
     """
     groups = dict.fromkeys(run.group for run in runs)
     return [_group([run for run in runs if run.group == group]) for group in groups]
@@ -66,15 +68,45 @@ def group_line(group: dict[str, Any]) -> str:
     return (
         f"{group_name(group)}, {group['runs']} runs (simulated): "
         f"SLAM ATE median {mm_text(estimate['median'])} "
-        f"({ratio(estimate['median'], wheels['median']):.2f} of odometry's), "
+        f"({group['ratio']['median']:.2f} of odometry's), "
         f"p90 {mm_text(estimate['p90'])}{at_the_end}; "
         f"odometry median {mm_text(wheels['median'])}{beside}; "
         f"landmark medians: precision {share_text(found['precision'])}, "
         f"recall {share_text(found['recall'])}, rmse {mm_text(found['rmse_m'])}; "
         f"no duplicate in {group['without_duplicates']:.0%}, "
         f"{group['confident_false']} confident false landmarks; "
-        f"ANEES in band at {in_band(group)} of {len(group['anees_pose'])} times"
+        f"{outcomes_text(group)}; "
+        f"mean NEES {group['anees_mean']:.2f}, its means over runs {in_band_text(group)}"
     )
+
+
+def outcomes_text(counts: Mapping[str, Any]) -> str:
+    """Return in words how many runs failed, of a group or of `outcomes`."""
+    n_runs = counts["runs"]
+    words = [
+        f"{counts[key]} of {n_runs} runs {what}"
+        for key, what in (
+            ("runs_above_odometry", "worse than their wheels"),
+            ("runs_lost", "lost without a carry"),
+            ("runs_lost_at_end", "lost at the end"),
+        )
+    ]
+    if counts["carries"]:
+        words.append(
+            f"{counts['carries_in_time']} of {counts['carries']} carries found within "
+            f"{FOUND_WITHIN_S:g} s of the third landmark in view"
+        )
+    return ", ".join(words)
+
+
+def in_band_text(group: Mapping[str, Any]) -> str:
+    """Return how often the mean NEES is in its band, and how wide that is: few runs say little.
+
+    >>> in_band_text({"anees_pose": [[1.0, 2.0], [2.0, 6.0]], "anees_band_95": [1.25, 5.5]})
+    '1 of 2 in 1.2-5.5'
+    """
+    low, high = group["anees_band_95"]
+    return f"{in_band(group)} of {len(group['anees_pose'])} in {low:.2g}-{high:.2g}"
 
 
 def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
@@ -85,8 +117,8 @@ def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
         "preset": first.preset,
         "settings": first.settings,
         "stress": first.stress,
-        "runs": len(runs),
-        "runs_below_odometry": sum(run.ate_ratio < 1.0 for run in runs),
+        **outcomes(runs),
+        "ratio": spread([min(run.ate_ratio, LARGEST) for run in runs]),
         **{
             name: spread([getattr(run, name) for run in runs])
             for name in ("ate_rmse_m", "ate_icp_rmse_m", "odometry_ate_rmse_m", "final_error_m")
@@ -107,13 +139,35 @@ def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
     }
 
 
+def outcomes(runs: Sequence[SweepRun]) -> dict[str, int]:
+    """Return how many runs there are, and how many of them failed, and how.
+
+    ``runs_lost`` were never carried and reported themselves lost; ``carries_in_time`` are those of
+    ``carries`` that were found in time, of which one with less to see than that does not count.
+    """
+    carries = [run.carry.in_time for run in runs if run.carry and run.carry.in_time is not None]
+    return {
+        "runs": len(runs),
+        "runs_below_odometry": sum(run.ate_ratio < 1.0 for run in runs),
+        "runs_above_odometry": sum(run.ate_ratio > 1.0 for run in runs),
+        "runs_lost": sum(run.carry is None and run.lost_share > 0.0 for run in runs),
+        "runs_lost_at_end": sum(run.lost_at_end for run in runs),
+        "carries": len(carries),
+        "carries_in_time": sum(carries),
+    }
+
+
 def _anees(values: Sequence[tuple[tuple[float, float], ...]]) -> dict[str, Any]:
     """Return [time, mean over runs] at each of the ten times, and where 95 % of them belong."""
     anees = [
         [statistics.fmean(pair[0] for pair in pairs), statistics.fmean(pair[1] for pair in pairs)]
         for pairs in zip(*values, strict=True)
     ]
-    return {"anees_pose": anees, "anees_band_95": _band(_POSE_DOF * len(values), len(values))}
+    return {
+        "anees_pose": anees,
+        "anees_mean": statistics.fmean(nees for _, nees in anees),
+        "anees_band_95": _band(_POSE_DOF * len(values), len(values)),
+    }
 
 
 def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
@@ -200,7 +254,7 @@ def times_clean(group: dict[str, Any], clean: dict[str, Any], statistic: str) ->
     return ratio(group["ate_rmse_m"][statistic], clean["ate_rmse_m"][statistic])
 
 
-def in_band(group: dict[str, Any]) -> int:
+def in_band(group: Mapping[str, Any]) -> int:
     """Return at how many of the ten times the mean NEES lies in its 95 % band."""
     low, high = group["anees_band_95"]
     return sum(low <= value <= high for _, value in group["anees_pose"])
@@ -217,7 +271,6 @@ def stress_table(
 ) -> tuple[str, Sequence[str], Sequence[Sequence[str]]]:
     """Return title, header and rows of a table of `stress_tables`, for `print_table`."""
     ates = [row["ate_rmse_m"] for row in rows]
-    wheels = [row["odometry_ate_rmse_m"] for row in rows]
     columns = {
         "stress": [row["stress"] for row in rows],
         "ATE median": [mm_text(ate["median"]) for ate in ates],
@@ -227,12 +280,18 @@ def stress_table(
             for row in rows
         ],
         "x clean": [f"{times_clean(row, clean, 'median'):.2f}" for row in rows],
-        "p90 x clean": [f"{times_clean(row, clean, 'p90'):.2f}" for row in rows],
-        "of odometry": [
-            f"{ratio(ate['median'], wheel['median']):.3f}"
-            for ate, wheel in zip(ates, wheels, strict=True)
+        "of odometry": [f"{row['ratio']['median']:.3f}" for row in rows],
+        "smoothed, of odometry": [
+            f"{row['smoothed']['ratio']['median']:.3f}" if row["smoothed"] else "-" for row in rows
         ],
-        "ANEES in band": [f"{in_band(row)} of {len(row['anees_pose'])}" for row in rows],
+        "worse": [str(row["runs_above_odometry"]) for row in rows],
+        "lost": [str(row["runs_lost"]) for row in rows],
+        "carries found": [
+            f"{row['carries_in_time']} of {row['carries']}" if row["carries"] else "-"
+            for row in rows
+        ],
+        "mean NEES": [f"{row['anees_mean']:.2f}" for row in rows],
+        "ANEES in band": [in_band_text(row) for row in rows],
         "no duplicate": [f"{row['without_duplicates']:.0%}" for row in rows],
         "recall": [share_text(row["landmark_medians"]["recall"]) for row in rows],
         "false per run": [f"{row['false_per_run']:.2f}" for row in rows],

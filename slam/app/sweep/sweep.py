@@ -29,6 +29,8 @@ from slam.app.sweep.bound import PURPOSE, load_gtsam
 from slam.app.sweep.run import Case, Key, SweepRun, make_case, program_version, run_case
 from slam.app.sweep.statistics import (
     group_line,
+    outcomes,
+    outcomes_text,
     settings_text,
     stress_table,
     stress_tables,
@@ -237,6 +239,8 @@ def run_sweep(
         print_text(one_line(group_line(group)))
     for clean, rows in stress_tables(groups):
         print_table(*stress_table(clean, rows))
+    if len(groups) > 1:
+        print_text(f"all together: {outcomes_text(outcomes(runs))}")
 
 
 def _cases(

@@ -1,0 +1,125 @@
+"""How long a robot was lost, and how soon it was found after a carry, on made-up runs."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
+from slam.app.records import RadarInfo, SessionInfo
+from slam.app.run.runner import RunRecord, States
+from slam.app.sweep.places import Carry, carry_of
+from slam.app.sweep.run import SweepRun, make_case
+from slam.app.sweep.statistics import group_line, outcomes, summarise_groups
+from slam.geometry import paper_rig
+
+S = 1_000_000_000
+DOWN_NS = 10 * S
+
+
+def record_of(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> RunRecord:
+    """Return a run of a state per second; the map frame is the world's."""
+    n = len(truth)
+    states = States(
+        t_ns=np.arange(n) * S,
+        truth=truth,
+        odometry=np.zeros((n, 3)),
+        estimate=estimate,
+        pose_covariances=np.repeat(np.eye(3)[np.newaxis], n, axis=0),
+        nis=np.zeros(n),
+        nis_dof=np.zeros(n, dtype=np.int32),
+    )
+    return RunRecord(states=states, last=None, n_frames=n, duration_ns=n * S, wall_s=1.0)
+
+
+def info_of(landmarks_m: Sequence[tuple[float, float]]) -> SessionInfo:
+    radars: tuple[RadarInfo, ...] = ()
+    return SessionInfo(
+        scene="a",
+        preset="robust",
+        seed=0,
+        radars=radars,
+        true_landmarks_m=np.array(landmarks_m).reshape(-1, 2),
+        versions={},
+    )
+
+
+# the robot drives along x at 0.1 m/s; the paper's rig looks left, and a landmark 0.8 m to the left
+# comes into view of 65 degrees when it is less than 0.4 m ahead of an antenna
+TRUTH = np.column_stack([0.1 * np.arange(60), np.zeros(60), np.zeros(60)])
+LANDMARKS = [(1.0, 1.0), (2.0, 1.0), (3.0, 1.0)]
+
+
+def found(wrong_until: int, lost_until: int, landmarks: Sequence[tuple[float, float]]) -> Carry:
+    """Return the outcome if the estimate is 1 m off, and lost, until these states."""
+    estimate = TRUTH.copy()
+    estimate[:wrong_until, 1] += 1.0
+    lost = np.arange(60) < lost_until
+    carry = carry_of(record_of(estimate, TRUTH), lost, DOWN_NS, info_of(landmarks), paper_rig())
+    assert carry is not None
+    return carry
+
+
+def test_a_robot_is_found_when_it_is_right_and_says_so() -> None:
+    carry = found(25, 30, LANDMARKS)
+    assert carry.found_s == 20.0  # state 30, 10 s after which it was set down
+    # at 2.6 m, state 26: 0.1 m ahead of the base stands the front antenna
+    assert carry.three_seen_s is not None
+    assert 2.4 <= 0.1 * (carry.three_seen_s + 10) <= 2.7
+    assert carry.in_time is True
+    late = found(48, 0, LANDMARKS)
+    assert late.found_s == 38.0
+    assert late.in_time is False
+
+
+def test_a_place_that_is_right_for_a_moment_is_not_found() -> None:
+    estimate = TRUTH.copy()
+    estimate[:, 0] += 0.5
+    estimate[20:24, 0] -= 0.5
+    lost = np.zeros(60, dtype=bool)
+    carry = carry_of(record_of(estimate, TRUTH), lost, DOWN_NS, info_of(LANDMARKS), paper_rig())
+    assert carry is not None
+    assert carry.found_s is None
+    assert carry.in_time is False
+
+
+def test_fewer_than_three_landmarks_tell_nothing() -> None:
+    assert found(25, 0, LANDMARKS[:2]).in_time is None
+    empty = record_of(TRUTH[:5], TRUTH[:5])
+    assert (
+        carry_of(empty, np.zeros(5, dtype=bool), DOWN_NS, info_of(LANDMARKS), paper_rig()) is None
+    )
+
+
+RUN: SweepRun = replace(run_of(make_case("lab", "paper", 0)), ate_rmse_m=0.01)
+
+
+def test_runs_that_failed_are_counted() -> None:
+    carried = Carry(three_seen_s=1.0, found_s=30.0)
+    runs = [
+        RUN,
+        replace(RUN, seed=1, ate_rmse_m=0.08, lost_share=0.1),
+        replace(RUN, seed=2, lost_share=0.2, lost_at_end=True, carry=carried),
+        replace(RUN, seed=3, carry=replace(carried, found_s=20.0)),
+        replace(RUN, seed=4, carry=replace(carried, three_seen_s=None)),
+    ]
+    assert outcomes(runs) == {
+        "runs": 5,
+        "runs_below_odometry": 4,
+        "runs_above_odometry": 1,
+        "runs_lost": 1,
+        "runs_lost_at_end": 1,
+        "carries": 2,
+        "carries_in_time": 1,
+    }
+    (group,) = summarise_groups(runs)
+    # of 0.01 / 0.04 four times, and 2
+    assert group["ratio"]["median"] == pytest.approx(0.25)
+    line = group_line(group)
+    assert "1 of 5 runs worse than their wheels, 1 of 5 runs lost without a carry" in line
+    assert "1 of 2 carries found within 20 s of the third landmark in view" in line
+    # 95 % of means of five chi-squares of 3 dof: quantiles of 15 dof over 5, 6.262 and 27.488
+    assert re.search(r"mean NEES .*, its means over runs \d+ of 2 in 1.3-5.5$", line)

@@ -1,0 +1,103 @@
+"""Whether the robot knew where it was: how long it was lost, and how soon after a carry found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.odometry.track import NS_PER_S
+from slam.app.records import SessionInfo, SessionObserver, Snapshot
+from slam.app.run.runner import RunRecord
+from slam.geometry import Rig, between, transform, wrap_angles
+
+LANDMARKS_TO_FIND = 3
+"""So many in view tell where a robot is on a map of points; ranges to two leave a mirror image."""
+FOUND_WITHIN_S = 20.0
+"""What it may take from then on."""
+FOUND_M, FOUND_RAD = 0.3, 0.2
+"""Errors within which a place is the right one, and no other: a carry is longer."""
+FOUND_FOR_S = 5.0
+"""So long it must be right, to be no chance."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Carry:
+    """What became of a robot that was set down elsewhere; times are from then on.
+
+    ``three_seen_s`` is when a third landmark had come into view, ``found_s`` when the estimate was
+    right again; None where that did not happen until the end of the run.
+    """
+
+    three_seen_s: float | None
+    found_s: float | None
+
+    @property
+    def in_time(self) -> bool | None:
+        """Whether it was found in time; None where it had too little to see or time to tell."""
+        if self.three_seen_s is None:
+            return None
+        return self.found_s is not None and self.found_s - self.three_seen_s <= FOUND_WITHIN_S
+
+
+class LostStates(SessionObserver):
+    """Keeps of every state whether SLAM said that it was lost."""
+
+    def __init__(self) -> None:
+        self.of_states: list[bool] = []
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        report = None if snapshot.step is None else snapshot.step.report
+        self.of_states.append(report is not None and report.lost)
+
+
+def carry_of(
+    record: RunRecord,
+    lost: NDArray[np.bool_],
+    down_ns: int,
+    info: SessionInfo,
+    rig: Rig,
+) -> Carry | None:
+    """Return what became of a robot set down at a session time; None if no state follows.
+
+    ``lost`` is that of every state, shape (n,).
+    """
+    states = record.states
+    after = np.flatnonzero(states.t_ns >= down_ns)
+    if not len(after):
+        return None
+    since_s = (states.t_ns[after] - down_ns) / NS_PER_S
+    truth = states.truth[after]
+    landmarks_m, field = info.true_landmarks_m, info.field_of_view
+    seen = np.zeros(len(landmarks_m), dtype=bool)
+    three_seen_s = None
+    for at_s, pose in zip(since_s.tolist(), truth, strict=True):
+        body_xy = transform(between(pose, np.zeros(3)), landmarks_m)
+        for mount in rig.mounts:
+            seen |= field.contains(mount, body_xy)
+        if seen.sum() >= LANDMARKS_TO_FIND:
+            three_seen_s = at_s
+            break
+    errors = states.estimate[after] - np.array(
+        [between(record.world_from_map, pose) for pose in truth]
+    )
+    right = (
+        ~lost[after]
+        & (np.hypot(errors[:, 0], errors[:, 1]) <= FOUND_M)
+        & (np.abs(wrap_angles(errors[:, 2])) <= FOUND_RAD)
+    )
+    return Carry(three_seen_s=three_seen_s, found_s=_begin_s(since_s, right))
+
+
+def _begin_s(since_s: NDArray[np.float64], right: NDArray[np.bool_]) -> float | None:
+    """Return when the first stretch begins that is right for long enough, or to the end."""
+    begin: float | None = None
+    for at_s, is_right in zip(since_s.tolist(), right.tolist(), strict=True):
+        if not is_right:
+            begin = None
+        elif begin is None:
+            begin = at_s
+        elif at_s - begin >= FOUND_FOR_S:
+            break
+    return begin
