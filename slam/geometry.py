@@ -137,6 +137,15 @@ class ReceivedPulse:
     imaginary: tuple[float, ...]
     relative_error: float  # norm of the error that is expected of the samples, over their norm
 
+    def __post_init__(self) -> None:
+        size = len(self.real)
+        if len(self.imaginary) != size or not size % 2:
+            raise ValueError("real and imaginary must have the same odd number of samples")
+        if not all(map(math.isfinite, (*self.real, *self.imaginary, self.relative_error))):
+            raise ValueError("samples and relative_error must be finite numbers")
+        if not 0 < self.step_m < math.inf:
+            raise ValueError("step_m must be positive")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:

@@ -427,9 +427,9 @@ _COMMANDS = (
     _Command(
         "calibrate",
         "slam.app.commands.calibrate:run_calibrate",
-        "estimate range offsets, mounts and gains from a recorded drive",
+        "estimate offsets, mounts, gains and pulses from a recorded drive",
         _add_calibrate,
-        "Estimates every radar's range offset, mount position and relative gain from a "
+        "Estimates every radar's range offset, mount position, relative gain and pulse from a "
         "session of `uwb-slam demo` past reflectors, and says what the drive cannot tell apart.",
     ),
     _Command(

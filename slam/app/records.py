@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
-from slam.geometry import PAPERS_FIELD, FieldOfView
+from slam.geometry import PAPERS_FIELD, FieldOfView, ReceivedPulse
 from slam.results import SmoothedRun, StepResult
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
@@ -30,6 +30,7 @@ class RadarInfo:
 
     `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
     true metres are in every RadarFrame. `start_skew_ns` is the session time of its first frame.
+    `pulse` is what the front end began with, None that of the data sheet.
     `gain_db` is its gain over the mean of the rig: SLAM gets samples without it, the session holds
     them as received.
     """
@@ -48,6 +49,7 @@ class RadarInfo:
     settings: Mapping[str, object]
     start_skew_ns: int = 0
     phase_offset_rad: float = 0.0
+    pulse: ReceivedPulse | None = None
     gain_db: float = 0.0
 
 

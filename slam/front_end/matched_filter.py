@@ -539,6 +539,12 @@ class MatchedFilterDetector:
         )
         return refit(found, again, filtered, split)
 
+    def learn(self, frame: RadarFrame) -> None:
+        """Let the pulse be estimated from a frame whose echoes are not asked for."""
+        filtered = self._filtered(frame)
+        found, _ = _single_pulses(filtered, math.inf)
+        self._learn(frame, filtered, found)
+
     def _learn(self, frame: RadarFrame, filtered: Filtered, peaks: Peaks) -> None:
         """Let the pulse be estimated from this frame, too; a change holds from the next one on."""
         if filtered.usable is not None or not self.estimator.is_due(frame.radar):

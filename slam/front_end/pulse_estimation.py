@@ -26,8 +26,9 @@ Error
     blocks of them are left out in turn (Efron 1982, chapter 2). Relative to the norm of T.
 Choice
     An estimate is used where it differs from the pulse used so far by more than ``_LEAST_CHANGE``
-    and by ``_ERRORS`` times its own error; so it at least halves the error, and a nominal pulse
-    stays what it is. That of all radars together replaces the nominal pulse, that of one radar
+    and by ``_ERRORS`` times its own error, so that it at least halves the error, and where enough
+    echoes agree with it better than the two agree with each other; a nominal pulse stays what it
+    is. That of all radars together replaces the nominal pulse, that of one radar
     replaces theirs: modules of one kind differ less from each other than from the data sheet.
 Origin
     Echoes do not tell delay from range. Zero of T is where the nominal filter has its peak, so an
@@ -68,16 +69,23 @@ _ROUNDS, _GROUPS = 10, 8
 _ERROR_SHARE, _LEAST_ERROR = 2.5, 0.015
 # Least difference from the pulse used so far, relative, and in standard deviations of the estimate
 _LEAST_CHANGE, _ERRORS = 0.05, 2.0
+# Samples near the peak, the share of the windows that must agree there, and how well: energy left
+# over that of the difference. Where every echo is a blend they do not.
+_NEAR_STEPS, _AGREEING, _LARGEST_REST = 4, 0.4, 0.5
 # Noise that the equaliser allows for, as a part of the largest power of the pulse
 _REGULARISATION = 3e-3
 # Widths of the Gaussian that a pulse is turned into, as a share of the nominal one
 _WIDTHS = np.linspace(0.7, 1.5, 161)
 # Newton steps towards the peak of a pulse behind the nominal filter
 _PEAK_STEPS = 20
-# Half the length of an equaliser in sigmas, and the length of the transform that it comes from
-_TAPS_SIGMAS, _N_TAPS = 16.0, 1024
+# Half the length of an equaliser in sigmas; the transform that it comes from is 4 times as long.
+_TAPS_SIGMAS = 16.0
 _AT_STEPS = np.arange(-_STEPS, _STEPS + 1)
-_NOMINAL = np.exp(-0.5 * (_STEP_SIGMAS * _AT_STEPS) ** 2)
+_NOMINAL: ComplexArray = np.exp(-0.5 * (_STEP_SIGMAS * _AT_STEPS) ** 2).astype(np.complex128)
+_NEAR = np.abs(_AT_STEPS) <= _NEAR_STEPS
+# Power of the noise of a window over sigma_y**2: both bands, and both quadratures
+_NOISE_GAIN = 2 * math.sqrt(math.pi) / _STEP_SIGMAS
+_ENERGY = float(np.sum(_NOMINAL.real**2))
 # Transforms of envelopes are of this length, so they do not wrap round.
 _N_FFT = 64
 _RAD_PER_STEP = math.tau * np.fft.fftfreq(_N_FFT)
@@ -115,14 +123,18 @@ class Envelope:
 
     samples: ComplexArray  # shape (25,)
     relative_error: float  # norm of its expected error over its own
+    # Energy that it leaves of a window near the peak, less that of noise and relative to its own:
+    # two fifths of the windows have less
+    unexplained: float
 
 
-def estimate_envelope(windows: ComplexArray) -> Envelope:
+def estimate_envelope(windows: ComplexArray, sigma_y: Array) -> Envelope:
     """Return the envelope that windows (n, 25) of `baseband` have in common, n >= 3.
 
-    Those with the same neighbours follow on each other.
+    Those with the same neighbours follow on each other; ``sigma_y`` (n,) is the noise of each
+    behind the nominal filter.
     """
-    first = windows @ _NOMINAL / (_NOMINAL @ _NOMINAL)
+    first = windows @ _NOMINAL / (_ENERGY)
     turned = windows / first[:, np.newaxis]
     envelope = _placed(np.median(turned.real, axis=0) + 1j * np.median(turned.imag, axis=0))
     weights = np.ones(windows.shape)
@@ -153,7 +165,14 @@ def estimate_envelope(windows: ComplexArray) -> Envelope:
     spread = np.sum(np.abs(others - others.mean(axis=0)) ** 2)
     variance = (len(blocks) - 1) / len(blocks) * spread / np.sum(np.abs(envelope) ** 2)
     error = _ERROR_SHARE * math.sqrt(float(variance))
-    return Envelope(samples=envelope, relative_error=max(error, _LEAST_ERROR))
+    energy = float(np.sum(np.abs(envelope[_NEAR]) ** 2))
+    noise = _NOISE_GAIN * (sigma_y / height[:, 0]) ** 2 * (np.count_nonzero(_NEAR) - 2)
+    unexplained = (np.sum(rest[:, _NEAR] ** 2, axis=1) - noise) / energy
+    return Envelope(
+        samples=envelope,
+        relative_error=max(error, _LEAST_ERROR),
+        unexplained=float(np.quantile(unexplained, _AGREEING)),
+    )
 
 
 def relative_difference(one: ComplexArray, other: ComplexArray) -> float:
@@ -176,7 +195,7 @@ def _placed(envelope: ComplexArray) -> ComplexArray:
         at -= climb / fall
     moved = np.fft.ifft(spectrum * np.exp(1j * _RAD_PER_STEP * at))[_AT_STEPS]
     height = complex((filtered * np.exp(1j * _RAD_PER_STEP * at)).mean())
-    placed: ComplexArray = moved * (_NOMINAL @ _NOMINAL / height) * _FADE
+    placed: ComplexArray = moved * (_ENERGY / height) * _FADE
     return placed
 
 
@@ -203,7 +222,9 @@ def module_pulse(received: ReceivedPulse, nominal: PulseModel, bin_length_m: flo
     model = replace(nominal, bandwidth_hz=nominal.bandwidth_hz / width)
 
     s = model.sigma_bins(bin_length_m)
-    cycles = np.fft.rfftfreq(_N_TAPS) - nominal.carrier_rad(bin_length_m) / math.tau
+    half = math.ceil(_TAPS_SIGMAS * nominal.sigma_bins(bin_length_m))
+    n_fft = 1 << (4 * half).bit_length()
+    cycles = np.fft.rfftfreq(n_fft) - nominal.carrier_rad(bin_length_m) / math.tau
     in_band = np.abs(cycles) < 0.5 * bin_length_m / received.step_m
     turns = np.exp(-2j * math.pi * np.outer(cycles[in_band], at_m / bin_length_m))
     spectrum = received.step_m / bin_length_m * turns @ envelope
@@ -211,8 +232,7 @@ def module_pulse(received: ReceivedPulse, nominal: PulseModel, bin_length_m: flo
     power = np.abs(spectrum) ** 2
     transfer = np.zeros(cycles.size, dtype=np.complex128)
     transfer[in_band] = wanted * spectrum.conj() / (power + _REGULARISATION * power.max())
-    half = math.ceil(_TAPS_SIGMAS * nominal.sigma_bins(bin_length_m))
-    taps = np.fft.irfft(transfer, _N_TAPS)[np.arange(-half, half + 1)]
+    taps = np.fft.irfft(transfer, n_fft)[np.arange(-half, half + 1)]
     return ModulePulse(model=model, error=received.relative_error, equaliser=taps)
 
 
@@ -227,7 +247,8 @@ class PulseEstimator:
         self._told = tuple(told)
         self._common: ReceivedPulse | None = None
         self._own: dict[int, ReceivedPulse | None] = {}
-        self._windows: dict[int, list[ComplexArray]] = {}
+        self._estimates: dict[int | None, ReceivedPulse] = {}  # by radar; None: of all
+        self._echoes: dict[int, list[tuple[ComplexArray, float]]] = {}
         self._waits: dict[int, int] = {}  # frames until the next echo is looked for
         self._last: dict[int, float] = {}  # position of the last one [bins]
         self._needed: dict[int | None, int] = {}  # echoes for the next estimate, by radar or of all
@@ -236,11 +257,19 @@ class PulseEstimator:
         """Return the pulse of a radar as far as it is known; None: the nominal one."""
         return self._own.get(radar) or self._begun(radar)
 
+    def estimate(self, radar: int) -> ReceivedPulse | None:
+        """Return the last estimate of a radar's own pulse, used or not; None: too few echoes."""
+        return self._estimates.get(radar)
+
+    def echoes(self, radar: int) -> int:
+        """Return how many echoes of a radar have been taken."""
+        return len(self._echoes.get(radar, ()))
+
     def is_due(self, radar: int) -> bool:
         """Return whether `take` would use an echo of the next frame of a radar; it counts them."""
         wait = self._waits.get(radar, 0)
         self._waits[radar] = max(0, wait - 1)
-        return not wait and len(self._windows.get(radar, ())) < _CAPACITY
+        return not wait and len(self._echoes.get(radar, ())) < _CAPACITY
 
     def take(
         self,
@@ -272,18 +301,19 @@ class PulseEstimator:
             return False
         self._last[radar] = position
         self._waits[radar] = _FRAMES_APART - 1
-        windows = self._windows.setdefault(radar, [])
-        windows.append(baseband(samples, position, self._nominal, bin_length_m))
+        window = baseband(samples, position, self._nominal, bin_length_m)
+        self._echoes.setdefault(radar, []).append((window, sigma_y))
         return self._learn(None) | self._learn(radar)
 
     def _learn(self, radar: int | None) -> bool:
         """Estimate the pulse of one radar, or of all, once there are enough new echoes."""
-        radars = sorted(self._windows) if radar is None else [radar]
-        windows = [window for each in radars for window in self._windows[each]]
-        if len(windows) < self._needed.get(radar, _FIRST):
+        radars = sorted(self._echoes) if radar is None else [radar]
+        echoes = [echo for each in radars for echo in self._echoes[each]]
+        if len(echoes) < self._needed.get(radar, _FIRST):
             return False
-        self._needed[radar] = math.ceil(_MORE * len(windows))
-        envelope = estimate_envelope(np.array(windows))
+        self._needed[radar] = math.ceil(_MORE * len(echoes))
+        windows, sigma_y = (np.array(column) for column in zip(*echoes, strict=True))
+        envelope = estimate_envelope(windows, sigma_y)
         step_m = _STEP_SIGMAS * self._nominal.sigma_m
         estimate = ReceivedPulse(
             step_m=step_m,
@@ -291,23 +321,25 @@ class PulseEstimator:
             imaginary=tuple(envelope.samples.imag.tolist()),
             relative_error=envelope.relative_error,
         )
+        self._estimates[radar] = estimate
         if radar is None:
-            before, self._common = self._common, self._unless_near(estimate, None)
+            before, self._common = self._common, self._choice(estimate, envelope, None)
             return self._common is not before
         before = self._own.get(radar)
-        own = self._unless_near(estimate, self._begun(radar))
+        own = self._choice(estimate, envelope, self._begun(radar))
         self._own[radar] = own
         return own is not before
 
-    def _unless_near(
-        self, estimate: ReceivedPulse, begun: ReceivedPulse | None
+    def _choice(
+        self, estimate: ReceivedPulse, envelope: Envelope, begun: ReceivedPulse | None
     ) -> ReceivedPulse | None:
-        """Return the estimate if it differs from what was begun with, None otherwise."""
+        """Return the estimate if it is better than what was begun with, None otherwise."""
         doubt = math.hypot(estimate.relative_error, begun.relative_error if begun else 0.0)
-        change = relative_difference(
-            envelope_at_steps(estimate, self._nominal), envelope_at_steps(begun, self._nominal)
-        )
-        return estimate if change > max(_LEAST_CHANGE, _ERRORS * doubt) else None
+        known = envelope_at_steps(begun, self._nominal)
+        change = relative_difference(envelope.samples, known)
+        if change < max(_LEAST_CHANGE, _ERRORS * doubt):
+            return None
+        return estimate if envelope.unexplained < _LARGEST_REST * change**2 else None
 
     def _begun(self, radar: int) -> ReceivedPulse | None:
         told = self._told[radar] if radar < len(self._told) else None
@@ -317,8 +349,8 @@ class PulseEstimator:
 def envelope_at_steps(pulse: ReceivedPulse | None, nominal: PulseModel) -> ComplexArray:
     """Return the envelope of a pulse at the 25 steps; None: the nominal one."""
     if pulse is None:
-        return _NOMINAL + 0j
-    samples = np.array(pulse.real) + 1j * np.array(pulse.imaginary)
+        return _NOMINAL
+    samples: ComplexArray = np.array(pulse.real) + 1j * np.array(pulse.imaginary)
     half = samples.size // 2
     # band-limited interpolation, from samples that are as many steps of their own apart
     at = _STEP_SIGMAS * nominal.sigma_m / pulse.step_m * _AT_STEPS
@@ -326,9 +358,9 @@ def envelope_at_steps(pulse: ReceivedPulse | None, nominal: PulseModel) -> Compl
     return found
 
 
-def difference_from_nominal(pulse: ReceivedPulse, nominal: PulseModel) -> float:
+def off_nominal(pulse: ReceivedPulse, nominal: PulseModel) -> float:
     """Return the norm of the difference of a pulse from the nominal one, relative to that."""
-    return relative_difference(envelope_at_steps(pulse, nominal), _NOMINAL + 0j)
+    return relative_difference(envelope_at_steps(pulse, nominal), _NOMINAL)
 
 
 def _lone_peak(

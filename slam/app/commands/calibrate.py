@@ -1,4 +1,4 @@
-"""`uwb-slam calibrate`: range offsets, mounts and gains from a recorded drive past reflectors."""
+"""`uwb-slam calibrate`: offsets, mounts, gains and pulses from a recorded drive past reflectors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from emulator.scene.scene import Scene, SceneError, load_scene
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import SessionInfo
-from slam.app.rig.files import RigFile, RigRadar, write_rig
+from slam.app.rig.files import RigFile, RigPulse, RigRadar, write_rig
 from slam.app.run.output import print_progress, print_text
 from slam.app.session.reader import RecordedSession, open_session
 from slam.calibration.calibration import Calibration, Drive, calibrate, make_drive
@@ -33,7 +33,9 @@ from slam.calibration.observability import (
 from slam.calibration.tracks import UNASSIGNED, RangeSet
 from slam.config import FrontEnd, SlamConfig, override
 from slam.frames import Detection, RadarFrame
-from slam.front_end import make_detector
+from slam.front_end.matched_filter import MatchedFilterDetector
+from slam.front_end.pulse import PulseModel
+from slam.front_end.pulse_estimation import PulseEstimator, off_nominal
 from slam.geometry import Rig
 from xethru_protocol.system import StopFlag, json_text, one_line, read_bounded
 from xethru_protocol.transport import is_network_port
@@ -49,6 +51,10 @@ _FRONT_END = override(
         "detection.max_range_m": 2.5,
     },
 )
+_NOMINAL_PULSE = PulseModel(
+    carrier_hz=_FRONT_END.matched_filter.carrier_hz,
+    bandwidth_hz=_FRONT_END.matched_filter.bandwidth_hz,
+)
 _YAW_LIMIT_DEG = 2.0
 _GAIN_LIMIT_DB = 1.0
 
@@ -60,6 +66,7 @@ class _Report:
     gains: GainEstimate
     weak: tuple[WeakDirection, ...]
     poor: tuple[str, ...]
+    pulses: PulseEstimator
 
 
 def run_calibrate(
@@ -79,7 +86,8 @@ def run_calibrate(
     _planted(recorded.rig, scene)
     if rig is not None:
         _check_rig_place(rig, session)
-    report = _report_of(_drive_of(recorded, stop), known)
+    detector = _taught(recorded, stop)
+    report = _report_of(_drive_of(recorded, detector, stop), known, detector.estimator)
     if recorded.cut_at_byte is not None:
         cut = f"{session}: cut at byte {recorded.cut_at_byte}; read up to there"
         print_progress(cut)
@@ -94,11 +102,20 @@ def run_calibrate(
             print_text("\n".join(one_line(line) for line in _lines(report, planted)))
 
 
-def _drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
-    """Read a session once and detect its echoes."""
+def _taught(session: RecordedSession, stop: StopFlag) -> MatchedFilterDetector:
+    """Return a detector that has estimated the modules' pulses from all frames of a session."""
+    detector = MatchedFilterDetector(_FRONT_END)
+    for record in session.records():
+        if isinstance(record, RadarFrame):
+            stop.check()
+            detector.learn(record)
+    return detector
+
+
+def _drive_of(session: RecordedSession, detector: MatchedFilterDetector, stop: StopFlag) -> Drive:
+    """Detect the echoes of a session."""
     samples: list[TumSample] = []
     detections: list[Detection] = []
-    detector = make_detector(_FRONT_END)
     has_frame = False
     for record in session.records():
         if isinstance(record, RadarFrame):
@@ -120,7 +137,7 @@ def _drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
     )
 
 
-def _report_of(drive: Drive, known_m: Array | None) -> _Report:
+def _report_of(drive: Drive, known_m: Array | None, pulses: PulseEstimator) -> _Report:
     """Calibrate, and find out what the drive does not determine."""
     with threadpool_limits(limits=1):
         calibration = calibrate(drive, known_m=known_m)
@@ -132,6 +149,7 @@ def _report_of(drive: Drive, known_m: Array | None) -> _Report:
             weak=weak_directions(calibration, names),
             poor=poor_drive(drive, calibration)
             + unseen_reflectors(calibration, 0 if known_m is None else len(known_m)),
+            pulses=pulses,
         )
 
 
@@ -179,6 +197,7 @@ def _rig_file(info: SessionInfo, report: _Report) -> RigFile:
     radars = []
     for index, radar in enumerate(info.radars):
         shift = report.calibration.mount_shifts_m[index] if is_known[index] else np.zeros(2)
+        pulse = report.pulses.pulse(index)
         has_gain = report.gains.gain_sigmas_db[index] <= _GAIN_LIMIT_DB
         radars.append(
             RigRadar(
@@ -193,6 +212,7 @@ def _rig_file(info: SessionInfo, report: _Report) -> RigFile:
                 phase_offset_deg=math.degrees(radar.phase_offset_rad),
                 gain_db=float(report.gains.gains_db[index]) if has_gain else 0.0,
                 port=radar.port if is_network_port(radar.port) else None,
+                pulse=None if pulse is None else RigPulse.rounded(pulse),
             )
         )
     return RigFile(radars=tuple(radars))
@@ -245,7 +265,14 @@ def _facts(report: _Report, planted: Mapping[str, tuple[float, float]]) -> dict[
             "yaw_shift_deg": math.degrees(gains.yaws_rad[index]),
             "yaw_sigma_deg": math.degrees(gains.yaw_sigmas_rad[index]),
             "told": bool(calibration.offset_sigmas_m[index] <= OFFSET_LIMIT_M),
+            "pulse_echoes": report.pulses.echoes(index),
+            "pulse_stored": report.pulses.pulse(index) is not None,
         }
+        if (estimate := report.pulses.estimate(index)) is not None:
+            row |= {
+                "pulse_off_nominal": off_nominal(estimate, _NOMINAL_PULSE),
+                "pulse_error": estimate.relative_error,
+            }
         if mount.name in planted:
             offset_m, gain_db = planted[mount.name]
             row |= {"planted_offset_m": offset_m, "planted_gain_db": gain_db}
@@ -303,6 +330,7 @@ def _lines(report: _Report, planted: Mapping[str, tuple[float, float]]) -> Itera
             truth_mm = 1e3 * planted[mount.name][0]
             line += f"{truth_mm:+12.2f}{offset - truth_mm:+10.2f}"
         yield line
+    yield from _pulse_lines(report)
     yield "offset: added to every range; moved, turned: off the nominal rig, the turn as amplitudes"
     yield "show it; gain: over the mean of all radars"
     marked = bool(np.any(calibration.offset_sigmas_m > OFFSET_LIMIT_M))
@@ -316,6 +344,18 @@ def _lines(report: _Report, planted: Mapping[str, tuple[float, float]]) -> Itera
         yield from dict.fromkeys(weak.description for weak in report.weak)
         for remedy in dict.fromkeys(weak.remedy for weak in report.weak):
             yield f"remedy: {remedy}"
+
+
+def _pulse_lines(report: _Report) -> Iterable[str]:
+    for index, mount in enumerate(report.drive.rig.mounts):
+        estimate = report.pulses.estimate(index)
+        if estimate is None:
+            text = f"{report.pulses.echoes(index)} lone strong echoes are too few for an estimate"
+        else:
+            off = f"{100 * off_nominal(estimate, _NOMINAL_PULSE):.1f}"
+            text = f"{off} +- {100 * estimate.relative_error:.1f} % off the data sheet's"
+        stored = "" if report.pulses.pulse(index) is None else "; a rig file has the estimate"
+        yield f"pulse of {mount.name}: {text}{stored}"
 
 
 def _with_sigma(value: float, sigma: float, limit: float) -> str:

@@ -6,6 +6,16 @@ metres, body frame x forward and y left, yaw in degrees counter-clockwise from f
 carrier phase (`Mount.phase_offset_rad`; no command estimates it), `gain_db` how much stronger its
 echoes are than the mean of the rig.
 
+A module whose pulse differs from that of the data sheet has a table `pulse` after its other keys:
+`real` and `imaginary`, samples of the pulse's complex envelope, `step_m` of range apart, the middle
+one where an echo's range is and about 1; `relative_error`, the norm of their error over their own.
+
+    [radars.pulse]
+    step_m = 0.0388
+    relative_error = 0.02
+    real = [0.0, 0.061, 0.332, 0.761, 1.0, 0.782, 0.351, 0.08, 0.003]
+    imaginary = [0.0, 0.0, 0.01, 0.003, 0.0, -0.012, -0.01, 0.009, 0.0]
+
 Which cable ends where does not matter: a module's mount, offset and gain follow its serial number.
 A module that is missing, foreign or there twice is refused by name before anything is set.
 `port` is for a module that is not found by itself, such as one at `tcp://HOST:PORT`.
@@ -19,16 +29,16 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, StrictFloat
+from pydantic import Field, StrictFloat, model_validator
 
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
 from emulator.scene.tables import SerialNumber, Table, is_name, load_table
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.rig.sources import RadarLink, RecordObserver
 from slam.config import WheelNoise
-from slam.geometry import Mount, Rig
+from slam.geometry import Mount, ReceivedPulse, Rig
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.system import written_whole
@@ -38,7 +48,48 @@ from xethru_protocol.wire.errors import PortUnavailable, XeThruError
 from xethru_protocol.wire.messages import SystemGetInfo
 
 _Sigma = Annotated[StrictFloat, Field(ge=0, le=10, allow_inf_nan=False)]
+_Sample = Annotated[StrictFloat, Field(ge=-2, le=2)]
+_Envelope = Annotated[tuple[_Sample, ...], Field(min_length=5, max_length=201)]
+_DECIMALS = 4
+# Least height of the middle of a pulse, of its largest sample
+_LEAST_MIDDLE = 0.7
 _Number = Annotated[StrictFloat, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+
+
+class RigPulse(Table):
+    """The pulse that a module receives, where it is not that of the data sheet; `ReceivedPulse`."""
+
+    step_m: Annotated[StrictFloat, Field(ge=1e-3, le=0.05)]
+    relative_error: Annotated[StrictFloat, Field(ge=0, lt=1)]
+    real: _Envelope
+    imaginary: _Envelope
+
+    @model_validator(mode="after")
+    def _is_a_pulse(self) -> Self:
+        received = self.received
+        pairs = zip(received.real, received.imaginary, strict=True)
+        heights = [math.hypot(*pair) for pair in pairs]
+        middle = heights[len(heights) // 2]
+        if middle < _LEAST_MIDDLE * max(*heights, 1.0):
+            raise ValueError(
+                "the middle sample must be about 1, where the pulse is high; "
+                f"it is {middle:.3g} of at most {max(heights):.3g}"
+            )
+        return self
+
+    @classmethod
+    def rounded(cls, pulse: ReceivedPulse) -> Self:
+        """Return what a rig file keeps of a pulse: four decimals."""
+        return cls(
+            step_m=round(pulse.step_m, 6),
+            relative_error=round(pulse.relative_error, _DECIMALS),
+            real=tuple(round(value, _DECIMALS) for value in pulse.real),
+            imaginary=tuple(round(value, _DECIMALS) for value in pulse.imaginary),
+        )
+
+    @property
+    def received(self) -> ReceivedPulse:
+        return ReceivedPulse(**self.model_dump())
 
 
 class RigRadar(Table):
@@ -53,6 +104,7 @@ class RigRadar(Table):
     phase_offset_deg: _Number = 0.0
     gain_db: _Number = 0.0
     port: Annotated[str, Field(min_length=1, max_length=300)] | None = None
+    pulse: RigPulse | None = None
 
 
 class RigWheels(Table):
@@ -100,6 +152,7 @@ class RigFile(Table):
                     yaw_rad=math.radians(radar.yaw_deg),
                     range_offset_m=radar.range_offset_m,
                     phase_offset_rad=math.radians(radar.phase_offset_deg),
+                    pulse=None if radar.pulse is None else radar.pulse.received,
                 )
                 for radar in self.radars
             )
@@ -159,9 +212,13 @@ def write_rig(path: Path, rig: RigFile) -> None:
     tables = []
     for radar in rig.radars:
         # a JSON string of these names is a TOML string
-        known = radar.model_dump(exclude_none=True)
+        known = radar.model_dump(exclude_none=True, exclude={"pulse"})
         lines = [f"{key} = {json.dumps(value)}" for key, value in known.items()]
         tables.append("\n".join(["[[radars]]", *lines]))
+        if radar.pulse is not None:
+            pulse = radar.pulse.model_dump()
+            lines = [f"{key} = {json.dumps(value)}" for key, value in pulse.items()]
+            tables.append("\n".join(["[radars.pulse]", *lines]))
     if rig.wheels != RigWheels():
         lines = [f"{key} = {json.dumps(value)}" for key, value in rig.wheels.model_dump().items()]
         tables.append("\n".join(["[wheels]", *lines]))

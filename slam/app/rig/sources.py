@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from typing import Literal, Self, cast
 
@@ -211,7 +211,7 @@ class RigSource:
                 rate_hz = link.driver.start(fps)
             radars.append(
                 RadarInfo(
-                    **asdict(link.mount),
+                    **{each.name: getattr(link.mount, each.name) for each in fields(link.mount)},
                     serial=link.serial,
                     port=link.port,
                     range_start_m=geometry.range_start_m,

@@ -40,7 +40,7 @@ from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import RadarInfo, SessionInfo, Snapshot
 from slam.app.session.constants import slam_constants
 from slam.config import SlamConfig, WheelNoise, load_preset
-from slam.geometry import Mount
+from slam.geometry import Mount, ReceivedPulse
 from slam.results import SmoothedRun
 from xethru_protocol.validation import reason_of, shown
 
@@ -441,6 +441,9 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
         known = {
             field.name: facts[field.name] for field in fields(RadarInfo) if field.name in facts
         }
+        if (pulse := known.get("pulse")) is not None:
+            samples = {key: tuple(map(float, pulse[key])) for key in ("real", "imaginary")}
+            known["pulse"] = ReceivedPulse(**(pulse | samples))
     except (ValueError, TypeError, KeyError) as error:
         raise AppError(f"{path}: {topic} cannot be read: {reason_of(error)}") from None
     missing = [
@@ -498,4 +501,5 @@ def imported_radar(
         rate_hz=rate_hz,
         settings={},
         phase_offset_rad=mount.phase_offset_rad,
+        pulse=mount.pulse,
     )

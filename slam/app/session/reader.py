@@ -329,6 +329,7 @@ class RecordedSession:
                     yaw_rad=radar.yaw_rad,
                     range_offset_m=radar.range_offset_m,
                     phase_offset_rad=radar.phase_offset_rad,
+                    pulse=radar.pulse,
                 )
                 for radar in self.info.radars
             )

@@ -19,6 +19,7 @@ from slam.app.rig import files as rig_match
 from slam.app.rig.emulated import rig_of
 from slam.app.rig.files import (
     RigFile,
+    RigPulse,
     RigRadar,
     RigWheels,
     are_emulated,
@@ -28,6 +29,7 @@ from slam.app.rig.files import (
 )
 from slam.app.rig.sources import RadarLink
 from slam.config import WheelNoise
+from slam.geometry import ReceivedPulse
 from xethru_protocol.driver.conversation import Observer, ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import PortInfo
@@ -55,12 +57,27 @@ def test_a_rig_comes_back_with_the_same_floats(tmp_path: Path) -> None:
                 range_offset_m=0.1 + 0.2,
                 phase_offset_deg=100 / 3,
                 gain_db=-1.5,
+                pulse=RigPulse(
+                    step_m=0.0388,
+                    relative_error=0.02,
+                    real=(0.0, 0.3, 0.98, 0.4, 0.1),
+                    imaginary=(1e-17, -0.1, 0.0, 1 / 3, 0.0),
+                ),
             ),
+            RigRadar(name="b", serial="202305070102", x_m=0.0, y_m=0.0, yaw_deg=0.0),
         ),
         wheels=RigWheels(scale_sigma=0.02, curvature_sigma_rad_per_m=0.001),
     )
     write_rig(tmp_path / "rig.toml", rig)
     assert load_rig(tmp_path / "rig.toml") == rig
+    first, second = rig.rig.mounts
+    assert first.pulse == ReceivedPulse(
+        step_m=0.0388,
+        relative_error=0.02,
+        real=(0.0, 0.3, 0.98, 0.4, 0.1),
+        imaginary=(1e-17, -0.1, 0.0, 1 / 3, 0.0),
+    )
+    assert second.pulse is None
     noise = rig.wheels.noise
     assert (noise.scale_sigma, noise.curvature_sigma_rad_per_m) == (0.02, 0.001)
     assert noise.turn_scale_sigma == WheelNoise().turn_scale_sigma
@@ -75,6 +92,34 @@ def test_a_rig_file_gives_mounts_in_radians(tmp_path: Path) -> None:
     assert mount.yaw_rad == pytest.approx(math.pi / 2)
     assert mount.phase_offset_rad == pytest.approx(-math.pi / 4)
     assert (mount.name, mount.x_m, mount.y_m, mount.range_offset_m) == ("left", 0.1, 0.0, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("step_m = 0.5", r"radars\[0\]\.pulse\.step_m: .*0\.05"),
+        ("relative_error = 1.0", r"radars\[0\]\.pulse\.relative_error: .*less than 1"),
+        ("real = [0.0, 1.0, 0.0]", r"radars\[0\]\.pulse\.real: .*5"),
+        ("real = [0.0, 0.0, 0.5, 1.0, 0.5, 0.0, 0.0]", r"pulse: .*the same odd number of samples"),
+        ("real = [1.0, 0.5, 0.0, 0.0, 0.0]", r"pulse: .*middle sample must be about 1"),
+        ("real = [0.0, 0.5, nan, 0.5, 0.0]", r"radars\[0\]\.pulse\.real"),
+        ("samples = 3", r"pulse\.samples"),
+    ],
+)
+def test_a_pulse_that_is_none_is_refused_by_key(tmp_path: Path, line: str, problem: str) -> None:
+    lines = {
+        "step_m": "step_m = 0.0388",
+        "relative_error": "relative_error = 0.02",
+        "real": "real = [0.0, 0.5, 1.0, 0.5, 0.0]",
+        "imaginary": "imaginary = [0.0, 0.0, 0.0, 0.0, 0.0]",
+    }
+    lines[line.split(" ")[0]] = line
+    (path := tmp_path / "rig.toml").write_text(
+        RADAR + "[radars.pulse]\n" + "\n".join(lines.values()) + "\n"
+    )
+    with pytest.raises(AppError, match=problem) as refused:
+        load_rig(path)
+    assert "\n" not in str(refused.value)
 
 
 def test_the_name_of_a_scene_gives_the_rig_file_that_ships_for_it() -> None:

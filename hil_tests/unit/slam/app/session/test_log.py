@@ -31,6 +31,7 @@ from slam.app.records import LogLine
 from slam.app.session import messages as ros
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
+from slam.geometry import ReceivedPulse
 from xethru_protocol.recordings.mcap import McapWriter
 
 N_SCANS = 300
@@ -67,6 +68,19 @@ def test_counters_stamps_and_samples_come_back_identical(finished: Path) -> None
             assert (sequence, t_ns) == (sent.counter, sent.t_ns)
             assert message.data.tobytes() == sent.samples.tobytes()
             assert message.layout.dim[0].label == "range_bin"
+
+
+def test_the_pulse_of_a_module_comes_back_for_replay(tmp_path: Path) -> None:
+    pulse = ReceivedPulse(
+        step_m=0.0388, relative_error=0.02, real=(0.1, 1 / 3, 0.7), imaginary=(0.0, 1e-17, -0.2)
+    )
+    info = session_info()
+    first, *others = info.radars
+    radars = (dataclasses.replace(first, pulse=pulse), *others)
+    path = write_session(
+        tmp_path / "s.mcap", 2, odometry(2), dataclasses.replace(info, radars=radars)
+    )
+    assert [mount.pulse for mount in open_session(path).rig.mounts] == [pulse, None]
 
 
 def test_odometry_is_written_as_far_as_the_scans_need_it(tmp_path: Path) -> None:
