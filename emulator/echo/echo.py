@@ -7,8 +7,7 @@ DAC is +-1) RF sample n of a frame at true time t is
     x[n] = sum_i a_i p(n - u_i; phase_i + j(t)) + c[n](t) + sigma w[n]
 
 with the leakage among the paths i, and the chip counts ``clip(round((x[n] + N / 2048) / q), 0,
-max)``. Floor, ceiling, elevation, polarisation, and paths of more bounces than named here are left
-out.
+max)``. Elevation of targets, polarisation, and paths of more bounces than named here are left out.
 
 Pulse p
     Gaussian envelope on the carrier (``emulator.echo.reflections``). Where the scene's table
@@ -36,6 +35,31 @@ Amplitude a of rod, point, person (``emulator.echo.reflections``)
 Cylinder
     Its surface, at R - radius, weakened by (1 / s) sqrt((1 + radius) / (s + radius)) over the
     distance s to it: geometric optics of a convex mirror.
+Body (``emulator.echo.targets``)
+    A target with points sends one echo from each, at its own range and of its share of the
+    amplitude; they add coherently, which is what makes complex targets fade and their apparent
+    place wander with aspect (Skolnik, 2.7: two points l apart give 2 (1 + cos(4 pi l sin(angle) /
+    wavelength)) times the power of one). Points do not shade each other.
+Scintillation (``emulator.echo.targets``)
+    The amplitude of a target times 10**(sigma_db g(t) / 20), or times sqrt((g(t)**2 + h(t)**2) /
+    2), whose power is exponential: Swerling's case I (IRE Trans. IT-6 (1960) 269), here with a
+    correlation in time. g and h are stationary Gaussian processes (``emulator.echo.receiver``) of
+    variance 1, keyed by the target and alike for all radars.
+Antenna
+    A path appears sin2_m sin(angle)**2, and what a table gives at the angle off boresight, farther;
+    ways out and back each count half. For an antenna whose phase centre lies d before the place
+    that its ranges are calibrated for, the path is longer by d (1 - cos(angle)), near d / 2
+    sin(angle)**2; in general a table by angle is measured, as the antennas of satellite navigation
+    have it (Rothacher and Schmid, ANTEX format). Shape and bandwidth of the pulse stay.
+Floor, ceiling (``emulator.echo.targets``)
+    Horizontal mirrors at the distance h from the antenna, phase pi each. Rods and cylinders stand
+    from floor to ceiling and make a right angle with it, which sends back what comes: half path
+    s = sqrt(d**2 + h**2) over the distance d to the surface, amplitude_1m / (d sqrt(s)) for a rod
+    (stationary phase along it, both orders of bouncing half of the first Fresnel zone each) and
+    sqrt((1 + radius) / (d + radius)) / s for a cylinder. Points and people are at the antenna's
+    height: legs of sqrt(d**2 + (2 h)**2), half path and spread as for ghosts. Beam and antenna as
+    for the leg's angle off boresight, elevation included. Walls have no such images, and no wave
+    goes by floor and ceiling on the same leg. Shadows are those of the straight leg.
 Wander (``emulator.echo.model_error``)
     Of a target seen under the bearing beta, from target to radar: range + a (0.7 cos(2 beta +
     phi_1) + 0.5 cos(5 beta + phi_2)) - rho; amplitude times max(0.1, 1 + c cos(3 beta + phi_3) +
@@ -89,6 +113,10 @@ Bursts (``emulator.echo.model_error``)
     Of other modules: echo_share of the frames hold 1 to 3 pulses, equally likely, at uniform
     ranges and phases, of amplitude times exp N(0, spread) and the module's gain; noise_share hold
     white noise of noise_sigma more. Assumed; keyed like w. Working points do not change them.
+Other modules (``emulator.echo.other_modules``)
+    Their pulses arrive amplitude_1m / distance strong, the beam once, and drift through the frame
+    by the difference of the clocks; the frame holds their mean over its sweep. 2 x 0.106 at 1 m is
+    a module of the same power that looks here: a mirror's echo has gone 2 m.
 Count q = 2**dac_step / (iterations pulses_per_step) / 1024, N = dac_max - dac_min + 1
     Protocol reference 9.7; outside the DAC window the counter saturates.
 Smoke
@@ -111,17 +139,20 @@ from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings, EchoSource
 from emulator.echo.model_error import Bursts, Stamps, TargetPairs, Wander
+from emulator.echo.other_modules import OtherModules
 from emulator.echo.receiver import CarrierJitter, Receiver, one_count
 from emulator.echo.reflections import (
+    SPEED_OF_LIGHT_MPS,
     PulseShape,
     Reflections,
+    Viewpoint,
     direct_reflections,
     person_scatterer,
     reflection_phase_rad,
     sum_of_pulses,
-    target_scatterers,
     viewpoint,
 )
+from emulator.echo.targets import Targets, mirrored_reflections
 from emulator.echo.walls import (
     corner_pairs,
     corner_reflections,
@@ -133,7 +164,6 @@ from emulator.echo.walls import (
 from emulator.scene.scene import RadarSpec, Scene
 from xethru_protocol.wire import x4
 
-SPEED_OF_LIGHT_MPS = 299_792_458.0
 _SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
 _SAMPLES_PER_MODULE_M = 2 * x4.SAMPLING_RATE_HZ / x4.MODULE_SPEED_MPS
 
@@ -148,13 +178,17 @@ class ScenePaths:
         self._scene = scene
         self._radar = radar
         self._trajectory = scene.trajectory()
-        self._targets = target_scatterers(scene.targets)
+        self._targets = Targets(scene.targets, seed)
         self._wander = Wander(scene.targets, seed)
-        self._target_pairs = TargetPairs(self._targets, scene.multipath.target_pairs)
+        self._target_pairs = TargetPairs(self._targets.steady, scene.multipath.target_pairs)
         self._leakage_phase_rad = np.array([reflection_phase_rad("leakage")])
         self._walled = bool(scene.walls or scene.objects)
         self._faces = faces_of(scene.walls, scene.objects)
         self._pairs = corner_pairs(self._faces)
+
+    def view(self, t_ns: NDArray[np.int64]) -> Viewpoint:
+        """Return where the radar is at true sample times of shape (n_frames,), int64."""
+        return viewpoint(self._radar, self._trajectory.poses(t_ns))
 
     def reflections(self, t_ns: NDArray[np.int64], wavelength_m: float) -> Reflections:
         """Return all paths at true sample times of shape (n_frames,), int64.
@@ -162,14 +196,18 @@ class ScenePaths:
         Amplitudes are at TX power 2 and before the receiver; a path that does not exist in a
         frame has amplitude 0.
         """
-        view = viewpoint(self._radar, self._trajectory.poses(t_ns))
+        view = self.view(t_ns)
+        heights = self._scene.heights
         scatterers = [
-            self._targets,
+            *self._targets.scatterers(t_ns),
             *(person_scatterer(person, t_ns) for person in self._scene.people),
         ]
         direct = [direct_reflections(each, view) for each in scatterers]
         if self._wander:
-            direct[0] = self._wander.applied(direct[0], self._targets, view)
+            direct[0] = self._wander.applied(direct[0], self._targets.steady, view)
+        mirrored: list[Reflections] = []
+        if heights.floor_reflection or heights.ceiling_reflection:
+            mirrored = [mirrored_reflections(each, view, heights) for each in scatterers]
         walls: list[Reflections] = []
         ghosts: list[Reflections] = []
         if self._walled:
@@ -180,6 +218,10 @@ class ScenePaths:
                 share = direct_share(self._faces, each, view, wavelength_m)
                 amplitude = direct[number].amplitude * share * share
                 direct[number] = replace(direct[number], amplitude=amplitude)
+                if mirrored:
+                    ways = mirrored[number].amplitude.shape[1] // share.shape[1]
+                    amplitude = mirrored[number].amplitude * np.tile(share * share, ways)
+                    mirrored[number] = replace(mirrored[number], amplitude=amplitude)
                 if self._scene.multipath.double_bounce:
                     ghosts.append(ghost_reflections(self._faces, each, view, share, wavelength_m))
         leakage = Reflections(
@@ -189,7 +231,7 @@ class ScenePaths:
         )
         pairs = [self._target_pairs.reflections(direct[0])] if self._target_pairs else []
         # frames are sums in this order, to the last bit
-        return _together([direct[0], leakage, *direct[1:], *walls, *ghosts, *pairs])
+        return _together([direct[0], leakage, *direct[1:], *walls, *ghosts, *pairs, *mirrored])
 
 
 def _together(terms: list[Reflections]) -> Reflections:
@@ -212,6 +254,7 @@ class SceneEcho:
         self._pulse = PulseShape.of(radar.pulse)
         self._bursts = Bursts(radar, self._pulse, seed)
         self._stamps = Stamps(radar, seed)
+        self._others = OtherModules(scene.other_modules, radar)
         self._clock = radar.clock
         self._gain = 10.0 ** (radar.gain_db / 20)
         self._jitter = CarrierJitter(scene.jitter, seed=seed, serial=int(radar.serial))
@@ -263,6 +306,9 @@ class SceneEcho:
         jitter_rad = self._jitter.phases_rad(indices, times_ns)
         signal = self.echo(capture, taken_ns, jitter_rad)
         self._bursts.add_to(signal, indices, capture)
+        if self._others:
+            view = self._paths.view(times_ns)
+            self._others.add_to(signal, view, times_ns, capture, self._gain)
         return self._receiver.counters(
             signal,
             indices,

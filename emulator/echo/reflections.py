@@ -29,7 +29,7 @@ from emulator.scene.motion import (
     positions_m,
     present,
 )
-from emulator.scene.scene import PulseSpec, RadarSpec, TargetSpec
+from emulator.scene.scene import AntennaSpec, PulseSpec, RadarSpec, TargetSpec
 from xethru_protocol.wire.x4 import CARRIER_HZ, SAMPLING_RATE_HZ
 
 BANDWIDTH_HZ = 1.4e9
@@ -46,7 +46,8 @@ BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2
 """n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
 NEAREST_M = 0.05
 """Amplitude laws are held from here inwards."""
-_RANGE_EXPONENT = {"rod": 1.5, "point": 2.0, "cylinder": 1.0}
+RANGE_EXPONENT = {"rod": 1.5, "point": 2.0, "cylinder": 1.0}
+SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 _SIGMA_SAMPLES = SIGMA_S * SAMPLING_RATE_HZ
 HALF_WINDOW = math.ceil(6 * _SIGMA_SAMPLES)
@@ -272,12 +273,25 @@ class Scatterers:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Viewpoint:
-    """A radar's phase centre and boresight (a unit vector): shape (n_frames, 1), world frame."""
+    """A radar's phase centre and boresight (a unit vector): shape (n_frames, 1), world frame.
+
+    ``antenna`` is how its phase centre depends on the angle.
+    """
 
     x_m: NDArray[np.float64]
     y_m: NDArray[np.float64]
     boresight_x: NDArray[np.float64]
     boresight_y: NDArray[np.float64]
+    antenna: AntennaSpec
+
+    def antenna_m(self, cos_angle: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how much farther a path appears whose ways out and back leave at an angle."""
+        law = self.antenna
+        farther_m = law.sin2_m * (1 - cos_angle * cos_angle)
+        if law.angle_deg:
+            angle_deg = np.degrees(np.arccos(np.clip(cos_angle, -1.0, 1.0)))
+            farther_m += np.interp(angle_deg, law.angle_deg, law.range_m)
+        return farther_m
 
     def take(self, frame: NDArray[np.int64]) -> Viewpoint:
         """Return where the radar is in some frames, shape (m,) each."""
@@ -286,6 +300,7 @@ class Viewpoint:
             y_m=self.y_m[frame, 0],
             boresight_x=self.boresight_x[frame, 0],
             boresight_y=self.boresight_y[frame, 0],
+            antenna=self.antenna,
         )
 
 
@@ -317,6 +332,7 @@ def viewpoint(radar: RadarSpec, robot_poses: NDArray[np.float64]) -> Viewpoint:
         y_m=y + sine * mount_x_m + cosine * mount_y_m,
         boresight_x=cosine * math.cos(yaw_rad) - sine * math.sin(yaw_rad),
         boresight_y=sine * math.cos(yaw_rad) + cosine * math.sin(yaw_rad),
+        antenna=radar.antenna,
     )
 
 
@@ -327,7 +343,7 @@ def target_scatterers(targets: tuple[TargetSpec, ...]) -> Scatterers:
         x_m=np.array([target.x_m for target in targets]),
         y_m=np.array([target.y_m for target in targets]),
         strength=np.array([target.amplitude_1m for target in targets]),
-        exponent=np.array([_RANGE_EXPONENT[target.kind] for target in targets]),
+        exponent=np.array([RANGE_EXPONENT[target.kind] for target in targets]),
         radius_m=radius_m,
         swell_m=radius_m,
         phase_rad=np.array([reflection_phase_rad(target.name) for target in targets]),
@@ -342,11 +358,22 @@ def person_scatterer(person: PersonSpec, t_ns: NDArray[np.int64]) -> Scatterers:
         x_m=position[:, :1],
         y_m=position[:, 1:],
         strength=np.where(present(person, t_ns), strength, 0.0)[:, np.newaxis],
-        exponent=np.array([_RANGE_EXPONENT["point"]]),
+        exponent=np.array([RANGE_EXPONENT["point"]]),
         radius_m=np.array([0.0]),
         swell_m=chest_displacement_m(person, t_ns)[:, np.newaxis],
         phase_rad=np.array([reflection_phase_rad(person.name)]),
     )
+
+
+def curved_spread(
+    surface_m: NDArray[np.float64], radius_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return what curvature takes from an echo at distances from a surface; 1 without a radius.
+
+    The mirror image in a cylinder is nearer the smaller the radius.
+    """
+    spread = np.sqrt((1 + radius_m) / (surface_m + radius_m))
+    return np.where(radius_m > 0, spread, 1.0)
 
 
 def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
@@ -362,11 +389,10 @@ def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
     if round_ones.any():
         radius_m = scatterers.radius_m
         surface_m = np.maximum(range_m - radius_m, NEAREST_M)
-        # Its mirror image is nearer the smaller the radius; inside it, nothing is received.
-        spread = np.sqrt((1 + radius_m) / (surface_m + radius_m)) * (range_m > radius_m)
-        strength = strength * np.where(round_ones, spread, 1.0)
+        # inside it, nothing is received
+        strength = strength * (curved_spread(surface_m, radius_m) * (range_m > radius_m))
     return Reflections(
-        range_m=range_m - scatterers.swell_m,
+        range_m=range_m - scatterers.swell_m + view.antenna_m(cos_angle),
         amplitude=strength * surface_m**-scatterers.exponent * beam_gain(cos_angle),
         phase_rad=scatterers.phase_rad,
     )

@@ -357,7 +357,9 @@ def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Refl
     strength = np.concatenate(amplitude, axis=1)
     x, y = np.concatenate(at_x, axis=1), np.concatenate(at_y, axis=1)
     ranges = np.concatenate(range_m, axis=1)
-    strength *= beam_gain(_cos_angle(view, x, y))
+    cos_angle = _cos_angle(view, x, y)
+    strength *= beam_gain(cos_angle)
+    ranges += view.antenna_m(cos_angle)
     frame, path = np.nonzero(strength)
     strength[frame, path] *= (
         passing(
@@ -451,8 +453,9 @@ def corner_reflections(
     start1 = one.along(x, y)
     bounce1 = start1 + (one.along(x2, y2) - start1) * share1
     x1, y1 = one.at(_between(bounce1, near1, far1))
-    gain1 = np.sqrt(beam_gain(_cos_angle(seen_from, x1, y1)))
-    gain2 = np.sqrt(beam_gain(_cos_angle(seen_from, x2, y2)))
+    cos1, cos2 = _cos_angle(seen_from, x1, y1), _cos_angle(seen_from, x2, y2)
+    gain1, gain2 = np.sqrt(beam_gain(cos1)), np.sqrt(beam_gain(cos2))
+    half_m[frame, pair] += 0.5 * (seen_from.antenna_m(cos1) + seen_from.antenna_m(cos2))
 
     # Edges, one by one: the way over the edge against the way of the mirrors.
     window = np.where((gain1 > 0) & (gain2 > 0), 1.0, 0.0)
@@ -521,10 +524,12 @@ class _Legs:
 
     The first is the straight one, the others go by way of a mirror each. ``gain`` is the share of
     a free leg's amplitude on boresight, and 0 where there is no leg; ``to_x``, ``to_y`` is the
-    unit vector from the target back along the leg.
+    unit vector from the target back along the leg; ``antenna_m`` is how much longer the antenna
+    makes it.
     """
 
     length_m: Array
+    antenna_m: Array
     gain: Array
     to_x: Array
     to_y: Array
@@ -578,7 +583,8 @@ def ghost_reflections(
                 * legs.gain[:, :, back]
                 * spread(scatterers, length_out, length_back, half_cosine)
             )
-            range_m.append(0.5 * (length_out + length_back) - swell_m * half_cosine)
+            antenna_m = 0.5 * (legs.antenna_m[:, :, out] + legs.antenna_m[:, :, back])
+            range_m.append(0.5 * (length_out + length_back) - swell_m * half_cosine + antenna_m)
             mirrors = 1 if out == 0 else 2
             phase_rad.append(scatterers.phase_rad + np.pi * mirrors)
     if not range_m:
@@ -682,10 +688,15 @@ def _legs(
     place = 1 + np.arange(len(row)) - first_of_row
     shape = (*x.shape, 1 + int(place.max(initial=0)))
     legs = _Legs(
-        length_m=np.ones(shape), gain=np.zeros(shape), to_x=np.ones(shape), to_y=np.zeros(shape)
+        length_m=np.ones(shape),
+        antenna_m=np.zeros(shape),
+        gain=np.zeros(shape),
+        to_x=np.ones(shape),
+        to_y=np.zeros(shape),
     )
     for table, straight, mirrored in (
         (legs.length_m, straight_m, length_m[kept]),
+        (legs.antenna_m, view.antenna_m(straight_cos), view.antenna_m(cos_angle[kept])),
         (legs.gain, straight_gain, gain[kept]),
         (legs.to_x, straight_x / straight_m, to_x[kept] / length_m[kept]),
         (legs.to_y, straight_y / straight_m, to_y[kept] / length_m[kept]),

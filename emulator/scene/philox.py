@@ -59,6 +59,7 @@ class Purpose(IntEnum):
     CLUTTER = 3
     STAMPS = 4
     BURSTS = 5
+    SCINTILLATION = 6
 
 
 def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:

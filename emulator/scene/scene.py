@@ -11,6 +11,7 @@ line naming file, key and what is allowed.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -71,6 +72,26 @@ class BurstSpec(Table):
     noise_sigma: Sigma = 2.5e-3
 
 
+class AntennaSpec(Table):
+    """How much farther than on boresight an echo appears at an angle off it.
+
+    ``sin2_m`` times the squared sine of the angle, and what a table says: ``range_m`` at the
+    angles ``angle_deg``, straight between them (``emulator.echo.echo``).
+    """
+
+    sin2_m: Annotated[Number, Field(ge=-0.1, le=0.1)] = 0.0
+    angle_deg: tuple[Annotated[Number, Field(ge=0, le=180)], ...] = ()
+    range_m: tuple[Annotated[Number, Field(ge=-0.1, le=0.1)], ...] = ()
+
+    @model_validator(mode="after")
+    def _is_a_table(self) -> AntennaSpec:
+        if len(self.range_m) != len(self.angle_deg):
+            raise ValueError("range_m: must have one number for each of angle_deg")
+        if any(low >= high for low, high in pairwise(self.angle_deg)):
+            raise ValueError("angle_deg: must ascend")
+        return self
+
+
 class RadarSpec(Table):
     """One X4M300 on the robot.
 
@@ -100,6 +121,7 @@ class RadarSpec(Table):
     stamp_sigma_ms: Annotated[Number, Field(ge=0, le=1000)] = 0.0
     pulse: PulseSpec = PulseSpec()
     bursts: BurstSpec = BurstSpec()
+    antenna: AntennaSpec = AntennaSpec()
 
     @property
     def clock(self) -> ModuleClock:
@@ -120,13 +142,41 @@ class WanderSpec(Table):
     phase_rad: Annotated[Number, Field(ge=0, le=10)] = 0.0
 
 
+class ScintillationSpec(Table):
+    """How a target's echo fades in time (``emulator.echo.targets``).
+
+    ``lognormal``: its level in dB is Gaussian, of standard deviation ``sigma_db``. ``rayleigh``:
+    its power is exponential, of the mean that the target has without (Swerling's case I).
+    ``correlation_s`` is the lag at which level or field are correlated by 1/e.
+    """
+
+    law: Literal["none", "lognormal", "rayleigh"] = "none"
+    sigma_db: Annotated[Number, Field(ge=0, le=20)] = 3.0
+    correlation_s: CorrelationTime = 1.0
+
+
+class ScatteringPointSpec(Table):
+    """One scattering point of a body, in the body's own frame.
+
+    ``share`` is its amplitude in those of the target's ``amplitude_1m``; ``phase_deg`` is added to
+    the target's reflection phase.
+    """
+
+    x_m: Annotated[Number, Field(ge=-10, le=10)]
+    y_m: Annotated[Number, Field(ge=-10, le=10)]
+    share: Annotated[Number, Field(gt=0, le=10)] = 1.0
+    phase_deg: Degrees = 0.0
+
+
 class TargetSpec(Table):
     """One reflector, in the world frame.
 
     ``kind`` selects the amplitude law: a ``rod`` falls with R**-1.5, a ``point`` with R**-2, and
     a ``cylinder`` of ``radius_m`` is seen at the point of its surface nearest to the radar.
     ``amplitude_1m`` is the echo's amplitude on boresight at 1 m (of a cylinder: 1 m from its
-    surface). The reflection phase is fixed by the name (``emulator.echo.echo``).
+    surface). The reflection phase is fixed by the name (``emulator.echo.echo``). A rod or a point
+    with ``points`` is a body: in place of one echo from its middle it sends one from each of them;
+    ``yaw_deg`` turns them with it.
     """
 
     name: Name
@@ -136,6 +186,15 @@ class TargetSpec(Table):
     amplitude_1m: Annotated[Number, Field(gt=0, le=10)] = 0.015
     radius_m: Annotated[Number, Field(ge=0, le=10)] = 0.0
     wander: WanderSpec = WanderSpec()
+    yaw_deg: Degrees = 0.0
+    points: Annotated[tuple[ScatteringPointSpec, ...], Field(max_length=64)] = ()
+    scintillation: ScintillationSpec = ScintillationSpec()
+
+    @model_validator(mode="after")
+    def _points_stand_alone(self) -> TargetSpec:
+        if self.points and (self.kind == "cylinder" or self.wander != WanderSpec()):
+            raise ValueError("points: a cylinder, or a target with wander, has none")
+        return self
 
     @model_validator(mode="after")
     def _radius_belongs_to_a_cylinder(self) -> TargetSpec:
@@ -214,6 +273,40 @@ class MultipathSpec(Table):
     double_bounce: StrictBool = True
     corners: StrictBool = True
     target_pairs: Annotated[Number, Field(ge=0, le=1)] = 0.0
+
+
+class HeightsSpec(Table):
+    """Floor and ceiling, as mirrors (``emulator.echo.targets``).
+
+    ``antenna_m`` and ``ceiling_m`` are heights above the floor, of the radars' phase centres and of
+    the ceiling; ``floor_reflection`` and ``ceiling_reflection`` the magnitudes of the reflection
+    coefficients, 0 for none.
+    """
+
+    antenna_m: Annotated[Number, Field(gt=0, le=100)] = 0.3
+    ceiling_m: Annotated[Number, Field(gt=0, le=100)] = 2.5
+    floor_reflection: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    ceiling_reflection: Annotated[Number, Field(ge=0, le=1)] = 0.0
+
+    @model_validator(mode="after")
+    def _antenna_is_below_the_ceiling(self) -> HeightsSpec:
+        if self.antenna_m >= self.ceiling_m:
+            raise ValueError("antenna_m: must be less than ceiling_m")
+        return self
+
+
+class OtherModuleSpec(Table):
+    """Another X4 in the world frame, which sends at its own pulse repetition.
+
+    ``amplitude_1m`` is that of its pulses at a radar that looks at it from 1 m; ``clock_ppm`` is
+    how fast its clock is. See ``emulator.echo.other_modules``.
+    """
+
+    name: Name
+    x_m: Metres
+    y_m: Metres
+    amplitude_1m: Annotated[Number, Field(gt=0, le=10)] = round(2 * MIRROR_AMPLITUDE_1M, 4)
+    clock_ppm: Annotated[Number, Field(ge=-1000, le=1000)] = 0.0
 
 
 class ClutterSpec(Table):
@@ -344,7 +437,9 @@ class Scene(Table):
     people: Annotated[tuple[PersonSpec, ...], Field(max_length=32)] = ()
     walls: Annotated[tuple[WallSpec, ...], Field(max_length=64)] = ()
     objects: Annotated[tuple[ObjectSpec, ...], Field(max_length=64)] = ()
+    other_modules: Annotated[tuple[OtherModuleSpec, ...], Field(max_length=32)] = ()
     multipath: MultipathSpec = MultipathSpec()
+    heights: HeightsSpec = HeightsSpec()
     path: PathSpec = PathSpec()
     odometry: OdometrySpec = OdometrySpec()
     noise: NoiseSpec = NoiseSpec()
@@ -361,6 +456,7 @@ class Scene(Table):
             ("people.name", [person.name for person in self.people]),
             ("walls.name", [wall.name for wall in self.walls]),
             ("objects.name", [box.name for box in self.objects]),
+            ("other_modules.name", [module.name for module in self.other_modules]),
         ):
             twice = sorted({value for value in values if values.count(value) > 1})
             if twice:
