@@ -374,6 +374,9 @@ class RobustConfig(_Model):
     # Standard deviation of each radar's unknown constant range offset.
     offset_sigma_m: NonNegative = 0.0
     detection_probability: Annotated[float, Field(gt=0, lt=1)] = 0.95
+    # Standard deviation of where an antenna is, along each axis, and of the radius of a target.
+    mount_sigma_m: NonNegative = 0.0
+    radius_sigma_m: NonNegative = 0.0
     # Ranges of nothing that stands there, per radar and frame.
     false_ranges_per_frame: Positive = 0.05
     # How far the wheels' calibration wanders per root of a metre, in its standard deviations.

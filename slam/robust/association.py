@@ -2,11 +2,11 @@
 
 A range is predicted from where the radar was when it sampled, antenna m in the body frame,
 
-    z = |l - p - R m| + b + v,   H = [e_th: 0, e_p: -u, e_l: u, b: 1],
+    z = |l - p - R m| - rho + b + v,   H = [e_th: 0, e_p: -u, e_l: u, e_rho: -1, b: 1, e_m: -R^T u],
 
-u the unit vector from antenna to landmark in the map frame. The heading has no entry: a turn of
-robot and map together changes no range. Of a wall (phi, d) the mirror image answers, along its
-normal n, from wherever the antenna q = p + R m is:
+u the unit vector from antenna to the landmark's axis in the map frame, rho its radius. The heading
+has no entry: a turn of robot and map together changes no range. Of a wall (phi, d) the mirror image
+answers, along its normal n, from wherever the antenna q = p + R m is:
 
     z = d - n . q + b + v,     H = [e_th: 0, e_p: -n, e_phi: -(J n) . q, e_d: 1, b: 1].
 
@@ -84,10 +84,6 @@ class RangeScan:
             return self
         return replace(self, sigmas_m=tuple(math.hypot(s, sigma_m) for s in self.sigmas_m))
 
-    def is_alone(self, index: int) -> bool:
-        others = (*self.ranges_m[:index], *self.ranges_m[index + 1 :], *self.blurred_m)
-        return all(abs(other_m - self.ranges_m[index]) > BLUR_M for other_m in others)
-
     def may_hide(self, range_m: float) -> bool:
         return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
 
@@ -108,27 +104,38 @@ class Antennas:
     position_m: Array
     yaw_rad: Array
     has_frame: NDArray[np.bool_]
+    told_m: Array  # shape (r, 2): positions if every mount were where the rig has it
+    turns_rad: Array  # shape (r,): of the robot from the pose to the sample
 
 
-def antennas_of(rig: Rig, scans: Sequence[RangeScan], calibration: Array) -> Antennas:
+def antennas_of(
+    rig: Rig, scans: Sequence[RangeScan], calibration: Array, moved_m: Array | None = None
+) -> Antennas:
     """Return where the antennas were; a radar without a scan stays at its mount.
 
     ``calibration`` (3,), s, w and kappa, corrects reported motions; over less than a step the
-    curvature has no effect.
+    curvature has no effect. ``moved_m`` (r, 2) is how far the mounts are from the rig's.
     """
     s, w = calibration[:2].tolist()
     mounts = rig.mounts
-    position = np.array([[mount.x_m, mount.y_m] for mount in mounts])
+    told = np.array([[mount.x_m, mount.y_m] for mount in mounts])
+    position = told.copy() if moved_m is None else told + moved_m
     yaw = np.array([mount.yaw_rad for mount in mounts])
+    turns = np.zeros(len(mounts))
     has_frame = np.zeros(len(mounts), dtype=bool)
     for scan in scans:
         has_frame[scan.radar] = True
         if scan.moved is not None:
             turn = scan.moved[2] / (1.0 + w)
             way = np.array(scan.moved[:2]) / (1.0 + s)
-            position[scan.radar] = way + rotation(turn) @ position[scan.radar]
+            turned = rotation(turn)
+            position[scan.radar] = way + turned @ position[scan.radar]
+            told[scan.radar] = way + turned @ told[scan.radar]
             yaw[scan.radar] += turn
-    return Antennas(position_m=position, yaw_rad=yaw, has_frame=has_frame)
+            turns[scan.radar] = turn
+    return Antennas(
+        position_m=position, yaw_rad=yaw, has_frame=has_frame, told_m=told, turns_rad=turns
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,6 +146,7 @@ class View:
     off_boresight_rad: Array  # shape (r, n + w), in [-pi, pi)
     directions: Array  # shape (r, n + w, 2), unit vectors u or n in the map frame
     by_feature: Array  # shape (r, n + w, 2), d(range) / d(error of the landmark or wall)
+    turned: Array  # shape (r, 2, 2): rotations from the body frame of the sample to the map
 
     def inside(
         self, noise: RangeNoise, widen_rad: float = 0.0, widen_m: float = 0.0
@@ -170,13 +178,16 @@ def view(state: State, antennas: Antennas) -> View:
         by_wall = np.stack([-places @ turned.T, np.ones((len(places), len(phi)))], axis=-1)
         by_feature = np.concatenate([directions, by_wall], axis=1)
         directions = np.concatenate([directions, walls], axis=1)
-    if state.radii_m:
+    if state.radius_sigma_m:
         ranges = ranges - state.feature_radii_m
+    c, s = np.cos(antennas.turns_rad), np.sin(antennas.turns_rad)
+    turned = R @ np.stack([np.column_stack([c, -s]), np.column_stack([s, c])], axis=1)
     return View(
         ranges_m=ranges + state.offsets_m[:, None],
         off_boresight_rad=wrap_angles(bearings - antennas.yaw_rad[:, None]),
         directions=directions,
         by_feature=by_feature,
+        turned=turned,
     )
 
 
@@ -194,20 +205,26 @@ class Rows:
 
 def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Rows:
     known, place = np.unique(landmarks, return_inverse=True)
-    n_offsets = len(state.offsets_m)
+    layout = state.layout
+    n_offsets = layout.n_radars
     at = np.concatenate(
-        [
-            np.array([1, 2]),
-            np.arange(state.offsets.start, state.offsets.stop),
-            state.landmark_columns(known),
-        ]
+        [np.array([1, 2]), np.arange(layout.offsets.start, state.n_fixed), layout.columns(known)]
     )
     k = np.arange(len(radars))
     u = seen.directions[radars, landmarks]
     H = np.zeros((len(radars), len(at)))
     H[:, :2] = -u
     H[k, 2 + radars] = 1.0
-    first = 2 + n_offsets + 2 * place
+    if layout.has_mounts:
+        by_mount = -np.einsum("ki,kij->kj", u, seen.turned[radars])
+        H[k, 2 + n_offsets + 2 * radars] = by_mount[:, 0]
+        H[k, 3 + n_offsets + 2 * radars] = by_mount[:, 1]
+    first = 2 + state.n_fixed - layout.offsets.start + 2 * place
+    if layout.has_radii:
+        points = int(np.searchsorted(known, layout.n_landmarks))
+        first = first + np.minimum(place, points)
+        of_point = np.flatnonzero(landmarks < layout.n_landmarks)
+        H[of_point, first[of_point] + 2] = -1.0
     by_feature = seen.by_feature[radars, landmarks]
     H[k, first] = by_feature[:, 0]
     H[k, first + 1] = by_feature[:, 1]
@@ -291,9 +308,9 @@ class SureLandmarks:
             landmarks=self.landmarks[sure], rows=rows, prior=self.prior[np.ix_(keep, keep)]
         )
 
-    def with_added_sigma(self, shape_sigmas_m: Array) -> SureLandmarks:
+    def with_added_sigma(self, added_sigmas_m: Array) -> SureLandmarks:
         """Add standard deviations, one per row of the map, to the predictions."""
-        added = np.square(shape_sigmas_m[self.rows.landmarks])
+        added = np.square(added_sigmas_m[self.rows.landmarks])
         return self if not added.any() else replace(self, prior=self.prior + np.diag(added))
 
     def unanswered(self, scans: Sequence[RangeScan], noise: RangeNoise, within_m: float) -> Indices:

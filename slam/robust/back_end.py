@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from slam.geometry import Rig, wrap_angles
+from slam.geometry import Rig
 from slam.results import PredictedRange, SmoothedRun, UpdateReport
 from slam.robust.association import (
     Antennas,
@@ -44,11 +44,11 @@ from slam.robust.initialisation import (
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.map import Existence, Roundness, apply_merge, find_merge
+from slam.robust.map import Existence, apply_merge, find_merge
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import is_due, relinearise, solve_whole_run
-from slam.robust.state import Array, Motion, State, calibrated_motion, predict
+from slam.robust.state import HEAD_SIZE, Array, Motion, State, calibrated_motion, predict
 from slam.robust.walls import WallKeeper
 
 # Standard deviations of a step that the wheels did not measure, and far more than what is left to
@@ -97,7 +97,12 @@ class RobustBackEnd:
         self.rig = rig
         self.parameters = parameters
         offsets = (parameters.ranges.offset_sigma_m,) * len(rig.mounts)
-        self.state = State(parameters.wheels.calibration_sigmas, offsets)
+        self.state = State(
+            parameters.wheels.calibration_sigmas,
+            offsets,
+            parameters.ranges.mount_sigma_m,
+            parameters.ranges.radius_sigma_m,
+        )
         self._sides = rig.sides(parameters.ranges.field_of_view)
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
@@ -108,7 +113,6 @@ class RobustBackEnd:
         self._existence = Existence(parameters.map)
         self._log = RunLog(parameters.wheels)
         self._walls = WallKeeper(self.state, parameters)
-        self._roundness = Roundness(parameters.roundness)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
@@ -157,16 +161,14 @@ class RobustBackEnd:
         solved = solve_whole_run(self._log, self.state, self.parameters)
         if solved is None:
             return None
-        estimate, pose_covariances, covariances_m2 = solved
+        poses, pose_covariances, features, covariances_m2 = solved
         rows = self.reported_rows()
-        poses = estimate.poses[1:].copy()
-        poses[:, 2] = wrap_angles(poses[:, 2])
         return SmoothedRun(
             t_ns=stamps_ns,
-            poses=poses,
+            poses=poses[1:],
             pose_covariances=pose_covariances[1:],
             landmark_ids=tuple(self.state.landmark_ids[row] for row in rows),
-            landmarks_m=estimate.landmarks_m[rows],
+            landmarks_m=features[rows],
             landmark_covariances_m2=covariances_m2[rows],
         )
 
@@ -177,7 +179,7 @@ class RobustBackEnd:
         """
         wheels = self.parameters.wheels
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
-        self._log.add_motion(increment, motion)
+        self._log.add_motion(increment, motion, is_loose=covariance is not None)
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
 
@@ -195,12 +197,12 @@ class RobustBackEnd:
         increment = np.zeros(3)
         free = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
         motion = Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=free, walk_variance=0.0)
-        self._log.add_motion(increment, motion)
+        self._log.add_motion(increment, motion, is_loose=True)
         self._unassigned.clear()
         state = self.state
         state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
         for landmark_id, point_m, covariance in points:
-            by_offsets = np.zeros((2, len(state.offsets_m)))
+            by_offsets = np.zeros((2, state.n_fixed - HEAD_SIZE))
             point = BodyPoint(point_m=point_m, covariance=covariance, by_offsets=by_offsets)
             update_with_point(state, state.landmark_ids.index(landmark_id), point)
         self._log.set_causal(state.pose)
@@ -210,7 +212,7 @@ class RobustBackEnd:
 
         ``sure_m`` replaces how sure a prediction must be for a range to continue a track.
         """
-        antennas = antennas_of(self.rig, scans, self.state.calibration)
+        antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         widened = [
             scan.with_added_sigma(self.parameters.ranges.association_sigma_m) for scan in scans
@@ -256,7 +258,7 @@ class RobustBackEnd:
         """Update the landmark in a row with a point, or add one (row -1)."""
         state = self.state
         if row < 0:
-            landmark_id = initialise_landmark(state, point.body_point(len(state.offsets_m)))
+            landmark_id = initialise_landmark(state, point.body_point(state.n_fixed - HEAD_SIZE))
             if point.label is not None:
                 self._landmark_of_label[point.label] = landmark_id
         else:
@@ -272,8 +274,7 @@ class RobustBackEnd:
         return relinearise(self._log, self.state, self.parameters)
 
     def _smooth_if_due(self) -> None:
-        gave_radii = self._roundness.give(self.state, self._log, self.parameters, self._existence)
-        if gave_radii or is_due(self._log, self.state, self.parameters):
+        if is_due(self._log, self.state, self.parameters):
             self.relinearise()
 
     def _associate(
@@ -315,8 +316,8 @@ class RobustBackEnd:
         if near is None:
             return
         sure = near.surer_than(sure_m)
-        shape_sigmas_m, ids = state.feature_shape_sigmas_m, state.feature_ids
-        near = near.with_added_sigma(shape_sigmas_m)
+        added_sigmas_m, ids = state.feature_added_sigmas_m, state.feature_ids
+        near = near.with_added_sigma(added_sigmas_m)
         self._find_missed(near, seen, scans, matches)
         inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
         known = () if sure is None else sure.landmarks
@@ -327,7 +328,7 @@ class RobustBackEnd:
         if sure is None:
             return
         matches.predicted += predicted_ranges(state, sure, antennas)
-        found = continue_tracks(sure.with_added_sigma(shape_sigmas_m), scans, noise, rule)
+        found = continue_tracks(sure.with_added_sigma(added_sigmas_m), scans, noise, rule)
         matches.continued += found
         count = Counter(continuation.row for continuation in found)
         for row in count:
@@ -385,9 +386,9 @@ class RobustBackEnd:
         )
         innovations_m = z - rows.predicted_m
         sigmas = np.array([of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found])
-        shape_sigmas_m = state.feature_shape_sigmas_m[[c.row for c in found]]
+        added_sigmas_m = state.feature_added_sigmas_m[[c.row for c in found]]
         by_state = rows.H @ state.P.block(rows.at)
-        S = by_state @ rows.H.T + np.diag(np.square(sigmas) + np.square(shape_sigmas_m))
+        S = by_state @ rows.H.T + np.diag(np.square(sigmas) + np.square(added_sigmas_m))
         L = np.linalg.cholesky(S)
         white = solve_triangular(L, innovations_m, lower=True)
         nis = float(white @ white)
@@ -404,20 +405,20 @@ class RobustBackEnd:
             )
             if (n_ranges := len(of_radar[radar].ranges_m))
         ]
-        prior = np.vecdot(by_state, rows.H) + np.square(shape_sigmas_m)
-        sigmas = huber_weighted_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
-        for (radar, at, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
-            x, y = antennas.position_m[radar].tolist()
+        prior = np.vecdot(by_state, rows.H) + np.square(added_sigmas_m)
+        for (radar, _, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
+            x, y = antennas.told_m[radar].tolist()
             self._log.add_range(
                 self._log.n_poses - 1,
                 radar,
                 landmark_id,
                 antenna=(x, y),
+                turn_rad=float(antennas.turns_rad[radar]),
                 range_m=float(range_m),
                 sigma_m=float(sigma_m),
-                alone=of_radar[radar].is_alone(at),
             )
-        variances = np.square(sigmas) + np.square(shape_sigmas_m)
+        sigmas = huber_weighted_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
+        variances = np.square(sigmas) + np.square(added_sigmas_m)
         state.update(rows.at, rows.H, innovations_m, variances)
         return continued, nis, likelihoods
 
@@ -470,13 +471,13 @@ class RobustBackEnd:
     def _use(self, landmark_id: int, seen: Sightings) -> None:
         """Count and log the ranges of a tracklet as those of a landmark or a wall."""
         self._existence.hit(landmark_id, seen.n_frames)
-        for pose, radar, antenna, range_m, sigma_m, alone in zip(
+        for pose, radar, antenna, turn_rad, range_m, sigma_m in zip(
             seen.poses.tolist(),
             seen.radars.tolist(),
-            seen.mounts_m.tolist(),
+            seen.told_m.tolist(),
+            seen.turns_rad.tolist(),
             seen.measured_m.tolist(),
             seen.sigmas_m.tolist(),
-            seen.alone.tolist(),
             strict=True,
         ):
             self._log.add_range(
@@ -484,9 +485,9 @@ class RobustBackEnd:
                 radar,
                 landmark_id,
                 antenna=(antenna[0], antenna[1]),
+                turn_rad=turn_rad,
                 range_m=range_m,
                 sigma_m=sigma_m,
-                alone=alone,
             )
 
     def _delete_vanished(self) -> None:

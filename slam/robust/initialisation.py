@@ -22,7 +22,9 @@ A point b with noise n and known dependence D_b on the unknowns of the radars me
     y = b - R^T (l - p),   H = [e_p: -R^T, e_l: R^T, e_b: -D_b],   S = H P H^T + C_b,
 
 and a new landmark is l = p + R b with e_l = e_p + R D_b e_b + R n: correlated with all that the
-pose is correlated with. (In right-invariant errors the heading enters neither.)
+pose is correlated with. (In right-invariant errors the heading enters neither.) The ranges of a few
+frames end at the surface: with o the direction away from where they were taken, the axis of a
+landmark of radius rho is seen at b + rho o, and H has e_rho: -o.
 
 Points measured with range and bearing, b = R^T (l - p) in the body frame, z = (|b|, atan2(b_y,
 b_x)) and G = dz / db, have ``H = [e_p: -G R^T, e_l: G R^T]``. They are matched to the landmarks of
@@ -59,7 +61,7 @@ from slam.robust.parameters import (
     TrackletRule,
     chi_square_limit,
 )
-from slam.robust.state import POSITION, Array, Indices, Motion, State, rotation
+from slam.robust.state import HEAD_SIZE, POSITION, Array, Indices, Motion, State, rotation
 
 _SEED_MARGIN_RAD = 0.05
 MEMBER_MARGIN_RAD = 0.1
@@ -94,12 +96,13 @@ class Sightings:
     variances: Array
     radars: Indices  # shape (k,)
     # As measured, for the log: the pose of each (k,), its antenna in the body frame of that pose
-    # (k, 2), range [m] and standard deviation (k,), and whether no other echo overlapped its own
+    # were its mount where the rig has it (k, 2), the robot's turn from the pose to the sample,
+    # range [m] and standard deviation (k,)
     poses: Indices
-    mounts_m: Array
+    told_m: Array
+    turns_rad: Array
     measured_m: Array
     sigmas_m: Array
-    alone: NDArray[np.bool_]
     n_radars: int  # of the rig
 
     @property
@@ -129,7 +132,8 @@ class UnassignedRanges:
         self._way = np.zeros(2)  # metres and radians, always growing
         self._newest, self._count = -1, 0
         self._places = np.zeros((capacity, n_radars, 3))
-        self._mounts_m = np.zeros((capacity, n_radars, 2))
+        self._mounts_m, self._told_m = np.zeros((2, capacity, n_radars, 2))
+        self._turns_rad = np.zeros((capacity, n_radars))
         self._poses, self._ways = np.zeros((capacity, 3)), np.zeros((capacity, 2))
         self._pose_indices = np.zeros(capacity, dtype=np.intp)
         self._has_frame = np.zeros((capacity, n_radars), dtype=np.bool_)
@@ -139,15 +143,14 @@ class UnassignedRanges:
         """Make room for so many ranges of a radar in a frame."""
         shape = (*self._has_frame.shape, most)
         ranges_m, sigmas_m = np.full(shape, np.nan), np.zeros(shape)
-        labels, alone = np.full(shape, _NO_LABEL, dtype=np.intp), np.zeros(shape, dtype=np.bool_)
+        labels = np.full(shape, _NO_LABEL, dtype=np.intp)
         if self._count:
             k = self._ranges_m.shape[2]
             ranges_m[..., :k], sigmas_m[..., :k] = self._ranges_m, self._sigmas_m
-            labels[..., :k], alone[..., :k] = self._labels, self._alone
+            labels[..., :k] = self._labels
         self._ranges_m: Array = ranges_m
         self._sigmas_m: Array = sigmas_m
         self._labels: Indices = labels
-        self._alone: NDArray[np.bool_] = alone
 
     def move(self, motion: Motion) -> None:
         step = np.array([motion.step_m[0], motion.step_m[1], motion.turn_rad])
@@ -175,6 +178,7 @@ class UnassignedRanges:
         self._places[f, :, :2] = antennas.position_m @ turn.T + self._pose[:2]
         self._places[f, :, 2] = antennas.yaw_rad + self._pose[2]
         self._mounts_m[f], self._has_frame[f] = antennas.position_m, antennas.has_frame
+        self._told_m[f], self._turns_rad[f] = antennas.told_m, antennas.turns_rad
         self._poses[f], self._ways[f], self._pose_indices[f] = self._pose, self._way, pose_index
         self._ranges_m[f], self._labels[f] = np.nan, _NO_LABEL
         for scan in scans:
@@ -184,7 +188,6 @@ class UnassignedRanges:
                 at = f, scan.radar, index
                 self._ranges_m[at] = range_m
                 self._sigmas_m[at] = scan.sigma(index, self._sigma_m)
-                self._alone[at] = scan.is_alone(index)
                 if (label := scan.label(index)) is not None:
                     self._labels[at] = label
 
@@ -251,10 +254,10 @@ class UnassignedRanges:
             variances=np.square(self._sigmas_m[at]) + drift,
             radars=radars,
             poses=self._pose_indices[f],
-            mounts_m=self._mounts_m[f, radars],
+            told_m=self._told_m[f, radars],
+            turns_rad=self._turns_rad[f, radars],
             measured_m=self._ranges_m[at],
             sigmas_m=self._sigmas_m[at],
-            alone=self._alone[at],
             n_radars=self._has_frame.shape[1],
         )
 
@@ -290,14 +293,15 @@ class FeatureRows:
 
 
 def point_rows(state: State, row: int, point: BodyPoint) -> FeatureRows:
-    R = rotation(state.heading_rad)
-    offsets = np.arange(state.offsets.start, state.offsets.stop)
-    at = np.concatenate([np.array([1, 2]), offsets, state.landmark_columns(np.array([row]))])
-    H = np.hstack([-R.T, -point.by_offsets, R.T])
+    R, layout = rotation(state.heading_rad), state.layout
+    fixed = np.arange(layout.offsets.start, state.n_fixed)
+    at = np.concatenate([np.array([1, 2]), fixed, layout.columns(np.array([row]))])
+    seen_m, by_radius = point.point_m, np.zeros((2, 0))
+    if layout.has_radii:
+        outward = np.zeros(2) if point.outward is None else point.outward
+        seen_m, by_radius = seen_m + state.radii_m[row] * outward, -outward[:, None]
+    H = np.hstack([-R.T, -point.by_offsets, R.T, by_radius])
     S = H @ state.P.block(at) @ H.T + point.covariance
-    seen_m = point.point_m
-    if point.outward is not None and (radius_m := state.radii_m.get(state.landmark_ids[row], 0.0)):
-        seen_m = seen_m + radius_m * point.outward
     return FeatureRows(
         residual=seen_m - R.T @ (state.landmarks_m[row] - state.position_m),
         at=at,
@@ -332,13 +336,19 @@ def update_with_point(state: State, row: int, point: BodyPoint) -> float:
 
 def initialise_landmark(state: State, point: BodyPoint) -> int:
     R = rotation(state.heading_rad)
-    at = np.arange(state.offsets.stop)
+    at = np.arange(state.n_fixed)
     columns = state.P.columns(at)
     G = np.zeros((2, len(at)))
     G[:, POSITION] = np.eye(2)
-    G[:, state.offsets] = R @ point.by_offsets
+    G[:, HEAD_SIZE:] = R @ point.by_offsets
     cross = columns @ G.T
     corner = G @ cross[at] + R @ point.covariance @ R.T
+    if state.radius_sigma_m:
+        # A point whose range and bearing were measured is where it was seen.
+        sigma_m = 0.0 if point.outward is None else state.radius_sigma_m
+        along = np.append(np.zeros(2) if point.outward is None else R @ point.outward, 1.0)
+        cross = np.column_stack([cross, np.zeros(len(cross))])
+        corner = np.pad(corner, (0, 1)) + sigma_m**2 * np.outer(along, along)
     return state.augment(state.position_m + R @ point.point_m, cross, (corner + corner.T) / 2)
 
 
@@ -729,13 +739,14 @@ class RangeBearing:
     def values(self) -> Array:
         return np.array([self.range_m, self.bearing_rad])
 
-    def body_point(self, n_radars: int) -> BodyPoint:
+    def body_point(self, n_unknowns: int) -> BodyPoint:
+        """Return the point; none of the unknowns of the radars matter."""
         c, s = math.cos(self.bearing_rad), math.sin(self.bearing_rad)
         G = np.array([[c, -self.range_m * s], [s, self.range_m * c]])
         return BodyPoint(
             point_m=self.range_m * np.array([c, s]),
             covariance=G @ self.covariance @ G.T,
-            by_offsets=np.zeros((2, n_radars)),
+            by_offsets=np.zeros((2, n_unknowns)),
         )
 
 

@@ -35,6 +35,10 @@ class RangeNoise:
     huber_sigmas: float = math.inf
     # Standard deviation of each radar's unknown constant range offset; zero if calibrated
     offset_sigma_m: float = 0.0
+    # Standard deviations of the antennas' places, per axis, and of landmarks' radii about zero; a
+    # zero takes the unknowns out of the state
+    mount_sigma_m: float = 0.0
+    radius_sigma_m: float = 0.0
     detection_probability: float = 0.92  # that a target in view is detected in a frame
     clutter_per_m: float = 0.15 / 1.3  # false ranges per radar, frame and metre of range
     field_of_view_rad: float = math.radians(65.0)  # full opening angle
@@ -132,34 +136,12 @@ class WallRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RoundnessRule:
-    """When a landmark is a round target and no point."""
-
-    # Frames looked back, fewer if the robot turned by more than that since
-    window: int = 120
-    most_turn_rad: float = 0.1
-    # Fewest ranges, and least way between the first and the last
-    min_ranges: int = 60
-    min_way_m: float = 0.4
-    every: int = 10  # frames that hit a landmark between two looks at it
-    # How many standard deviations a radius must be from zero to be likely, and what none exceeds
-    sigmas: float = 3.0
-    largest_m: float = 0.5
-    # By how much the cost of the solution over all poses must fall for it to be believed
-    margin: float = 9.0
-    # Share of the standard deviation at the last look that is worth another one
-    sharper: float = 0.9
-    # How far chi-square may exceed its degrees of freedom, in its standard deviations
-    excess_sigmas: float = 3.1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RelinearisationRule:
-    """When all poses that are kept are solved for again, and how."""
+    """When the whole run is solved for again, and how."""
 
-    # When more poses than this are kept, all but this share of it are condensed into a prior
-    most_poses: int = 3000
-    kept_share: float = 0.67
+    # Way and turn from one keyframe to the next
+    key_m: float = 0.05
+    key_rad: float = 0.1
     # How far the filter's pose may part from the stored trajectory
     turn_rad: float = 0.02
     shift_m: float = 0.04
@@ -168,6 +150,12 @@ class RelinearisationRule:
     # Ranges further off than this are left out from that iteration on
     outlier_sigmas: float = 4.0
     outliers_from: int = 3
+    # Standard deviations of a slip, how many steps there are to one, and from which iteration on
+    # there are any
+    slip_m: float = 0.015
+    slip_rad: float = math.radians(2.0)
+    steps_per_slip: float = 100.0
+    slips_from: int = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,5 +211,4 @@ class BackEndParameters:
     map: MapRule = field(default_factory=MapRule)
     branches: BranchRule = field(default_factory=BranchRule)
     walls: WallRule = field(default_factory=WallRule)
-    roundness: RoundnessRule = field(default_factory=RoundnessRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)

@@ -165,6 +165,8 @@ def back_end_parameters(
             association_sigma_m=robust.association_doubt_m,
             huber_sigmas=robust.huber_sigmas,
             offset_sigma_m=robust.offset_sigma_m,
+            mount_sigma_m=robust.mount_sigma_m,
+            radius_sigma_m=robust.radius_sigma_m,
             detection_probability=robust.detection_probability,
             clutter_per_m=robust.false_ranges_per_frame / reach_m,
             field_of_view_rad=robust.field_of_view_rad,

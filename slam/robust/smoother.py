@@ -1,144 +1,52 @@
-"""Solution over all poses, when the filter has come far from where it linearised.
+"""Solution over the whole run, when the filter has come far from where it linearised.
 
-Unknown are the poses, the calibration errors of the wheels (constant, or one set per pose that
-walks), the range offsets and the landmarks. The normal equations are a band along time with a
-border: the last pose, its calibration, the offsets and the landmarks. A band Cholesky in time
-order eliminates all earlier poses in O(poses); the Schur complement left on the border is the
-information of the belief that replaces the filter's, so no measurement counts twice. Errors are
-additive here. Step lengths are halved until the cost falls. Source: square root smoothing, Dellaert
-and Kaess, IJRR 25(12), 2006, with time order instead of a search for one.
+Unknown are the keyframes' poses, the calibration errors of the wheels (constant, or one set per
+keyframe that walks), and what does not move: range offsets, mounts, landmarks. The normal equations
+are a band along time with a border: the last pose, its calibration, and what does not move. A band
+Cholesky in time order eliminates all earlier poses in O(poses); the Schur complement left on the
+border is the information of the belief that replaces the filter's, so no measurement counts twice.
+Errors are additive here. Step lengths are halved until the cost falls. Source: square root
+smoothing, Dellaert and Kaess, IJRR 25(12), 2006, with time order instead of a search for one.
 
-The measurements of poses that are kept no longer become a prior, a quadratic about where they were
-linearised. In additive errors it would fix the direction of the map a little more at every such
-point, although no range can see it, and the estimate would become too sure. In right-invariant
-errors
-
-    e_th = theta - theta0,   e_p = Rot(-e_th) p - p0,   e_l = Rot(-e_th) l - l0
-    e_phi = phi - e_th - phi0,   e_d = d - d0 (a wall's)
-
-it does not: turning and shifting robot and map together changes no range, and exactly so. Hence
-first estimates (FEJ: Huang, Mourikis, Roumeliotis, IJRR 29(5), 2010) need not be kept for the
-measurements that stay. Calibration and offsets have additive errors.
+Every solution weighs anew: ranges by Huber's weights, and by zero beyond a limit; and each motion
+either has the wheels' noise, or the wheels slipped in it, at a price (the mixture of two Gaussians
+by its larger part: Olson and Agarwal, IJRR 32(7), 2013).
 """
 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dtbtrs
 
-from slam.geometry import wrap_angle, wrap_angles
+from slam.geometry import wrap_angles
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
-from slam.robust.run_log import Estimate, Prior, Problem, RunLog, start_prior
-from slam.robust.state import (
-    HEADING,
-    Array,
-    Indices,
-    State,
-    SymmetricMatrix,
-    quarter_turn,
-    rotation,
+from slam.robust.run_log import (
+    Estimate,
+    Problem,
+    RunLog,
+    all_poses,
+    chain_of,
+    motion_covariances,
+    motions_by_calibration,
 )
+from slam.robust.state import HEAD_SIZE, HEADING, Array, Indices, State, SymmetricMatrix
 
-X, POSE_HEADING = slice(0, 2), 2
 # Columns of the border
-POSE, CALIBRATION = slice(0, 3), slice(3, 6)
-BORDER_HEAD = 6
+POSE, CALIBRATION = slice(0, 3), slice(3, HEAD_SIZE)
 _LEAST_WALK_SHARE = 1e-5
 _UNKNOWN = 100.0
 # The decrease of the cost that ends a search, what rounding may add to it, and how often a step is
 # halved
 _TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
+# What share of its price a slip must gain to be tried, and among how many neighbours on either side
+_FIRST_SHARE, _NEIGHBOURS = 0.25, 4
 # What keeps a direction finite where a landmark stands at an antenna, or at the robot, and a root
 # where nothing walks
-_LEAST_RANGE_M, _LEAST_RANGE_M2, _LEAST_RADIUS_WAY_M, _TINY = 1e-9, 1e-18, 1e-6, 1e-300
-
-
-def first_values(estimate: Estimate) -> Array:
-    """Return the values a prior is about: first pose, its calibration, offsets, landmarks."""
-    return np.concatenate(
-        [
-            estimate.poses[0],
-            estimate.calibration[0],
-            estimate.offsets_m,
-            estimate.landmarks_m.ravel(),
-        ]
-    )
-
-
-def prior_cost(prior: Prior, values: Array, n_offsets: int) -> float:
-    e, _ = _errors(prior, values, n_offsets)
-    return float(e @ (prior.information @ e + 2.0 * prior.gradient))
-
-
-def prior_terms(prior: Prior, values: Array, n_offsets: int) -> tuple[Array, Array]:
-    """Return half the derivatives of a prior's cost by additive errors: (m, m) and (m,)."""
-    e, turned = _errors(prior, values, n_offsets)
-    pulled = prior.information @ e
-    back = rotation(-wrap_angle(float(values[POSE_HEADING] - prior.mean[POSE_HEADING])))
-    points = _points(len(values), n_offsets, prior.n_walls)
-    by_heading = -_swept(turned, points)
-    half = _right(prior.information, back, by_heading, points)
-    information = _right(half.T, back, by_heading, points)
-    gradient = _right((pulled + prior.gradient)[None, :], back, by_heading, points)[0]
-    return (information + information.T) / 2, gradient
-
-
-def prior_about(
-    information: Array, gradient: Array, values: Array, n_offsets: int, n_walls: int = 0
-) -> Prior:
-    """Return the prior with this information and gradient of additive errors at values."""
-    points = _points(len(values), n_offsets, n_walls)
-    by_heading = _swept(values, points)
-    stay = np.eye(2)
-    half = _right(information, stay, by_heading, points)
-    whole = _right(half.T, stay, by_heading, points)
-    return Prior(
-        information=(whole + whole.T) / 2,
-        gradient=_right(gradient[None, :], stay, by_heading, points)[0],
-        mean=values.copy(),
-        n_walls=n_walls,
-    )
-
-
-def _errors(prior: Prior, values: Array, n_offsets: int) -> tuple[Array, Array]:
-    """Return the errors e, and the values with all points turned back by e_th."""
-    angle = wrap_angle(float(values[POSE_HEADING] - prior.mean[POSE_HEADING]))
-    turned, points = values.copy(), _points(len(values), n_offsets, prior.n_walls)
-    back = rotation(-angle)
-    turned[X] = back @ values[X]
-    turned[points] = (values[points].reshape(-1, 2) @ back.T).ravel()
-    turned[points.stop :: 2] -= angle
-    e = turned - prior.mean
-    e[POSE_HEADING] = angle
-    return e, turned
-
-
-def _points(size: int, n_offsets: int, n_walls: int) -> slice:
-    return slice(6 + n_offsets, size - 2 * n_walls)
-
-
-def _swept(values: Array, points: slice) -> Array:
-    """Return how points and walls of some values move per radian about the origin, shape (m,)."""
-    swept = np.zeros(len(values))
-    swept[X] = quarter_turn(values[X])
-    swept[points] = quarter_turn(values[points].reshape(-1, 2)).ravel()
-    swept[points.stop :: 2] = 1.0
-    return swept
-
-
-def _right(rows: Array, turn: Array, by_heading: Array, points: slice) -> Array:
-    """Return rows times the matrix [points: turn, heading column: by_heading + 1, rest: I]."""
-    result = rows.copy()
-    result[:, POSE_HEADING] += rows @ by_heading
-    result[:, X] = rows[:, X] @ turn
-    turned = rows[:, points].reshape(len(rows), -1, 2) @ turn
-    result[:, points] = turned.reshape(len(rows), -1)
-    return result
+_LEAST_RANGE_M, _LEAST_RANGE_M2, _TINY = 1e-9, 1e-18, 1e-300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,40 +54,41 @@ class Rows:
     """White scalar rows of measurements: residual and derivatives; shapes (m,) unless said."""
 
     poses: Indices
-    landmarks: Indices
     residual: Array
     by_pose: Array  # (m, 3)
-    by_landmark: Array  # (m, 2)
-    radars: Indices  # -1: none
-    by_offset: Array
+    # (m, c): columns of the border, and derivatives by them; those of no use are zero
+    columns: Indices
+    by_border: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Steps:
-    """White residuals (k, 3) of all motions, derivatives (k, 3, 3) by both poses, calibration."""
+    """Residuals (k, 3) of all motions, derivatives (k, 3, 3) by both poses and calibration."""
 
     residual: Array
     by_before: Array
     by_after: Array
     by_calibration: Array
 
+    def whitened(self, roots: Array) -> Steps:
+        return Steps(
+            residual=np.einsum("kij,kj->ki", roots, self.residual),
+            by_before=roots @ self.by_before,
+            by_after=roots @ self.by_after,
+            by_calibration=roots @ self.by_calibration,
+        )
 
-def motion_residuals(problem: Problem, estimate: Estimate, roots: Array) -> Steps:
-    """Return the residuals of all motions, whitened by ``roots`` (k, 3, 3)."""
-    poses = estimate.poses
-    k = len(problem.increments)
-    calibration = estimate.calibration[:k] if problem.is_walking else estimate.calibration
-    s, w, kappa = calibration[:, 0], calibration[:, 1], calibration[:, 2]
-    d = problem.increments[:, :2] / (1.0 + s)[:, None]
-    D = np.hypot(d[:, 0], d[:, 1])
-    a = (problem.increments[:, 2] - kappa * D) / (1.0 + w)
 
+def motion_residuals(problem: Problem, estimate: Estimate) -> Steps:
+    poses, calibration = estimate.poses, estimate.calibration[: len(problem.keys) - 1]
+    k = len(poses) - 1
+    chain = chain_of(problem.steps, problem.keys, calibration)
     c, sn = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     gone = np.diff(poses[:, :2], axis=0)
     along = c * gone[:, 0] + sn * gone[:, 1]
     across = -sn * gone[:, 0] + c * gone[:, 1]
-    turned = wrap_angles(np.diff(poses[:, 2]) - a)
-    residual = np.column_stack([along - d[:, 0], across - d[:, 1], turned])
+    residual = np.column_stack([along, across, np.diff(poses[:, 2])]) - chain.ends
+    residual[:, 2] = wrap_angles(residual[:, 2])
     by_before = np.zeros((k, 3, 3))
     by_before[:, 0, 0], by_before[:, 0, 1], by_before[:, 0, 2] = -c, -sn, across
     by_before[:, 1, 0], by_before[:, 1, 1], by_before[:, 1, 2] = sn, -c, -along
@@ -188,16 +97,11 @@ def motion_residuals(problem: Problem, estimate: Estimate, roots: Array) -> Step
     by_after[:, 0, 0], by_after[:, 0, 1] = c, sn
     by_after[:, 1, 0], by_after[:, 1, 1] = -sn, c
     by_after[:, 2, 2] = 1.0
-    by_calibration = np.zeros((k, 3, 3))
-    by_calibration[:, :2, 0] = d / (1.0 + s)[:, None]
-    by_calibration[:, 2, 0] = -kappa * D / ((1.0 + s) * (1.0 + w))
-    by_calibration[:, 2, 1] = a / (1.0 + w)
-    by_calibration[:, 2, 2] = D / (1.0 + w)
     return Steps(
-        residual=np.einsum("kij,kj->ki", roots, residual),
-        by_before=roots @ by_before,
-        by_after=roots @ by_after,
-        by_calibration=roots @ by_calibration,
+        residual=residual,
+        by_before=by_before,
+        by_after=by_after,
+        by_calibration=-motions_by_calibration(chain, calibration),
     )
 
 
@@ -206,7 +110,7 @@ def measurement_residuals(problem: Problem, estimate: Estimate) -> Rows:
     ranges = _range_rows(problem, estimate)
     if not len(problem.points):
         return ranges
-    points = _point_rows(problem, estimate)
+    points = _point_rows(problem, estimate, ranges.columns.shape[1])
     names = [column.name for column in fields(Rows)]
     return Rows(
         **{name: np.concatenate([getattr(ranges, name), getattr(points, name)]) for name in names}
@@ -214,44 +118,65 @@ def measurement_residuals(problem: Problem, estimate: Estimate) -> Rows:
 
 
 def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
+    layout, at = problem.layout, problem.range_landmarks
+    values = np.concatenate([np.zeros(HEAD_SIZE), estimate.fixed])
+    radars, first = problem.range_radars, layout.first_columns(at)
     pose = estimate.poses[problem.range_poses]
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    mx, my = problem.range_antennas[:, 0], problem.range_antennas[:, 1]
+    mx, my = problem.range_antennas.T
+    of_offset = layout.offsets.start + radars
+    columns, by_mount = [of_offset, first, first + 1], []
+    if layout.has_mounts:
+        # A mount that is elsewhere shifts the antenna as the robot stood when it sampled.
+        of_mount = layout.mounts.start + 2 * radars
+        cm, sm = np.cos(problem.range_turns), np.sin(problem.range_turns)
+        ex, ey = values[of_mount], values[of_mount + 1]
+        mx, my = mx + cm * ex - sm * ey, my + sm * ex + cm * ey
     arm = np.column_stack([c * mx - s * my, s * mx + c * my])
     places = pose[:, :2] + arm
-    landmarks = estimate.landmarks_m[problem.range_landmarks]
-    away = landmarks - places
+    x, y = values[first], values[first + 1]
+    away = np.column_stack([x, y]) - places
     distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_RANGE_M)
     sigmas = problem.range_sigmas_m
     u = away / (distance * sigmas)[:, None]
     by_landmark = u
-    n_points = len(estimate.landmarks_m) - problem.n_walls
-    walls = np.flatnonzero(problem.range_landmarks >= n_points)
+    is_wall = at >= layout.n_landmarks
+    walls = np.flatnonzero(is_wall)
     if len(walls):
         # z = d - n . q: the place matters along the normal only.
-        c, s = np.cos(landmarks[walls, 0]), np.sin(landmarks[walls, 0])
+        cw, sw = np.cos(x[walls]), np.sin(x[walls])
         qx, qy = places[walls].T
-        distance[walls] = landmarks[walls, 1] - c * qx - s * qy
-        u[walls] = np.column_stack([c, s]) / sigmas[walls, None]
+        distance[walls] = y[walls] - cw * qx - sw * qy
+        u[walls] = np.column_stack([cw, sw]) / sigmas[walls, None]
         by_landmark = u.copy()
-        by_wall = np.column_stack([s * qx - c * qy, np.ones(len(walls))])
+        by_wall = np.column_stack([sw * qx - cw * qy, np.ones(len(walls))])
         by_landmark[walls] = by_wall / sigmas[walls, None]
     by_pose = np.column_stack([-u, u[:, 0] * arm[:, 1] - u[:, 1] * arm[:, 0]])
-    predicted = distance + estimate.offsets_m[problem.range_radars]
+    predicted = distance + values[of_offset]
+    by_border = [1.0 / sigmas, *by_landmark.T]
+    if layout.has_mounts:
+        ct, st = c * cm - s * sm, s * cm + c * sm
+        by_mount = [-(u[:, 0] * ct + u[:, 1] * st), u[:, 0] * st - u[:, 1] * ct]
+        columns, by_border = [*columns, of_mount, of_mount + 1], [*by_border, *by_mount]
+    if layout.has_radii:
+        of_radius = np.where(is_wall, of_offset, first + 2)
+        predicted -= np.where(is_wall, 0.0, values[of_radius])
+        columns.append(of_radius)
+        by_border.append(np.where(is_wall, 0.0, -1.0 / sigmas))
     return Rows(
         poses=problem.range_poses,
-        landmarks=problem.range_landmarks,
         residual=(predicted - problem.ranges_m) / sigmas,
         by_pose=by_pose,
-        by_landmark=by_landmark,
-        radars=problem.range_radars,
-        by_offset=1.0 / sigmas,
+        columns=np.column_stack(columns),
+        by_border=np.column_stack(by_border),
     )
 
 
-def _point_rows(problem: Problem, estimate: Estimate) -> Rows:
+def _point_rows(problem: Problem, estimate: Estimate, n_columns: int) -> Rows:
+    first = problem.layout.first_columns(problem.point_landmarks)
     pose = estimate.poses[problem.point_poses]
-    away = estimate.landmarks_m[problem.point_landmarks] - pose[:, :2]
+    landmarks = estimate.fixed[np.column_stack([first, first + 1]) - HEAD_SIZE]
+    away = landmarks - pose[:, :2]
     q = np.maximum(np.sum(away**2, axis=1), _LEAST_RANGE_M2)
     distance = np.sqrt(q)
     residual = np.column_stack([distance, np.arctan2(away[:, 1], away[:, 0]) - pose[:, 2]])
@@ -264,14 +189,16 @@ def _point_rows(problem: Problem, estimate: Estimate) -> Rows:
     by_pose[:, :, :2] = -by_landmark
     by_pose[:, 1, 2] = -1.0
     roots = problem.point_roots
+    columns = np.repeat(first, n_columns).reshape(-1, n_columns)
+    columns[:, 1] += 1
+    by_border = np.zeros((2 * len(q), n_columns))
+    by_border[:, :2] = (roots @ by_landmark).reshape(-1, 2)
     return Rows(
         poses=np.repeat(problem.point_poses, 2),
-        landmarks=np.repeat(problem.point_landmarks, 2),
         residual=np.einsum("kij,kj->ki", roots, residual).ravel(),
         by_pose=(roots @ by_pose).reshape(-1, 3),
-        by_landmark=(roots @ by_landmark).reshape(-1, 2),
-        radars=np.full(2 * len(q), -1, dtype=np.intp),
-        by_offset=np.zeros(2 * len(q)),
+        columns=np.repeat(columns, 2, axis=0),
+        by_border=by_border,
     )
 
 
@@ -316,19 +243,13 @@ class NormalEquations:
         self.g[:-1] += np.einsum("kij,kj->ki", before_t, residual)
         self.g[1:] += np.einsum("kij,kj->ki", after_t, residual)
 
-    def add_rows(self, rows: Rows, weight: NDArray[np.bool_], n_offsets: int) -> None:
-        """Add scalar rows, those of weight zero left out."""
+    def add_rows(self, rows: Rows, weights: Array) -> None:
+        """Add scalar rows, each with the root of its weight."""
         n_poses, n_border = self.n_chain + 1, len(self.h)
-        at = np.flatnonzero(weight)
-        pose, residual = rows.poses[at], rows.residual[at]
-        by_pose = rows.by_pose[at]
-        offset = np.where(rows.radars[at] >= 0, BORDER_HEAD + rows.radars[at], -1)
-        first = BORDER_HEAD + n_offsets + 2 * rows.landmarks[at]
-        columns = np.column_stack([np.maximum(offset, BORDER_HEAD), first, first + 1])
-        columns = np.minimum(columns, n_border - 1)
-        by_border = np.column_stack(
-            [np.where(offset >= 0, rows.by_offset[at], 0.0), rows.by_landmark[at]]
-        )
+        at = np.flatnonzero(weights)
+        root = weights[at]
+        pose, residual, columns = rows.poses[at], root * rows.residual[at], rows.columns[at]
+        by_pose, by_border = root[:, None] * rows.by_pose[at], root[:, None] * rows.by_border[at]
         for i in range(3):
             for j in range(i + 1):
                 block = np.bincount(pose, by_pose[:, i] * by_pose[:, j], n_poses)
@@ -336,30 +257,29 @@ class NormalEquations:
                 if i != j:
                     self.diagonal[:, j, i] += block
             self.g[:, i] += np.bincount(pose, by_pose[:, i] * residual, n_poses)
-            flat = (pose * self.size + i)[:, None] * n_border + columns
-            np.add.at(self.B.reshape(-1), flat, by_pose[:, i, None] * by_border)
-        for j in range(3):
+        # Sorted by column, most entries of B hit are neighbours; many ranges share one.
+        flat = pose[:, None] * n_border + columns
+        for i in range(3):
+            values = by_pose[:, i, None] * by_border
+            summed = np.bincount(flat.ravel(), values.ravel(), n_poses * n_border)
+            self.B[:, i] += summed.reshape(n_poses, n_border)
+        for j in range(columns.shape[1]):
             self.h += np.bincount(columns[:, j], by_border[:, j] * residual, n_border)
             flat = columns[:, j, None] * n_border + columns
-            np.add.at(self.C.reshape(-1), flat, by_border[:, j, None] * by_border)
+            values = by_border[:, j, None] * by_border
+            summed = np.bincount(flat.ravel(), values.ravel(), n_border * n_border)
+            self.C += summed.reshape(n_border, n_border)
 
-    def add_prior(self, information: Array, gradient: Array) -> None:
-        pose, rest = slice(0, 3), slice(BORDER_HEAD, None)
-        self.g[0, :3] += gradient[:3]
-        self.diagonal[0, :3, :3] += information[pose, pose]
-        if self.size == BORDER_HEAD:
-            calibration = slice(3, 6)
-            self.g[0, 3:] += gradient[calibration]
-            self.diagonal[0, 3:, :] += information[calibration, :6]
-            self.diagonal[0, :3, 3:] += information[pose, calibration]
-            self.B[0, :, rest] += information[:6, rest]
-            self.C[rest, rest] += information[rest, rest]
-            self.h[rest] += gradient[rest]
-        else:
-            border = slice(3, None)
-            self.B[0, :, border] += information[pose, border]
-            self.C[border, border] += information[border, border]
-            self.h[border] += gradient[border]
+    def add_prior(self, sigmas: Array, away: Array) -> None:
+        """Add the prior of first pose and what is fixed, given how far they are from its mean."""
+        information = sigmas**-2.0
+        gradient = information * away
+        first = np.arange(self.size)
+        self.diagonal[0, first, first] += information[: self.size]
+        self.g[0] += gradient[: self.size]
+        rest = np.arange(self.size, len(self.h))
+        self.C[rest, rest] += information[self.size :]
+        self.h[rest] += gradient[self.size :]
 
     def closed(self) -> tuple[Array, Array, Array, Array, Array]:
         """Return band, B, C, g and h with the last pose moved to the border."""
@@ -458,10 +378,11 @@ class Solution:
     """The least-squares estimate and its information."""
 
     estimate: Estimate
-    # shape (6 + r + 2 n,) squared: the Schur complement on last pose, its calibration, offsets and
-    # landmarks, additive errors
+    # shape (6 + q,) squared: the Schur complement on last pose, its calibration, and what is fixed;
+    # additive errors
     information: Array
-    cost: float  # sum of squared white residuals, counted from where the prior was taken
+    cost: float
+    slips: NDArray[np.bool_]  # shape (k,): in which motions the wheels slipped
 
 
 class Smoother:
@@ -469,57 +390,85 @@ class Smoother:
 
     def __init__(self, problem: Problem, rule: RelinearisationRule) -> None:
         self._problem, self._rule = problem, rule
+        first = problem.keys[:-1]
+        chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))
+        covariances = motion_covariances(chain, problem.step_covariances)
         # W with W C W^T = I, shape (k, 3, 3)
-        self._roots = np.asarray(np.linalg.inv(np.linalg.cholesky(problem.covariances)))
-        least = _LEAST_WALK_SHARE * np.sqrt(problem.walks.max(axis=0, initial=0.0))
-        self._walk_roots = 1.0 / np.sqrt(problem.walks + least**2 + _TINY)
+        factors = np.linalg.cholesky(covariances)
+        self._roots = np.asarray(np.linalg.inv(factors))
+        walks = np.add.reduceat(problem.walks, first)
+        least = _LEAST_WALK_SHARE * np.sqrt(walks.max(axis=0, initial=0.0))
+        self._walk_roots = 1.0 / np.sqrt(walks + least**2 + _TINY)
+        slip = np.diag(np.square([rule.slip_m, rule.slip_m, rule.slip_rad]))
+        slipped = np.linalg.cholesky(covariances + slip)
+        self._slip_roots = np.asarray(np.linalg.inv(slipped))
+        # Twice the nats that a slip costs: it is rare, and its noise is wide
+        rarity = math.log(rule.steps_per_slip) - np.log(np.diff(problem.keys))
+        spread = np.log(np.einsum("kii->ki", slipped) / np.einsum("kii->ki", factors))
+        self._slip_price = 2.0 * (np.maximum(rarity, 0.0) + spread.sum(axis=1))
 
     def solve(self, start: Estimate, tolerance: float = _TOLERANCE) -> Solution | None:
         """Return the solution reached from a start, or None if it failed.
 
         The search ends when the cost decreases by less than ``tolerance``.
         """
-        estimate, limit = start, math.inf
-        cost = self.cost(estimate, limit)
-        for iteration in range(1, self._rule.iterations + 1):
-            if iteration == self._rule.outliers_from:
-                limit = self._rule.outlier_sigmas
-                cost = self.cost(estimate, limit)
+        estimate, limit, rule = start, math.inf, self._rule
+        slips = np.zeros(len(self._roots), dtype=np.bool_)
+        cost = self.cost(estimate, slips, limit)
+        for iteration in range(1, rule.iterations + 1):
+            # A slip far from where it was looks like many small ones; an outlier like a slip.
+            before = slips
+            if iteration >= rule.slips_from:
+                slips = self._slips(estimate, slips, is_first=iteration == rule.slips_from)
+            if iteration == rule.outliers_from:
+                limit = rule.outlier_sigmas
+            is_other = iteration == rule.outliers_from or bool(np.any(slips != before))
+            if is_other:
+                cost = self.cost(estimate, slips, limit)
             try:
-                change = solve(self._equations(estimate, limit))
+                change = solve(self._equations(estimate, slips, limit))
             except np.linalg.LinAlgError:
                 return None
             share, better = 1.0, estimate
             for _ in range(_HALVINGS):
                 better = _moved(estimate, change, share)
-                new_cost = self.cost(better, limit)
+                new_cost = self.cost(better, slips, limit)
                 if new_cost <= cost + _ROUNDING:
                     break
                 share *= 0.5
             else:
                 new_cost, better = cost, estimate
             decrease, cost, estimate = cost - new_cost, new_cost, better
-            if decrease < tolerance and iteration >= self._rule.outliers_from:
+            if decrease < tolerance and iteration >= rule.outliers_from and not is_other:
                 break
         try:
-            information = eliminate(self._equations(estimate, limit)).information
+            information = eliminate(self._equations(estimate, slips, limit)).information
             np.linalg.cholesky(information)
         except np.linalg.LinAlgError:
             return None
-        return Solution(estimate=estimate, information=information, cost=cost)
+        return Solution(estimate=estimate, information=information, cost=cost, slips=slips)
 
-    def cost(self, estimate: Estimate, limit: float = math.inf) -> float:
-        """Return the sum of squared white residuals, each measurement's capped at ``limit``."""
-        steps = motion_residuals(self._problem, estimate, self._roots)
-        rows = measurement_residuals(self._problem, estimate)
-        total = float(np.sum(np.minimum(rows.residual**2, limit**2)))
-        total += float(np.sum(steps.residual**2))
+    def cost(self, estimate: Estimate, slips: NDArray[np.bool_], limit: float = math.inf) -> float:
+        """Return what is to be least: Huber's costs of all measurements, capped at ``limit``.
+
+        To these come the costs of all motions, given in which of them the wheels slipped.
+        """
+        problem = self._problem
+        away = np.minimum(np.abs(measurement_residuals(problem, estimate).residual), limit)
+        bound = problem.huber_sigmas
+        total = float(np.sum(away**2 - np.maximum(away - bound, 0.0) ** 2))
+        as_wheels, slipped = self._motion_costs(motion_residuals(problem, estimate).residual)
+        total += float(np.sum(np.where(slips, slipped, as_wheels)))
         total += float(np.sum(self._walk_residual(estimate) ** 2))
-        n_offsets = len(estimate.offsets_m)
-        return total + prior_cost(self._problem.prior, first_values(estimate), n_offsets)
+        return total + float(np.sum((self._from_prior(estimate) / problem.prior_sigmas) ** 2))
 
-    def covariances(self, estimate: Estimate) -> tuple[Array, Array]:
-        """Return the covariances of all poses (k + 1, 3, 3) and of the border at a solution.
+    def start_cost(self, estimate: Estimate) -> float:
+        """Return the cost of values to start from: any motion may be a slip."""
+        as_wheels, slipped = self._motion_costs(motion_residuals(self._problem, estimate).residual)
+        return self.cost(estimate, slipped < as_wheels)
+
+    def covariances(self, estimate: Estimate, slips: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return the covariances of all keyframes (k + 1, 3, 3) and of the border at a solution.
 
         Errors are additive; residuals beyond the limit of outliers are left out.
 
@@ -528,51 +477,67 @@ class Smoother:
         numpy.linalg.LinAlgError
             Something is not determined.
         """
-        left = eliminate(self._equations(estimate, self._rule.outlier_sigmas))
+        left = eliminate(self._equations(estimate, slips, self._rule.outlier_sigmas))
         chain, border = covariances(left)
         return np.concatenate([chain, border[None, POSE, POSE]]), border
 
-    def condensed(self, estimate: Estimate, n_steps: int, limit: float) -> Prior:
-        """Return all measurements before pose ``n_steps`` as a prior on what is left.
+    def _motion_costs(self, residual: Array, share: float = 1.0) -> tuple[Array, Array]:
+        """Return the costs of all motions, shapes (k,): of the wheels' noise, and of a slip.
 
-        Residuals beyond ``limit`` are left out. With the prior in place of the first ``n_steps``
-        steps and of the measurements from their poses, the normal equations at this estimate have
-        the same Schur complement: nothing is lost there, and nothing counts twice.
+        Of the price of a slip only a share counts.
         """
-        part = Smoother(self._problem.beginning(n_steps), self._rule)
-        beginning = replace(
-            estimate,
-            poses=estimate.poses[: n_steps + 1],
-            calibration=estimate.calibration[: n_steps + 1],
-        )
-        left = eliminate(part._equations(beginning, limit))
-        newest = replace(
-            beginning, poses=beginning.poses[-1:], calibration=beginning.calibration[-1:]
-        )
-        n_offsets, n_walls = len(estimate.offsets_m), self._problem.n_walls
-        return prior_about(
-            left.information, left.gradient, first_values(newest), n_offsets, n_walls
-        )
+        as_wheels = np.sum(np.einsum("kij,kj->ki", self._roots, residual) ** 2, axis=1)
+        slipped = np.sum(np.einsum("kij,kj->ki", self._slip_roots, residual) ** 2, axis=1)
+        return as_wheels, slipped + share * self._slip_price
+
+    def _slips(
+        self, estimate: Estimate, slips: NDArray[np.bool_], *, is_first: bool
+    ) -> NDArray[np.bool_]:
+        """Return in which motions the wheels slipped, given in which they did before.
+
+        A new slip is where it gains most among its neighbours: until it is named, they share it.
+        So at first it need not gain all its price.
+        """
+        residual = motion_residuals(self._problem, estimate).residual
+        as_wheels, slipped = self._motion_costs(residual, _FIRST_SHARE if is_first else 1.0)
+        gain = as_wheels - slipped
+        k = len(gain)
+        padded = np.pad(gain, _NEIGHBOURS, constant_values=-math.inf)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1)
+        is_most = gain >= windows[:k].max(axis=1)
+        return np.asarray((gain > 0.0) & (is_most | slips))
 
     def _walk_residual(self, estimate: Estimate) -> Array:
         if len(estimate.calibration) == 1:
             return np.zeros((0, 3))
         return np.asarray(np.diff(estimate.calibration, axis=0) * self._walk_roots)
 
-    def _equations(self, estimate: Estimate, limit: float) -> NormalEquations:
-        problem, n_offsets = self._problem, len(estimate.offsets_m)
-        n_border = BORDER_HEAD + n_offsets + 2 * len(estimate.landmarks_m)
+    def _from_prior(self, estimate: Estimate) -> Array:
+        first = np.concatenate([estimate.poses[0], estimate.calibration[0], estimate.fixed])
+        return np.asarray(first - self._problem.prior_mean)
+
+    def weights(self, residual: Array, limit: float) -> Array:
+        """Return roots of the weights of white residuals, shape (m,)."""
+        away = np.abs(residual)
+        roots = np.sqrt(np.minimum(self._problem.huber_sigmas / np.maximum(away, _TINY), 1.0))
+        return np.asarray(np.where(away <= limit, roots, 0.0))
+
+    def _equations(
+        self, estimate: Estimate, slips: NDArray[np.bool_], limit: float
+    ) -> NormalEquations:
+        problem = self._problem
+        n_border = HEAD_SIZE + len(estimate.fixed)
         size = 6 if problem.is_walking else 3
-        equations = NormalEquations(len(problem.increments), size, n_border)
-        steps = motion_residuals(self._problem, estimate, self._roots)
+        equations = NormalEquations(len(estimate.poses) - 1, size, n_border)
+        roots = np.where(slips[:, None, None], self._slip_roots, self._roots)
+        steps = motion_residuals(problem, estimate).whitened(roots)
         if problem.is_walking:
             equations.add_walking_steps(steps, self._walk_roots, self._walk_residual(estimate))
         else:
             equations.add_steps(steps)
-        rows = measurement_residuals(self._problem, estimate)
-        weight = np.abs(rows.residual) <= limit
-        equations.add_rows(rows, weight, n_offsets)
-        equations.add_prior(*prior_terms(problem.prior, first_values(estimate), n_offsets))
+        rows = measurement_residuals(problem, estimate)
+        equations.add_rows(rows, self.weights(rows.residual, limit))
+        equations.add_prior(problem.prior_sigmas, self._from_prior(estimate))
         return equations
 
 
@@ -582,29 +547,22 @@ def _moved(estimate: Estimate, change: tuple[Array, Array], share: float) -> Est
     poses[:-1] += share * chain[:, :3]
     poses[-1] += share * border[POSE]
     calibration = estimate.calibration.copy()
-    if chain.shape[1] == BORDER_HEAD:
+    if chain.shape[1] == HEAD_SIZE:
         calibration[:-1] += share * chain[:, 3:]
         calibration[-1] += share * border[CALIBRATION]
     else:
         calibration[0] += share * border[CALIBRATION]
-    n_offsets = len(estimate.offsets_m)
-    rest = share * border[BORDER_HEAD:]
     return Estimate(
         poses=poses,
         calibration=calibration,
-        offsets_m=estimate.offsets_m + rest[:n_offsets],
-        landmarks_m=estimate.landmarks_m + rest[n_offsets:].reshape(-1, 2),
+        fixed=estimate.fixed + share * border[HEAD_SIZE:],
     )
 
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Return whether the pose is too far from the stored trajectory, or too many poses are kept."""
+    """Return whether the pose is too far from the stored trajectory."""
     rule = parameters.relinearisation
-    if log.since_solved < rule.every:
-        return False
-    if log.n_kept > rule.most_poses:
-        return True
-    if not state.feature_ids:
+    if log.since_solved < rule.every or not state.feature_ids:
         return False
     shift_m, turn_rad = log.parted(state.pose)
     return turn_rad > rule.turn_rad or shift_m > rule.shift_m
@@ -612,94 +570,43 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
 
 def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
     """Solve for all poses and replace the belief by the result; return whether it worked."""
-    rule = parameters.relinearisation
     log.since_solved = 0
-    smoother, start = _all_poses(log, state, parameters)
-    solution = smoother.solve(start)
-    if solution is not None and not is_determined(solution.information):
-        solution = None
-    if solution is not None:
-        _replace(state, solution)
-        log.solved(solution.estimate)
-    if log.n_kept > rule.most_poses:
-        # Best at the solution; but the log must not grow, not even where there is none.
-        known = start if solution is None else solution.estimate
-        n_steps = log.n_kept - math.ceil(rule.kept_share * rule.most_poses)
-        with suppress(np.linalg.LinAlgError):  # then it is tried again a little later
-            prior = smoother.condensed(known, n_steps, rule.outlier_sigmas)
-            log.condense(prior, state.feature_ids, n_steps)
-    return solution is not None
-
-
-def give_radius(
-    log: RunLog,
-    state: State,
-    parameters: BackEndParameters,
-    candidate: tuple[int, float],
-    margin: float,
-) -> bool:
-    """Give the landmark in a row a radius if a solution with it is likelier; return whether it is.
-
-    The cost of the solution over all poses must fall by ``margin``. Then that solution replaces the
-    belief.
-    """
-    row, radius_m = candidate
-    smoother, start = _all_poses(log, state, parameters)
-    solution = smoother.solve(start)
-    if solution is None:
+    problem = log.problem(state, parameters)
+    smoother = Smoother(problem, parameters.relinearisation)
+    solution = smoother.solve(min(log.starts(state, problem), key=smoother.start_cost))
+    if solution is None or not is_determined(solution.information):
         return False
-    least = solution.cost - margin
-    id_, point_m = state.landmark_ids[row], state.landmarks_m[row].copy()
-    before_m = state.radii_m.pop(id_, 0.0)
-    away = point_m - state.position_m
-    state.landmarks_m[row] += (
-        (radius_m - before_m) * away / max(float(np.hypot(*away)), _LEAST_RADIUS_WAY_M)
-    )
-    if radius_m:
-        state.radii_m[id_] = radius_m
-    smoother, start = _all_poses(log, state, parameters)
-    solution = smoother.solve(start)
-    fits = solution is not None and solution.cost <= least
-    if solution is not None and fits and is_determined(solution.information):
-        _replace(state, solution)
-        log.solved(solution.estimate)
-        return True
-    state.landmarks_m[row] = point_m
-    state.radii_m.pop(id_, None)
-    if before_m:
-        state.radii_m[id_] = before_m
-    return False
+    _replace(state, solution)
+    log.solved(problem, solution.estimate)
+    return True
 
 
 def solve_whole_run(
     log: RunLog, state: State, parameters: BackEndParameters
-) -> tuple[Estimate, Array, Array] | None:
-    """Return the solution over all poses since the start, or None if there is none.
+) -> tuple[Array, Array, Array, Array] | None:
+    """Return poses (n + 1, 3) and covariances, features (m, 2) and covariances; None if it fails.
 
-    With it the covariances of the poses (k + 1, 3, 3) and of the features (n, 2, 2), errors
-    additive. Nothing is changed.
+    Errors are additive. Nothing is changed.
     """
-    prior = _start_prior(state, parameters)
-    # A landmark whose ranges are all left out as outliers stays where it is, and is unknown.
-    where = np.arange(len(prior.mean) - 2 * len(state.feature_ids), len(prior.mean))
-    prior.information[where, where] = _UNKNOWN**-2.0
-    prior.mean[where] = state.features.ravel()
-    prior = replace(prior, n_walls=len(state.wall_ids))
-    problem = log.problem(state, prior, whole=True)
+    if log.n_poses < 2:
+        return None
+    problem = log.problem(state, parameters)
     smoother = Smoother(problem, parameters.relinearisation)
     found = [smoother.solve(start) for start in log.starts(state, problem)]
     solutions = [solution for solution in found if solution is not None]
     if not solutions:
         return None
-    best = min(solutions, key=lambda solution: solution.cost).estimate
+    solution = min(solutions, key=lambda each: each.cost)
+    best = solution.estimate
     try:
-        of_poses, border = smoother.covariances(best)
+        of_keys, border = smoother.covariances(best, solution.slips)
     except np.linalg.LinAlgError:
         return None
-    first, n = BORDER_HEAD + len(best.offsets_m), len(best.landmarks_m)
-    blocks = border[first:, first:].reshape(n, 2, n, 2)
-    each = np.arange(n)
-    return best, of_poses, blocks[each, :, each, :]
+    first = problem.layout.first_columns(np.arange(len(state.feature_ids)))
+    columns = np.column_stack([first, first + 1])
+    blocks = border[columns[:, :, None], columns[:, None, :]]
+    poses, of_poses = all_poses(problem, best, of_keys)
+    return poses, of_poses, best.fixed[columns - HEAD_SIZE], blocks
 
 
 def is_determined(information: Array) -> bool:
@@ -712,33 +619,21 @@ def is_determined(information: Array) -> bool:
     return bool(np.all((variances > 0.0) & (variances < _UNKNOWN**2)))
 
 
-def _all_poses(
-    log: RunLog, state: State, parameters: BackEndParameters
-) -> tuple[Smoother, Estimate]:
-    """Return the problem of all poses and the better of the values to start from."""
-    problem = log.problem(state, _start_prior(state, parameters))
-    smoother = Smoother(problem, parameters.relinearisation)
-    return smoother, min(log.starts(state, problem), key=smoother.cost)
-
-
-def _start_prior(state: State, parameters: BackEndParameters) -> Prior:
-    return start_prior(
-        parameters.wheels.calibration_sigmas,
-        (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
-        len(state.feature_ids),
-    )
-
-
 def _replace(state: State, solution: Solution) -> None:
-    estimate = solution.estimate
+    estimate, layout = solution.estimate, state.layout
     pose = estimate.poses[-1]
     state.position_m = pose[:2].copy()
     state.heading_rad = math.remainder(float(pose[2]), math.tau)
     state.calibration = estimate.calibration[-1].copy()
-    state.offsets_m = estimate.offsets_m.copy()
-    n = len(state.landmark_ids)
-    state.landmarks_m = estimate.landmarks_m[:n].copy()
-    state.walls = estimate.landmarks_m[n:].copy()
+    values = np.concatenate([np.zeros(HEAD_SIZE), estimate.fixed])
+    state.offsets_m = values[layout.offsets].copy()
+    if layout.has_mounts:
+        state.mounts_m = values[layout.mounts].reshape(-1, 2).copy()
+    landmarks = values[layout.landmarks].reshape(-1, layout.landmark_size)
+    state.landmarks_m = landmarks[:, :2].copy()
+    if layout.has_radii:
+        state.radii_m = landmarks[:, 2].copy()
+    state.walls = values[layout.walls].reshape(-1, 2).copy()
     # The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...)
     additive = np.linalg.inv(solution.information)
     order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])

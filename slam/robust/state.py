@@ -1,18 +1,21 @@
 """The state of the robust back end, its covariance, and its prediction from odometry.
 
 The map frame is the body frame at the start. The state holds the heading theta, the position p,
-the calibration errors (s, w, kappa) of the wheels, one range offset b per radar, and landmarks l.
+the calibration errors (s, w, kappa) of the wheels, per radar a range offset b and how far its
+antenna is from where the rig has it (m, body frame), and landmarks: axis l and radius rho.
 Errors, in the order of the covariance P::
 
-    [e_th, e_p (2), e_s, e_w, e_kappa, e_b (one per radar), e_l0 (2), e_l1 (2), ..., e_w0 (2), ...]
+    [e_th, e_p (2), e_s, e_w, e_kappa, e_b (one per radar), e_m (two per radar),
+     e_l0 (2), e_rho0, e_l1 (2), e_rho1, ..., e_w0 (2), ...]
     theta = theta^ + e_th,   p = Rot(e_th) p^ + V(e_th) e_p,   l = Rot(e_th) l^ + V(e_th) e_l,
     phi = phi^ + e_th + e_phi,   d = d^ + e_d,
 
 all others additive; (phi, d) is a wall, the line n . x = d with n = [cos phi, sin phi] away from
-the robot. An error of the heading thus turns the whole map with the robot, which ranges
-cannot see: the linearised filter keeps the three unobservable directions of SLAM whatever the
-estimate does. Sources: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties",
-2015 (arXiv 1510.06263); Zhang, Wu, Song, Huang, Dissanayake, IEEE RA-L 2(2), 2017.
+the robot. Where the mounts, or the radii, are known, P has no rows for them. An error of the
+heading thus turns the whole map with the robot, which ranges cannot see: the linearised filter
+keeps the three unobservable directions of SLAM whatever the estimate does. Sources: Barrau and
+Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015 (arXiv 1510.06263); Zhang, Wu,
+Song, Huang, Dissanayake, IEEE RA-L 2(2), 2017.
 
 With the reported increment (ux, uy, ua) and the state's (s, w, kappa)::
 
@@ -251,43 +254,109 @@ def quarter_turn(points: Array) -> Array:
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where everything lies in the error."""
+
+    n_radars: int
+    n_landmarks: int = 0
+    n_walls: int = 0
+    has_mounts: bool = False
+    has_radii: bool = False
+
+    @property
+    def offsets(self) -> slice:
+        return slice(HEAD_SIZE, HEAD_SIZE + self.n_radars)
+
+    @property
+    def mounts(self) -> slice:
+        """Return where the mounts are, an empty slice if they are known."""
+        first = HEAD_SIZE + self.n_radars
+        return slice(first, first + 2 * self.n_radars * self.has_mounts)
+
+    @property
+    def landmark_size(self) -> int:
+        return 3 if self.has_radii else 2
+
+    @property
+    def landmarks(self) -> slice:
+        first = self.mounts.stop
+        return slice(first, first + self.landmark_size * self.n_landmarks)
+
+    @property
+    def walls(self) -> slice:
+        first = self.landmarks.stop
+        return slice(first, first + 2 * self.n_walls)
+
+    @property
+    def size(self) -> int:
+        return int(self.walls.stop)
+
+    def first_columns(self, rows: Indices) -> Indices:
+        """Return where features begin; walls are the rows from ``n_landmarks`` on."""
+        of_landmark: Indices = self.mounts.stop + self.landmark_size * rows
+        if not (self.n_walls and self.has_radii):
+            return of_landmark
+        of_wall = self.walls.start + 2 * (rows - self.n_landmarks)
+        return np.asarray(np.where(rows < self.n_landmarks, of_landmark, of_wall))
+
+    def columns(self, rows: Indices) -> Indices:
+        """Return all columns of some features."""
+        first = self.first_columns(rows)
+        places = np.column_stack([first, first + 1, first + 2])
+        of_feature = np.full(len(rows), self.landmark_size)
+        of_feature[rows >= self.n_landmarks] = 2
+        return np.asarray(places[np.arange(3) < of_feature[:, None]])
+
+
 class State:
     """Mean and covariance of the filter, map frame; changed in place."""
 
     __slots__ = (
         "P",
+        "added_sigmas_m",
         "calibration",
         "heading_rad",
         "landmark_ids",
         "landmarks_m",
+        "mount_sigma_m",
+        "mounts_m",
         "next_id",
         "offsets_m",
         "position_m",
         "radii_m",
-        "shape_sigmas_m",
+        "radius_sigma_m",
         "wall_ids",
         "walls",
     )
 
     def __init__(
-        self, calibration_sigmas: tuple[float, float, float], offset_sigmas_m: tuple[float, ...]
+        self,
+        calibration_sigmas: tuple[float, float, float],
+        offset_sigmas_m: tuple[float, ...],
+        mount_sigma_m: float = 0.0,
+        radius_sigma_m: float = 0.0,
     ) -> None:
         self.heading_rad = 0.0
         self.position_m: Array = np.zeros(2)
         self.calibration: Array = np.zeros(3)  # s, w [1], kappa [rad/m]
         self.offsets_m: Array = np.zeros(len(offset_sigmas_m))  # what each radar measures too long
+        # How far each antenna is from where the rig has it, body frame
+        self.mounts_m: Array = np.zeros((len(offset_sigmas_m), 2))
+        # Of the prior; zero: what it is about is known to be zero
+        self.mount_sigma_m, self.radius_sigma_m = mount_sigma_m, radius_sigma_m
         self.landmarks_m: Array = np.zeros((0, 2))
+        self.radii_m: Array = np.zeros(0)  # one per landmark; none where they are known
         self.landmark_ids: list[int] = []  # in row order; an id is never used twice
         self.walls: Array = np.zeros((0, 2))  # phi [rad], not wrapped, and d [m]
         self.wall_ids: list[int] = []  # from the same sequence as the landmarks'
-        # By id: radius of each landmark known to be round, whose axis is the landmark
-        self.radii_m: dict[int, float] = {}
-        # By id: what is added in squares to the sigmas of a feature's ranges, for the uncertainty
-        # of a radius or the roughness of a wall
-        self.shape_sigmas_m: dict[int, float] = {}
+        # By id: what is added in squares to the sigmas of a feature's ranges
+        self.added_sigmas_m: dict[int, float] = {}
         self.next_id = 0
         sigmas = [0.0, 0.0, 0.0, *calibration_sigmas, *offset_sigmas_m]
-        # Covariance of the errors, size 6 + r + 2 (n + w)
+        if mount_sigma_m:
+            sigmas += [mount_sigma_m] * (2 * len(offset_sigmas_m))
+        # Covariance of the errors
         self.P = SymmetricMatrix(np.diag(np.square(sigmas)))
 
     @property
@@ -296,8 +365,23 @@ class State:
         return np.array([self.position_m[0], self.position_m[1], self.heading_rad])
 
     @property
+    def layout(self) -> Layout:
+        return Layout(
+            len(self.offsets_m),
+            len(self.landmark_ids),
+            len(self.wall_ids),
+            self.mount_sigma_m > 0.0,
+            self.radius_sigma_m > 0.0,
+        )
+
+    @property
     def offsets(self) -> slice:
         return slice(HEAD_SIZE, HEAD_SIZE + len(self.offsets_m))
+
+    @property
+    def n_fixed(self) -> int:
+        """Return how many rows of the error come before those of the features."""
+        return HEAD_SIZE + len(self.offsets_m) * (3 if self.mount_sigma_m else 1)
 
     @property
     def feature_ids(self) -> list[int]:
@@ -310,15 +394,17 @@ class State:
 
     @property
     def feature_radii_m(self) -> Array:
-        return np.array([self.radii_m.get(id_, 0.0) for id_ in self.feature_ids])
+        n, n_walls = len(self.landmark_ids), len(self.wall_ids)
+        radii_m = self.radii_m if self.radius_sigma_m else np.zeros(n)
+        return np.concatenate([radii_m, np.zeros(n_walls)])
 
     @property
-    def feature_shape_sigmas_m(self) -> Array:
-        return np.array([self.shape_sigmas_m.get(id_, 0.0) for id_ in self.feature_ids])
+    def feature_added_sigmas_m(self) -> Array:
+        return np.array([self.added_sigmas_m.get(id_, 0.0) for id_ in self.feature_ids])
 
-    def landmark_columns(self, rows: NDArray[np.intp]) -> Indices:
-        """Return where landmarks lie in the error, shape (2 k,); walls are the rows from n on."""
-        first = self.offsets.stop + 2 * rows
+    def landmark_columns(self, rows: Indices) -> Indices:
+        """Return where (x, y), or (phi, d), lie in the error, (2 k,); walls are rows from n on."""
+        first = self.layout.first_columns(rows)
         return np.stack([first, first + 1], axis=-1).ravel()
 
     def correct(self, error: Array) -> None:
@@ -329,10 +415,14 @@ class State:
         self.position_m = turn @ self.position_m + V @ error[POSITION]
         self.calibration = self.calibration + error[CALIBRATION]
         self.offsets_m = self.offsets_m + error[self.offsets]
-        shifts = error[self.offsets.stop :].reshape(-1, 2)
-        n = len(self.landmarks_m)
-        self.landmarks_m = self.landmarks_m @ turn.T + shifts[:n] @ V.T
-        self.walls = self.walls + shifts[n:] + [angle, 0.0]
+        layout = self.layout
+        if layout.has_mounts:
+            self.mounts_m = self.mounts_m + error[layout.mounts].reshape(-1, 2)
+        shifts = error[layout.landmarks].reshape(-1, layout.landmark_size)
+        self.landmarks_m = self.landmarks_m @ turn.T + shifts[:, :2] @ V.T
+        if layout.has_radii:
+            self.radii_m = self.radii_m + shifts[:, 2]
+        self.walls = self.walls + error[layout.walls].reshape(-1, 2) + [angle, 0.0]
 
     def update(self, at: Indices, H: Array, residual: Array, R: Array) -> float:
         """Correct mean and covariance with k measurements, ``residual = z - h``.
@@ -354,14 +444,21 @@ class State:
         return float(whitened @ whitened)
 
     def augment(self, point_m: Array, cross: Array, corner: Array) -> int:
-        """Append a landmark and return its id; ``cross`` (m, 2), ``corner`` (2, 2)."""
+        """Append a landmark and return its id.
+
+        ``cross`` (m, k) is the covariance with the rest, ``corner`` (k, k) its own, k = 3 with the
+        radius and 2 without.
+        """
         self.P.grow(cross, corner)
         if self.wall_ids:
+            k = len(corner)
             m, n_walls = self.P.size, 2 * len(self.wall_ids)
             order = np.arange(m)
-            order[m - n_walls - 2 :] = np.roll(order[m - n_walls - 2 :], 2)
+            order[m - n_walls - k :] = np.roll(order[m - n_walls - k :], k)
             self.P = SymmetricMatrix(self.P.full()[np.ix_(order, order)])
         self.landmarks_m = np.vstack([self.landmarks_m, point_m])
+        if self.radius_sigma_m:
+            self.radii_m = np.append(self.radii_m, 0.0)
         self.landmark_ids.append(self.next_id)
         self.next_id += 1
         return self.landmark_ids[-1]
@@ -376,13 +473,14 @@ class State:
 
     def remove(self, row: int) -> None:
         """Marginalise a landmark, or a wall; the covariance of the rest stays bit for bit."""
-        first = self.offsets.stop + 2 * row
-        self.P.keep(np.delete(np.arange(self.P.size), [first, first + 1]))
+        gone = self.layout.columns(np.array([row]))
+        self.P.keep(np.delete(np.arange(self.P.size), gone))
         n = len(self.landmark_ids)
-        self.radii_m.pop(self.feature_ids[row], None)
-        self.shape_sigmas_m.pop(self.feature_ids[row], None)
+        self.added_sigmas_m.pop(self.feature_ids[row], None)
         if row < n:
             self.landmarks_m = np.delete(self.landmarks_m, row, axis=0)
+            if self.radius_sigma_m:
+                self.radii_m = np.delete(self.radii_m, row)
             del self.landmark_ids[row]
         else:
             self.walls = np.delete(self.walls, row - n, axis=0)
@@ -412,9 +510,10 @@ class State:
         self.P = SymmetricMatrix((P + P.T) / 2)
 
     def take_calibration(self, other: State) -> None:
-        """Take over the calibration and the offsets of a state, in a state without landmarks."""
+        """Take over all of a state that is no pose or landmark, in a state without landmarks."""
         self.calibration, self.offsets_m = other.calibration.copy(), other.offsets_m.copy()
-        known = np.arange(CALIBRATION.start, self.offsets.stop)
+        self.mounts_m = other.mounts_m.copy()
+        known = np.arange(CALIBRATION.start, self.n_fixed)
         P = self.P.full()
         P[np.ix_(known, known)] = other.P.block(known)
         self.P = SymmetricMatrix(P)
@@ -423,14 +522,17 @@ class State:
         """Return T with e_additive = T e, shape (m, m), at the present mean."""
         T = np.eye(self.P.size)
         T[POSITION, HEADING] = quarter_turn(self.position_m)
-        T[self.offsets.stop :, HEADING] = self.turned_features().ravel()
+        T[self.n_fixed :, HEADING] = self.turned_features()
         return T
 
     def turned_features(self) -> Array:
-        """Return d(landmark, wall) / d(heading) as the whole map turns, shape (n + w, 2)."""
+        """Return d(features) / d(heading) as the whole map turns, in the order of their columns."""
+        landmarks = quarter_turn(self.landmarks_m)
+        if self.radius_sigma_m:
+            landmarks = np.column_stack([landmarks, np.zeros(len(landmarks))])
         walls = np.zeros_like(self.walls)
         walls[:, 0] = 1.0
-        return np.vstack([quarter_turn(self.landmarks_m), walls])
+        return np.concatenate([landmarks.ravel(), walls.ravel()])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -495,7 +597,7 @@ def predict(state: State, motion: Motion, wheels: WheelNoise) -> None:
     direction = np.zeros(P.size)
     direction[HEADING] = 1.0
     direction[POSITION] = -quarter_turn(state.position_m)
-    direction[state.offsets.stop :] = -state.turned_features().ravel()
+    direction[state.n_fixed :] = -state.turned_features()
     along = head[:, 2:] @ gains
     along[POSITION] += by_scale * along[CALIBRATION.start]
     variance = float(gains @ along[CALIBRATION]) + float(motion.covariance[2, 2])

@@ -38,7 +38,7 @@ from slam.robust.initialisation import (
     find_tracklets,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
-from slam.robust.state import Array, State, rotation
+from slam.robust.state import HEAD_SIZE, Array, State, rotation
 
 _PRIOR_RAD = 0.3
 
@@ -137,7 +137,7 @@ def wall_rows(state: State, wall_row: int, seen: BodyWall) -> FeatureRows:
     phi, d = (float(value) for value in state.walls[wall_row])
     n = np.array([math.cos(phi), math.sin(phi)])
     along = float(state.position_m @ np.array([-n[1], n[0]]))
-    offsets = np.arange(state.offsets.start, state.offsets.stop)
+    offsets = np.arange(state.offsets.start, state.n_fixed)
     columns = state.landmark_columns(np.array([len(state.landmark_ids) + wall_row]))
     at = np.concatenate([np.array([1, 2]), offsets, columns])
     by_position = np.array([[0.0, 0.0], -n])
@@ -198,10 +198,10 @@ def initialise_wall(state: State, seen: BodyWall) -> int:
     along = float(state.position_m @ np.array([-n[1], n[0]]))
     d = float(seen.wall[1] + n @ state.position_m)
     by_noise = np.array([[1.0, 0.0], [along, 1.0]])
-    at = np.arange(state.offsets.stop)
+    at = np.arange(state.n_fixed)
     G = np.zeros((2, len(at)))
     G[1, 1:3] = n
-    G[:, state.offsets] = by_noise @ seen.by_offsets
+    G[:, HEAD_SIZE:] = by_noise @ seen.by_offsets
     cross = state.P.columns(at) @ G.T
     corner = G @ cross[at] + by_noise @ seen.covariance @ by_noise.T
     return state.augment_wall(np.array([phi, d]), cross, (corner + corner.T) / 2)
@@ -262,7 +262,7 @@ class WallKeeper:
 
     def tracker(self, *, is_wall: bool) -> Tracker:
         state = self._state
-        block = state.P.block(np.arange(state.offsets.start, state.offsets.stop))
+        block = state.P.block(np.arange(HEAD_SIZE, state.n_fixed))
         return Tracker(self._parameters, state.offsets_m, block, is_wall=is_wall)
 
     def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[Tracklet]:
@@ -299,7 +299,7 @@ class WallKeeper:
             if is_unresolved(state, seen, self.cells, self._rule):
                 return None
             wall_id = initialise_wall(state, seen)
-            state.shape_sigmas_m[wall_id] = self._rule.roughness_m
+            state.added_sigmas_m[wall_id] = self._rule.roughness_m
             row = len(state.wall_ids) - 1
         else:
             wall_id = state.wall_ids[row]

@@ -48,7 +48,7 @@ FILE = "victoria_park.txt"
 # A park is a hundred times wider than a room, and its trees are known to half a metre.
 # Nothing is left out as an outlier: a tree seen twice would be left without a place.
 PARK_RULE = RelinearisationRule(
-    turn_rad=0.02, shift_m=0.5, every=100, most_poses=10_000, outlier_sigmas=math.inf
+    turn_rad=0.02, shift_m=0.5, every=100, outlier_sigmas=math.inf, steps_per_slip=math.inf
 )
 
 # Wheels of which nothing is known: a tenth in distance and turn, a degree per two metres.

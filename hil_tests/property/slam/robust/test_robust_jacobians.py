@@ -36,9 +36,9 @@ from slam.robust.initialisation import (
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.run_log import Estimate, Problem, start_prior
+from slam.robust.run_log import Estimate, Problem
 from slam.robust.smoother import measurement_residuals, motion_residuals
-from slam.robust.state import calibrated_motion, left_jacobian, predict, rotation
+from slam.robust.state import Layout, calibrated_motion, left_jacobian, predict, rotation
 
 WHEELS = WheelNoise(walk_per_sqrt_m=0.0)
 few = settings(max_examples=40, deadline=None)
@@ -201,14 +201,18 @@ def test_left_jacobian_is_the_mean_of_rotations(angle: float) -> None:
 def small_problem(seed: int) -> tuple[Problem, Estimate]:
     rng = np.random.default_rng(seed)
     problem = Problem(
-        increments=0.3 * rng.standard_normal((4, 3)),
-        covariances=np.tile(np.diag([1e-4, 2e-4, 3e-4]), (4, 1, 1)),
+        layout=Layout(N_RADARS, 2),
+        prior_mean=np.zeros(6 + N_RADARS + 4),
+        prior_sigmas=np.ones(6 + N_RADARS + 4),
+        steps=0.3 * rng.standard_normal((4, 3)),
+        step_covariances=np.tile(np.diag([1e-4, 2e-4, 3e-4]), (4, 1, 1)),
         walks=np.zeros((4, 3)),
-        prior=start_prior((0.02, 0.02, 0.01), (0.01,) * N_RADARS, 2),
+        keys=np.arange(5),
         range_poses=np.array([1, 2, 4, 4]),
         range_radars=np.array([0, 3, 1, 2]),
         range_landmarks=np.array([0, 1, 0, 1]),
         range_antennas=rng.uniform(-0.2, 0.2, (4, 2)),
+        range_turns=np.zeros(4),
         ranges_m=rng.uniform(0.5, 1.5, 4),
         range_sigmas_m=np.full(4, 0.01),
         point_poses=np.array([3, 4]),
@@ -219,8 +223,7 @@ def small_problem(seed: int) -> tuple[Problem, Estimate]:
     estimate = Estimate(
         poses=rng.uniform(-2, 2, (5, 3)),
         calibration=0.02 * rng.standard_normal((1, 3)),
-        offsets_m=0.01 * rng.standard_normal(N_RADARS),
-        landmarks_m=rng.uniform(2, 4, (2, 2)),
+        fixed=np.concatenate([0.01 * rng.standard_normal(N_RADARS), rng.uniform(2, 4, 4)]),
     )
     return problem, estimate
 
@@ -229,14 +232,15 @@ def small_problem(seed: int) -> tuple[Problem, Estimate]:
 @given(seeds)
 def test_derivatives_of_the_smoother_are_those_of_its_residuals(seed: int) -> None:
     problem, estimate = small_problem(seed)
-    roots = np.linalg.inv(np.linalg.cholesky(problem.covariances))
-    steps = motion_residuals(problem, estimate, roots)
+    roots = np.linalg.inv(np.linalg.cholesky(problem.step_covariances))
+    steps = motion_residuals(problem, estimate).whitened(roots)
+    landmarks_m = estimate.fixed[N_RADARS:].reshape(-1, 2)
     for k in range(4):
 
         def step(x: Complex, k: int = k) -> Complex:
             before, after, (s, w, kappa) = x[:3], x[3:6], x[6:]
-            d = problem.increments[k, :2] / (1 + s)
-            a = (problem.increments[k, 2] - kappa * np.sqrt(d @ d)) / (1 + w)
+            d = problem.steps[k, :2] / (1 + s)
+            a = (problem.steps[k, 2] - kappa * np.sqrt(d @ d)) / (1 + w)
             gone = turn(before[2]).T @ (after[:2] - before[:2])
             result: Complex = roots[k] @ np.concatenate([gone - d, [after[2] - before[2] - a]])
             return result
@@ -256,12 +260,13 @@ def test_derivatives_of_the_smoother_are_those_of_its_residuals(seed: int) -> No
         x = np.concatenate(
             [
                 estimate.poses[problem.range_poses[i]],
-                estimate.landmarks_m[problem.range_landmarks[i]],
-                [estimate.offsets_m[problem.range_radars[i]]],
+                landmarks_m[problem.range_landmarks[i]],
+                [estimate.fixed[problem.range_radars[i]]],
             ]
         )
         wanted = complex_step(white_range, x)[0]
-        found = np.concatenate([rows.by_pose[i], rows.by_landmark[i], [rows.by_offset[i]]])
+        own = rows.by_border[i]
+        found = np.concatenate([rows.by_pose[i], own[1:3], own[:1]])
         assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()
         assert rows.residual[i] == pytest.approx(white_range(x.astype(complex))[0].real, abs=1e-9)
     for i in range(2):
@@ -276,9 +281,9 @@ def test_derivatives_of_the_smoother_are_those_of_its_residuals(seed: int) -> No
         x = np.concatenate(
             [
                 estimate.poses[problem.point_poses[i]],
-                estimate.landmarks_m[problem.point_landmarks[i]],
+                landmarks_m[problem.point_landmarks[i]],
             ]
         )
         wanted = complex_step(white_point, x)
-        found = np.hstack([rows.by_pose[4 + 2 * i :][:2], rows.by_landmark[4 + 2 * i :][:2]])
+        found = np.hstack([rows.by_pose[4 + 2 * i :][:2], rows.by_border[4 + 2 * i :][:2, :2]])
         assert np.abs(found - wanted).max() <= 1e-9 * np.abs(wanted).max()

@@ -21,10 +21,13 @@ from slam.robust.map import apply_merge, merge_rows
 from slam.robust.state import Indices, State, calibrated_motion, predict
 
 WHEELS = WheelNoise(walk_per_sqrt_m=0.1)
+PLACES = np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]])
 ANTENNAS = Antennas(
-    position_m=np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]]),
+    position_m=PLACES,
     yaw_rad=np.array([1.0, 1.0, -1.0, -1.0]) * math.pi / 2,
     has_frame=np.ones(4, dtype=bool),
+    told_m=PLACES,
+    turns_rad=np.zeros(4),
 )
 few = settings(max_examples=30, deadline=None)
 

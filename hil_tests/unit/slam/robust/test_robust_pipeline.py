@@ -103,7 +103,9 @@ def test_ranges_correct_wheels_that_report_too_much() -> None:
     def odometry(t_ns: int) -> Array:
         return straight(t_ns) * 1.02
 
-    calibrated = override(ROBUST, {"robust.offset_sigma_m": "0"})  # or offsets may explain it
+    # Or offsets, mounts and radii may explain it.
+    names = ("offset_sigma_m", "mount_sigma_m", "radius_sigma_m")
+    calibrated = override(ROBUST, {f"robust.{name}": "0" for name in names})
     beliefs = drive(robust(calibrated), 130, odometry)
     assert len(beliefs) == 129
     end = straight(129 * TICK_NS)

@@ -12,7 +12,6 @@ from hil_tests.unit.slam.robust.range_world import (
     follow,
     odometry_path,
     reported,
-    step_of,
     true_path,
 )
 from slam.config import WheelNoise
@@ -30,8 +29,6 @@ from slam.robust.initialisation import (
     find_tracklets,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
-from slam.robust.run_log import Estimate, RunLog, start_prior
-from slam.robust.smoother import measurement_residuals, prior_about, prior_cost, prior_terms
 from slam.robust.state import Array, Indices, State, SymmetricMatrix, calibrated_motion, predict
 from slam.robust.walls import (
     BodyWall,
@@ -215,55 +212,6 @@ def test_cells_tell_where_a_wall_answered() -> None:
     assert cells.spans_m(7) == []
 
 
-def test_wall_rows_of_the_smoother_are_derivatives() -> None:
-    state = state_with_map()
-    log = RunLog(WheelNoise())
-    log.add_motion(*step_of([0.1, 0.0, 0.2], 1.0))
-    for landmark_id in (0, 1, 2, 3):
-        log.add_range(
-            1, landmark_id, landmark_id, antenna=(0.1, -0.2), range_m=1.0, sigma_m=SIGMA_M
-        )
-    problem = log.problem(state, start_prior((0.1, 0.1, 0.1), OFFSETS, 4))
-    assert problem.n_walls == 2
-    start = Estimate(
-        poses=np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.6]]),
-        calibration=np.zeros((1, 3)),
-        offsets_m=np.zeros(4),
-        landmarks_m=state.features,
-    )
-    rows = measurement_residuals(problem, start)
-    for i in range(3):
-        poses = [start.poses.copy(), start.poses.copy()]
-        poses[0][1, i] += 1e-6
-        poses[1][1, i] -= 1e-6
-        ahead, behind = (measurement_residuals(problem, replace(start, poses=p)) for p in poses)
-        slope = (ahead.residual - behind.residual) / 2e-6
-        assert rows.by_pose[:, i] == pytest.approx(slope, rel=1e-6, abs=1e-3)
-    for i in range(2):
-        shift = np.zeros_like(start.landmarks_m)
-        shift[:, i] = 1e-6
-        ahead, behind = (
-            measurement_residuals(problem, replace(start, landmarks_m=start.landmarks_m + sign))
-            for sign in (shift, -shift)
-        )
-        slope = (ahead.residual - behind.residual) / 2e-6
-        assert rows.by_landmark[:, i] == pytest.approx(slope, rel=1e-6, abs=1e-3)
-
-
-def test_a_prior_with_walls_feels_no_turn_and_pulls_as_its_cost_falls() -> None:
-    rng = np.random.default_rng(4)
-    values = rng.standard_normal(6 + 4 + 8)
-    root = rng.standard_normal((18, 18))
-    prior = prior_about(root @ root.T, rng.standard_normal(18), values, 4, n_walls=2)
-    apart = values + 0.1 * rng.standard_normal(18)
-    _, gradient = prior_terms(prior, apart, 4)
-    for i in range(18):
-        step = np.zeros(18)
-        step[i] = 1e-6
-        slope = (prior_cost(prior, apart + step, 4) - prior_cost(prior, apart - step, 4)) / 2e-6
-        assert 2.0 * gradient[i] == pytest.approx(slope, rel=1e-6, abs=1e-5)
-
-
 def bare_room(path: Array, rng: np.random.Generator) -> list[list[RangeScan]]:
     """Return what four radars hear of four walls 1 m beyond the path's square, and nothing else."""
     walls = np.array([[0.0, 3.0], [math.pi / 2, 3.0], [math.pi, 1.0], [-math.pi / 2, 1.0]])
@@ -294,7 +242,7 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
     list(follow(back_end, increments, bare_room(path, rng)))
     assert back_end.reported_rows() == []
     rough = dict.fromkeys(back_end.state.wall_ids, WallRule().roughness_m)
-    assert back_end.state.shape_sigmas_m == rough
+    assert back_end.state.added_sigmas_m == rough
     true_d_m = {0: 3.0, 1: 3.0, 2: 1.0, 3: 1.0}
     state = back_end.state
     T = state.additive_transform()
@@ -406,10 +354,10 @@ def sightings(antennas: Array, ranges: Array, radars: Indices | None = None) -> 
         variances=np.full(k, SHARP_SIGMA_M**2),
         radars=np.zeros(k, dtype=np.intp) if radars is None else radars,
         poses=np.arange(k),
-        mounts_m=np.zeros((k, 2)),
+        told_m=np.zeros((k, 2)),
+        turns_rad=np.zeros(k),
         measured_m=ranges,
         sigmas_m=np.full(k, SHARP_SIGMA_M),
-        alone=np.ones(k, dtype=np.bool_),
         n_radars=2,
     )
 

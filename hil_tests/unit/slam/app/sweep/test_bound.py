@@ -41,9 +41,10 @@ from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, compose, mount_at, paper_rig
 from slam.paper.ekf import start
 from slam.results import StepResult
-from slam.robust.parameters import RelinearisationRule
-from slam.robust.run_log import Estimate, Problem, start_prior
+from slam.robust.parameters import BackEndParameters, RangeNoise, RelinearisationRule
+from slam.robust.run_log import Estimate, Problem, prior_sigmas
 from slam.robust.smoother import Smoother, Solution
+from slam.robust.state import Layout
 
 Array = NDArray[np.float64]
 
@@ -126,18 +127,23 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
             for dx, dy, turn in run.increments
         ]
     )
-    n_landmarks = len(row)
+    layout = Layout(4, len(row))
+    noise = RangeNoise(offset_sigma_m=offset_sigma_m)
     problem = Problem(
-        increments=run.increments,
-        covariances=covariances,
+        layout=layout,
+        prior_mean=np.zeros(layout.size),
+        prior_sigmas=prior_sigmas(layout, BackEndParameters(wheels=wheels, ranges=noise)),
+        steps=run.increments,
+        step_covariances=covariances,
         walks=np.zeros((len(run.increments), 3)),
-        prior=start_prior(wheels.calibration_sigmas, (offset_sigma_m,) * 4, n_landmarks),
+        keys=np.arange(len(run.increments) + 1),
         range_poses=np.array([step for step, _ in used]),
         range_radars=np.array([known.radar for _, known in used]),
         range_landmarks=np.array([row[known.landmark] for _, known in used]),
         range_antennas=np.array(
             [(mounts[known.radar].x_m, mounts[known.radar].y_m) for _, known in used]
         ),
+        range_turns=np.zeros(len(used)),
         ranges_m=np.array([known.range_m for _, known in used]),
         range_sigmas_m=np.full(len(used), SIGMA_M),
         point_poses=np.zeros(0, dtype=np.intp),
@@ -145,12 +151,11 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
         points=np.zeros((0, 2)),
         point_roots=np.zeros((0, 2, 2)),
     )
-    rule = RelinearisationRule(iterations=20, outlier_sigmas=math.inf)
+    rule = RelinearisationRule(iterations=20, outlier_sigmas=math.inf, steps_per_slip=math.inf)
     begin = Estimate(
         poses=np.vstack([np.zeros(3), bound.filtered]),
         calibration=np.zeros((1, 3)),
-        offsets_m=np.zeros(4),
-        landmarks_m=bound.landmarks_m + 0.01,
+        fixed=np.concatenate([np.zeros(4), bound.landmarks_m.ravel() + 0.01]),
     )
     solution = Smoother(problem, rule).solve(begin, tolerance=1e-12)
     assert solution is not None
@@ -167,7 +172,7 @@ def test_the_smoother_is_ours_and_the_filtered_pose_ends_there(offset_sigma_m: f
     ours = batch_of(run, bound, offset_sigma_m)
     # Two solvers of one problem; what is left is the noise model's own linearisation, see above.
     np.testing.assert_allclose(bound.smoothed[:, :2], ours.estimate.poses[1:, :2], atol=2e-4)
-    np.testing.assert_allclose(bound.landmarks_m, ours.estimate.landmarks_m, atol=5e-4)
+    np.testing.assert_allclose(bound.landmarks_m, ours.estimate.fixed[4:].reshape(-1, 2), atol=5e-4)
     np.testing.assert_allclose(bound.calibration, ours.estimate.calibration[0], atol=2e-4)
     covariance = np.linalg.inv(ours.information)[:3, :3]
     sigmas = np.sqrt(np.diag(covariance))
