@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fractions import Fraction
 
 import numpy as np
@@ -269,6 +269,15 @@ class Scatterers:
     radius_m: NDArray[np.float64]
     swell_m: NDArray[np.float64]
     phase_rad: NDArray[np.float64]
+
+    def take(
+        self, frame: NDArray[np.int64], number: NDArray[np.int64], shape: tuple[int, int]
+    ) -> Scatterers:
+        """Return some of the scatterers in some of the frames, of (n_frames, k): shape (m,)."""
+        arrays = (each.name for each in fields(self))
+        return Scatterers(
+            **{name: np.broadcast_to(getattr(self, name), shape)[frame, number] for name in arrays}
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

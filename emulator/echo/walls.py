@@ -291,19 +291,20 @@ def passing(
         Bodies that do not count, shape (m,) each: those a leg was reflected by; -1 is none.
     """
     share = np.ones(len(from_x))
+    # A row for each face: NumPy's inner loops run over the legs, of which there are more.
+    rows = faces.take(np.arange(len(faces))[:, np.newaxis])
     step = max(_LEGS_TIMES_FACES // max(len(faces), 1), 1)
     for first in range(0, len(from_x), step):
         part = slice(first, first + step)
-        x0, y0 = from_x[part, np.newaxis], from_y[part, np.newaxis]
-        x1, y1 = to_x[part, np.newaxis], to_y[part, np.newaxis]
-        h0, h1 = faces.height(x0, y0), faces.height(x1, y1)
+        x0, y0, x1, y1 = from_x[part], from_y[part], to_x[part], to_y[part]
+        h0, h1 = rows.height(x0, y0), rows.height(x1, y1)
         crosses = (h0 * h1 < 0) & (np.minimum(np.abs(h0), np.abs(h1)) > ON_THE_FACE_M)
         for body in but:
-            crosses &= faces.body != body[part, np.newaxis]
-        leg, face = np.nonzero(crosses)
+            crosses &= rows.body != body[part]
+        face, leg = np.nonzero(crosses)
         one = faces.take(face)
-        x0, y0, x1, y1 = x0[leg, 0], y0[leg, 0], x1[leg, 0], y1[leg, 0]
-        height0, height1 = h0[leg, face], h1[leg, face]
+        x0, y0, x1, y1 = x0[leg], y0[leg], x1[leg], y1[leg]
+        height0, height1 = h0[crosses], h1[crosses]
         start, stop = one.along(x0, y0), one.along(x1, y1)
         at = start + (stop - start) * (height0 / (height0 - height1))
         way = length(x1 - x0, y1 - y0)
@@ -564,50 +565,47 @@ def ghost_reflections(
         Shape (n_frames, k): of the straight leg, from `direct_share`.
     """
     legs = _legs(faces, scatterers, view, share, wavelength_m)
-    swell_m = np.broadcast_to(scatterers.swell_m, share.shape)
-    range_m, amplitude, phase_rad = [], [], []
-    n_legs = legs.gain.shape[2]
-    for out in range(n_legs):
-        for back in range(max(out, 1), n_legs):
-            cosine = (
-                legs.to_x[:, :, out] * legs.to_x[:, :, back]
-                + legs.to_y[:, :, out] * legs.to_y[:, :, back]
-            )
-            half_cosine = np.sqrt(np.clip(0.5 * (1 + cosine), 0.0, 1.0))
-            length_out, length_back = legs.length_m[:, :, out], legs.length_m[:, :, back]
-            # Out by one and back by the other, and the reverse: equally long, so they add.
-            both_ways = 1.0 if out == back else 2.0
-            amplitude.append(
-                both_ways
-                * legs.gain[:, :, out]
-                * legs.gain[:, :, back]
-                * spread(scatterers, length_out, length_back, half_cosine)
-            )
-            antenna_m = 0.5 * (legs.antenna_m[:, :, out] + legs.antenna_m[:, :, back])
-            range_m.append(0.5 * (length_out + length_back) - swell_m * half_cosine + antenna_m)
-            mirrors = 1 if out == 0 else 2
-            phase_rad.append(scatterers.phase_rad + np.pi * mirrors)
-    if not range_m:
-        empty = np.empty((len(share), 0))
-        return Reflections(range_m=empty, amplitude=empty, phase_rad=np.empty(0))
+    n_frames, n_targets, n_legs = legs.gain.shape
+    ways = [(out, back) for out in range(n_legs) for back in range(max(out, 1), n_legs)]
+    out, back = np.array(ways, dtype=np.int64).reshape(-1, 2).T
+    gain = legs.gain.transpose(0, 2, 1)
+    amplitude = gain[:, out] * gain[:, back]
+    # Out by one and back by the other, and the reverse: equally long, so they add.
+    amplitude *= np.where(out == back, 1.0, 2.0)[:, np.newaxis]
+    range_m = np.zeros(amplitude.shape)
+
+    # in lists, shape (m,): those that exist
+    frame, way, target = there = np.nonzero(amplitude)
+    going, coming = (frame, target, out[way]), (frame, target, back[way])
+    one = scatterers.take(frame, target, (n_frames, n_targets))
+    cosine = legs.to_x[going] * legs.to_x[coming] + legs.to_y[going] * legs.to_y[coming]
+    half_cosine = np.sqrt(np.clip(0.5 * (1 + cosine), 0.0, 1.0))
+    out_m, back_m = legs.length_m[going], legs.length_m[coming]
+    amplitude[there] *= spread(one, out_m, back_m, half_cosine)
+    antenna_m = 0.5 * (legs.antenna_m[going] + legs.antenna_m[coming])
+    range_m[there] = 0.5 * (out_m + back_m) - one.swell_m * half_cosine + antenna_m
+
+    mirrors = np.where(out == 0, 1, 2)
+    phase_rad = scatterers.phase_rad + np.pi * mirrors[:, np.newaxis]
+    shape = n_frames, len(ways) * n_targets
     return Reflections(
-        range_m=np.concatenate(range_m, axis=1),
-        amplitude=np.concatenate(amplitude, axis=1),
-        phase_rad=np.concatenate(phase_rad),
+        range_m=range_m.reshape(shape),
+        amplitude=amplitude.reshape(shape),
+        phase_rad=phase_rad.ravel(),
     )
 
 
 def spread(scatterers: Scatterers, out_m: Array, back_m: Array, half_cosine: Array) -> Array:
-    """Return the echo's amplitude for two different legs, shape (n_frames, k), beam left aside.
+    """Return the echoes' amplitudes for two different legs, shape (m,), beam left aside.
 
     With equal legs it is that of `emulator.echo.reflections.direct_reflections`.
 
     Parameters
     ----------
     out_m, back_m
-        Shape (n_frames, k): lengths of the legs, to the scatterer's axis.
+        Shape (m,): lengths of the legs, to the scatterer's axis.
     half_cosine
-        Shape (n_frames, k): cosine of half the angle between the legs at the scatterer.
+        Shape (m,): cosine of half the angle between the legs at the scatterer.
     """
     radius_m = scatterers.radius_m
     s1 = np.maximum(out_m - radius_m, NEAREST_M)
