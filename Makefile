@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test test-quick test-all check bench sweep stress scenes pictures clean
+.PHONY: demo test test-quick test-all check bench sweep stress scenes failures pictures clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -40,18 +40,32 @@ sweep: $(VENV)/installed-sweep
 	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
 	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
 
-# What each hardship costs preset robust, on five seeds: 100 runs, 23 minutes of two cores.
-# Stopped, it goes on where it was; picture and table in out/experiments.
+SCENES := lab classroom lab_six lab_three symmetric smoke calibration two_rooms walls corridor store hall
+FAMILIES := pillars office dense loop sparse people rig
+MODEL_ERRORS := pulse_wide pulse wander_3 wander_10 rod_rod bursts slip mounts stamps offsets_20 mismatch
+STRESSES := outliers dropped skew walk silent all dead carried $(MODEL_ERRORS)
+
+# What each hardship costs preset robust, on two laps and five seeds: 200 runs. `make stress
+# STRESSES="wander_10 slip"` runs some rows only. Stopped, it goes on where it was; picture and table
+# in out/experiments.
 stress: $(VENV)/installed-demo
-	$(BIN)/uwb-slam sweep --scene lab classroom --seeds 5 --json out/stress.json \
-		--stress outliers dropped skew walk silent all dead offsets_20 carried
+	$(BIN)/uwb-slam sweep --scene lab classroom --laps 2 --seeds 5 --json out/stress.json \
+		--stress $(STRESSES)
 	$(BIN)/uwb-slam experiment stress --sweep out/stress.json
 
-# Preset robust in every scene that has wheels and something to map, five seeds each; likewise.
+# Preset robust in every scene that has wheels and something to map, five seeds each, and in ten
+# rooms of every random family: 130 runs, in two sweeps that go on likewise.
 scenes: $(VENV)/installed-demo
-	$(BIN)/uwb-slam sweep --seeds 5 --json out/scenes.json --scene lab classroom lab_six symmetric \
-		smoke calibration two_rooms walls corridor store hall
+	$(BIN)/uwb-slam sweep --seeds 5 --json out/scenes.json --scene $(SCENES)
 	$(BIN)/uwb-slam experiment scenes --sweep out/scenes.json
+	$(BIN)/uwb-slam sweep --seeds 1 --json out/rooms.json --scene $(FAMILIES:=:0-9)
+	$(BIN)/uwb-slam experiment scenes --sweep out/rooms.json --out out/experiments/rooms
+
+# Every scene and three rooms of every family under every hardship, a run each: 660 runs, whose last
+# line counts those that are worse than their wheels, lost, or carried and not found.
+failures: $(VENV)/installed-demo
+	$(BIN)/uwb-slam sweep --laps 2 --seeds 1 --json out/failures.json \
+		--scene $(SCENES) $(FAMILIES:=:0-2) --stress $(STRESSES)
 
 # The pictures of fixtures/pictures, and the numbers of `limits`: about a quarter of an hour of one
 # core. Needs Mesa's lavapipe (Debian: mesa-vulkan-drivers) for the screenshot of Rerun and Chromium

@@ -20,6 +20,8 @@ from emulator.chip.chip import CaptureSettings
 from emulator.echo.echo import echo_source
 from emulator.scene.scene import load_scene
 from hil_tests.paths import FIXTURES
+from slam.app.sweep import STRESSES
+from slam.app.sweep.run import stressed_scene
 
 BASELINE = FIXTURES / "baselines" / "chip_counters.toml"
 CASES: list[dict[str, Any]] = tomllib.loads(BASELINE.read_text())["case"]
@@ -32,7 +34,7 @@ PRINT_DIGESTS = (
 
 def digest(case: dict[str, Any]) -> str:
     """Return the SHA-256 of a case's counters: all radars, in the scene's order."""
-    scene = load_scene(case["scene"])
+    scene = stressed_scene(load_scene(case["scene"]), STRESSES[case["stress"]], case["seed"])
     capture = CaptureSettings(**case["capture"])
     counters = np.arange(case["frames"], dtype=np.int64) * case["every"]
     times = counters * 200_000_000

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene, load_scene
+from slam.app.rig.emulated import rig_of
 
 SCENES = ("lab", "classroom", "smoke")
 OTHERS = ("corridor", "two_rooms", "symmetric", "hall", "store", "lab_six")
@@ -45,6 +46,7 @@ def distance_to_square(point: NDArray[np.float64], side_m: float) -> float:
         ("hall", 5, 2.4),
         ("store", 14, 0.3),
         ("lab_six", 14, 0.35),
+        ("lab_three", 14, 0.35),
     ],
 )
 def test_targets_are_as_sparse_as_described(name: str, count: int, spacing_m: float) -> None:
@@ -77,18 +79,18 @@ def test_a_room_of_bare_walls_has_no_landmark() -> None:
     assert len(scene.walls) == 4
 
 
-def test_the_lab_with_six_radars_is_the_lab() -> None:
-    lab, six = load_scene("lab"), load_scene("lab_six")
-    assert six.targets == lab.targets
-    assert (six.path, six.noise, six.clutter, six.jitter, six.leakage, six.odometry) == (
-        lab.path,
-        lab.noise,
-        lab.clutter,
-        lab.jitter,
-        lab.leakage,
-        lab.odometry,
-    )
-    assert len(six.radars) == 6
+@pytest.mark.parametrize(("name", "count"), [("lab_six", 6), ("lab_three", 3)])
+def test_the_lab_with_other_radars_is_the_lab(name: str, count: int) -> None:
+    lab, other = load_scene("lab"), load_scene(name)
+    changed = {"name", "description", "radars"}
+    assert other.model_dump(exclude=changed) == lab.model_dump(exclude=changed)
+    assert len(other.radars) == count
+
+
+def test_three_radars_120_degrees_apart_share_no_field() -> None:
+    yaws = sorted(radar.yaw_deg % 360 for radar in load_scene("lab_three").radars)
+    assert np.diff([*yaws, yaws[0] + 360]).tolist() == [120.0, 120.0, 120.0]
+    assert rig_of(load_scene("lab_three")).pairs() == ()
 
 
 @pytest.mark.parametrize("name", ["lab", "classroom"])
@@ -161,7 +163,7 @@ def test_each_landmark_is_detectable_often_enough_on_both_laps(name: str) -> Non
             assert in_window.max() >= WINDOW_HITS, (target.name, rear)
 
 
-@pytest.mark.parametrize("name", [*SCENES, *OTHERS])
+@pytest.mark.parametrize("name", [*SCENES, *OTHERS, "lab_three"])
 def test_no_echo_saturates_the_dac_window(name: str) -> None:
     scene = load_scene(name)
     half_window = (1100 - 949 + 1) / 2048
