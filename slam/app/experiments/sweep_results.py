@@ -17,7 +17,16 @@ from pydantic import BaseModel, Field, ValidationError
 from slam.app.errors import AppError
 from slam.app.experiments import Result, table
 from slam.app.run.output import mm_text, share_text
-from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from slam.app.run.pictures import (
+    ESTIMATE,
+    GRID,
+    LANDMARK,
+    ODOMETRY,
+    PALE_INK,
+    SMOOTHED,
+    TRUTH,
+    label,
+)
 from slam.app.sweep import CLEAN
 from slam.app.sweep.statistics import (
     group_name,
@@ -376,6 +385,14 @@ def _draw_errors(axes: Axes, groups: Sequence[Group]) -> None:
     axes.plot(odometry_mm, places, "s", markersize=6, color=ODOMETRY, label="wheels, median")
     axes.plot(median_mm, places, "o", markersize=6, color=ESTIMATE, label="SLAM, median")
     axes.plot(p90_mm, places, "D", markersize=6, color=LANDMARK, label="SLAM, p90")
+    smoothed = [
+        (max(1e3 * group["smoothed"]["ate_rmse_m"]["median"], _LEAST_MM), place)
+        for place, group in zip(places, groups, strict=True)
+        if group["smoothed"] is not None
+    ]
+    if smoothed:
+        values_mm, rows = zip(*smoothed, strict=True)
+        axes.plot(values_mm, rows, "^", markersize=6, color=SMOOTHED, label="smoothed, median")
     _log_scale(axes, (1.0, 2.0, 5.0))
     label(axes, "absolute trajectory error", "mm", "")
     _name_rows(axes, [group_name(group) for group in groups])
