@@ -27,7 +27,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +35,8 @@ from scipy.special import chdtri
 
 from slam.geometry import Rig, wrap_angles
 from slam.results import PredictedRange
-from slam.robust.parameters import (
-    MARGIN_NATS,
-    TAIL_PROBABILITY,
-    ContinuationRule,
-    RangeNoise,
-)
+from slam.robust import kernels
+from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, BackEndParameters, RangeNoise
 from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end says.
@@ -50,9 +45,8 @@ LONGEST_M = 1e6
 BLUR_M = 0.12
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
-# How far an echo may lie from its prediction to answer it, and a landmark outside the limits of
-# range to be looked for, in standard deviations
-_ANSWER_SIGMAS, _VIEW_SIGMAS = 4.0, 5.0
+# How far a landmark may lie outside the limits of range to be looked for, in standard deviations
+_VIEW_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,15 +77,6 @@ class RangeScan:
         if self.sigmas_m is None or not sigma_m:
             return self
         return replace(self, sigmas_m=tuple(math.hypot(s, sigma_m) for s in self.sigmas_m))
-
-    def may_hide(self, range_m: float) -> bool:
-        return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
-
-    def answers(self, range_m: float, reach_m: float) -> bool:
-        """Return whether any echo, blurred or not, may be that of a target at a range."""
-        return any(abs(detected_m - range_m) <= reach_m for detected_m in self.ranges_m) or any(
-            abs(blurred_m - range_m) <= BLUR_M + reach_m for blurred_m in self.blurred_m
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -261,222 +246,129 @@ def fix_of_pair(
     return np.asarray(first_m + x * along + math.sqrt(square) * across)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Continuation:
-    """Range ``index`` of the scan of ``radar`` is of the landmark in ``row``."""
-
-    row: int
-    radar: int
-    index: int
-
-
-@dataclass(frozen=True, slots=True)
-class Option:
-    """One choice for one landmark: ``(radar, index)`` of the ranges used, and its cost."""
-
-    used: tuple[tuple[int, int], ...]
-    cost: float
-
-
-NOTHING = Option((), 0.0)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SureLandmarks:
-    """Landmarks that one side of the robot may see, or those of them that may be continued."""
+class Known:
+    """The c features that some radar may have in view, and which ranges are theirs."""
 
-    landmarks: Indices  # rows of the landmarks, shape (c,)
-    rows: Rows  # their predicted ranges: landmark by landmark, radar by radar
-    prior: Array  # H P H^T of those rows, shape (k, k)
-
-    def surer_than(self, limit_m: float) -> SureLandmarks | None:
-        """Return those with more certain ranges of all radars; None without any."""
-        per_landmark = len(self.rows.radars) // len(self.landmarks)
-        variances = self.prior.diagonal().reshape(-1, per_landmark)
-        sure = (variances <= limit_m**2).all(axis=1)
-        if not sure.any():
-            return None
-        keep = np.flatnonzero(np.repeat(sure, per_landmark))
-        rows = replace(
-            self.rows,
-            radars=self.rows.radars[keep],
-            landmarks=self.rows.landmarks[keep],
-            H=self.rows.H[keep],
-            predicted_m=self.rows.predicted_m[keep],
-        )
-        return SureLandmarks(
-            landmarks=self.landmarks[sure], rows=rows, prior=self.prior[np.ix_(keep, keep)]
-        )
-
-    def with_added_sigma(self, added_sigmas_m: Array) -> SureLandmarks:
-        """Add standard deviations, one per row of the map, to the predictions."""
-        added = np.square(added_sigmas_m[self.rows.landmarks])
-        return self if not added.any() else replace(self, prior=self.prior + np.diag(added))
-
-    def unanswered(self, scans: Sequence[RangeScan], noise: RangeNoise, within_m: float) -> Indices:
-        """Return the rows of those with no echo within four standard deviations of a prediction.
-
-        ``BLUR_M`` more counts for a blurred echo. Those whose ranges are less certain than
-        ``within_m`` are left out: they may be out of view.
-        """
-        scan_of = {scan.radar: scan for scan in scans}
-        per_landmark = len(self.rows.radars) // len(self.landmarks)
-        variances = self.prior.diagonal()
-        silent = variances <= within_m**2
-        reaches_m = _ANSWER_SIGMAS * np.sqrt(variances + noise.sigma_m**2)
-        for k in np.flatnonzero(silent).tolist():
-            scan, range_m = scan_of[int(self.rows.radars[k])], self.rows.predicted_m[k]
-            silent[k] = not scan.answers(float(range_m), float(reaches_m[k]))
-        return self.landmarks[silent.reshape(-1, per_landmark).all(axis=1)]
+    rows: Indices  # shape (c,)
+    prior: Array  # shape (c, r, r): H P H^T between the radars, the features' own variances added
+    assigned: Indices  # shape (k, 3): radar, index of its range, place in ``rows``
+    # shape (s, c, 3), per side: whether it took part, was missed, was hit by all of its radars
+    of_side: NDArray[np.bool_]
+    unheard: NDArray[np.bool_]  # shape (c, r): surely in view, and no echo near its prediction
+    at: Indices  # columns of the error that H has entries for
+    H: Array  # shape (k, columns), of the assignment
+    block: Array  # the covariance of these columns
 
 
-def landmarks_in_view(
+def find_known(
     state: State,
     seen: View,
-    radars: Sequence[int],
-    noise: RangeNoise,
-    rule: ContinuationRule,
-) -> SureLandmarks | None:
-    """Return the landmarks that any of some radars, all with frames, may see, or None."""
-    looking = np.array(radars, dtype=np.intp)
+    scans: Sequence[RangeScan],
+    side_of: Indices,
+    parameters: BackEndParameters,
+    *,
+    sure_m: float,
+) -> Known | None:
+    """Return the likeliest one-to-one assignment of ranges to landmarks; None with none in view.
+
+    ``side_of`` (r,) is the side of each radar. Those whose ranges the prior predicts less surely
+    than ``sure_m`` take no part.
+    """
+    noise, rule, limits = parameters.ranges, parameters.continuation, parameters.map
+    ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
+    has_frame = np.zeros(len(side_of), dtype=np.bool_)
+    has_frame[[scan.radar for scan in scans]] = True
     margin_m = _VIEW_SIGMAS * noise.sigma_m
-    inside = seen.inside(noise, rule.view_margin_rad, margin_m)[looking]
-    landmarks = np.flatnonzero(inside.any(axis=0))
-    if not len(landmarks):
+    inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
+    rows = np.flatnonzero(inside.any(axis=0))
+    if not len(rows):
         return None
-    rows = rows_of(
-        state, seen, np.tile(looking, len(landmarks)), np.repeat(landmarks, len(looking))
+    layout, state_columns = state.layout, np.arange(state.offsets.start, state.n_fixed)
+    at = np.concatenate([np.array([1, 2]), state_columns, layout.columns(rows)])
+    block = state.P.block(at)
+    widths = np.where(rows < layout.n_landmarks, layout.landmark_size, 2)
+    first = 2 + len(state_columns) + np.cumsum(widths) - widths
+    by_mount = np.zeros((0, 0, 0))
+    if layout.has_mounts:
+        by_mount = -np.einsum("rni,rij->rnj", seen.directions, seen.turned)
+    odds = noise.detection_probability / (1.0 - noise.detection_probability)
+    prior, assigned, of_side, unheard, H = kernels.assign(
+        seen.ranges_m,
+        seen.off_boresight_rad,
+        np.ascontiguousarray(seen.directions),
+        np.ascontiguousarray(seen.by_feature),
+        by_mount,
+        rows,
+        first,
+        widths,
+        np.square(state.feature_added_sigmas_m[rows]),
+        block,
+        has_frame,
+        side_of,
+        ranges_m,
+        variances,
+        blurred_m,
+        np.array(
+            [
+                noise.field_of_view_rad / 2,
+                noise.min_range_m,
+                noise.max_range_m,
+                rule.view_margin_rad,
+                margin_m,
+                limits.view_inset_rad,
+                limits.view_inset_m,
+                sure_m**2,
+                *chdtri([1, 2], TAIL_PROBABILITY),
+                2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau),
+                math.hypot(noise.sigma_m, parameters.branches.model_sigma_m),
+                parameters.branches.miss_sigmas,
+                BLUR_M,
+            ]
+        ),
     )
-    prior = rows.H @ state.P.block(rows.at) @ rows.H.T
-    return SureLandmarks(landmarks=landmarks, rows=rows, prior=prior)
+    return Known(
+        rows=rows,
+        prior=prior,
+        assigned=assigned,
+        of_side=of_side,
+        unheard=unheard,
+        at=at,
+        H=H,
+        block=block,
+    )
 
 
-def continue_tracks(
-    sure: SureLandmarks, scans: Sequence[RangeScan], noise: RangeNoise, rule: ContinuationRule
-) -> list[Continuation]:
-    """Return the likeliest one-to-one assignment of the ranges of one side to landmarks."""
-    rows, per_landmark = sure.rows, len(sure.rows.radars) // len(sure.landmarks)
-    by_radar = {scan.radar: scan for scan in scans}
-    options: list[list[Option]] = []
-    for place in range(len(sure.landmarks)):
-        mine = slice(place * per_landmark, (place + 1) * per_landmark)
-        options.append(
-            options_of(
-                [by_radar[int(radar)] for radar in rows.radars[mine]],
-                rows.predicted_m[mine],
-                sure.prior[mine, mine],
-                noise,
-                rule,
-            )
-        )
-    return [
-        Continuation(row=int(sure.landmarks[place]), radar=radar, index=index)
-        for place, option in enumerate(cheapest(options))
-        for radar, index in option.used
-    ]
+def _padded(
+    scans: Sequence[RangeScan], n_radars: int, noise: RangeNoise
+) -> tuple[Array, Array, Array]:
+    """Return ranges and their variances (r, k), and blurred ranges (r, b), filled up with NaN."""
+    n = max((len(scan.ranges_m) for scan in scans), default=0)
+    n_blurred = max((len(scan.blurred_m) for scan in scans), default=0)
+    ranges_m, variances = np.full((n_radars, n), np.nan), np.full((n_radars, n), np.nan)
+    blurred_m = np.full((n_radars, n_blurred), np.nan)
+    for scan in scans:
+        k = len(scan.ranges_m)
+        ranges_m[scan.radar, :k] = scan.ranges_m
+        sigmas_m = noise.sigma_m if scan.sigmas_m is None else np.array(scan.sigmas_m)
+        variances[scan.radar, :k] = np.square(sigmas_m)
+        blurred_m[scan.radar, : len(scan.blurred_m)] = scan.blurred_m
+    return ranges_m, variances, blurred_m
 
 
 def labelled(
     scans: Sequence[RangeScan], state: State, landmark_of_label: Mapping[int, int]
-) -> list[Continuation]:
+) -> tuple[Indices, Indices]:
+    """Return (radar, index) of the ranges of known labels, (k, 2), and their landmarks' rows."""
     rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
-    return [
-        Continuation(row=rows[landmark_of_label[label]], radar=scan.radar, index=index)
+    found = [
+        (scan.radar, index, rows[landmark_of_label[label]])
         for scan in scans
         for index in range(len(scan.ranges_m))
         if (label := scan.label(index)) in landmark_of_label and label is not None
     ]
-
-
-def options_of(
-    scans: Sequence[RangeScan],
-    predicted_m: Array,
-    prior: Array,
-    noise: RangeNoise,
-    rule: ContinuationRule,
-) -> list[Option]:
-    """Return the options of one landmark that cost less than none, cheapest first, none last."""
-    near: list[list[tuple[int, float, float] | None]] = []
-    for place, scan in enumerate(scans):
-        centre, spread = float(predicted_m[place]), float(prior[place, place])
-        found: list[tuple[int, float, float] | None] = [None]
-        for index, range_m in enumerate(scan.ranges_m):
-            variance = scan.sigma(index, noise.sigma_m) ** 2
-            if (range_m - centre) ** 2 <= rule.gates[-1] * (spread + variance):
-                found.append((index, range_m - centre, variance))
-        near.append(found)
-    odds = noise.detection_probability / (1.0 - noise.detection_probability)
-    per_range = 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau)
-    options = []
-    for choice in product(*near):
-        places = [place for place, taken in enumerate(choice) if taken is not None]
-        if not places:
-            continue
-        nu = [taken[1] for taken in choice if taken is not None]
-        variances = [taken[2] for taken in choice if taken is not None]
-        gate = rule.gates[min(len(places), len(rule.gates)) - 1]
-        distance, log_det = _distance(nu, places, prior, variances)
-        cost = distance + log_det + len(places) * per_range
-        if distance <= gate and cost < 0.0:
-            used = tuple(
-                (scans[place].radar, taken[0])
-                for place, taken in enumerate(choice)
-                if taken is not None
-            )
-            options.append(Option(used, cost))
-    options.sort(key=lambda option: (option.cost, option.used))
-    return [*options, NOTHING]
-
-
-def _distance(
-    nu: list[float], places: list[int], prior: Array, variances: list[float]
-) -> tuple[float, float]:
-    """Return nu^T S^-1 nu and ln det S."""
-    if len(places) == 1:
-        s = float(prior[places[0], places[0]]) + variances[0]
-        return nu[0] ** 2 / s, math.log(s)
-    if len(places) == 2:
-        i, j = places
-        a, b = float(prior[i, i]) + variances[0], float(prior[j, j]) + variances[1]
-        c = float(prior[i, j])
-        det = a * b - c * c
-        squared = b * nu[0] ** 2 - 2.0 * c * nu[0] * nu[1] + a * nu[1] ** 2
-        return squared / det, math.log(det)
-    S = prior[np.ix_(places, places)] + np.diag(variances)
-    return float(nu @ np.linalg.solve(S, nu)), float(np.linalg.slogdet(S)[1])
-
-
-def cheapest(options: Sequence[Sequence[Option]]) -> list[Option]:
-    """Return one option per landmark of least total cost that use no range twice.
-
-    Each landmark's options come cheapest first; the bound on what is still to come is the sum of
-    the cheapest. The result does not depend on the order of the landmarks unless costs tie.
-    """
-    bounds = [0.0] * (len(options) + 1)
-    for place in range(len(options) - 1, -1, -1):
-        bounds[place] = bounds[place + 1] + options[place][0].cost
-    best_cost = math.inf
-    best: list[Option] = [NOTHING] * len(options)
-    chosen: list[Option] = []
-    taken: set[tuple[int, int]] = set()
-
-    def branch(place: int, cost: float) -> None:
-        nonlocal best_cost, best
-        if cost + bounds[place] >= best_cost:
-            return
-        if place == len(options):
-            best_cost, best = cost, chosen.copy()
-            return
-        for option in options[place]:
-            if taken.isdisjoint(option.used):
-                taken.update(option.used)
-                chosen.append(option)
-                branch(place + 1, cost + option.cost)
-                chosen.pop()
-                taken.difference_update(option.used)
-
-    branch(0, 0.0)
-    return best
+    table = np.array(found, dtype=np.intp).reshape(-1, 3)
+    return table[:, :2], table[:, 2]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -539,32 +431,30 @@ def density_per_m2(points_m: Array, reach_m: float) -> float:
     return max(others, 1.0) / (math.pi * reach_m**2)
 
 
-def predicted_ranges(state: State, sure: SureLandmarks, antennas: Antennas) -> list[PredictedRange]:
+def predicted_ranges(
+    state: State, seen: View, known: Known, side_of: Indices, antennas: Antennas
+) -> list[PredictedRange]:
     """Return the ranges of landmarks that could continue a track, before any is looked at.
 
     Those of walls are left out: their echoes have no fixed place to compare with a true landmark's.
     """
-    rows = sure.rows
-    of_point = np.flatnonzero(rows.landmarks < len(state.landmark_ids))
-    landmarks, radars = rows.landmarks[of_point], rows.radars[of_point]
-    places = antennas.position_m[radars].tolist()
-    points = state.landmarks_m[landmarks] - state.position_m
-    return [
-        PredictedRange(
-            radar=radar,
-            landmark_id=state.landmark_ids[row],
-            range_m=range_m,
-            variance=variance,
-            antenna_m=(place[0], place[1]),
-            point_m=(point[0], point[1]),
-        )
-        for radar, row, range_m, variance, place, point in zip(
-            radars.tolist(),
-            landmarks.tolist(),
-            rows.predicted_m[of_point].tolist(),
-            sure.prior.diagonal()[of_point].tolist(),
-            places,
-            (points @ rotation(state.heading_rad)).tolist(),
-            strict=True,
-        )
-    ]
+    places = antennas.position_m.tolist()
+    points = (state.landmarks_m - state.position_m) @ rotation(state.heading_rad)
+    predicted = []
+    for side, place in np.argwhere(known.of_side[:, :, 0]).tolist():
+        row = int(known.rows[place])
+        if row >= len(state.landmark_ids):
+            continue
+        point_m = (float(points[row, 0]), float(points[row, 1]))
+        predicted += [
+            PredictedRange(
+                radar=radar,
+                landmark_id=state.landmark_ids[row],
+                range_m=float(seen.ranges_m[radar, row]),
+                variance=float(known.prior[place, radar, radar]),
+                antenna_m=(places[radar][0], places[radar][1]),
+                point_m=point_m,
+            )
+            for radar in np.flatnonzero((side_of == side) & antennas.has_frame).tolist()
+        ]
+    return predicted

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +15,11 @@ from slam.geometry import Rig
 from slam.results import PredictedRange, SmoothedRun, UpdateReport
 from slam.robust.association import (
     Antennas,
-    Continuation,
     RangeScan,
-    SureLandmarks,
     View,
     antennas_of,
-    continue_tracks,
+    find_known,
     labelled,
-    landmarks_in_view,
     predicted_ranges,
     rows_of,
     view,
@@ -48,7 +44,15 @@ from slam.robust.map import Existence, apply_merge, find_merge
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import is_due, relinearise, solve_whole_run
-from slam.robust.state import HEAD_SIZE, Array, Motion, State, calibrated_motion, predict
+from slam.robust.state import (
+    HEAD_SIZE,
+    Array,
+    Indices,
+    Motion,
+    State,
+    calibrated_motion,
+    predict,
+)
 from slam.robust.walls import WallKeeper
 
 # Standard deviations of a step that the wheels did not measure, and far more than what is left to
@@ -79,10 +83,16 @@ def huber_weighted_sigmas_m(
 class Matches:
     """Ranges of known landmarks among the scans of one time."""
 
-    continued: list[Continuation] = field(default_factory=list)
+    # shape (k, 2): radar and index of each range; (k,): the row of its landmark
+    ranges: Indices
+    landmarks: Indices
+    # Columns of the error, the derivatives of the ranges by them (k, columns), and their covariance
+    at: Indices
+    H: Array
+    block: Array
     # The ranges of every landmark that took part, measured or not
     predicted: list[PredictedRange] = field(default_factory=list)
-    # Landmarks well in view, one entry per radar, that have no range near their prediction
+    # Landmarks surely in view, one entry per radar, that have no range near their prediction
     missed: list[int] = field(default_factory=list)
 
 
@@ -104,6 +114,9 @@ class RobustBackEnd:
             parameters.ranges.radius_sigma_m,
         )
         self._sides = rig.sides(parameters.ranges.field_of_view)
+        self._side_of = np.zeros(len(rig.mounts), dtype=np.intp)
+        for number, side in enumerate(self._sides):
+            self._side_of[list(side)] = number
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
         window = max(rule.window, rule.single_window)
@@ -218,7 +231,7 @@ class RobustBackEnd:
             scan.with_added_sigma(self.parameters.ranges.association_sigma_m) for scan in scans
         ]
         matches, seen = self._associate(scans, widened, antennas, sure_m)
-        continued, nis, likelihoods = self._correct(matches.continued, seen, scans, antennas)
+        continued, nis, likelihoods = self._correct(matches, seen, scans, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
@@ -231,8 +244,11 @@ class RobustBackEnd:
             continued=continued,
             nis=nis,
             dof=len(continued),
-            predicted=tuple(matches.predicted),
-            evidence=(*likelihoods, *((id_, miss) for id_ in matches.missed)),
+            predicted=tuple(matches.predicted) if matches else (),
+            evidence=(
+                *likelihoods,
+                *((id_, miss) for id_ in (matches.missed if matches else ())),
+            ),
         )
 
     def update_points(self, points: Sequence[RangeBearing]) -> tuple[int | None, ...]:
@@ -283,85 +299,52 @@ class RobustBackEnd:
         widened: Sequence[RangeScan],
         antennas: Antennas,
         sure_m: float | None,
-    ) -> tuple[Matches, View]:
-        """Find the ranges of known landmarks among the ``widened`` scans."""
-        state, matches = self.state, Matches()
+    ) -> tuple[Matches | None, View]:
+        """Find the ranges of known landmarks among the ``widened`` scans; count hits and misses."""
+        state, existence = self.state, self._existence
         seen = view(state, antennas)
         if not state.feature_ids:
-            return matches, seen
+            return None, seen
         seen = self._walls.look(seen, antennas)
         if sure_m is None:
             sure_m = self.parameters.continuation.tight_sigmas * self.parameters.ranges.sigma_m
-        for side in self._sides:
-            if of_side := [scan for scan in widened if scan.radar in side]:
-                self._match_known_landmarks(of_side, seen, antennas, sure_m, matches)
+        known = find_known(state, seen, widened, self._side_of, self.parameters, sure_m=sure_m)
+        if known is None:
+            return None, seen
+        ids = [state.feature_ids[row] for row in known.rows.tolist()]
+        hits = set(known.assigned[:, 2].tolist())
+        for place in hits:
+            existence.hit(ids[place])
+        for place in np.flatnonzero(known.of_side[:, :, 1].any(axis=0)).tolist():
+            existence.miss(ids[place])
+        for side in known.of_side[:, :, 2]:
+            existence.seen_whole(ids[place] for place in np.flatnonzero(side).tolist())
+        matches = Matches(
+            ranges=known.assigned[:, :2],
+            landmarks=known.rows[known.assigned[:, 2]],
+            at=known.at,
+            H=known.H,
+            block=known.block,
+            predicted=predicted_ranges(state, seen, known, self._side_of, antennas),
+            # A wall may end before it comes into view.
+            missed=[
+                ids[place]
+                for place in np.nonzero(known.unheard)[0].tolist()
+                if known.rows[place] < len(state.landmark_ids)
+            ],
+        )
         if any(scan.labels is not None for scan in scans):
-            matches.continued = labelled(scans, state, self._landmark_of_label)
-        return matches, seen
-
-    def _match_known_landmarks(
-        self,
-        scans: Sequence[RangeScan],
-        seen: View,
-        antennas: Antennas,
-        sure_m: float,
-        matches: Matches,
-    ) -> None:
-        """Add the ranges of known landmarks on one side; count hits and misses."""
-        state, existence = self.state, self._existence
-        noise, rule = self.parameters.ranges, self.parameters.continuation
-        limits = self.parameters.map
-        radars = [scan.radar for scan in scans]
-        near = landmarks_in_view(state, seen, radars, noise, rule)
-        if near is None:
-            return
-        sure = near.surer_than(sure_m)
-        added_sigmas_m, ids = state.feature_added_sigmas_m, state.feature_ids
-        near = near.with_added_sigma(added_sigmas_m)
-        self._find_missed(near, seen, scans, matches)
-        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
-        known = () if sure is None else sure.landmarks
-        # Too unsure for single ranges: a miss only where no echo at all is near the prediction.
-        for row in np.setdiff1d(near.unanswered(scans, noise, limits.view_inset_m), known).tolist():
-            if inside[:, row].all():
-                existence.miss(ids[row])
-        if sure is None:
-            return
-        matches.predicted += predicted_ranges(state, sure, antennas)
-        found = continue_tracks(sure.with_added_sigma(added_sigmas_m), scans, noise, rule)
-        matches.continued += found
-        count = Counter(continuation.row for continuation in found)
-        for row in count:
-            existence.hit(ids[row])
-        for row in sure.landmarks[inside[:, sure.landmarks].all(axis=0)].tolist():
-            hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
-            if row not in count and not hidden:
-                existence.miss(ids[row])
-        whole = max(len(scans), 2)
-        existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
-
-    def _find_missed(
-        self, near: SureLandmarks, seen: View, scans: Sequence[RangeScan], matches: Matches
-    ) -> None:
-        """Add the landmarks, one entry per radar, that are surely in view and have no range."""
-        noise, limits = self.parameters.ranges, self.parameters.map
-        branches, rows, ids = self.parameters.branches, near.rows, self.state.landmark_ids
-        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)
-        variances = near.prior.diagonal()
-        counts = inside[rows.radars, rows.landmarks] & (variances <= limits.view_inset_m**2)
-        counts &= rows.landmarks < len(ids)  # a wall may end before it comes into view
-        by_radar = {scan.radar: scan for scan in scans}
-        for k in np.flatnonzero(counts).tolist():
-            scan, predicted_m = by_radar[int(rows.radars[k])], float(rows.predicted_m[k])
-            reach_m = branches.miss_sigmas * math.sqrt(
-                float(variances[k]) + noise.sigma_m**2 + branches.model_sigma_m**2
+            ranges, landmarks = labelled(scans, state, self._landmark_of_label)
+            rows = rows_of(state, seen, ranges[:, 0], landmarks)
+            block = state.P.block(rows.at)
+            matches = replace(
+                matches, ranges=ranges, landmarks=landmarks, at=rows.at, H=rows.H, block=block
             )
-            if not scan.answers(predicted_m, reach_m):
-                matches.missed.append(ids[int(rows.landmarks[k])])
+        return matches, seen
 
     def _correct(
         self,
-        found: Sequence[Continuation],
+        matches: Matches | None,
         seen: View,
         scans: Sequence[RangeScan],
         antennas: Antennas,
@@ -372,23 +355,21 @@ class RobustBackEnd:
         range the landmark and ln(Pd p / lambda), where p is its density given those before it, and
         lambda that of ranges in its scan, whatever they are of.
         """
-        if not found:
+        if matches is None or not len(matches.ranges):
             return (), 0.0, []
-        state, ids = self.state, self.state.feature_ids
-        continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
-        of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
-        z = np.array([of_radar[c.radar].ranges_m[c.index] for c in found])
-        rows = rows_of(
-            state,
-            seen,
-            np.array([c.radar for c in found], dtype=np.intp),
-            np.array([c.row for c in found], dtype=np.intp),
+        state, ids, H = self.state, self.state.feature_ids, matches.H
+        pairs, landmarks = matches.ranges.tolist(), matches.landmarks
+        continued = tuple(
+            (radar, index, ids[row])
+            for (radar, index), row in zip(pairs, landmarks.tolist(), strict=True)
         )
-        innovations_m = z - rows.predicted_m
-        sigmas = np.array([of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found])
-        added_sigmas_m = state.feature_added_sigmas_m[[c.row for c in found]]
-        by_state = rows.H @ state.P.block(rows.at)
-        S = by_state @ rows.H.T + np.diag(np.square(sigmas) + np.square(added_sigmas_m))
+        of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
+        z = np.array([of_radar[radar].ranges_m[index] for radar, index in pairs])
+        innovations_m = z - seen.ranges_m[matches.ranges[:, 0], landmarks]
+        sigmas = np.array([of_radar[radar].sigma(index, noise.sigma_m) for radar, index in pairs])
+        added_sigmas_m = state.feature_added_sigmas_m[landmarks]
+        by_state = H @ matches.block
+        S = by_state @ H.T + np.diag(np.square(sigmas) + np.square(added_sigmas_m))
         L = np.linalg.cholesky(S)
         white = solve_triangular(L, innovations_m, lower=True)
         nis = float(white @ white)
@@ -405,7 +386,7 @@ class RobustBackEnd:
             )
             if (n_ranges := len(of_radar[radar].ranges_m))
         ]
-        prior = np.vecdot(by_state, rows.H) + np.square(added_sigmas_m)
+        prior = np.vecdot(by_state, H) + np.square(added_sigmas_m)
         for (radar, _, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
             x, y = antennas.told_m[radar].tolist()
             self._log.add_range(
@@ -419,7 +400,7 @@ class RobustBackEnd:
             )
         sigmas = huber_weighted_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
         variances = np.square(sigmas) + np.square(added_sigmas_m)
-        state.update(rows.at, rows.H, innovations_m, variances)
+        state.update(matches.at, H, innovations_m, variances)
         return continued, nis, likelihoods
 
     def _initialise_landmarks(self) -> None:

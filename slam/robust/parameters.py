@@ -62,8 +62,6 @@ class ContinuationRule:
     view_margin_rad: float = 0.25  # widens the field of view
     # A landmark takes part while its predicted ranges are surer than so many range deviations
     tight_sigmas: float = 1.0
-    # Bounds on d^2 by the number of ranges, the last one for all higher numbers
-    gates: tuple[float, ...] = (9.0, 13.8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

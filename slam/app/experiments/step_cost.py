@@ -25,8 +25,8 @@ from slam.app.experiments import Result, table
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, note
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.association import antennas_of, landmarks_in_view, rows_of, view
-from slam.robust.parameters import ContinuationRule, RangeNoise
+from slam.robust.association import RangeScan, antennas_of, find_known, rows_of, view
+from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
 
@@ -84,8 +84,10 @@ def stepper(state: State) -> Callable[[], None]:
 
     The robot goes to and fro, so that what it sees stays the same.
     """
-    rig, wheels, noise, rule = paper_rig(), WheelNoise(), RangeNoise(), ContinuationRule()
-    sides = rig.sides()
+    rig, wheels, noise = paper_rig(), WheelNoise(), RangeNoise()
+    parameters, sides = BackEndParameters(ranges=noise), rig.sides()
+    side_of = np.repeat(np.arange(len(sides)), [len(side) for side in sides])
+    scans = [RangeScan(radar=radar, ranges_m=()) for radar in range(len(rig.mounts))]
     radars = np.array([radar for side in sides for radar in side], dtype=np.intp)
     R = np.full(N_UPDATES, noise.sigma_m**2)
     mounts = antennas_of(rig, (), np.zeros(3))
@@ -100,10 +102,7 @@ def stepper(state: State) -> Callable[[], None]:
         increment = np.array([0.01 if taken % 2 else -0.01, 0.0, 0.0])
         predict(state, calibrated_motion(increment, state.calibration, wheels), wheels)
         seen = view(state, mounts)
-        for side in sides:
-            near = landmarks_in_view(state, seen, side, noise, rule)
-            if near is not None:
-                near.surer_than(rule.tight_sigmas * noise.sigma_m)
+        find_known(state, seen, scans, side_of, parameters, sure_m=noise.sigma_m)
         rows = rows_of(state, seen, radars, landmarks)
         state.update(rows.at, rows.H, np.zeros(N_UPDATES), R)
 

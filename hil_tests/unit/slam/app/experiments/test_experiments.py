@@ -34,8 +34,8 @@ from slam.app.run.pictures import picture
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
-from slam.robust.association import antennas_of, landmarks_in_view, view
-from slam.robust.parameters import ContinuationRule, RangeNoise
+from slam.robust.association import RangeScan, antennas_of, find_known, view
+from slam.robust.parameters import BackEndParameters, RangeNoise
 from xethru_protocol.system import StopFlag
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
@@ -137,12 +137,12 @@ def test_a_step_predicts_and_learns_from_a_landmark_on_each_side() -> None:
 def test_the_gate_of_a_step_has_something_to_weigh() -> None:
     state, rig = mapped_state(40), paper_rig()
     seen = view(state, antennas_of(rig, (), np.zeros(3)))
-    for side in rig.sides():
-        near = landmarks_in_view(state, seen, side, RangeNoise(), ContinuationRule())
-        assert near is not None
-        sure = near.surer_than(RangeNoise().sigma_m)
-        assert sure is not None
-        assert {0, 1} & set(sure.landmarks.tolist())
+    scans = [RangeScan(radar=radar, ranges_m=()) for radar in range(4)]
+    sides, sure_m = np.array([0, 0, 1, 1]), RangeNoise().sigma_m
+    known = find_known(state, seen, scans, sides, BackEndParameters(), sure_m=sure_m)
+    assert known is not None
+    for side in known.of_side[:, :, 0]:
+        assert {0, 1} & set(known.rows[side].tolist())
 
 
 def test_the_slope_is_that_of_a_power_law() -> None:
