@@ -68,6 +68,7 @@ class Step:
     scans: Sequence[RangeScan]
     next_id: int  # landmarks known before it have smaller ids
     evidence: tuple[tuple[int, float], ...]
+    table: Array  # the evidence, shape (k, 2): ids and nats
 
 
 class Tally:
@@ -240,6 +241,7 @@ class Branches:
             scans=scans,
             next_id=next_id,
             evidence=report.evidence,
+            table=np.array(report.evidence).reshape(-1, 2),
         )
         self._now += 1
         if any(scan.labels is not None for scan in scans):
@@ -330,21 +332,26 @@ class Branches:
 
         More than one landmark must be against the pose: one alone may be hidden or taken away.
         """
-        rule, sums = self._rule, dict[int, float]()
-        best, most = self._now, 0.0
-        for number in range(self._now - 1, min(self._snapshots) - 1, -1):
-            step = self._steps[number]
-            for landmark_id, nats in step.evidence:
-                sums[landmark_id] = sums.get(landmark_id, 0.0) - nats / rule.correlated_steps
-            known = [
-                max(min(against, rule.most_against), -rule.most_for)
-                for landmark_id, against in sums.items()
-                if landmark_id < step.next_id
-            ]
-            against = math.fsum(known)
-            if against > most and against > max(known):
-                best, most = number, against
-        return best, most
+        rule, first = self._rule, min(self._snapshots)
+        steps = [self._steps[number] for number in range(first, self._now)]
+        lengths = [len(step.evidence) for step in steps]
+        if not sum(lengths):
+            return self._now, 0.0
+        table = np.concatenate([step.table for step in steps])
+        ids, place = np.unique(table[:, 0], return_inverse=True)
+        against = np.zeros((len(steps), len(ids)))
+        np.add.at(against, (np.repeat(np.arange(len(steps)), lengths), place), -table[:, 1])
+        # From each step on, each landmark within its bounds, if it was known before the step
+        sums = np.cumsum(against[::-1], axis=0)[::-1] / rule.correlated_steps
+        sums = np.clip(sums, -rule.most_for, rule.most_against)
+        known = ids < np.array([step.next_id for step in steps])[:, None]
+        totals = np.where(known, sums, 0.0).sum(axis=1)
+        several = totals > np.where(known, sums, -np.inf).max(axis=1)
+        best = int(np.argmax(np.where(several, totals, -np.inf)[::-1]))
+        best = len(steps) - 1 - best  # the latest of equals
+        if not several[best] or totals[best] <= 0.0:
+            return self._now, 0.0
+        return first + best, float(totals[best])
 
     def _begin_slip(self, since: int) -> None:
         """Go back to about a step, and try slips at some steps around it; keep the best."""
