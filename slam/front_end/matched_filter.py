@@ -48,7 +48,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,14 +58,17 @@ from scipy.optimize import brentq
 
 from slam.config import FrontEnd, SlamConfig
 from slam.frames import Detection, RadarFrame, reaches_limits, usable_samples
-from slam.front_end.overlapping import (
-    REACH_STEPS,
-    Correlation,
-    KnownPulse,
-    SplitTest,
-    fit_echoes,
-    fit_whole_echoes,
+from slam.front_end import kernels
+from slam.front_end.kernels import (
+    AMPLITUDE,
+    BINS_PER_STEP,
+    COLUMNS,
+    MAX_ECHOES,
+    PHASE,
+    POSITION,
+    SEVERAL,
 )
+from slam.front_end.overlapping import KnownPulse, SplitTest, fit_echoes, fit_whole_echoes
 from slam.front_end.pulse import ComplexArray, ModulePulse, PulseModel
 from slam.front_end.pulse_estimation import PulseEstimator, module_pulse
 from slam.geometry import ReceivedPulse
@@ -73,8 +77,6 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _PROBES = np.linspace(-2.0, 2.0, 9)
-# Bins from one value of y to the next.
-BINS_PER_STEP = 2
 # Distance of the samples that the noise is taken from, in envelope sigmas
 _STRIDE_SIGMAS = 0.75
 # No threshold is so high, in standard deviations of the noise.
@@ -82,11 +84,6 @@ _LARGEST_THRESHOLD = 1e6
 # Variance of a mean of exponential powers, correlated by rho**2, over that of their median / ln 2;
 # (ln 2)**2 if they were independent. A series of Laguerre polynomials gives it, see its test.
 _MEDIAN_EFFICIENCY = 0.643
-# Cells this many times the first guess of sigma_y**2 hold an echo, and so do two on either side.
-_ECHO_LEVEL = 3.5**2
-_FLANK_CELLS = 2
-# Below one part in so many of its cells left, a frame is taken as a whole.
-_LEAST_QUIET = 8
 # Samples this far from a peak, in envelope sigmas, belong to it: beyond, 1 % of its height.
 _REACH = 3.0
 # Peaks closer than this, in envelope sigmas, overlap: rho there is 1 %.
@@ -97,16 +94,9 @@ _MARGIN = 5.0
 _SEARCH = 3.5
 # With fewer usable samples than this many envelope sigmas a fit says nothing.
 _LEAST_SAMPLES = 2.0
-# Behind the filter an echo is wider: beyond, 1e-7 of its height.
-_FILTERED_REACH = 8.0
-# Columns of a table of echoes.
-_POSITION, _AMPLITUDE, _PHASE, _SIGMA = range(4)
-# Most echoes that a group is taken apart into.
-_MAX_ECHOES = 4
 # What a wrong pulse may leave near the peak of one that is fitted, over its relative error: 0.46 to
 # 0.50 for a wrong width, 0.27 for skew, 0.37 for ringing, 0.45 for all of them; and a quarter more
 _NEAR_PEAK = 0.625
-_NEIGHBOURS = np.array([[-1], [0], [1]])
 # A float32 frame says its samples to this part of the largest; noise is never less.
 _RESOLUTION = float(np.finfo(np.float32).eps)
 
@@ -139,8 +129,8 @@ class PulseFilter:
         # The next power of two, or three quarters of it: transforms of other lengths are slower.
         power_of_two = 1 << (reach - 1).bit_length()
         enough = power_of_two // 4 * 3 >= reach
-        self._n_fft = power_of_two // 4 * 3 if enough else power_of_two
-        placed = np.zeros(self._n_fft, dtype=np.complex128)
+        self.n_fft = power_of_two // 4 * 3 if enough else power_of_two
+        placed = np.zeros(self.n_fft, dtype=np.complex128)
         placed[np.arange(-half, half + 1)] = template * (2 / energy)
         # The whole spectrum at once is real: the pulse is even but for its carrier.
         spectrum = np.fft.fft(placed).real
@@ -148,27 +138,30 @@ class PulseFilter:
         """sigma_y over sigma of white noise per RF sample, behind the equaliser if there is one."""
         self.told_noise_gain = self.noise_gain
         """The same before the equaliser."""
-        self._equaliser: ComplexArray | None = None
-        if taps is not None:
-            kernel = np.zeros(self._n_fft)
-            kernel[np.arange(taps.size) - taps.size // 2] = taps
-            self._equaliser = np.fft.rfft(kernel)
-            both = np.abs(spectrum * np.fft.fft(kernel)) ** 2
-            self.told_noise_gain = math.sqrt(0.5 * float(np.mean(both)))
-        self._spectrum = spectrum[: self._n_fft // BINS_PER_STEP] / BINS_PER_STEP
-        self._n_steps = math.ceil(n_bins / BINS_PER_STEP)
-        self._stride = max(1, int(_STRIDE_SIGMAS * self.sigma_bins / BINS_PER_STEP))
-        self.probes = np.unique(np.rint(_PROBES * self.sigma_bins / BINS_PER_STEP).astype(np.intp))
+        self._spectrum = (spectrum[: self.n_fft // 2] / BINS_PER_STEP).astype(np.complex128)
+        self.n_steps = math.ceil(n_bins / BINS_PER_STEP)
+        self._equaliser = None if taps is None else _spectrum_of(taps, self.n_fft)
+        self.spectrum = self._spectrum
+        """Of the filter behind the equaliser: factors on the first half of `numpy.fft.rfft`."""
+        if self._equaliser is not None:
+            self.spectrum = self._spectrum * self._equaliser[: self._spectrum.size]
+            power = float(np.sum(np.abs(BINS_PER_STEP * self.spectrum) ** 2)) / self.n_fft
+            self.told_noise_gain = math.sqrt(0.5 * power)
+        self.table = np.empty((self.n_steps // 2 + 1, COLUMNS))
+        """Where the peaks of a frame are written."""
+        self.stride = max(1, int(_STRIDE_SIGMAS * self.sigma_bins / BINS_PER_STEP))
+        self.cells = np.empty((2, self.n_steps))
+        """Where the noise is estimated."""
+        self.probes = np.unique(np.rint(_PROBES * self.sigma_bins / BINS_PER_STEP).astype(np.int64))
         """Where around a peak the misfit is looked at, in steps of y."""
         probe_bins = BINS_PER_STEP * self.probes.astype(np.float64)
-        self.probe_sigmas = probe_bins / self.sigma_bins
-        """The same in envelope sigmas."""
+        probe_sigmas = probe_bins / self.sigma_bins
         self.probe_turns = np.exp(-1j * self.carrier_rad * probe_bins)
         """What turns the carrier at the probes to its phase at the peak."""
-        rho_sq = np.exp(-0.5 * self.probe_sigmas**2)
+        rho_sq = np.exp(-0.5 * probe_sigmas**2)
         self.probe_energy = float(np.sum(rho_sq))
         """Energy of a pulse of amplitude 1 at the probes."""
-        self.probe_noise = float(np.sum(2 - (2 + 0.5 * self.probe_sigmas**2) * rho_sq))
+        self.probe_noise = float(np.sum(2 - (2 + 0.5 * probe_sigmas**2) * rho_sq))
         """Energy at the probes, over sigma_y**2, that noise leaves once a pulse is fitted."""
         self.pulse_error = module.error
         self.left_near_peak = _NEAR_PEAK * module.error
@@ -178,34 +171,33 @@ class PulseFilter:
         )
 
     def apply(self, samples: Array) -> ComplexArray:
-        """Return y of frames of shape (..., n_bins) at every second bin, shape (..., n_steps)."""
-        # The negative half of the spectrum is zero, so the other half alone has y's even bins.
-        half = np.fft.rfft(samples, self._n_fft)[..., : self._spectrum.size] * self._spectrum
-        y: ComplexArray = fft.ifft(half, overwrite_x=True)[..., : self._n_steps]
-        return y
+        """Return y of frames of shape (..., n_bins) at every second bin, shape (..., n_steps).
+
+        The frames are equalised, if there is an equaliser.
+        """
+        return correlate(samples, self._spectrum, self)
 
     def equalised(self, samples: Array) -> Array:
         """Return one frame, shape (n_bins,), as if the module's pulse were the fitted one."""
         if self._equaliser is None:
             return samples
-        spectrum = np.fft.rfft(samples, self._n_fft) * self._equaliser
-        return np.fft.irfft(spectrum, self._n_fft)[: self.n_bins]
+        spectrum = np.fft.rfft(samples, self.n_fft) * self._equaliser
+        return np.fft.irfft(spectrum, self.n_fft)[: self.n_bins]
 
-    def noise_power(self, power: Array) -> float:
-        """Return sigma_y**2 from ``|y|**2`` of one frame, shape (n_steps,)."""
-        cells = power[:: self._stride]
-        first = _median(cells) / (2 * math.log(2))
-        echo = cells > _ECHO_LEVEL * first
-        if not echo.any():
-            return first
-        wide = echo.copy()
-        for shift in range(1, _FLANK_CELLS + 1):
-            wide[shift:] |= echo[:-shift]
-            wide[:-shift] |= echo[shift:]
-        quiet = cells[~wide]
-        return (
-            _median(quiet) / (2 * math.log(2)) if quiet.size * _LEAST_QUIET > cells.size else first
-        )
+
+def _spectrum_of(taps: Array, n_fft: int) -> ComplexArray:
+    """Return the spectrum of a filter whose middle is at delay zero, as `numpy.fft.rfft`."""
+    kernel = np.zeros(n_fft)
+    kernel[np.arange(taps.size) - taps.size // 2] = taps
+    return np.fft.rfft(kernel)
+
+
+def correlate(samples: Array, spectrum: ComplexArray, pulse_filter: PulseFilter) -> ComplexArray:
+    """Return frames (..., n_bins) behind a filter of this spectrum, shape (..., n_steps)."""
+    # The negative half of the spectrum is zero, so the other half alone has y's even bins.
+    half = np.fft.rfft(samples, pulse_filter.n_fft)[..., : spectrum.shape[-1]] * spectrum
+    y: ComplexArray = fft.ifft(half, overwrite_x=True)[..., : pulse_filter.n_steps]
+    return y
 
 
 def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_known: bool) -> float:
@@ -226,32 +218,14 @@ def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_know
     return float(brentq(excess, 1.0, _LARGEST_THRESHOLD)) if excess(1.0) > 0 else 1.0
 
 
-def _median(values: Array) -> float:
-    middle = values.size // 2
-    return float(np.partition(values, middle)[middle])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Peaks:
-    """Echoes of one frame, k of them, nearest first; every array has shape (k,)."""
-
-    position_bins: Array  # from sample 0
-    amplitude: Array  # of the pulse, in the unit of the samples
-    phase_rad: Array  # of the carrier at the position, up to whole turns
-    sigma_bins: Array  # predicted standard deviation of the position
-    misfit: Array  # unexplained over expected energy near the peak
-    saturated: BoolArray  # whether samples within reach of the peak were missing inside the frame
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Filtered:
     """One frame behind the filter."""
 
-    samples: Array  # shape (n_bins,): mean removed, unknown samples zero
+    samples: Array  # shape (n_bins,): mean removed, unknown samples zero; not equalised
     # shape (n_bins,): samples that are known and not at a limit of the sampler; None: all
     usable: BoolArray | None
     y: ComplexArray  # shape (n_steps,), complex: correlation with the pulse, at every second bin
-    power: Array  # shape (n_steps,): squared magnitude of y
     sigma_y: float  # standard deviation of its noise, per quadrature
     pulse_filter: PulseFilter
 
@@ -279,123 +253,91 @@ def saturated_pulses(position_bins: Array, filtered: Filtered) -> BoolArray:
     return beyond
 
 
-def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) -> Peaks:
-    """Return the peaks with those ``again`` (k,), and those that overlap with them, fitted anew.
+def refit(
+    table: Array,
+    again: BoolArray,
+    filtered: Filtered,
+    split: SplitTest,
+    within: tuple[float, float],
+) -> Array:
+    """Return the echoes with those ``again`` (k,), and those that overlap with them, fitted anew.
 
-    ``split.max_echoes`` 1 leaves each peak one echo.
+    ``split.max_echoes`` 1 leaves each peak one echo. Those between the positions ``within`` get
+    their misfits.
     """
     pulse_filter = filtered.pulse_filter
-    table = np.column_stack(
-        [peaks.position_bins, peaks.amplitude, peaks.phase_rad, peaks.sigma_bins]
-    )
     linked = OVERLAP * pulse_filter.sigma_bins if split.max_echoes > 1 else 0.0
-    starts = np.flatnonzero(np.diff(peaks.position_bins) > linked) + 1
+    starts = np.flatnonzero(np.diff(table[:, POSITION]) > linked) + 1
     groups = []
-    for members in np.split(np.arange(len(table)), starts):
-        group = table[members]
-        if again[members].any():
-            others = np.delete(table, members, axis=0)
+    for first, end in pairwise([0, *starts.tolist(), len(table)]):
+        group = table[first:end]
+        if again[first:end].any():
+            others = np.concatenate([table[:first], table[end:]])
             group = _fitted(group, others, filtered, split)
         groups.append(group)
     table = np.concatenate(groups)
-    inside = (table[:, _POSITION] >= -0.5) & (table[:, _POSITION] < pulse_filter.n_bins - 0.5)
-    table = table[inside & (table[:, _AMPLITUDE] > pulse_filter.threshold * filtered.sigma_y)]
-    table = table[np.argsort(table[:, _POSITION])]
-    return Peaks(
-        position_bins=table[:, _POSITION],
-        amplitude=table[:, _AMPLITUDE],
-        phase_rad=table[:, _PHASE],
-        sigma_bins=table[:, _SIGMA],
-        misfit=_misfit(table, filtered),
-        saturated=saturated_pulses(table[:, _POSITION], filtered),
-    )
+    inside = (table[:, POSITION] >= -0.5) & (table[:, POSITION] < pulse_filter.n_bins - 0.5)
+    table = table[inside & (table[:, AMPLITUDE] > pulse_filter.threshold * filtered.sigma_y)]
+    table = table[np.argsort(table[:, POSITION])]
+    _assess(table, filtered, within)
+    return table
 
 
 def _fitted(group: Array, others: Array, filtered: Filtered, split: SplitTest) -> Array:
     """Return the echoes near a group of peaks; the group where no sample is usable."""
     pulse_filter = filtered.pulse_filter
     margin = _MARGIN * pulse_filter.sigma_bins
-    first = int(np.floor(group[0, _POSITION] - margin))
-    last = int(np.ceil(group[-1, _POSITION] + margin))
+    first = int(np.floor(group[0, POSITION] - margin))
+    last = int(np.ceil(group[-1, POSITION] + margin))
     inside = slice(max(first, 0), min(last + 1, pulse_filter.n_bins))
     usable = np.zeros(last + 1 - first, dtype=np.bool_)
     known = slice(inside.start - first, inside.stop - first)
     usable[known] = True if filtered.usable is None else filtered.usable[inside]
+    search = _SEARCH * pulse_filter.sigma_bins
+    pulse = KnownPulse(
+        envelope_sigma_bins=pulse_filter.sigma_bins,
+        carrier_rad_per_bin=pulse_filter.carrier_rad,
+    )
     if usable.all():
-        return _fitted_whole(group, others, filtered, split)
+        return fit_whole_echoes(
+            filtered.y,
+            (group[0, POSITION] - search, group[-1, POSITION] + search),
+            others=others,
+            pulse=pulse,
+            sigma_y=filtered.sigma_y,
+            split=split,
+        )
     if np.count_nonzero(usable) < _LEAST_SAMPLES * pulse_filter.sigma_bins:
         return group
     window = np.zeros(usable.size)
-    window[known] = filtered.samples[inside] - _render(others, pulse_filter)[inside]
+    window[known] = pulse_filter.equalised(filtered.samples)[inside]
+    window[known] -= _render(others, pulse_filter)[inside]
     # Echoes are looked for near the peaks, and as far beyond an end of the frame as it was cut.
-    edge = margin - _SEARCH * pulse_filter.sigma_bins
+    edge = margin - search
     search_bins = (
         0.0 if first < 0 else edge,
         window.size - 1 - (0.0 if last >= pulse_filter.n_bins else edge),
     )
     fits = fit_echoes(
         window,
-        pulse=KnownPulse(
-            envelope_sigma_bins=pulse_filter.sigma_bins,
-            carrier_rad_per_bin=pulse_filter.carrier_rad,
-        ),
+        pulse=pulse,
         noise_sigma=filtered.sigma_y / pulse_filter.noise_gain,
         usable=usable,
         search_bins=search_bins,
         split=split,
     )
-    table = np.array(fits)
-    table[:, _POSITION] += first
+    table = np.zeros((len(fits), COLUMNS))
+    table[:, : len(fits[0])] = fits
+    table[:, POSITION] += first
     return table
-
-
-def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitTest) -> Array:
-    pulse_filter = filtered.pulse_filter
-    search = _SEARCH * pulse_filter.sigma_bins
-    # one step more than z is interpolated from, rounding included
-    first = int((group[0, _POSITION] - search) / BINS_PER_STEP) - REACH_STEPS - 1
-    last = int((group[-1, _POSITION] + search) / BINS_PER_STEP) + REACH_STEPS + 2
-    steps = np.arange(max(first, 0), min(last + 1, filtered.y.size))
-    begin = BINS_PER_STEP * float(steps[0])
-    z = filtered.y[steps] - _correlated(others, steps, pulse_filter)
-    z *= np.exp(-1j * pulse_filter.carrier_rad * (BINS_PER_STEP * steps - begin))
-    fits = fit_whole_echoes(
-        Correlation(
-            z,
-            step_bins=BINS_PER_STEP,
-            sigma_bins=pulse_filter.sigma_bins,
-            sigma_y=filtered.sigma_y,
-        ),
-        group[0, _POSITION] - search - begin,
-        group[-1, _POSITION] + search - begin,
-        split,
-    )
-    table = np.array(fits)
-    table[:, _PHASE] += pulse_filter.carrier_rad * table[:, _POSITION]
-    table[:, _POSITION] += begin
-    return table
-
-
-def _correlated(table: Array, steps: NDArray[np.intp], pulse_filter: PulseFilter) -> ComplexArray:
-    """Return whole echoes behind the filter, at steps of y; the shape of the steps."""
-    reach = _FILTERED_REACH * pulse_filter.sigma_bins
-    begin, end = BINS_PER_STEP * steps[0] - reach, BINS_PER_STEP * steps[-1] + reach
-    near = table[(table[:, _POSITION] > begin) & (table[:, _POSITION] < end)]
-    away = BINS_PER_STEP * steps - near[:, _POSITION, np.newaxis]
-    pulses = np.exp(
-        -0.25 * (away / pulse_filter.sigma_bins) ** 2
-        + 1j * (pulse_filter.carrier_rad * away + near[:, _PHASE, np.newaxis])
-    )
-    summed: ComplexArray = near[:, _AMPLITUDE] @ pulses
-    return summed
 
 
 def _render(table: Array, pulse_filter: PulseFilter) -> Array:
     """Return the sum of echoes, shape (n_bins,)."""
-    nearest = np.rint(table[:, _POSITION])
+    nearest = np.rint(table[:, POSITION])
     pulses = (
-        pulse_filter.pulse.samples(table[:, _POSITION] - nearest, pulse_filter.bin_length_m)
-        * (table[:, _AMPLITUDE] * np.exp(1j * table[:, _PHASE]))[:, np.newaxis]
+        pulse_filter.pulse.samples(table[:, POSITION] - nearest, pulse_filter.bin_length_m)
+        * (table[:, AMPLITUDE] * np.exp(1j * table[:, PHASE]))[:, np.newaxis]
     )
     half = pulses.shape[1] // 2
     bins = nearest.astype(np.intp)[:, np.newaxis] + np.arange(-half, half + 1)
@@ -404,56 +346,32 @@ def _render(table: Array, pulse_filter: PulseFilter) -> Array:
     return total.astype(np.float64, copy=False)  # of nothing, bincount answers integers
 
 
-def _misfit(table: Array, filtered: Filtered) -> Array:
-    """Return the misfit of each echo where all echoes together are the model."""
+def _assess(table: Array, filtered: Filtered, within: tuple[float, float]) -> None:
+    """Write the misfit of each echo between two positions where all echoes are the model."""
     if not len(table):
-        return np.empty(0)
+        return
     pulse_filter = filtered.pulse_filter
-    nearest = np.rint(table[:, _POSITION] / BINS_PER_STEP).astype(np.intp)
-    steps = nearest[:, np.newaxis] + pulse_filter.probes
     reach = pulse_filter.pulse.half_length(pulse_filter.bin_length_m)
-    at = BINS_PER_STEP * steps.astype(np.float64)
-    first, last = table[[0, -1], _POSITION]
-    if filtered.usable is None and first >= reach and last < pulse_filter.n_bins - reach:
-        steps = steps.ravel()
-        left = filtered.y[steps] - _correlated(table, steps, pulse_filter)
-        left = left.reshape(len(table), -1)
-    else:
-        residual = filtered.samples - _render(table, pulse_filter)
+    first, last = table[[0, -1], POSITION]
+    y = filtered.y
+    is_whole = filtered.usable is None and first >= reach and last < pulse_filter.n_bins - reach
+    if not is_whole:
+        residual = pulse_filter.equalised(filtered.samples) - _render(table, pulse_filter)
         if filtered.usable is not None:
             residual *= filtered.usable
-        left = pulse_filter.apply(residual).take(steps, mode="clip")
-    energy: Array = np.sum(left.real**2 + left.imag**2, axis=1)
-    return energy / _expected(table[:, _POSITION], table[:, _AMPLITUDE], at, filtered)
-
-
-def _expected(position_bins: Array, amplitude: Array, at: Array, filtered: Filtered) -> Array:
-    """Return the energy that noise and a wrong pulse leave at points (k, n) [bins], shape (k,)."""
-    pulse_filter = filtered.pulse_filter
-    wrong = pulse_filter.left_near_peak**2 * _echo_power(
-        position_bins, amplitude, at, pulse_filter
-    ).sum(axis=1)
-    expected: Array = filtered.sigma_y**2 * pulse_filter.probe_noise + wrong
-    return expected
-
-
-def _echo_power(
-    position_bins: Array, amplitude: Array, at: Array, pulse_filter: PulseFilter
-) -> Array:
-    """Return the sum of A**2 rho**2 of all echoes at positions [bins] of any shape."""
-    away = (at[..., np.newaxis] - position_bins) / pulse_filter.sigma_bins
-    power: Array = np.exp(-0.5 * away**2) @ amplitude**2
-    return power
-
-
-def _raised_by_neighbours(peaks: Peaks, filtered: Filtered) -> Array:
-    """Return by what a wrong pulse of the others raises each deviation, shape (k,)."""
-    at, amplitude = peaks.position_bins, peaks.amplitude
-    others = _echo_power(at, amplitude, at, filtered.pulse_filter)
-    others = np.maximum(others - amplitude**2, 0.0)
-    wrong = (filtered.pulse_filter.left_near_peak / filtered.sigma_y) ** 2 * others
-    raised: Array = np.sqrt(1 + wrong)
-    return raised
+        y = pulse_filter.apply(residual)
+    kernels.assess(
+        y,
+        is_whole,
+        filtered.sigma_y,
+        pulse_filter.sigma_bins,
+        pulse_filter.carrier_rad,
+        pulse_filter.probes,
+        pulse_filter.probe_noise,
+        pulse_filter.left_near_peak,
+        *within,
+        table,
+    )
 
 
 class MatchedFilterDetector:
@@ -472,95 +390,112 @@ class MatchedFilterDetector:
         self._filters: dict[tuple[int, int, float], PulseFilter] = {}
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
-        limits = self.config.detection
-        start_m = frame.range_start_m - range_offset_m
-        peaks = self.peaks(frame, (limits.min_range_m - start_m, limits.max_range_m - start_m))
-        ranges_m = start_m + peaks.position_bins * frame.bin_length_m
-        columns = zip(
-            ranges_m.tolist(),
-            peaks.amplitude.tolist(),
-            peaks.phase_rad.tolist(),
-            (peaks.sigma_bins * frame.bin_length_m).tolist(),
-            peaks.misfit.tolist(),
-            peaks.saturated.tolist(),
-            strict=True,
-        )
-        return tuple(
-            Detection(
-                radar=frame.radar,
-                t_ns=frame.t_ns,
-                range_m=range_m,
-                amplitude=amplitude,
-                phase_rad=math.remainder(phase_rad, math.tau),
-                sigma_m=sigma_m,
-                misfit=misfit,
-                saturated=saturated,
-            )
-            for range_m, amplitude, phase_rad, sigma_m, misfit, saturated in columns
-            if limits.min_range_m <= range_m <= limits.max_range_m
-        )
+        return self.detect_many([frame], [range_offset_m])[0]
 
     def detect_many(
         self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
     ) -> list[tuple[Detection, ...]]:
-        return [self.detect(*each) for each in zip(frames, offsets_m, strict=True)]
+        found: list[tuple[Detection, ...]] = []
+        while len(found) < len(frames):
+            rest, offsets = frames[len(found) :], offsets_m[len(found) :]
+            for frame, filtered, offset_m in zip(rest, self._filtered(rest), offsets, strict=True):
+                detections, has_learnt = self._detections(frame, filtered, offset_m)
+                found.append(detections)
+                if has_learnt:  # the other frames come behind another filter
+                    break
+        return found
 
-    def peaks(self, frame: RadarFrame, within_m: tuple[float, float]) -> Peaks:
-        """Return every echo of a frame, whatever its range.
-
-        Only echoes that lie ``within_m``, from the first bin on [m], or overlap with one that may,
-        are fitted anew.
-        """
-        filtered = self._filtered(frame)
-        peaks = self._fitted_peaks(frame, filtered, within_m)
-        if not peaks.position_bins.size:
-            return peaks
-        return replace(peaks, sigma_bins=peaks.sigma_bins * _raised_by_neighbours(peaks, filtered))
-
-    def _fitted_peaks(
-        self, frame: RadarFrame, filtered: Filtered, within_m: tuple[float, float]
-    ) -> Peaks:
-        pulse_filter = filtered.pulse_filter
-        found, several = _single_pulses(filtered, self.config.matched_filter.max_single_misfit)
-        self._learn(frame, filtered, found)
-        again = cut_pulses(found.position_bins, filtered)
-        if self._joint:
-            again = several if again is None else again | several
-        if again is None:
-            return found
+    def _detections(
+        self, frame: RadarFrame, filtered: Filtered, range_offset_m: float
+    ) -> tuple[tuple[Detection, ...], bool]:
+        """Return the detections of one frame, and whether a pulse has changed."""
+        limits, pulse_filter = self.config.detection, filtered.pulse_filter
+        start_m, bin_m = frame.range_start_m - range_offset_m, frame.bin_length_m
+        # Only echoes within the limits, or that overlap with one that may be, are looked into.
         reach = OVERLAP * pulse_filter.sigma_bins
-        again &= found.position_bins > within_m[0] / pulse_filter.bin_length_m - reach
-        again &= found.position_bins < within_m[1] / pulse_filter.bin_length_m + reach
-        if not again.any():
-            return found
-        split = SplitTest(
-            max_echoes=_MAX_ECHOES if self._joint else 1,
-            model_error=pulse_filter.pulse_error,
+        within = (
+            (limits.min_range_m - start_m) / bin_m - reach,
+            (limits.max_range_m - start_m) / bin_m + reach,
         )
-        return refit(found, again, filtered, split)
+        table = self._single_pulses(filtered, within)
+        position = table[:, POSITION]
+        has_learnt = self._learn(frame, filtered, table)
+        again = cut_pulses(position, filtered)
+        if self._joint:
+            several = table[:, SEVERAL] > 0
+            again = several if again is None else again | several
+        if again is not None and again.any():
+            again &= (position > within[0]) & (position < within[1])
+            if again.any():
+                split = SplitTest(
+                    max_echoes=MAX_ECHOES if self._joint else 1,
+                    model_error=pulse_filter.pulse_error,
+                )
+                table = refit(table, again, filtered, split, within)
+        if not len(table):
+            return (), has_learnt
+        kernels.raise_deviations(
+            filtered.sigma_y, pulse_filter.sigma_bins, pulse_filter.left_near_peak, table
+        )
+        saturated = saturated_pulses(table[:, POSITION], filtered).tolist()
+        detections = tuple(
+            Detection(
+                radar=frame.radar,
+                t_ns=frame.t_ns,
+                range_m=start_m + position * bin_m,
+                amplitude=amplitude,
+                phase_rad=math.remainder(phase_rad, math.tau),
+                sigma_m=sigma_bins * bin_m,
+                misfit=misfit,
+                saturated=was_cut,
+            )
+            for (position, amplitude, phase_rad, sigma_bins, misfit, _), was_cut in zip(
+                table.tolist(), saturated, strict=True
+            )
+            if limits.min_range_m <= start_m + position * bin_m <= limits.max_range_m
+        )
+        return detections, has_learnt
 
     def learn(self, frame: RadarFrame) -> None:
         """Let the pulse be estimated from a frame whose echoes are not asked for."""
-        filtered = self._filtered(frame)
-        found, _ = _single_pulses(filtered, math.inf)
-        self._learn(frame, filtered, found)
+        (filtered,) = self._filtered([frame])
+        self._learn(frame, filtered, self._single_pulses(filtered, (0.0, 0.0)))
 
-    def _learn(self, frame: RadarFrame, filtered: Filtered, peaks: Peaks) -> None:
-        """Let the pulse be estimated from this frame, too; a change holds from the next one on."""
+    def _single_pulses(self, filtered: Filtered, within: tuple[float, float]) -> Array:
+        """Return the peaks of a frame; those between two positions are looked into."""
+        pulse_filter = filtered.pulse_filter
+        n = kernels.single_pulses(
+            filtered.y,
+            filtered.sigma_y,
+            pulse_filter.threshold,
+            pulse_filter.sigma_bins,
+            pulse_filter.carrier_rad,
+            pulse_filter.probes,
+            pulse_filter.probe_turns,
+            pulse_filter.probe_energy,
+            pulse_filter.probe_noise,
+            pulse_filter.left_near_peak,
+            self.config.matched_filter.max_single_misfit,
+            *within,
+            pulse_filter.table,
+        )
+        return pulse_filter.table[:n]
+
+    def _learn(self, frame: RadarFrame, filtered: Filtered, table: Array) -> bool:
+        """Let the pulse be estimated from this frame, too, and return whether it has changed."""
         if filtered.usable is not None or not self.estimator.is_due(frame.radar):
-            return
-        samples = frame.samples.astype(np.float64)
-        samples -= np.add.reduce(samples) / samples.size
+            return False
         has_changed = self.estimator.take(
             frame.radar,
-            samples,
+            filtered.samples,
             frame.bin_length_m,
-            position_bins=peaks.position_bins,
-            amplitude=peaks.amplitude,
+            position_bins=table[:, POSITION],
+            amplitude=table[:, AMPLITUDE],
             sigma_y=filtered.sigma_y,
         )
         if has_changed:
             self._filters.clear()
+        return has_changed
 
     def _filter(self, frame: RadarFrame) -> PulseFilter:
         key = frame.radar, frame.samples.size, frame.bin_length_m
@@ -577,70 +512,48 @@ class MatchedFilterDetector:
             )
         return self._filters[key]
 
-    def _filtered(self, frame: RadarFrame) -> Filtered:
-        pulse_filter = self._filter(frame)
-        samples = frame.samples.astype(np.float64)
+    def _filtered(self, frames: Sequence[RadarFrame]) -> list[Filtered]:
+        """Return the frames behind their filters; those of one length are transformed together."""
+        filters = [self._filter(frame) for frame in frames]
+        batches: dict[tuple[int, int], list[int]] = {}
+        for k, each in enumerate(filters):
+            batches.setdefault((each.n_bins, each.n_fft), []).append(k)
+        found: dict[int, Filtered] = {}
+        for chosen in batches.values():
+            prepared = [_without_mean(frames[k]) for k in chosen]
+            spectra = np.stack([filters[k].spectrum for k in chosen])
+            y = correlate(
+                np.stack([samples for samples, _, _ in prepared]),
+                spectra,
+                filters[chosen[0]],
+            )
+            for row, k in enumerate(chosen):
+                samples, usable, largest = prepared[row]
+                configured = self.config.matched_filter.noise_sigma
+                sigma_y = configured * filters[k].told_noise_gain
+                if not configured:
+                    sigma_y = math.sqrt(
+                        kernels.noise_power(y[row], filters[k].stride, filters[k].cells)
+                    )
+                found[k] = Filtered(
+                    samples=samples,
+                    usable=usable,
+                    y=y[row],
+                    sigma_y=max(sigma_y, _RESOLUTION * largest),
+                    pulse_filter=filters[k],
+                )
+        return [found[k] for k in range(len(frames))]
+
+
+def _without_mean(frame: RadarFrame) -> tuple[Array, BoolArray | None, float]:
+    """Return the samples (n_bins,), unknown ones zero, which are usable, and the largest."""
+    samples = frame.samples.astype(np.float64)
+    lowest, highest = float(samples.min()), float(samples.max())
+    usable = None
+    if math.isnan(lowest) or reaches_limits(frame, lowest, highest):
+        usable = usable_samples(frame)
+        samples[np.isnan(samples)] = 0.0
         lowest, highest = float(samples.min()), float(samples.max())
-        usable = None
-        if math.isnan(lowest) or reaches_limits(frame, lowest, highest):
-            usable = usable_samples(frame)
-            samples[np.isnan(samples)] = 0.0
-            lowest, highest = float(samples.min()), float(samples.max())
-        # A constant frame must come out as nothing, not as the two steps at its ends.
-        samples -= np.add.reduce(samples) / samples.size
-        samples = pulse_filter.equalised(samples)
-        y = pulse_filter.apply(samples)
-        power = y.real**2 + y.imag**2
-        configured = self.config.matched_filter.noise_sigma
-        sigma_y = configured * pulse_filter.told_noise_gain
-        if not configured:
-            sigma_y = math.sqrt(pulse_filter.noise_power(power))
-        sigma_y = max(sigma_y, _RESOLUTION * max(highest, -lowest))
-        return Filtered(
-            samples=samples,
-            usable=usable,
-            y=y,
-            power=power,
-            sigma_y=sigma_y,
-            pulse_filter=pulse_filter,
-        )
-
-
-def _single_pulses(filtered: Filtered, max_misfit: float) -> tuple[Peaks, BoolArray]:
-    """Return every peak as one pulse, and which leave more than noise and a wrong pulse would."""
-    y, power, sigma_y = filtered.y, filtered.power, filtered.sigma_y
-    pulse_filter = filtered.pulse_filter
-    at = (power[1:-1] > (pulse_filter.threshold * sigma_y) ** 2).nonzero()[0] + 1
-    near = power.take(at + _NEIGHBOURS)
-    highest = (near[1] > near[0]) & (near[1] >= near[2])
-    at = at[highest]
-    before, middle, after = np.log(near[:, highest])
-    offset = 0.5 * BINS_PER_STEP * (before - after) / (before - 2 * middle + after)
-    s, kappa = pulse_filter.sigma_bins, pulse_filter.carrier_rad
-    at_peak = y[at]
-    height = np.abs(at_peak)
-    amplitude = height * np.exp((offset / (2 * s)) ** 2)
-
-    # Turned back by the peak's phase and the carrier, a pulse is real.
-    around = y.take(at[:, np.newaxis] + pulse_filter.probes, mode="clip")
-    around *= pulse_filter.probe_turns
-    around *= (at_peak.conj() / height)[:, np.newaxis]
-    away = pulse_filter.probe_sigmas - (offset / s)[:, np.newaxis]
-    around -= amplitude[:, np.newaxis] * np.exp(-0.25 * (away * away))
-    left = np.vecdot(around, around).real
-    several = left > max_misfit * sigma_y**2 * pulse_filter.probe_noise
-    several &= left > pulse_filter.left_near_peak**2 * pulse_filter.probe_energy * amplitude**2
-
-    position = BINS_PER_STEP * at + offset
-    phase = np.arctan2(at_peak.imag, at_peak.real) + kappa * offset
-    sigma = math.sqrt(2) * s * sigma_y / amplitude
-    probed = BINS_PER_STEP * (at[:, np.newaxis] + pulse_filter.probes).astype(np.float64)
-    peaks = Peaks(
-        position_bins=position,
-        amplitude=amplitude,
-        phase_rad=phase,
-        sigma_bins=sigma,
-        misfit=left / _expected(position, amplitude, probed, filtered),
-        saturated=np.zeros(at.size, dtype=np.bool_),
-    )
-    return peaks, several
+    # A constant frame must come out as nothing, not as the two steps at its ends.
+    samples -= np.add.reduce(samples) / samples.size
+    return samples, usable, max(highest, -lowest)

@@ -7,39 +7,14 @@ compiled once and kept on disk. Nothing is reordered (no ``fastmath``): same inp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import cache, wraps
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.compiled import kernel
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
-def kernel(signature: str) -> Callable[[_Function], _Function]:
-    """Return a decorator that compiles a function for a signature when it is first called."""
-
-    def decorate(function: _Function) -> _Function:
-        @cache
-        def machine_code() -> Callable[..., Any]:
-            from numba import njit  # half a second, and not every run has a robust back end
-
-            compiled: Callable[..., Any] = njit(signature, cache=True, error_model="numpy")(
-                function
-            )
-            return compiled
-
-        @wraps(function)
-        def call(*args: object) -> object:
-            return machine_code()(*args)
-
-        return call  # type: ignore[return-value]  # the same function, faster
-
-    return decorate
 
 
 @kernel(

@@ -1,6 +1,7 @@
 """How long the front end takes per frame, and one SLAM step against the size of the map."""
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 from threadpoolctl import threadpool_limits
 
+from emulator.scene.scene import load_scene
 from hil_tests.unit.slam.simulation import BIN_LENGTH_M, frame_of
+from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
 from slam.config import (
     AssociationConfig,
     ClusteringConfig,
@@ -16,6 +19,7 @@ from slam.config import (
     FrontEnd,
     SlamConfig,
     TrilaterationConfig,
+    load_preset,
 )
 from slam.frames import RadarFrame
 from slam.front_end import make_detector
@@ -26,6 +30,7 @@ from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.ekf import predict, update
 from slam.paper.trilateration import Trilaterator
 from slam.results import Belief, Fix
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 Q = np.diag([0.15**2, 1.0])
@@ -63,6 +68,31 @@ def test_front_end_per_frame(benchmark: BenchmarkFixture, name: FrontEnd) -> Non
     benchmark.extra_info["frames"] = 1
     detections = benchmark(detector.detect, one)
     assert len(detections) >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lab", "store"])
+@pytest.mark.benchmark(
+    group="preset robust: front end, 50 scans of a scene (bar: lab 250 us a frame, store 400)",
+    timer=time.process_time,
+)
+def test_front_end_of_a_scene(benchmark: BenchmarkFixture, name: str) -> None:
+    """Frames as the scene has them: its clutter, echoes that overlap, pulses that are cut."""
+    scene = load_scene(name)
+    radars = open_loopback(scene, seed=5)
+    radars.start(RAW_CONFIG, FRAME_RATE_HZ)
+    ticks = radars.scans(400, StopFlag())
+    scans = [scan.frames for tick, scan in enumerate(ticks) if tick % 8 == 0]
+    detector = make_detector(load_preset("robust"))
+
+    def detect() -> int:
+        found = [detector.detect_many(frames, [0.0] * len(frames)) for frames in scans]
+        return sum(len(detections) for of_scan in found for detections in of_scan)
+
+    benchmark.extra_info["frames"] = sum(map(len, scans))
+    with threadpool_limits(1):
+        detect()  # the pulses are estimated then
+        assert benchmark(detect) > len(scans)
 
 
 @pytest.mark.parametrize(

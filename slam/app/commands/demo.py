@@ -33,6 +33,8 @@ from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
+from slam.compiled import compile_kernels
+from slam.config import BackEnd
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
@@ -64,6 +66,9 @@ def run_demo(
         with ExitStack() as stack:
             emulator = stack.enter_context(EmulatorProcess(scene, seed))
             from slam.app.view.panels import RerunView  # a second, while the emulator starts
+
+            if config.back_end is BackEnd.ROBUST:
+                compile_kernels()  # seconds the first time
 
             emulator.wait_until_ready(stop)
             odometry = read_odometry_socket(emulator.odometry_socket)

@@ -26,6 +26,7 @@ from slam.app.records import (
     Snapshot,
     TruthAt,
 )
+from slam.compiled import compile_kernels
 from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import TrueAssociationNis, true_range_nis
 from slam.frames import Detector, RadarFrame
@@ -53,6 +54,7 @@ def make_slam(
     replaces the front end that the configuration names, ``rules`` those of the robust back end.
     """
     if config.back_end is BackEnd.ROBUST:
+        compile_kernels()  # or the first scans would wait for it
         return RobustSlam(config, rig, wheels, detector, rules)
     return UwbRadarSlam(config, rig, detector)
 

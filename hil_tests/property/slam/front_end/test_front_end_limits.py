@@ -110,6 +110,57 @@ def test_one_echo_is_ranged_at_the_cramer_rao_bound(front_end: str, wide: float)
     assert abs(errors.mean()) < 1e-4
 
 
+@pytest.mark.parametrize("amplitude", [0.01, 0.02, 0.05])
+@pytest.mark.parametrize("wide", [0.9, 1.0, 1.05, 1.1])
+def test_a_pulse_ten_percent_off_explains_an_echo_however_strong(
+    wide: float, amplitude: float
+) -> None:
+    """Behind the filter the relative error of a width 10 % off is 3.4 % near the peak."""
+    rng = np.random.default_rng(7)
+    frames = frames_of(places(rng, 400), amplitude, rng, wide=wide)
+    config = override(SlamConfig(), {"detection.front_end": "joint", "detection.max_range_m": 20.0})
+    found = make_detector(config).detect_many(frames, [0.0] * len(frames))
+    misfits = np.array([echo.misfit for each in found for echo in each])
+    assert len(misfits) == pytest.approx(400, rel=0.01)
+    assert np.mean(misfits < 1.5) >= 0.9
+
+
+def test_an_echo_that_is_two_has_a_misfit_however_strong_the_pulses_error_may_be() -> None:
+    """8 cm apart, 1.5 sigmas: of one pulse fitted to both half of the cases leave far more."""
+    rng = np.random.default_rng(8)
+    first_m = places(rng, 80)
+    frames = frames_of(np.hstack([first_m, first_m + 0.08]), 0.02, rng)
+    config = override(
+        SlamConfig(), {"detection.front_end": "matched_filter", "detection.max_range_m": 20.0}
+    )
+    found = make_detector(config).detect_many(frames, [0.0] * len(frames))
+    misfits = np.array([echo.misfit for each in found for echo in each])
+    assert np.median(misfits) > 1.5
+
+
+def test_the_deviation_grows_by_what_a_wrong_pulse_of_a_neighbour_leaves() -> None:
+    """Two echoes 4.3 sigmas apart, the other 20 times as strong: 5 % of what it has there."""
+    row = np.zeros(N_BINS)
+    x = np.arange(N_BINS)
+    for range_m, amplitude in ((0.9, 0.005), (1.12, 0.1)):
+        at = (range_m - START_M) / BIN_M
+        row += amplitude * np.exp(-0.5 * ((x - at) / S) ** 2) * np.cos(CARRIER * (x - at))
+    row += 1e-4 * np.random.default_rng(9).standard_normal(N_BINS)
+    config = override(SlamConfig(), {"detection.front_end": "joint"})
+    weak, strong = make_detector(config).detect(frame_of(row.astype(np.float32)))
+
+    def ratio(model_error: float) -> float:
+        exact = override(config, {"matched_filter.model_error": model_error})
+        found = make_detector(exact).detect(frame_of(row.astype(np.float32)))
+        return weak.sigma_m / found[0].sigma_m
+
+    rho = math.exp(-0.25 * ((strong.range_m - weak.range_m) / (S * BIN_M)) ** 2)
+    sigma_y = weak.sigma_m / ratio(0.0) * weak.amplitude / (math.sqrt(2) * S * BIN_M)
+    expected = math.hypot(1.0, 0.05 * strong.amplitude * rho / sigma_y)
+    assert expected > 1.5
+    assert ratio(0.0) == pytest.approx(expected, rel=0.02)
+
+
 def test_two_equal_echoes_ten_centimetres_apart_are_resolved() -> None:
     rng = np.random.default_rng(2)
     first_m = places(rng, 600)  # a share of 0.9 to 1.2 %

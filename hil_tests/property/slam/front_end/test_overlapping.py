@@ -1,6 +1,7 @@
 """Laws of the joint fit of close echoes, by windows and by whole frames."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,13 +9,21 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.front_end.matched_filter import BINS_PER_STEP, PulseFilter
+from slam.front_end import kernels
+from slam.front_end.kernels import (
+    CLIMB,
+    COLUMNS,
+    INFORMATION,
+    MAX_ECHOES,
+    ROWS,
+    U,
+)
+from slam.front_end.matched_filter import PulseFilter
 from slam.front_end.overlapping import (
-    Correlation,
+    _TAYLOR,
     EchoFit,
     KnownPulse,
     SplitTest,
-    _Fit,
     fit_echoes,
     fit_whole_echoes,
     split_threshold,
@@ -289,36 +298,35 @@ def whole_signal(positions: Array, amplitudes: Array, phases: Array) -> Array:
     return total
 
 
-def correlation(samples: Array, noise_sigma: float) -> Correlation:
-    n = BINS_PER_STEP * np.arange(N_WHOLE // BINS_PER_STEP)
-    return Correlation(
-        FILTER.apply(samples) * np.exp(-1j * MODEL_CARRIER * n),
-        step_bins=BINS_PER_STEP,
-        sigma_bins=MODEL_SIGMA,
+def fit_whole(
+    samples: Array,
+    noise_sigma: float,
+    split: SplitTest,
+    limits: tuple[float, float] = (FIRST, LAST),
+) -> list[EchoFit]:
+    table = fit_whole_echoes(
+        FILTER.apply(samples),
+        limits,
+        others=np.empty((0, COLUMNS)),
+        pulse=KnownPulse(envelope_sigma_bins=MODEL_SIGMA, carrier_rad_per_bin=MODEL_CARRIER),
         sigma_y=FILTER.noise_gain * noise_sigma,
+        split=split,
     )
-
-
-def phase(fit: EchoFit) -> float:
-    return fit.phase_rad + MODEL_CARRIER * fit.position_bins
+    return [EchoFit(*row) for row in table[:, :4].tolist()]
 
 
 @settings(max_examples=30)
 @given(whole_clusters())
 def test_whole_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, Array]) -> None:
-    fits = fit_whole_echoes(
-        correlation(whole_signal(*cluster), 1e-3), FIRST, LAST, SplitTest(model_error=0.0)
-    )
+    fits = fit_whole(whole_signal(*cluster), 1e-3, SplitTest(model_error=0.0))
     positions, amplitudes, phases = cluster
     assert len(fits) == len(positions)
     for fit, position in zip(fits, positions, strict=True):
         # far less than the noise that the fit was told of, 1e-3, would move them
         assert abs(fit.position_bins - position) < 0.1 * fit.sigma_bins
     assert [fit.amplitude for fit in fits] == pytest.approx(amplitudes, rel=2e-4)
-    turns = [
-        math.remainder(phase(fit) - told, math.tau) for fit, told in zip(fits, phases, strict=True)
-    ]
-    assert np.abs(turns).max() < 2e-3
+    turns = [turn(fit.phase_rad, told) for fit, told in zip(fits, phases, strict=True)]
+    assert max(turns) < 2e-3
 
 
 @settings(max_examples=40)
@@ -333,7 +341,7 @@ def test_the_closed_form_finds_what_the_samples_tell(
         noise_sigma=sigma,
         search_bins=(FIRST, LAST),
     )
-    fits = fit_whole_echoes(correlation(samples, sigma), FIRST, LAST, SplitTest())
+    fits = fit_whole(samples, sigma, SplitTest())
     assert len(fits) == len(known)
     for one, other in zip(fits, known, strict=True):
         assert abs(one.position_bins - other.position_bins) < 0.3 * other.sigma_bins
@@ -341,42 +349,68 @@ def test_the_closed_form_finds_what_the_samples_tell(
         assert one.amplitude == pytest.approx(other.amplitude, rel=0.1)
 
 
+def evaluated(data: kernels.ComplexArray, positions: list[float]) -> tuple[float, Array, Array]:
+    """Return what echoes at some positions explain, its gradient, and the information."""
+    state, n = np.zeros((ROWS, MAX_ECHOES)), len(positions)
+    state[U, :n] = positions
+    explained = kernels.evaluate(data, MODEL_SIGMA, state, n)
+    return explained, state[CLIMB, :n], state[INFORMATION : INFORMATION + n, :n]
+
+
+def polynomials(samples: Array) -> kernels.ComplexArray:
+    """Return z of a whole frame of samples as the kernels take it."""
+    y = FILTER.apply(samples)
+    around = np.empty((y.size - 8, 9), dtype=np.complex128)
+    nobody = np.empty((0, COLUMNS))
+    kernels.interpolate(y, nobody, 0, MODEL_SIGMA, MODEL_CARRIER, _TAYLOR, np.empty_like(y), around)
+    return around
+
+
+def window(samples: Array) -> kernels.ComplexArray:
+    """Return a window of samples as the kernels take it, a fifth of it unknown."""
+    turned = np.exp(1j * MODEL_CARRIER * np.arange(N_WHOLE))
+    columns: kernels.ComplexArray = np.stack([samples + 0j, turned], axis=1)
+    columns[100:105] = 0.0
+    return columns
+
+
 @settings(max_examples=30)
 @given(whole_clusters(), st.floats(-3, 3))
+@pytest.mark.parametrize("of", [polynomials, window])
 def test_gradient_and_information_are_derivatives_of_what_is_explained(
-    cluster: tuple[Array, Array, Array], off: float
+    of: Callable[[Array], kernels.ComplexArray], cluster: tuple[Array, Array, Array], off: float
 ) -> None:
-    data = correlation(whole_signal(*cluster), 1e-3)
+    data = of(whole_signal(*cluster))
     positions = (cluster[0] + off * np.arange(1, len(cluster[0]) + 1) / 4).tolist()
-    fit = _Fit(data, positions)
+    explained, gradient, information = evaluated(data, positions)
     for k in range(len(positions)):
         shifted = [
             [*positions[:k], positions[k] + step, *positions[k + 1 :]] for step in (-1e-4, 1e-4)
         ]
-        below, above = (_Fit(data, each).explained for each in shifted)
+        below, above = (evaluated(data, each)[0] for each in shifted)
         slope = (above - below) / 4e-4
-        assert fit.gradient[k] == pytest.approx(slope, abs=1e-3 * fit.explained / MODEL_SIGMA)
-    np.testing.assert_allclose(fit.information, np.transpose(fit.information), rtol=1e-9)
+        assert gradient[k] == pytest.approx(slope, abs=1e-3 * explained / MODEL_SIGMA)
+    np.testing.assert_allclose(information, information.T, rtol=1e-9)
     # at the truth nothing is left, so the Gauss-Newton matrix is minus half the Hessian
     true = cluster[0].tolist()
-    at_truth = _Fit(data, true)
+    at_truth = evaluated(data, true)[2]
     for k in range(len(true)):
         climb = [
-            _Fit(data, [*true[:k], true[k] + step, *true[k + 1 :]]).gradient[k]
+            evaluated(data, [*true[:k], true[k] + step, *true[k + 1 :]])[1][k]
             for step in (-1e-2, 1e-2)
         ]
         bend = (climb[0] - climb[1]) / 2e-2
-        assert at_truth.information[k][k] == pytest.approx(bend, rel=2e-2)
+        assert at_truth[k][k] == pytest.approx(bend, rel=2e-2)
 
 
 def test_interval_too_short_for_two_gives_one() -> None:
     samples = whole_signal(np.array([118.0, 124.0]), np.array([1.0, 1.0]), np.array([0.0, 2.0]))
-    fits = fit_whole_echoes(correlation(samples, 1e-3), 120.0, 122.0, SplitTest())
+    fits = fit_whole(samples, 1e-3, SplitTest(), (120.0, 122.0))
     assert len(fits) == 1
     assert 120.0 <= fits[0].position_bins <= 122.0
 
 
 def test_nothing_gives_one_echo_of_nothing() -> None:
-    (fit,) = fit_whole_echoes(correlation(np.zeros(N_WHOLE), 1e-3), FIRST, LAST, SplitTest())
+    (fit,) = fit_whole(np.zeros(N_WHOLE), 1e-3, SplitTest())
     assert fit.amplitude == 0.0
     assert math.isinf(fit.sigma_bins)

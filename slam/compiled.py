@@ -1,0 +1,76 @@
+"""Functions of numbers and arrays that are compiled by numba when they are first called.
+
+The same input gives the same bits on every machine: no fast mathematics, no threads, nothing
+reordered. What is compiled is kept beside the source, or, where that cannot be written, in the
+user's cache folder (``NUMBA_CACHE_DIR`` names another), and otherwise compiled again by the next
+process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, update_wrapper
+from types import FunctionType
+from typing import Any, TypeVar
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+_KERNELS: list[_Kernel] = []
+
+
+class _Kernel:
+    """A function that is compiled once, for one signature."""
+
+    def __init__(self, function: FunctionType, signature: str) -> None:
+        self._function = function
+        self._signature = signature
+        self.compiled = cache(self._compiled)
+        update_wrapper(self, function)
+        _KERNELS.append(self)
+
+    def __call__(self, *args: object) -> object:
+        return self.compiled()(*args)
+
+    def _compiled(self) -> Callable[..., Any]:
+        import numba  # half a second, and not every process calls a kernel
+
+        function = self._function
+        known = dict(function.__globals__)
+        for name in function.__code__.co_names:  # what it calls must be compiled, too
+            if isinstance(called := known.get(name), _Kernel):
+                known[name] = called.compiled()
+        bound = FunctionType(function.__code__, known, function.__name__)
+        bound.__module__, bound.__qualname__ = function.__module__, function.__qualname__
+        # Loops are short: their vectorised variants would take a third of the compilation.
+        vectorise = numba.config.LOOP_VECTORIZE
+        numba.config.LOOP_VECTORIZE = 0
+        try:
+            kept = numba.njit(cache=True, error_model="numpy")(bound)
+        except RuntimeError:  # no folder can be written
+            kept = numba.njit(error_model="numpy")(bound)
+        try:
+            kept.compile(self._signature)
+        finally:
+            numba.config.LOOP_VECTORIZE = vectorise
+        kept.disable_compile()
+        compiled: Callable[..., Any] = kept
+        return compiled
+
+
+def kernel(signature: str) -> Callable[[_Function], _Function]:
+    """Return a decorator that compiles a function for a signature when it is first called.
+
+    A kernel may call kernels of its own module. Arrays are C-contiguous.
+    """
+
+    def decorate(function: _Function) -> _Function:
+        assert isinstance(function, FunctionType)
+        return _Kernel(function, signature)  # type: ignore[return-value]  # the same function, faster
+
+    return decorate
+
+
+def compile_kernels() -> None:
+    """Compile or load every kernel of the modules imported so far: seconds the first time."""
+    for each in _KERNELS:
+        each.compiled()
