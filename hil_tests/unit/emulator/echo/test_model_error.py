@@ -12,6 +12,8 @@ from scipy.signal import hilbert
 from emulator.echo.echo import SceneEcho, ScenePaths
 from emulator.scene.scene import (
     BurstSpec,
+    ClutterSpec,
+    JitterSpec,
     MultipathSpec,
     PathSpec,
     PulseSpec,
@@ -195,9 +197,12 @@ def test_other_modules_noise_is_in_a_twentieth_of_the_frames() -> None:
     assert abs(np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]) < 0.02
 
 
-def test_bursts_are_selected_by_the_frame_alone() -> None:
-    radar = radar_at(0, 0, 0, bursts=BurstSpec(echo_share=0.5, noise_share=0.5))
-    echo = SceneEcho(room(radar), radar, 9)
+def test_what_a_frame_holds_does_not_depend_on_the_others() -> None:
+    """Also where frames are taken in another order than that of their indices."""
+    bursts = BurstSpec(echo_share=0.5, noise_share=0.5)
+    radar = radar_at(0, 0, 0, bursts=bursts, stamp_sigma_ms=200.0)
+    slow = {"clutter": ClutterSpec(sigma=5e-4), "jitter": JitterSpec(white_rad=0.1, slow_rad=0.1)}
+    echo = SceneEcho(room(radar, targets=(target(2.0, 0.0, "rod"),), **slow), radar, 9)
     indices = np.arange(12, dtype=np.int64)
     together = echo.rf_counters(PAPER, indices, indices * 10**8)
     for index in (7, 2):
