@@ -88,7 +88,7 @@ _JITTER_INSTANTS_PER_KNOT = 16
 _COUNTERS_AT_ONCE = 256
 # What is worked on stays in the processor's cache, a block of frames does not.
 _FRAMES_AT_ONCE = 4
-_VALUES_AT_ONCE = 4096
+_VALUES_AT_ONCE = 2048
 
 GRIDS = ((0.054, 0.16), (0.239, 0.24), (1.205, 0.60))
 """Spacing of the clutter's knots in correlation times, and share of the variance, fastest first."""
@@ -130,16 +130,19 @@ class SlowNoise:
         serial: int,
         purpose: Purpose,
     ) -> None:
-        self._grids = grids
         self._seed = seed
         self._streams = [stream_of(serial, purpose, part) for part in range(len(grids))]
         self._instant_ns = grids[0].spacing_ns // instants_per_knot
         # the parts behind the grids' own: their offsets, and that of the instants
         periods_ns = [*(grid.spacing_ns for grid in grids), self._instant_ns]
-        *self._offsets_ns, self._instants_offset_ns = (
+        *offsets_ns, self._instants_offset_ns = (
             Rng(seed, stream_of(serial, purpose, part)).below(period_ns)
             for part, period_ns in enumerate(periods_ns, len(grids))
         )
+        # columns, one row for each grid
+        self._offsets_of_grids_ns = np.array(offsets_ns, dtype=np.int64)[:, np.newaxis]
+        self._spacings_ns = np.array([[grid.spacing_ns] for grid in grids], dtype=np.int64)
+        self._scales = np.array([[grid.sigma * _SCALE] for grid in grids])
         self._n_values = n_values
         none_yet = _Knots(numbers=np.empty(0, dtype=np.int64), values=np.empty((0, n_values)))
         self._held = [none_yet] * len(grids)
@@ -156,32 +159,28 @@ class SlowNoise:
 
     def values_at(self, instants: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the values at instants of shape (n,): shape (n, n_values), float64."""
-        weight = np.empty((len(instants), len(self._grids) * _KNOTS))
-        place = np.empty(weight.shape, dtype=np.int64)
-        knots: list[NDArray[np.float64]] = []
-        n_knots = 0
-        for member, grid in enumerate(self._grids):
-            since_ns = instants * self._instant_ns + self._offsets_ns[member]
-            first_knot, rest_ns = np.divmod(since_ns, grid.spacing_ns)
-            columns = slice(member * _KNOTS, (member + 1) * _KNOTS)
-            weight[:, columns] = _cubic_weights(rest_ns / grid.spacing_ns, grid.sigma * _SCALE)
-            held, first_place = self._with_knots(member, first_knot)
-            place[:, columns] = (n_knots + first_place)[:, np.newaxis] + _FOUR
-            knots.append(held)
-            n_knots += len(held)
-        knot = np.concatenate(knots)
+        since_ns = instants * self._instant_ns + self._offsets_of_grids_ns
+        first_knots, rest_ns = np.divmod(since_ns, self._spacings_ns)
+        weights = _cubic_weights(rest_ns / self._spacings_ns, self._scales)
+        weight = weights.transpose(1, 0, 2).reshape(len(instants), -1)
+        knots = [self._with_knots(member, first) for member, first in enumerate(first_knots)]
         values = np.empty((len(instants), self._n_values))
         at_once = max(_VALUES_AT_ONCE // self._n_values, 1)
+        near = np.empty((min(at_once, len(instants)), weight.shape[1], self._n_values))
         for first in range(0, len(instants), at_once):
             part = slice(first, first + at_once)
+            factors = weight[part]
+            for member, (held, place) in enumerate(knots):
+                columns = slice(member * _KNOTS, (member + 1) * _KNOTS)
+                near[: len(factors), columns] = held[place[part]]
             # einsum multiplies and adds in loops of its own, never by BLAS
-            np.einsum("ik,ikn->in", weight[part], knot[place[part]], out=values[part])
+            np.einsum("ik,ikn->in", factors, near[: len(factors)], out=values[part])
         return values
 
     def _with_knots(
         self, member: int, first_knot: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return knots of a member, and where among them the four that begin with each one are."""
+        """Return knots of a member, and where among them the fours from each first are, (n, 4)."""
         held = self._held[member]
         place = held.numbers.searchsorted(first_knot)
         if not held.have(first_knot, place):
@@ -202,7 +201,7 @@ class SlowNoise:
             )
             held = self._held[member] = _Knots(numbers=numbers, values=values)
             place = numbers.searchsorted(first_knot)
-        return held.values, place
+        return held.values, place[:, np.newaxis] + _FOUR
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -222,14 +221,14 @@ class _Knots:
         return bool(ends_are_there.all())
 
 
-def _cubic_weights(u: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """Return the weights of four knots in a row at fractions u behind the second, (n, 4)."""
+def _cubic_weights(u: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights of four knots in a row at fractions u behind the second, (..., 4)."""
     v = 1 - u
-    weights = np.empty((len(u), _KNOTS))
-    weights[:, 0] = scale * (v * v * v / 6)
-    weights[:, 1] = scale * (2 / 3 - u * u * (2 - u) / 2)
-    weights[:, 2] = scale * (2 / 3 - v * v * (2 - v) / 2)
-    weights[:, 3] = scale * (u * u * u / 6)
+    weights = np.empty((*u.shape, _KNOTS))
+    weights[..., 0] = scale * (v * v * v / 6)
+    weights[..., 1] = scale * (2 / 3 - u * u * (2 - u) / 2)
+    weights[..., 2] = scale * (2 / 3 - v * v * (2 - v) / 2)
+    weights[..., 3] = scale * (u * u * u / 6)
     return weights
 
 

@@ -190,7 +190,7 @@ def sum_of_pulses(
     first = nearest.astype(np.int64) + 2 * half_window
 
     width = n_samples + 4 * half_window
-    padded = np.empty((n_frames, width))
+    frames = np.empty((n_frames, n_samples))
     # whole frames at a time: what is added stays in the processor's cache, a block does not
     ends = np.searchsorted(frame, np.arange(1, n_frames + 1)).tolist()
     begin = done = 0
@@ -201,11 +201,12 @@ def sum_of_pulses(
         bins = ((frame[part] - done) * width + first[part])[:, np.newaxis] + _offsets(half_window)
         waves = pulse.envelope(shift[part, np.newaxis])
         waves *= _on_carrier(in_phase[part], quadrature[part], tx_center_frequency, half_window)
-        padded[done:n_done] = np.bincount(
+        padded = np.bincount(
             bins.ravel(), weights=waves.ravel(), minlength=(n_done - done) * width
         ).reshape(-1, width)
+        frames[done:n_done] = padded[:, 2 * half_window : 2 * half_window + n_samples]
         begin, done = end, n_done
-    return padded[:, 2 * half_window : 2 * half_window + n_samples]
+    return frames
 
 
 def _on_carrier(
