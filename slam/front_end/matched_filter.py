@@ -125,11 +125,10 @@ class PulseFilter:
         self.bin_length_m = bin_length_m
         self.sigma_bins = pulse.sigma_bins(bin_length_m)
         self.carrier_rad = pulse.carrier_rad(bin_length_m)
-        reach = n_bins + half + (0 if taps is None else taps.size // 2)
-        # The next power of two, or three quarters of it: transforms of other lengths are slower.
-        power_of_two = 1 << (reach - 1).bit_length()
-        enough = power_of_two // 4 * 3 >= reach
-        self.n_fft = power_of_two // 4 * 3 if enough else power_of_two
+        self.known = KnownPulse(
+            envelope_sigma_bins=self.sigma_bins, carrier_rad_per_bin=self.carrier_rad
+        )
+        self.n_fft = _transform_length(n_bins + half + (0 if taps is None else taps.size // 2))
         placed = np.zeros(self.n_fft, dtype=np.complex128)
         placed[np.arange(-half, half + 1)] = template * (2 / energy)
         # The whole spectrum at once is real: the pulse is even but for its carrier.
@@ -163,7 +162,8 @@ class PulseFilter:
         """Energy of a pulse of amplitude 1 at the probes."""
         self.probe_noise = float(np.sum(2 - (2 + 0.5 * probe_sigmas**2) * rho_sq))
         """Energy at the probes, over sigma_y**2, that noise leaves once a pulse is fitted."""
-        self.pulse_error = module.error
+        self.split = SplitTest(max_echoes=MAX_ECHOES, model_error=module.error)
+        self.single = SplitTest(max_echoes=1)
         self.left_near_peak = _NEAR_PEAK * module.error
         """What a wrong pulse leaves near the peak, relative to the amplitude."""
         self.threshold = threshold_sigmas(
@@ -183,6 +183,12 @@ class PulseFilter:
             return samples
         spectrum = np.fft.rfft(samples, self.n_fft) * self._equaliser
         return np.fft.irfft(spectrum, self.n_fft)[: self.n_bins]
+
+
+def _transform_length(least: int) -> int:
+    """Return the next power of two, or three quarters of it: other lengths are slower."""
+    power_of_two = 1 << (least - 1).bit_length()
+    return power_of_two // 4 * 3 if power_of_two // 4 * 3 >= least else power_of_two
 
 
 def _spectrum_of(taps: Array, n_fft: int) -> ComplexArray:
@@ -254,24 +260,23 @@ def saturated_pulses(position_bins: Array, filtered: Filtered) -> BoolArray:
 
 
 def refit(
-    table: Array,
-    again: BoolArray,
-    filtered: Filtered,
-    split: SplitTest,
-    within: tuple[float, float],
+    table: Array, again: BoolArray, filtered: Filtered, within: tuple[float, float], *, joint: bool
 ) -> Array:
     """Return the echoes with those ``again`` (k,), and those that overlap with them, fitted anew.
 
-    ``split.max_echoes`` 1 leaves each peak one echo. Those between the positions ``within`` get
-    their misfits.
+    Where not ``joint``, each peak is left one echo, and none overlaps. Echoes between the positions
+    ``within`` get their misfits.
     """
     pulse_filter = filtered.pulse_filter
-    linked = OVERLAP * pulse_filter.sigma_bins if split.max_echoes > 1 else 0.0
-    starts = np.flatnonzero(np.diff(table[:, POSITION]) > linked) + 1
+    linked, split = 0.0, pulse_filter.single
+    if joint:
+        linked, split = OVERLAP * pulse_filter.sigma_bins, pulse_filter.split
+    position, chosen = table[:, POSITION].tolist(), again.tolist()
+    starts = [k for k in range(1, len(table)) if position[k] - position[k - 1] > linked]
     groups = []
-    for first, end in pairwise([0, *starts.tolist(), len(table)]):
+    for first, end in pairwise([0, *starts, len(table)]):
         group = table[first:end]
-        if again[first:end].any():
+        if True in chosen[first:end]:
             others = np.concatenate([table[:first], table[end:]])
             group = _fitted(group, others, filtered, split)
         groups.append(group)
@@ -287,26 +292,23 @@ def _fitted(group: Array, others: Array, filtered: Filtered, split: SplitTest) -
     """Return the echoes near a group of peaks; the group where no sample is usable."""
     pulse_filter = filtered.pulse_filter
     margin = _MARGIN * pulse_filter.sigma_bins
-    first = int(np.floor(group[0, POSITION] - margin))
-    last = int(np.ceil(group[-1, POSITION] + margin))
+    nearest, farthest = float(group[0, POSITION]), float(group[-1, POSITION])
+    first, last = math.floor(nearest - margin), math.ceil(farthest + margin)
     inside = slice(max(first, 0), min(last + 1, pulse_filter.n_bins))
-    usable = np.zeros(last + 1 - first, dtype=np.bool_)
-    known = slice(inside.start - first, inside.stop - first)
-    usable[known] = True if filtered.usable is None else filtered.usable[inside]
+    is_whole = inside.start == first and inside.stop == last + 1
     search = _SEARCH * pulse_filter.sigma_bins
-    pulse = KnownPulse(
-        envelope_sigma_bins=pulse_filter.sigma_bins,
-        carrier_rad_per_bin=pulse_filter.carrier_rad,
-    )
-    if usable.all():
+    if is_whole and (filtered.usable is None or filtered.usable[inside].all()):
         return fit_whole_echoes(
             filtered.y,
-            (group[0, POSITION] - search, group[-1, POSITION] + search),
+            (nearest - search, farthest + search),
             others=others,
-            pulse=pulse,
+            pulse=pulse_filter.known,
             sigma_y=filtered.sigma_y,
             split=split,
         )
+    usable = np.zeros(last + 1 - first, dtype=np.bool_)
+    known = slice(inside.start - first, inside.stop - first)
+    usable[known] = True if filtered.usable is None else filtered.usable[inside]
     if np.count_nonzero(usable) < _LEAST_SAMPLES * pulse_filter.sigma_bins:
         return group
     window = np.zeros(usable.size)
@@ -320,7 +322,7 @@ def _fitted(group: Array, others: Array, filtered: Filtered, split: SplitTest) -
     )
     fits = fit_echoes(
         window,
-        pulse=pulse,
+        pulse=pulse_filter.known,
         noise_sigma=filtered.sigma_y / pulse_filter.noise_gain,
         usable=usable,
         search_bins=search_bins,
@@ -427,11 +429,7 @@ class MatchedFilterDetector:
         if again is not None and again.any():
             again &= (position > within[0]) & (position < within[1])
             if again.any():
-                split = SplitTest(
-                    max_echoes=MAX_ECHOES if self._joint else 1,
-                    model_error=pulse_filter.pulse_error,
-                )
-                table = refit(table, again, filtered, split, within)
+                table = refit(table, again, filtered, within, joint=self._joint)
         if not len(table):
             return (), has_learnt
         kernels.raise_deviations(
