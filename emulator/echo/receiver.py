@@ -162,7 +162,7 @@ class SlowNoise:
         since_ns = instants * self._instant_ns + self._offsets_of_grids_ns
         first_knots, rest_ns = np.divmod(since_ns, self._spacings_ns)
         weights = _cubic_weights(rest_ns / self._spacings_ns, self._scales)
-        weight = weights.transpose(1, 0, 2).reshape(len(instants), -1)
+        weight = weights.transpose(1, 0, 2).reshape(len(instants), len(self._streams) * _KNOTS)
         knots = [self._with_knots(member, first) for member, first in enumerate(first_knots)]
         values = np.empty((len(instants), self._n_values))
         at_once = max(_VALUES_AT_ONCE // self._n_values, 1)
