@@ -220,10 +220,13 @@ class RobustBackEnd:
             update_with_point(state, state.landmark_ids.index(landmark_id), point)
         self._log.set_causal(state.pose)
 
-    def update(self, scans: Sequence[RangeScan], *, sure_m: float | None = None) -> UpdateReport:
+    def update(
+        self, scans: Sequence[RangeScan], *, sure_m: float | None = None, solve: bool = True
+    ) -> UpdateReport:
         """Take in the scans of one time; a radar without a frame is absent, not empty.
 
-        ``sure_m`` replaces how sure a prediction must be for a range to continue a track.
+        ``sure_m`` replaces how sure a prediction must be for a range to continue a track. Without
+        ``solve`` the solution over all poses waits for a later time.
         """
         antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
@@ -238,7 +241,8 @@ class RobustBackEnd:
         self._initialise_landmarks()
         self._delete_vanished()
         self._merge()
-        self._smooth_if_due()
+        if solve and is_due(self._log, self.state, self.parameters):
+            self.relinearise()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
@@ -288,10 +292,6 @@ class RobustBackEnd:
     def relinearise(self) -> bool:
         """Solve for all poses and replace the belief; return whether that worked."""
         return relinearise(self._log, self.state, self.parameters)
-
-    def _smooth_if_due(self) -> None:
-        if is_due(self._log, self.state, self.parameters):
-            self.relinearise()
 
     def _associate(
         self,

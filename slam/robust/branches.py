@@ -48,7 +48,7 @@ from slam.robust.state import Array
 
 # Steps between two snapshots, and how many are kept: a carry that is noticed later than that is
 # dated to the oldest.
-_SNAPSHOT_EVERY, _SNAPSHOTS = 50, 4
+_SNAPSHOT_EVERY, _SNAPSHOTS = 25, 7
 # Steps between two looks for suspicion, and how many an alternative that lags behind takes a step
 _LOOK_EVERY, _CATCH_UP = 5, 10
 # A missing range counts as one three standard deviations off. How fast what is usual is forgotten
@@ -90,20 +90,27 @@ class Tally:
         least = -self._rule.most_against
         return math.fsum(min(max(nats, least), most) for nats in self._of_landmark.values())
 
-    def gain(self, other: Tally, most: float) -> float:
-        """Return how much likelier this is than the other, and than that nothing explains them.
+    def gain(self, other: Tally, most: float = math.inf) -> float:
+        """Return how much likelier this is than the other, each landmark saying at most so much.
 
         Nothing is likelier by explaining less: where little is certain, little can be missed.
         """
-        more = self._explained - other._explained
-        return min(self.total(most), self.total() - other.total(), 2.0 * more)
+        more = 2.0 * (self._explained - other._explained)
+        if most == math.inf:
+            return min(self.total() - other.total(), more)
+        mine, theirs = self._of_landmark, other._of_landmark
+        differences = [
+            mine.get(landmark_id, 0.0) - theirs.get(landmark_id, 0.0)
+            for landmark_id in mine.keys() | theirs.keys()
+        ]
+        return min(math.fsum(min(max(one, -most), most) for one in differences), more)
 
 
 class Alternative:
     """A back end that takes the steps from ``since`` on, and its evidence against the main one's.
 
     One ``set_down`` begins at the end of the first of these motions, which it does not take.
-    ``slipping`` are the steps to whose noise a slip is added.
+    ``slipping`` is the step to whose noise a slip is added, if any.
     """
 
     def __init__(
@@ -113,7 +120,7 @@ class Alternative:
         rule: BranchRule,
         *,
         set_down: bool = False,
-        slipping: range = range(0),
+        slipping: int | None = None,
     ) -> None:
         self.back_end = back_end
         self.since = self.next_step = since
@@ -127,18 +134,27 @@ class Alternative:
 
     @property
     def gain(self) -> float:
-        return self._own.gain(self._main, math.inf if self._is_new else self._rule.most_for)
+        """Return by how much this is likelier than the main one since it began, in nats.
+
+        Three landmarks must be for it if that is to exceed the price, and it must be as much
+        likelier than that the robot is elsewhere. A map of its own has nothing to compare.
+        """
+        if self._is_new:
+            return self._own.gain(self._main)
+        most_for = self._rule.most_for
+        return min(self._own.gain(self._main, self.price / 2.0), self._own.total(most_for))
 
     def take(self, step: Step) -> None:
         rule, back_end, number = self._rule, self.back_end, self.next_step
         if number > self.since or not self.set_down:
             covariance = step.covariance
-            if number in self._slipping:
+            if number == self._slipping:
                 slip = np.square([rule.slip_m, rule.slip_m, rule.slip_rad])
                 covariance = back_end.step_covariance(step.increment, covariance) + np.diag(slip)
             back_end.predict(step.increment, covariance)
-        begins = len(self._slipping) > 0 and number < self.since + rule.steps
-        report = back_end.update(step.scans, sure_m=4.0 * rule.slip_m if begins else None)
+        begins = self._slipping is not None and number < self.since + rule.steps
+        sure_m = 4.0 * rule.slip_m if begins else None
+        report = back_end.update(step.scans, sure_m=sure_m, solve=False)
         # What a back end maps after it went wrong explains the ranges there, too.
         known = math.inf if self._is_new else self._next_id
         self._own.add([one for one in report.evidence if one[0] < known])
@@ -201,10 +217,10 @@ class Branches:
         self._now = 0  # number of the next step
         self._motion: tuple[Array, Array | None] | None = None
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
-        self._slips: list[Alternative] = []
+        self._slip: Alternative | None = None
         self._placed: Alternative | None = None
         self._carry: Carry | None = None
-        self._no_slip_before = self._tried_until = 0
+        self._no_slip_until = self._tried_until = self._judged = 0
         self._strain = Strain(self._rule.steps)
         self.is_lost = False
 
@@ -258,10 +274,10 @@ class Branches:
         self._snapshots[self._now] = self.main.copy()
         for old in sorted(self._snapshots)[:-_SNAPSHOTS]:
             del self._snapshots[old]
-        needed = [min(self._snapshots), *(other.since for other in self._slips)]
+        needed = min(self._snapshots)
         if self._carry is not None:
-            needed.append(self._carry.fresh.since)
-        for old in [number for number in self._steps if number < min(needed)]:
+            needed = min(needed, self._carry.fresh.since)
+        for old in [number for number in self._steps if number < needed]:
             del self._steps[old]
 
     def _at(self, number: int) -> RobustBackEnd:
@@ -275,7 +291,7 @@ class Branches:
         for number in range(begin, end):
             step = self._steps[number]
             back_end.predict(step.increment, step.covariance)
-            back_end.update(step.scans)
+            back_end.update(step.scans, solve=False)
 
     def _is_up_to_date(self, other: Alternative) -> bool:
         """Let an alternative take some of its steps; return whether none is left."""
@@ -285,13 +301,13 @@ class Branches:
 
     def _decide(self) -> bool:
         """Adopt or drop alternatives; return whether the robot was carried elsewhere."""
-        rule, carry, placed = self._rule, self._carry, self._placed
-        for slip in list(self._slips):
-            if self._is_up_to_date(slip) and slip.gain > slip.price:
+        rule, slip, carry, placed = self._rule, self._slip, self._carry, self._placed
+        if slip is not None and self._is_up_to_date(slip):
+            if slip.gain > slip.price:
                 self._adopt(slip)
                 return False
             if self._now - slip.since > 3 * rule.steps:
-                self._slips.remove(slip)
+                self._slip = None
         if placed is not None and self._is_up_to_date(placed):
             if placed.gain > placed.price:
                 was_lost = self.is_lost
@@ -303,23 +319,27 @@ class Branches:
             gain = carry.fresh.gain
             self.is_lost = gain > (0.0 if self.is_lost else rule.carry_price)
             if gain < -rule.carry_price and self._placed is None:
-                self._carry = None
+                # What spoke against the pose until now has been judged.
+                self._carry, self._judged = None, self._now
         return False
 
     def _adopt(self, other: Alternative) -> None:
         """Let an alternative be the main back end."""
         self.main = other.back_end
-        self._slips, self._placed, self._carry, self.is_lost = [], None, None, False
+        self._slip = self._placed = self._carry = None
+        self.is_lost = False
         self._snapshots = {self._now: self.main.copy()}
         self._strain.settle()
+        self._no_slip_until = self._judged = self._now
 
     def _look(self) -> None:
         """Look for reasons to doubt the pose, and begin alternatives."""
         rule = self._rule
-        ago = self._strain.steps_ago()
-        if ago is not None and not self.is_lost and self._now >= self._no_slip_before:
+        ago = self._strain.steps_ago() or 0
+        # A few steps later it shows where it began, and what comes of it.
+        if ago > _LOOK_EVERY and not self.is_lost and self._now - ago > self._no_slip_until:
             self._begin_slip(self._now - ago)
-            self._no_slip_before = self._now + rule.steps
+            self._no_slip_until = self._now - _LOOK_EVERY
         if self._carry is None:
             since, against = self._doubt()
             if against > rule.suspicious:
@@ -332,7 +352,7 @@ class Branches:
 
         More than one landmark must be against the pose: one alone may be hidden or taken away.
         """
-        rule, first = self._rule, min(self._snapshots)
+        rule, first = self._rule, max(min(self._snapshots), self._judged)
         steps = [self._steps[number] for number in range(first, self._now)]
         lengths = [len(step.evidence) for step in steps]
         if not sum(lengths):
@@ -354,20 +374,16 @@ class Branches:
         return first + best, float(totals[best])
 
     def _begin_slip(self, since: int) -> None:
-        """Go back to about a step, and try slips at some steps around it; keep the best."""
-        rule, oldest = self._rule, min(self._snapshots)
-        width = rule.steps // 3
-        starts = sorted({max(since + shift, oldest) for shift in (-width, -width // 2, 0)})
-        back_end, tried = self._at(starts[0]), []
-        for start, end in zip(starts, [*starts[1:], starts[-1]], strict=True):
-            slip = Alternative(back_end.copy(), start, rule, slipping=range(start, start + width))
+        """Go back to about a step, try a slip at each of some steps around it; keep the best."""
+        width, oldest = self._rule.steps // 3, min(self._snapshots)
+        back_end, tried = self._at(max(since - width, oldest)), []
+        for start in range(max(since - width, oldest), min(since + 2, self._now)):
+            slip = Alternative(back_end.copy(), start, self._rule, slipping=start)
             for number in range(start, self._now):
                 slip.take(self._steps[number])
             tried.append(slip)
-            self._lead(back_end, start, end)
-        best = max(tried, key=lambda one: one.gain)
-        if best.gain > 0.0:
-            self._slips = [best]
+            self._lead(back_end, start, start + 1)
+        self._slip = max(tried, key=lambda one: one.gain)
 
     def _begin_carry(self, since: int) -> None:
         before = self._at(since)

@@ -174,7 +174,7 @@ class BranchRule:
     # Evidence [nats] against the pose from which on alternatives are looked for, and by which an
     # alternative must be likelier to be adopted: a slip is more frequent than a carry
     suspicious: float = 12.0
-    slip_price: float = 12.0
+    slip_price: float = 15.0
     carry_price: float = 25.0
     # What a slip adds to the standard deviations of a step
     slip_m: float = 0.015

@@ -188,10 +188,20 @@ def tally(*evidence: tuple[int, float]) -> Tally:
 
 
 def test_ranges_that_lie_near_by_chance_for_long_do_not_make_a_place() -> None:
-    """Two landmarks that seem to be there against three that are missing."""
+    """Two landmarks that seem to be there do not outweigh three that are missing."""
     chance = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20, *[(id_, 3.0) for id_ in (4, 5)] * 50)
     assert chance.total() > RULE.carry_price
-    assert chance.gain(tally(), RULE.most_for) < 0.0
+    assert chance.total(RULE.most_for) < 0.0
+
+
+def test_two_landmarks_do_not_say_where_the_robot_is() -> None:
+    """They have a say in two of three unknowns; a third one must confirm them."""
+    main, most = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20), RULE.carry_price / 2.0
+    two = tally(*[(id_, 3.0) for id_ in (1, 2)] * 50, *[(3, -3.0)] * 20)
+    three = tally(*[(id_, 3.0) for id_ in (1, 2, 3)] * 50)
+    assert two.gain(main) > RULE.carry_price
+    assert two.gain(main, most) <= RULE.carry_price
+    assert three.gain(main, most) > RULE.carry_price
 
 
 def test_one_landmark_alone_says_only_so_much_against_a_place() -> None:
@@ -206,8 +216,8 @@ def test_a_place_that_explains_less_is_not_likelier() -> None:
     main = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20, *[(4, 3.0)] * 5)
     silent, better = tally(), tally(*[(id_, 3.0) for id_ in (1, 2, 3, 5)] * 20)
     assert silent.total() > main.total()
-    assert silent.gain(main, math.inf) < 0.0
-    assert better.gain(main, RULE.most_for) > RULE.carry_price
+    assert silent.gain(main) < 0.0
+    assert better.gain(main) > RULE.carry_price
 
 
 def test_evidence_is_the_likelihood_of_the_ranges() -> None:
