@@ -168,6 +168,7 @@ def _consistency(groups: Sequence[Group]) -> Result:
             "name": group_name(group),
             "runs": group["runs"],
             "anees_in_band": in_band(group),
+            "anees_band_95": group["anees_band_95"],
             "bound_anees_in_band": None if group["bound"] is None else in_band(group["bound"]),
             "nis_in_band": nis_in_band(group),
             "nis_mean": group["nis_mean"],
@@ -176,10 +177,14 @@ def _consistency(groups: Sequence[Group]) -> Result:
     ]
     cells = [
         (
-            row["name"],
-            *("-" if row[key] is None else f"{row[key]:.4g}" for key in list(row)[1:]),
+            group_name(group),
+            str(group["runs"]),
+            in_band_text(group),
+            "-" if group["bound"] is None else in_band_text(group["bound"]),
+            str(nis_in_band(group)),
+            "-" if group["nis_mean"] is None else f"{group['nis_mean']:.4g}",
         )
-        for row in rows
+        for group in groups
     ]
     return Result(
         numbers={"simulated": True, "groups": rows},
@@ -188,7 +193,7 @@ def _consistency(groups: Sequence[Group]) -> Result:
         draw=lambda figure: _draw_consistency(figure, groups, scenes),
         tables=[
             (
-                "times of ten in their 95 % band: simulated numbers",
+                "times of ten in their 95 % band, and the band of the ANEES: simulated numbers",
                 ("group", "seeds", "ANEES", "known association", "NIS", "NIS mean"),
                 cells,
             )
