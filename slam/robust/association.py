@@ -291,7 +291,7 @@ def find_known(
     first = 2 + len(state_columns) + np.cumsum(widths) - widths
     by_mount = np.zeros((0, 0, 0))
     if layout.has_mounts:
-        by_mount = -np.einsum("rni,rij->rnj", seen.directions, seen.turned)
+        by_mount = np.ascontiguousarray(-np.einsum("rni,rij->rnj", seen.directions, seen.turned))
     odds = noise.detection_probability / (1.0 - noise.detection_probability)
     prior, assigned, of_side, unheard, H = kernels.assign(
         seen.ranges_m,
