@@ -36,8 +36,8 @@ from scipy.signal import welch
 from emulator.chip import Pace
 from emulator.chip.downconversion import CHANNELS, TAP_COUNT
 from emulator.device import radar_device
-from emulator.echo.echo import SPEED_OF_LIGHT_MPS, echo_source
-from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
+from emulator.echo.echo import echo_source
+from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S, SPEED_OF_LIGHT_MPS
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
