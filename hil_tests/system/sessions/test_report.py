@@ -166,7 +166,7 @@ def test_the_smoothed_path_has_its_number_and_is_on_the_map(tmp_path: Path) -> N
     assert shown == [f"{1e3 * ate_m:.1f}"]
     pictures = [base64.b64decode(data).decode() for data in re.findall(r'base64,([^"]*)"', page)]
     coloured = [SMOOTHED in picture for picture in pictures]
-    assert coloured == [True] * 4 + [False] * 4  # map and errors, each narrow and wide
+    assert coloured == [True] * 6 + [False] * 2  # map, errors, consistency; each narrow and wide
 
 
 def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:

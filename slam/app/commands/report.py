@@ -29,6 +29,7 @@ from slam.app.run.evaluation import (
     nis_dof,
     pose_nees,
     position_errors_m,
+    smoothed_errors,
     summarise,
     world_from_odom,
 )
@@ -69,6 +70,21 @@ class _Series(NamedTuple):
     nis_dof: NDArray[np.float64]
     nees_per_dof: NDArray[np.float64]
     n_landmarks: NDArray[np.float64]
+
+
+class _Smoothed(NamedTuple):
+    """Errors of the smoothed path, not aligned, and NEES of its poses, shape (n_states,) each."""
+
+    error_m: NDArray[np.float64]
+    nees_per_dof: NDArray[np.float64]
+
+
+def _smoothed(record: RunRecord) -> _Smoothed | None:
+    smoothed = record.whole_smoothed
+    if smoothed is None or not record.states.has_truth:
+        return None
+    errors_m, nees = smoothed_errors(smoothed, record.states.truth, record.world_from_map)
+    return _Smoothed(errors_m, nees / POSE_DOF)
 
 
 class _ReportData(SessionObserver):
@@ -253,9 +269,7 @@ _BAR = 0.7
 _TIME = "time since the first scan [s]"
 
 
-def _draw_errors(
-    figure: Figure, series: _Series, smoothed_error_m: NDArray[np.float64] | None
-) -> None:
+def _draw_errors(figure: Figure, series: _Series, smoothed: _Smoothed | None) -> None:
     """Draw the position errors in mm, where the truth is known, and the number of landmarks."""
     has_truth = bool(np.isfinite(series.slam_error_m).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
@@ -263,8 +277,8 @@ def _draw_errors(
         axes = panels[0]
         axes.plot(series.t_s, 1e3 * series.odometry_error_m, color=ODOMETRY, label="wheel odometry")
         axes.plot(series.t_s, 1e3 * series.slam_error_m, color=ESTIMATE, label="radar SLAM")
-        if smoothed_error_m is not None:
-            smoothed_mm = 1e3 * smoothed_error_m
+        if smoothed is not None:
+            smoothed_mm = 1e3 * smoothed.error_m
             axes.plot(series.t_s, smoothed_mm, color=SMOOTHED, label="smoothed at the end")
         label(axes, "Position error, from the start pose, not aligned", "", "error [mm]")
         axes.set_ylim(bottom=0.0)
@@ -275,7 +289,7 @@ def _draw_errors(
     panels[-1].yaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _draw_consistency(figure: Figure, series: _Series) -> None:
+def _draw_consistency(figure: Figure, series: _Series, smoothed: _Smoothed | None) -> None:
     """Draw NIS and NEES over their degrees of freedom, with the 95 % band of each state."""
     has_truth = bool(np.isfinite(series.nees_per_dof).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
@@ -291,7 +305,12 @@ def _draw_consistency(figure: Figure, series: _Series) -> None:
     if has_truth:
         bound = np.array(band_95(POSE_DOF)) / POSE_DOF
         _draw_band(panels[1], series.t_s, np.tile(bound, (len(series.t_s), 1)))
-        panels[1].plot(series.t_s, series.nees_per_dof, color=ESTIMATE, linewidth=1.0)
+        lines = [(series.nees_per_dof, ESTIMATE, "radar SLAM")]
+        if smoothed is not None:
+            lines.append((smoothed.nees_per_dof, SMOOTHED, "smoothed at the end"))
+        for values, colour, name in lines:
+            panels[1].plot(series.t_s, values, color=colour, linewidth=1.0, label=name)
+        panels[1].legend(frameon=False, loc="upper left", ncols=2)
         label(panels[1], "NEES of the pose in the start frame / 3, 95 % band", "", "NEES / 3 [1]")
         _scale(panels[1], series.nees_per_dof)
     panels[-1].set_xlabel(_TIME)
@@ -373,7 +392,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
             "has no NIS of true associations, no band of the NIS and no walls."
         )
     _write_numbers(page, info, data, record, summary)
-    series = data.series()
+    series, smoothed = data.series(), _smoothed(record)
     page.heading("Map and trajectory")
     page.picture(
         "map with paths and landmarks",
@@ -389,7 +408,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         "position errors and number of landmarks over time",
         _draw_errors,
         series,
-        _smoothed_error_m(record),
+        smoothed,
         height_in=4.4,
         narrow_height_in=4.6,
     )
@@ -402,6 +421,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         "NIS and NEES over time with their bands",
         _draw_consistency,
         series,
+        smoothed,
         height_in=4.4,
         narrow_height_in=4.4,
     )
@@ -409,15 +429,6 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     _write_links(page, info, data)
     _write_parameters(page, info)
     return page.text()
-
-
-def _smoothed_error_m(record: RunRecord) -> NDArray[np.float64] | None:
-    """Return the distance of the smoothed path to the truth, from the start pose, not aligned."""
-    smoothed = record.whole_smoothed
-    if smoothed is None:
-        return None
-    path = transform(record.world_from_map, smoothed.poses[:, :2])
-    return np.asarray(np.linalg.norm(path - record.states.truth[:, :2], axis=1))
 
 
 def _write_numbers(

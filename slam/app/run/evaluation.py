@@ -25,6 +25,7 @@ from slam.evaluation import (
     observable_landmarks,
 )
 from slam.geometry import Rig, align_se2, between, compose, transform
+from slam.results import SmoothedRun
 
 
 def ratio(error_m: float, odometry_error_m: float) -> float:
@@ -149,6 +150,22 @@ def pose_nees(snapshot: Snapshot) -> float:
         return nees_pose(snapshot.estimate, snapshot.pose_covariance, truth)
     except (ValueError, np.linalg.LinAlgError):  # singular at the very start: no statement
         return math.nan
+
+
+def smoothed_errors(
+    smoothed: SmoothedRun, truth: NDArray[np.float64], world_from_map: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances to the truth, not aligned [m], and NEES of the poses, shape (n,) each.
+
+    `truth` has shape (n, 3), world frame; NaN where it is unknown.
+    """
+    path = transform(world_from_map, smoothed.poses[:, :2])
+    errors_m = np.asarray(np.linalg.norm(path - truth[:, :2], axis=1))
+    nees = np.full(len(truth), np.nan)
+    for row in np.flatnonzero(np.isfinite(truth).all(axis=1)).tolist():
+        true_pose = between(world_from_map, truth[row])
+        nees[row] = nees_pose(smoothed.poses[row], smoothed.pose_covariances[row], true_pose)
+    return errors_m, nees
 
 
 NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)

@@ -26,6 +26,7 @@ from slam.app.run.evaluation import (
     nis_dof,
     pose_nees,
     position_errors_m,
+    smoothed_errors,
     world_from_odom,
 )
 from slam.app.run.pictures import LINK_COLOURS, half_axes_95_m
@@ -46,6 +47,7 @@ from slam.app.view.rerun_recording import (
     LANDMARK_RGB,
     ODOMETRY_RGB,
     RADAR_RGB,
+    SMOOTHED_RGB,
     Recording,
     Rgb,
     Stamps,
@@ -54,6 +56,7 @@ from slam.app.view.rerun_recording import (
     rrb,
     screen,
 )
+from slam.packed import PackedRows
 from slam.results import SmoothedRun
 
 _ABOUT = """\
@@ -188,7 +191,7 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
 def _numbers(info: SessionInfo) -> rrb.Tabs:
     """Lay out the curves; without truth, errors and NEES stay empty."""
     contents = {
-        "Error [m]": ("/error", ["$origin/slam", "$origin/odometry"]),
+        "Error [m]": ("/error", ["$origin/slam", "$origin/odometry", "$origin/smoothed"]),
         "SLAM [m]": ("/error", ["$origin/slam", "$origin/believed/**"]),
         "NEES": ("/consistency/nees", ["$origin/**"]),
         "NIS": ("/consistency/nis", ["$origin/**"]),
@@ -328,9 +331,11 @@ class LinkLayer:
 # Entity, name in the legend, colour, line width in points.
 _SERIES: tuple[tuple[str, str, Rgb, float], ...] = (
     ("error/slam", "SLAM [m]", ESTIMATE_RGB, 2.0),
+    ("error/smoothed", "smoothed [m]", SMOOTHED_RGB, 1.5),
     ("error/odometry", "wheels [m]", ODOMETRY_RGB, 1.5),
     ("consistency/nis/value", "NIS / dof", ESTIMATE_RGB, 1.5),
     ("consistency/nees/value", "NEES / 3", ESTIMATE_RGB, 1.5),
+    ("consistency/nees/smoothed", "NEES / 3, smoothed", SMOOTHED_RGB, 1.5),
     ("landmarks/count", "landmarks", LANDMARK_RGB, 2.0),
 )
 
@@ -402,6 +407,25 @@ def send_numbers(
             recording.rows(f"{entity}/edge", stamps.at(finite_rows.tolist()), edge)
 
 
+def send_smoothed_numbers(
+    recording: Recording,
+    smoothed: SmoothedRun,
+    truth: NDArray[np.float64],
+    world_from_map: NDArray[np.float64],
+    stamps: Stamps,
+) -> None:
+    """Send the errors and NEES of smoothed poses, where the truth, (n, 3), is known."""
+    errors_m, nees = smoothed_errors(smoothed, truth, world_from_map)
+    (known,) = np.nonzero(np.isfinite(nees))
+    if len(known):
+        of_known = stamps.at(known.tolist())
+        for entity, values in (
+            ("error/smoothed", errors_m),
+            ("consistency/nees/smoothed", nees / POSE_DOF),
+        ):
+            recording.rows(entity, of_known, rr.Scalars.columns(scalars=values[known]))
+
+
 def _band(dof: int | None) -> tuple[float, float]:
     """Return the 95 % band of a chi-square divided by its degrees of freedom."""
     if not dof:
@@ -449,6 +473,11 @@ class RerunView(SessionObserver):
         self._began = False
         self._waiting: list[Snapshot] = []
         self._stamps = Stamps()
+        # of all states: session time, counter and host time (-1: unknown); truth
+        self._times = PackedRows(np.dtype(np.int64), 3)
+        self._truth = PackedRows(np.dtype(np.float64), 3)
+        self._world_from_map = np.zeros(3)
+        self._smoothed: SmoothedRun | None = None
         self._odom: NDArray[np.float64] | None = None
         self._host_ns: int | None = None
         seed, of_seed = ("", "") if info.seed is None else (f"-{info.seed}", f", seed {info.seed}")
@@ -486,6 +515,10 @@ class RerunView(SessionObserver):
             self._odom = world_from_odom(snapshot)
         self._map.on_snapshot(snapshot, self._host_ns, self._odom)
         self._waiting.append(snapshot)
+        host_ns = -1 if self._host_ns is None else self._host_ns
+        self._times.append((snapshot.t_ns, snapshot.counter, host_ns))
+        self._truth.append(snapshot.truth)
+        self._world_from_map = snapshot.world_from_map
         self._stamps.add(snapshot.t_ns, snapshot.counter, self._host_ns)
         if len(self._waiting) == _BLOCK_STATES:
             self._send_states()
@@ -493,6 +526,7 @@ class RerunView(SessionObserver):
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         self._map.on_smoothed(smoothed)
+        self._smoothed = smoothed
 
     def on_log(self, line: LogLine) -> None:
         """Draw a line of the log; after `close` it is ignored."""
@@ -505,6 +539,7 @@ class RerunView(SessionObserver):
         self._frames.send()
         self._send_states()
         self._map.send_last()
+        self._send_smoothed_numbers()
         self._link.finish()
         self._recording.finish()
 
@@ -523,6 +558,18 @@ class RerunView(SessionObserver):
         self._link.send()
         self._send_states()
         self._link.send()
+
+    def _send_smoothed_numbers(self) -> None:
+        """Send the curves of the whole run: those of a part of it would be there twice."""
+        smoothed, times = self._smoothed, self._times.rows
+        if smoothed is None or not np.array_equal(smoothed.t_ns, times[:, 0]):
+            return
+        stamps = Stamps()
+        for t_ns, counter, host_ns in times.tolist():
+            stamps.add(t_ns, counter, None if host_ns < 0 else host_ns)
+        send_smoothed_numbers(
+            self._recording, smoothed, self._truth.rows, self._world_from_map, stamps
+        )
 
     def _send_states(self) -> None:
         rows, self._waiting = self._waiting, []

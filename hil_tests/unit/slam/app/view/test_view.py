@@ -293,6 +293,13 @@ def test_the_smoothed_path_is_drawn_at_the_last_state(tmp_path: Path) -> None:
     dots = rows(tmp_path / "s.rrd", "/map/smoothed/landmarks", "Points2D:positions")
     (places,) = (v for _, v in dots if v)
     np.testing.assert_allclose(places, made.landmarks_m * [1, -1], rtol=1e-6)
+    errors = dict(rows(tmp_path / "s.rrd", "/error/smoothed", "Scalars:scalars"))
+    nees = dict(rows(tmp_path / "s.rrd", "/consistency/nees/smoothed", "Scalars:scalars"))
+    assert list(errors) == list(nees) == list(range(12))
+    away = made.poses[7] - snapshot(7).truth  # the map is the world there
+    assert errors[7] == pytest.approx([float(np.hypot(*away[:2]))])
+    wanted = away @ np.linalg.solve(made.pose_covariances[7], away) / 3
+    assert nees[7] == pytest.approx([wanted])
 
 
 def test_wall_clock_is_nowhere_in_the_data(finished: Path) -> None:
