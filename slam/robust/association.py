@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,14 @@ class RangeScan:
     def with_added_sigma(self, sigma_m: float) -> RangeScan:
         if self.sigmas_m is None or not sigma_m:
             return self
-        return replace(self, sigmas_m=tuple(math.hypot(s, sigma_m) for s in self.sigmas_m))
+        return RangeScan(
+            radar=self.radar,
+            ranges_m=self.ranges_m,
+            labels=self.labels,
+            sigmas_m=tuple([math.hypot(s, sigma_m) for s in self.sigmas_m]),
+            moved=self.moved,
+            blurred_m=self.blurred_m,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -258,7 +265,6 @@ class Known:
     unheard: NDArray[np.bool_]  # shape (c, r): surely in view, and no echo near its prediction
     at: Indices  # columns of the error that H has entries for
     H: Array  # shape (k, columns), of the assignment
-    block: Array  # the covariance of these columns
 
 
 def find_known(
@@ -335,7 +341,6 @@ def find_known(
         unheard=unheard,
         at=at,
         H=H,
-        block=block,
     )
 
 

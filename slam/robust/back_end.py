@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from slam.geometry import Rig
 from slam.results import PredictedRange, SmoothedRun, UpdateReport
+from slam.robust import kernels
 from slam.robust.association import (
     Antennas,
     RangeScan,
@@ -61,24 +61,6 @@ _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 _FREE_M, _FREE_RAD = 1.0, 1.0
 
 
-def huber_weighted_sigmas_m(
-    innovations_m: Array, prior_variances: Array, sigmas_m: Array, bound: float
-) -> Array:
-    """Return standard deviations of ranges, those of large innovations enlarged.
-
-    With S = prior variance + sigma^2, an innovation of ``k`` standard deviations, k > bound, is
-    given the variance S k / bound, so that its information falls by Huber's weight, bound / k, and
-    what it moves grows no further. All shapes are (m,), with ``prior_variances`` [m^2] those of the
-    predictions. Source: Huber, Annals of Mathematical Statistics 35(1), 1964.
-
-    >>> huber_weighted_sigmas_m(np.array([1.0, 4.0]), np.zeros(2), np.ones(2), 2.0) ** 2
-    array([1., 2.])
-    """
-    S = prior_variances + np.square(sigmas_m)
-    excess = np.abs(innovations_m) / (bound * np.sqrt(S))
-    return np.where(excess > 1.0, np.sqrt(np.maximum(S * excess - prior_variances, 0.0)), sigmas_m)
-
-
 @dataclass(slots=True)
 class Matches:
     """Ranges of known landmarks among the scans of one time."""
@@ -86,10 +68,9 @@ class Matches:
     # shape (k, 2): radar and index of each range; (k,): the row of its landmark
     ranges: Indices
     landmarks: Indices
-    # Columns of the error, the derivatives of the ranges by them (k, columns), and their covariance
+    # Columns of the error, and the derivatives of the ranges by them (k, columns)
     at: Indices
     H: Array
-    block: Array
     # The ranges of every landmark that took part, measured or not
     predicted: list[PredictedRange] = field(default_factory=list)
     # Landmarks surely in view, one entry per radar, that have no range near their prediction
@@ -311,7 +292,8 @@ class RobustBackEnd:
         known = find_known(state, seen, widened, self._side_of, self.parameters, sure_m=sure_m)
         if known is None:
             return None, seen
-        ids = [state.feature_ids[row] for row in known.rows.tolist()]
+        features = state.feature_ids
+        ids = [features[row] for row in known.rows.tolist()]
         hits = set(known.assigned[:, 2].tolist())
         for place in hits:
             existence.hit(ids[place])
@@ -324,7 +306,6 @@ class RobustBackEnd:
             landmarks=known.rows[known.assigned[:, 2]],
             at=known.at,
             H=known.H,
-            block=known.block,
             predicted=predicted_ranges(state, seen, known, self._side_of, antennas),
             # A wall may end before it comes into view.
             missed=[
@@ -336,10 +317,7 @@ class RobustBackEnd:
         if any(scan.labels is not None for scan in scans):
             ranges, landmarks = labelled(scans, state, self._landmark_of_label)
             rows = rows_of(state, seen, ranges[:, 0], landmarks)
-            block = state.P.block(rows.at)
-            matches = replace(
-                matches, ranges=ranges, landmarks=landmarks, at=rows.at, H=rows.H, block=block
-            )
+            matches = replace(matches, ranges=ranges, landmarks=landmarks, at=rows.at, H=rows.H)
         return matches, seen
 
     def _correct(
@@ -367,12 +345,10 @@ class RobustBackEnd:
         z = np.array([of_radar[radar].ranges_m[index] for radar, index in pairs])
         innovations_m = z - seen.ranges_m[matches.ranges[:, 0], landmarks]
         sigmas = np.array([of_radar[radar].sigma(index, noise.sigma_m) for radar, index in pairs])
-        added_sigmas_m = state.feature_added_sigmas_m[landmarks]
-        by_state = H @ matches.block
-        S = by_state @ H.T + np.diag(np.square(sigmas) + np.square(added_sigmas_m))
-        L = np.linalg.cholesky(S)
-        white = solve_triangular(L, innovations_m, lower=True)
-        nis = float(white @ white)
+        variances = np.square(sigmas) + np.square(state.feature_added_sigmas_m[landmarks])
+        gain, weighted, white, scales = kernels.weigh(
+            state.P.columns(matches.at), matches.at, H, innovations_m, variances, noise.huber_sigmas
+        )
         span_m = noise.max_range_m - noise.min_range_m
         likelihoods = [
             (
@@ -382,26 +358,25 @@ class RobustBackEnd:
                 - math.log(scale_m),
             )
             for (radar, _, id_), square, scale_m in zip(
-                continued, np.square(white).tolist(), L.diagonal().tolist(), strict=True
+                continued, np.square(white).tolist(), scales.tolist(), strict=True
             )
             if (n_ranges := len(of_radar[radar].ranges_m))
         ]
-        prior = np.vecdot(by_state, H) + np.square(added_sigmas_m)
-        for (radar, _, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
-            x, y = antennas.told_m[radar].tolist()
+        told_m, turns_rad = antennas.told_m.tolist(), antennas.turns_rad.tolist()
+        for (radar, _, landmark_id), range_m, sigma_m in zip(
+            continued, z.tolist(), sigmas.tolist(), strict=True
+        ):
             self._log.add_range(
                 self._log.n_poses - 1,
                 radar,
                 landmark_id,
-                antenna=(x, y),
-                turn_rad=float(antennas.turns_rad[radar]),
-                range_m=float(range_m),
-                sigma_m=float(sigma_m),
+                antenna=told_m[radar],
+                turn_rad=turns_rad[radar],
+                range_m=range_m,
+                sigma_m=sigma_m,
             )
-        sigmas = huber_weighted_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
-        variances = np.square(sigmas) + np.square(added_sigmas_m)
-        state.update(matches.at, H, innovations_m, variances)
-        return continued, nis, likelihoods
+        state.apply(gain, weighted)
+        return continued, float(white @ white), likelihoods
 
     def _initialise_landmarks(self) -> None:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""

@@ -419,3 +419,68 @@ def assign(
         for a in range(8):
             H[k, columns[chosen[k, 0], chosen[k, 2], a]] += entries[chosen[k, 0], chosen[k, 2], a]
     return prior, chosen[:n_chosen], status, unheard, H
+
+
+@kernel(
+    "Tuple((f8[:,::1], f8[::1], f8[::1], f8[::1]))"
+    "(f8[:,::1], i8[::1], f8[:,::1], f8[::1], f8[::1], f8)"
+)
+def weigh(
+    covariance: Array, at: Indices, H: Array, innovations: Array, variances: Array, huber: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return the gain of k measurements, those far off weighted by Huber.
+
+    ``covariance`` (m, c) are the columns ``at`` (c,) of P, for which H (k, c) has entries. With
+    S = H P H^T + R = L L^T: first for the ``variances`` R as they are, then with those enlarged
+    whose innovations exceed ``huber`` standard deviations, so that the information falls by Huber's
+    weight and what they move grows no further. Source: Huber, Annals of Mathematical Statistics
+    35(1), 1964.
+
+    Returns W = P H^T L^-T (m, k) and L^-1 innovations, both with the weights; and without, L^-1
+    innovations and the diagonal of L.
+    """
+    m, k = len(covariance), len(innovations)
+    gain, prior = np.zeros((m, k)), np.zeros((k, k))
+    white, weighted, scale = np.empty(k), np.empty(k), np.empty(k)
+    L = np.zeros((k, k))
+    for i in range(k):
+        for c in range(len(at)):
+            h = H[i, c]
+            if h != 0.0:
+                for row in range(m):
+                    gain[row, i] += h * covariance[row, c]
+    for i in range(k):
+        for c in range(len(at)):
+            h = H[i, c]
+            if h != 0.0:
+                for j in range(k):
+                    prior[i, j] += h * gain[at[c], j]
+    for again in range(2):
+        for i in range(k):
+            nu = innovations[i]
+            variance = variances[i]
+            whole = prior[i, i] + variance
+            excess = abs(nu) / (huber * math.sqrt(whole))
+            if again == 1 and excess > 1.0:
+                variance = whole * excess - prior[i, i]
+            for j in range(i + 1):
+                value = 0.5 * (prior[i, j] + prior[j, i])
+                if i == j:
+                    value += variance
+                for b in range(j):
+                    value -= L[i, b] * L[j, b]
+                L[i, j] = math.sqrt(value) if i == j else value / L[j, j]
+            for b in range(i):
+                nu -= L[i, b] * weighted[b]
+            weighted[i] = nu / L[i, i]
+        if again == 0:
+            for i in range(k):
+                white[i] = weighted[i]
+                scale[i] = L[i, i]
+    for row in range(m):
+        for i in range(k):
+            value = gain[row, i]
+            for b in range(i):
+                value -= gain[row, b] * L[i, b]
+            gain[row, i] = value / L[i, i]
+    return gain, weighted, white, scale

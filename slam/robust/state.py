@@ -439,9 +439,13 @@ class State:
         L_inverse = np.linalg.inv(L)
         W = PHt @ L_inverse.T
         whitened = L_inverse @ residual
+        self.apply(W, whitened)
+        return float(whitened @ whitened)
+
+    def apply(self, W: Array, whitened: Array) -> None:
+        """Move the mean by ``W whitened`` and take ``W W^T`` off the covariance."""
         self.P.subtract_gram(W)
         self.correct(W @ whitened)
-        return float(whitened @ whitened)
 
     def augment(self, point_m: Array, cross: Array, corner: Array) -> int:
         """Append a landmark and return its id.
