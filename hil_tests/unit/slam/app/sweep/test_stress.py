@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from emulator.scene.scene import BurstSpec, PulseSpec, Scene, WanderSpec, load_scene
+from emulator.scene.tables import shipped_names
 from emulator.scene.wheels import scene_odometry
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.odometry.track import OdometryTrack
 from slam.app.records import Scan
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
-from slam.app.sweep import CLEAN, STRESSES, Stress
+from slam.app.sweep import CLEAN, FAMILIES, STRESSES, Stress
 from slam.app.sweep.run import OutlierDetector, stressed_scans, stressed_scene
 from slam.frames import Detection, RadarFrame
 
@@ -93,6 +94,16 @@ def test_a_stressed_scene_is_a_valid_scene_and_the_same_every_time(name: str) ->
     scene = stressed_scene(lab, STRESSES[name], 5)
     assert Scene.model_validate(scene.model_dump()) == scene
     assert stressed_scene(lab, STRESSES[name], 5) == scene
+
+
+@pytest.mark.parametrize("name", STRESSES)
+def test_every_row_suits_every_scene_that_is_driven(name: str) -> None:
+    rooms = [f"{family}:7" for family in FAMILIES]
+    for scene in (*shipped_names("scenes"), *rooms):
+        loaded = load_scene(scene)
+        if loaded.path.laps:
+            stressed = stressed_scene(loaded, STRESSES[name], 2)
+            assert Scene.model_validate(stressed.model_dump()) == stressed
 
 
 def test_rows_plant_what_they_say() -> None:
