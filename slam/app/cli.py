@@ -309,8 +309,14 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
         metavar="SEEDS",
         type=count,
         default=20,
-        help="number of runs of each scene, with seeds from 0; the first seed of a random room is "
-        "its number (default: %(default)s)",
+        help="number of runs of each scene, each with a seed of its own (default: %(default)s)",
+    )
+    sweep.add_argument(
+        "--first-seed",
+        type=seed,
+        default=0,
+        metavar="SEED",
+        help="the first of the seeds; a random room adds its number (default: %(default)s)",
     )
     sweep.add_argument(
         "--laps", type=count, help="drive the first laps of each scene only, so many"

@@ -257,13 +257,13 @@ class Case:
     def key(self) -> Key:
         return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
 
-    def with_seeds(self, count: int) -> list[Case]:
-        """Return so many runs: seeds from 0, those of a random room from its number.
+    def with_seeds(self, count: int, first: int = 0) -> list[Case]:
+        """Return so many runs: seeds from ``first``, those of a random room from its number more.
 
         Wheels and noise of two rooms of a family are never alike.
         """
-        first, step = (0, 1) if self.room is None else (self.room[1], MOST_ROOMS)
-        return [replace(self, seed=first + step * run) for run in range(count)]
+        number, step = (0, 1) if self.room is None else (self.room[1], MOST_ROOMS)
+        return [replace(self, seed=first + number + step * run) for run in range(count)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

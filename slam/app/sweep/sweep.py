@@ -177,6 +177,7 @@ def run_sweep(
     scenes: Sequence[str] | None = None,
     presets: Sequence[str] | None = None,
     n_seeds: int,
+    first_seed: int = 0,
     settings: Sequence[tuple[str, tuple[str, ...]]] = (),
     stresses: Sequence[str] = (),
     bound: bool = False,
@@ -200,7 +201,13 @@ def run_sweep(
     presets = presets or ["robust"]
     # a wrong name ends the command before any run
     cases = _cases(
-        rooms_named(scenes or ["lab"]), presets, n_seeds, settings, stresses, bound=bound, laps=laps
+        rooms_named(scenes or ["lab"]),
+        presets,
+        (n_seeds, first_seed),
+        settings,
+        stresses,
+        bound=bound,
+        laps=laps,
     )
     if bound:
         load_gtsam(PURPOSE)
@@ -209,7 +216,7 @@ def run_sweep(
     if out.exists() and not out.is_file():
         # it would be replaced: as root, even a device for everybody
         raise AppError(f"{out}: is no regular file, must be one")
-    command = _command(cases, presets, n_seeds, settings, bound=bound)
+    command = _command(cases, presets, (n_seeds, first_seed), settings, bound=bound)
     path = out.with_name(f"{out.name}.part")
     if path.exists() and not path.is_file():  # opening a pipe waits for who writes into it
         raise AppError(f"{path}: is no regular file; choose another --json, or move it away")
@@ -246,14 +253,17 @@ def run_sweep(
 def _cases(
     scenes: Sequence[str],
     presets: Sequence[str],
-    n_seeds: int,
+    seeds: tuple[int, int],
     settings: Sequence[tuple[str, tuple[str, ...]]],
     stresses: Sequence[str],
     *,
     bound: bool,
     laps: int | None,
 ) -> list[Case]:
-    """Return the runs in their order: seeds innermost, so that groups are done one by one."""
+    """Return the runs in their order: seeds innermost, so that groups are done one by one.
+
+    ``seeds`` are how many, and the first.
+    """
     values = [[(key, value) for value in of_key] for key, of_key in settings]
     rows = dict.fromkeys((CLEAN, *stresses))
     cells = [
@@ -267,7 +277,7 @@ def _cases(
             if names
             else "--preset, --set: one of them is given twice; give each once"
         )
-    return [case for cell in cells for case in cell.with_seeds(n_seeds)]
+    return [case for cell in cells for case in cell.with_seeds(*seeds)]
 
 
 def rooms_named(scenes: Sequence[str]) -> list[str]:
@@ -292,7 +302,7 @@ def rooms_named(scenes: Sequence[str]) -> list[str]:
 def _command(
     cases: Sequence[Case],
     presets: Sequence[str],
-    n_seeds: int,
+    seeds: tuple[int, int],
     settings: Sequence[tuple[str, tuple[str, ...]]],
     *,
     bound: bool,
@@ -301,12 +311,12 @@ def _command(
     command = {
         "scenes": " ".join(dict.fromkeys(case.scene.name for case in cases)),
         "presets": " ".join(presets),
-        "seeds": str(n_seeds),
+        "seeds": f"{seeds[0]} from {seeds[1]}",
         "settings": " ".join(f"{key}={','.join(values)}" for key, values in settings),
         "stresses": " ".join(dict.fromkeys(case.stress for case in cases)),
         "bound": str(bound),
     }
-    for case in cases[::n_seeds]:
+    for case in cases[:: seeds[0]]:
         command[f"scene file {case.scene.name}"] = _digest(case.scene.model_dump_json())
         command[f"preset file {case.preset}"] = ""
     for preset in presets:

@@ -100,7 +100,7 @@ def test_rooms_of_a_family_are_one_group() -> None:
     (group,) = summarise_groups([*runs])
     assert (group["scene"], group["runs"]) == ("rig", 4)
     lab = make_case("lab", "paper", 0, laps=2)
-    assert [case.seed for case in lab.with_seeds(3)] == [0, 1, 2]
+    assert [case.seed for case in lab.with_seeds(3, 1000)] == [1000, 1001, 1002]
     assert lab.scene.path.laps == ("forward", "forward")
     with pytest.raises(UsageError, match="rig:4-3: the first room must not lie behind the last"):
         rooms_named(["rig:4-3"])
