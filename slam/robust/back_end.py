@@ -18,6 +18,7 @@ from slam.robust.association import (
     RangeScan,
     View,
     antennas_of,
+    density_per_m2,
     find_known,
     labelled,
     predicted_ranges,
@@ -40,7 +41,7 @@ from slam.robust.initialisation import (
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.map import Existence, apply_merge, find_merge
+from slam.robust.map import Existence, apply_merge, find_merge, judge
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import is_due, relinearise, solve_whole_run
@@ -464,10 +465,25 @@ class RobustBackEnd:
         if self._landmark_of_label or self._n_updates % rule.merge_every:
             return
         merge = find_merge(self.state, self._existence, rule)
-        if merge is None:
-            return
-        ids = [tuple(self.state.landmark_ids[row] for row in pair) for pair in merge.pairs]
-        apply_merge(self.state, merge.pairs, rule.merge_sigma_m)
+        if merge is not None:
+            self._merge_rows(merge.pairs)
+
+    def merge_if_possible(self, pairs: Sequence[tuple[int, int]]) -> bool:
+        """Merge landmarks, rows of the older first, if the map lets all be one; return whether.
+
+        Then all poses are solved for again.
+        """
+        state, rule = self.state, self.parameters.map
+        density = density_per_m2(state.landmarks_m, rule.merge_reach_m)
+        if not judge(state, tuple(pairs), rule.merge_sigma_m, density).is_possible:
+            return False
+        self._merge_rows(tuple(pairs))
+        self.relinearise()
+        return True
+
+    def _merge_rows(self, pairs: tuple[tuple[int, int], ...]) -> None:
+        ids = [tuple(self.state.landmark_ids[row] for row in pair) for pair in pairs]
+        apply_merge(self.state, pairs, self.parameters.map.merge_sigma_m)
         for kept, gone in ids:
             self._existence.merge(kept, gone)
             self._log.rename(gone, kept)

@@ -12,7 +12,11 @@ Suspicion
     grow beyond what they were all along.
 Slip
     Copies of the main back end go back to a few steps before that, and take the motions and scans
-    since once more, a slip added to the noise of some steps.
+    since once more, a slip added to the noise of one step, another one for each copy.
+Recognition
+    Where nothing is known that could be missed, landmarks of the last steps may yet lie on older
+    ones as a constellation. If the map lets them be the same, they are merged, and a loop is
+    closed; if not, the robot may have been carried before it saw the first of them.
 Carry
     A back end with an empty map takes the motions and scans since. Where its landmarks lie on the
     map of the main back end as it was then is searched for (`slam.robust.constellation`). A copy of
@@ -48,9 +52,11 @@ from slam.robust.state import Array
 
 # Steps between two snapshots, and how many are kept: a carry that is noticed later than that is
 # dated to the oldest.
-_SNAPSHOT_EVERY, _SNAPSHOTS = 25, 7
+_SNAPSHOT_EVERY, _SNAPSHOTS = 50, 9
 # Steps between two looks for suspicion, and how many an alternative that lags behind takes a step
 _LOOK_EVERY, _CATCH_UP = 5, 10
+# How many of the newest landmarks are looked for among all others
+_NEWEST = 8
 # A missing range counts as one three standard deviations off. How fast what is usual is forgotten
 # per step, how many ranges as predicted it begins with, and by how many standard deviations of
 # chi-square the innovations must be too large for a slip to be looked for
@@ -221,6 +227,7 @@ class Branches:
         self._placed: Alternative | None = None
         self._carry: Carry | None = None
         self._no_slip_until = self._tried_until = self._judged = 0
+        self._recognised_ids: set[int] = set()  # new landmarks that were searched for
         self._strain = Strain(self._rule.steps)
         self.is_lost = False
 
@@ -342,7 +349,9 @@ class Branches:
             self._no_slip_until = self._now - _LOOK_EVERY
         if self._carry is None:
             since, against = self._doubt()
-            if against > rule.suspicious:
+            if against <= rule.suspicious:
+                since = self._recognised()
+            if since < self._now:
                 self._begin_carry(since)
         elif self._placed is None and self._now >= self._carry.search_from:
             self._search(self._carry)
@@ -372,6 +381,32 @@ class Branches:
         if not several[best] or totals[best] <= 0.0:
             return self._now, 0.0
         return first + best, float(totals[best])
+
+    def _recognised(self) -> int:
+        """Return the step before which the robot was elsewhere if new landmarks lie on older ones.
+
+        Where the map itself lets them be the same landmarks, a loop is closed: they are merged.
+        """
+        main, rule, first = self.main, self._rule, max(min(self._snapshots), self._judged)
+        rows, ids = main.reported_rows(), main.state.landmark_ids
+        oldest_id = self._steps[first].next_id if first < self._now else main.state.next_id
+        newest = sorted(rows, key=lambda row: -ids[row])[: min(_NEWEST, len(rows) // 2)]
+        new = [row for row in newest if ids[row] >= oldest_id]
+        new_ids = {ids[row] for row in new}
+        if new_ids <= self._recognised_ids:
+            return self._now
+        self._recognised_ids = new_ids
+        older = [row for row in rows if ids[row] not in new_ids]
+        here = constellation_of(main.state, new, rule.model_sigma_m)
+        there = constellation_of(main.state, older, rule.model_sigma_m)
+        placement = find_placement(here, there, rule)
+        if placement is None or placement.evidence < rule.suspicious:
+            return self._now
+        if main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs]):
+            return self._now
+        born = min(here.ids[own] for _, own in placement.pairs)
+        steps = [n for n in range(first, self._now) if self._steps[n].next_id <= born]
+        return max(steps[-1] - rule.steps, first)
 
     def _begin_slip(self, since: int) -> None:
         """Go back to about a step, try a slip at each of some steps around it; keep the best."""

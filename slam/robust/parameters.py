@@ -170,7 +170,7 @@ class BranchRule:
     # Most evidence [nats] that one landmark gives against a place (it may have been taken away) and
     # for it (other ranges may lie near its prediction for long)
     most_against: float = 12.0
-    most_for: float = 8.0
+    most_for: float = 9.0
     # Evidence [nats] against the pose from which on alternatives are looked for, and by which an
     # alternative must be likelier to be adopted: a slip is more frequent than a carry
     suspicious: float = 12.0

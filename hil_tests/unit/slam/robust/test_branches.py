@@ -253,3 +253,25 @@ def test_evidence_is_the_likelihood_of_the_ranges() -> None:
             assert hits[0][1] == pytest.approx(expected, abs=1e-6)
             checked += 1
     assert checked > 5
+
+
+def test_a_robot_carried_to_where_nothing_is_missed_recognises_the_place() -> None:
+    """Set down at its start again, while it believes to drive on where it has never been."""
+    rng = np.random.default_rng(8)
+    x = np.arange(0.0, 1.6, 0.02)
+    there = np.column_stack([x, np.zeros((len(x), 2))])
+    onward = np.column_stack([1.6 + x[:60], np.zeros((60, 2))])
+    poses = np.vstack([there, onward, there])
+    cut = len(there) + len(onward)
+    increments = reported(poses, LAB, rng, 0.0, unaware=cut)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    carried = [
+        k
+        for k, report in enumerate(
+            led(branches, increments, scans_of(poses, PLACES, rng, SIGMA_M)), start=1
+        )
+        if report.carried
+    ]
+    assert len(carried) == 1
+    assert carried[0] > cut
+    assert error_m(branches.main.pose, poses[-1]) < 0.03
