@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.special import wofz
 
 from emulator.chip.chip import CaptureSettings
+from emulator.echo.receiver import highest_rate_hz
 from emulator.echo.reflections import (
     CARRIER_CYCLES_PER_SAMPLE,
     HALF_WINDOW,
@@ -46,12 +47,11 @@ from xethru_protocol.wire.x4 import (
     FRAME_SAMPLES,
     MODULE_SPEED_MPS,
     SAMPLING_RATE_HZ,
-    fps_max,
 )
 
 _SIGMA_SAMPLES = SIGMA_S * SAMPLING_RATE_HZ
 _SWEEP_SHARE = 0.95
-"""Of the frame period at the highest rate that `fps_max` gives."""
+"""Of the frame period at the highest rate that `highest_rate_hz` gives."""
 _SHORT_DRIFT = 1.0
 # Gauss and Legendre's: for a drift of a sample they miss 1e-6 of the mean of a carrier
 _NODES, _WEIGHTS = (each / 2 for each in np.polynomial.legendre.leggauss(5))
@@ -87,13 +87,7 @@ class OtherModules:
         gain
             Of its receiver.
         """
-        sweep_s = _SWEEP_SHARE / fps_max(
-            iterations=capture.iterations,
-            pulses_per_step=capture.pulses_per_step,
-            dac_min=capture.dac_min,
-            dac_max=capture.dac_max,
-            dac_step=capture.dac_step,
-        )
+        sweep_s = _SWEEP_SHARE / highest_rate_hz(capture)
         rate_hz = SAMPLING_RATE_HZ * self._radar.clock.rate
         first = capture.first_sample_m * (2 * SAMPLING_RATE_HZ / MODULE_SPEED_MPS)
         for module in self._modules:

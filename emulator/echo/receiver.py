@@ -75,8 +75,8 @@ from xethru_protocol.wire.x4 import RF_BIN_M, SAMPLING_RATE_HZ
 
 SPACINGS_PER_E_FOLD = 1.185
 """Lag at which B7(lag) / B7(0) is 1/e, in knot spacings."""
-_KNOTS = 4
-_FOUR = np.arange(_KNOTS)
+_KNOTS = 5
+_FIVE = np.arange(_KNOTS)
 _KNOTS_AHEAD = 8
 _SCALE = (151 / 315) ** -0.5 / UNITS_PER_SIGMA
 # Knot indices must not be negative, while a clock that is early may ask for a time before 0.
@@ -93,6 +93,7 @@ _VALUES_AT_ONCE = 2048
 GRIDS = ((0.054, 0.16), (0.239, 0.24), (1.205, 0.60))
 """Spacing of the clutter's knots in correlation times, and share of the variance, fastest first."""
 _CLUTTER_INSTANTS_PER_KNOT = 4
+_MOST_FRAMES_WITHOUT_INSTANTS = 4.0  # between two instants; fewer cost less each by themselves
 _SCATTERER_SAMPLES = 8
 _SCATTERERS = 256
 _REACH = 4
@@ -147,27 +148,62 @@ class SlowNoise:
         none_yet = _Knots(numbers=np.empty(0, dtype=np.int64), values=np.empty((0, n_values)))
         self._held = [none_yet] * len(grids)
 
+    @property
+    def instants_apart_ns(self) -> int:
+        return self._instant_ns
+
     def instants_before(
         self, times_ns: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the instants before scene times and the fractions of the way to the next.
 
-        Shape (n,) each, like ``times_ns``. Ask `values_at` for them and their successors.
+        Shape (n,) each, like ``times_ns``.
         """
         instants, rest_ns = np.divmod(times_ns + self._instants_offset_ns, self._instant_ns)
         return instants, rest_ns / self._instant_ns
 
-    def values_at(self, instants: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the values at instants of shape (n,): shape (n, n_values), float64."""
-        since_ns = instants * self._instant_ns + self._offsets_of_grids_ns
-        first_knots, rest_ns = np.divmod(since_ns, self._spacings_ns)
-        weights = _cubic_weights(rest_ns / self._spacings_ns, self._scales)
-        weight = weights.transpose(1, 0, 2).reshape(len(instants), len(self._streams) * _KNOTS)
+    def at_instants(
+        self,
+        instants: NDArray[np.int64],
+        kept: Mapping[int, _T],
+        make: Callable[[NDArray[np.float64]], Iterable[_T]],
+    ) -> dict[int, _T]:
+        """Return what belongs to instants and their successors, in order: kept, or made now.
+
+        ``make`` gets the values at some of them, shape (m, n_values).
+        """
+        wanted = sorted({*instants.tolist(), *(instants + 1).tolist()})
+        missing = [instant for instant in wanted if instant not in kept]
+        found = dict(kept)
+        if missing:
+            times_ns = np.array(missing, dtype=np.int64) * self._instant_ns
+            times_ns -= self._instants_offset_ns
+            found.update(zip(missing, make(self.values_at(times_ns)), strict=True))
+        return {instant: found[instant] for instant in wanted}
+
+    def values_at(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the values at scene times of shape (n,): shape (n, n_values), float64."""
+        instants, fractions = self.instants_before(times_ns)
+        fraction = fractions[:, np.newaxis]
+        first_knots, since_ns = np.divmod(
+            instants * self._instant_ns + self._offsets_of_grids_ns, self._spacings_ns
+        )
+        # The next instant may lie behind the next knot: both instants together have five.
+        later_ns = since_ns + self._instant_ns
+        is_behind = later_ns >= self._spacings_ns
+        later_ns -= is_behind * self._spacings_ns
+        here = _cubic_weights(since_ns / self._spacings_ns, self._scales) * (1 - fraction)
+        there = _cubic_weights(later_ns / self._spacings_ns, self._scales) * fraction
+        weights = np.zeros((*first_knots.shape, _KNOTS))
+        weights[..., :-1] = here
+        weights[..., :-1] += there * ~is_behind[..., np.newaxis]
+        weights[..., 1:] += there * is_behind[..., np.newaxis]
+        weight = weights.transpose(1, 0, 2).reshape(len(times_ns), len(self._streams) * _KNOTS)
         knots = [self._with_knots(member, first) for member, first in enumerate(first_knots)]
-        values = np.empty((len(instants), self._n_values))
+        values = np.empty((len(times_ns), self._n_values))
         at_once = max(_VALUES_AT_ONCE // self._n_values, 1)
-        near = np.empty((min(at_once, len(instants)), weight.shape[1], self._n_values))
-        for first in range(0, len(instants), at_once):
+        near = np.empty((min(at_once, len(times_ns)), weight.shape[1], self._n_values))
+        for first in range(0, len(times_ns), at_once):
             part = slice(first, first + at_once)
             factors = weight[part]
             for member, (held, place) in enumerate(knots):
@@ -180,11 +216,11 @@ class SlowNoise:
     def _with_knots(
         self, member: int, first_knot: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return knots of a member, and where among them the fours from each first are, (n, 4)."""
+        """Return knots of a member, and where among them the five from each first are, (n, 5)."""
         held = self._held[member]
         place = held.numbers.searchsorted(first_knot)
         if not held.have(first_knot, place):
-            numbers = np.unique(first_knot[:, np.newaxis] + _FOUR)
+            numbers = np.unique(first_knot[:, np.newaxis] + _FIVE)
             before = held.numbers.searchsorted(numbers)
             known = np.append(held.numbers, -_FIRST_KNOT)[before] == numbers
             if known.any():  # frames follow each other: make some for those to come
@@ -201,7 +237,7 @@ class SlowNoise:
             )
             held = self._held[member] = _Knots(numbers=numbers, values=values)
             place = numbers.searchsorted(first_knot)
-        return held.values, place[:, np.newaxis] + _FOUR
+        return held.values, place[:, np.newaxis] + _FIVE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,11 +248,11 @@ class _Knots:
     values: NDArray[np.float64]
 
     def have(self, first: NDArray[np.int64], place: NDArray[np.int64]) -> bool:
-        """Return whether the four that begin with each ``first`` begin at ``place``."""
+        """Return whether the five that begin with each ``first`` begin at ``place``."""
         end = place + (_KNOTS - 1)
         if end.max(initial=0) >= len(self.numbers):
             return len(first) == 0
-        # numbers ascend without repeats: four in a row are there if both ends are
+        # numbers ascend without repeats: five in a row are there if both ends are
         ends_are_there = (self.numbers[place] == first) & (self.numbers[end] == first + _KNOTS - 1)
         return bool(ends_are_there.all())
 
@@ -224,7 +260,7 @@ class _Knots:
 def _cubic_weights(u: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the weights of four knots in a row at fractions u behind the second, (..., 4)."""
     v = 1 - u
-    weights = np.empty((*u.shape, _KNOTS))
+    weights = np.empty((*u.shape, 4))
     weights[..., 0] = scale * (v * v * v / 6)
     weights[..., 1] = scale * (2 / 3 - u * u * (2 - u) / 2)
     weights[..., 2] = scale * (2 / 3 - v * v * (2 - v) / 2)
@@ -232,23 +268,9 @@ def _cubic_weights(u: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArra
     return weights
 
 
-def _at_ends(
-    instants: NDArray[np.int64],
-    kept: Mapping[int, _T],
-    make: Callable[[NDArray[np.int64]], Iterable[_T]],
-) -> dict[int, _T]:
-    """Return what belongs to instants and their successors, in order: kept, or made now."""
-    wanted = sorted({*instants.tolist(), *(instants + 1).tolist()})
-    missing = [instant for instant in wanted if instant not in kept]
-    made = (
-        dict(zip(missing, make(np.array(missing, dtype=np.int64)), strict=True)) if missing else {}
-    )
-    return {instant: made[instant] if instant in made else kept[instant] for instant in wanted}
-
-
-def _last_two(made: Mapping[int, _T]) -> dict[int, _T]:
-    """Return the part of `_at_ends` that the frames to come need, too."""
-    return dict(list(made.items())[-2:])
+def _last_two(of_instants: Mapping[int, _T]) -> dict[int, _T]:
+    """Return what the frames that follow need, too."""
+    return dict(list(of_instants.items())[-2:])
 
 
 class CarrierJitter:
@@ -289,10 +311,8 @@ class CarrierJitter:
         phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad
         if self._spec.slow_rad > 0:
             instants, fractions = self._slow.instants_before(scene_times_ns)
-            slow_rad = _at_ends(
-                instants,
-                self._slow_rad,
-                lambda missing: self._slow.values_at(missing)[:, 0].tolist(),
+            slow_rad = self._slow.at_instants(
+                instants, self._slow_rad, lambda values: values[:, 0].tolist()
             )
             before = np.array([slow_rad[instant] for instant in instants.tolist()])
             after = np.array([slow_rad[instant + 1] for instant in instants.tolist()])
@@ -328,8 +348,8 @@ class ClutterField:
             serial=serial,
             purpose=Purpose.CLUTTER,
         )
-        self._row: _Row | None = None
         self._answers: dict[int, NDArray[np.float64]] = {}
+        self._answers_are_of: tuple[_Row, float] | None = None
 
     def add_to(
         self,
@@ -343,13 +363,19 @@ class ClutterField:
         if strength == 0.0:
             return
         row = _Row.of(capture)
+        apart_s = self._scatterers.instants_apart_ns / 1e9
+        # What the chip is set to decides, not the frames at hand: their last bits must not depend
+        # on how many are made at once.
+        if highest_rate_hz(capture) * apart_s < _MOST_FRAMES_WITHOUT_INSTANTS:
+            signal += row.answers(strength * self._scatterers.values_at(scene_times_ns))
+            return
         instants, fractions = self._scatterers.instants_before(scene_times_ns)
-        answers = _at_ends(
+        answers = self._scatterers.at_instants(
             instants,
-            self._answers if row == self._row else {},
-            lambda missing: row.answers(self._scatterers.values_at(missing)),
+            self._answers if (row, strength) == self._answers_are_of else {},
+            lambda values: row.answers(strength * values),
         )
-        self._row, self._answers = row, _last_two(answers)
+        self._answers, self._answers_are_of = _last_two(answers), (row, strength)
         at: int | None = None
         clutter = np.empty(capture.n_samples)
         # frame by frame: one stays in the processor's cache, a block does not
@@ -357,9 +383,9 @@ class ClutterField:
             signal, instants.tolist(), fractions.tolist(), strict=True
         ):
             if instant != at:
-                start, end = answers[instant], answers[instant + 1]
-                rise, start, at = end - start, start * strength, instant
-            np.multiply(rise, strength * fraction, out=clutter)
+                start, at = answers[instant], instant
+                rise = answers[instant + 1] - start
+            np.multiply(rise, fraction, out=clutter)
             np.add(clutter, start, out=clutter)
             np.add(frame, clutter, out=frame)
 
@@ -386,8 +412,8 @@ class _Row:
             tx_center_frequency=capture.tx_center_frequency,
         )
 
-    def answers(self, scatterers: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return what scatterers answer, n frames of the variance of the scatterers.
+    def answers(self, scatterers: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what scatterers answer, of their variance: shape (n, n_samples).
 
         ``scatterers`` has the shape (n, 2 * _SCATTERERS): real parts, then imaginary parts.
         """
@@ -395,26 +421,31 @@ class _Row:
         n_cells = -(-(lead + self.n_samples) // _SCATTERER_SAMPLES)
         places = _near_scatterers(first_cell % _SCATTERERS, n_cells)
         kernels = _KERNELS[self.tx_center_frequency]
-        near = np.empty(places.shape)
-        by_place = np.empty((_SCATTERER_SAMPLES, n_cells))
         answers = np.empty((len(scatterers), n_cells, _SCATTERER_SAMPLES))
-        for values, frame in zip(scatterers, answers, strict=True):
-            values.take(places, out=near, mode="clip")  # "raise" would copy
+        for first in range(0, len(scatterers), _FRAMES_AT_ONCE):
+            values = scatterers[first : first + _FRAMES_AT_ONCE]
+            near = values.ravel().take(places[:, : len(values)].reshape(len(places), -1))
             # einsum multiplies and adds in loops of its own, never by BLAS
-            np.einsum("kc,kr->rc", near, kernels, out=by_place)
-            frame[:] = by_place.T
-        return list(answers.reshape(len(answers), -1)[:, lead : lead + self.n_samples])
+            by_place = np.einsum("kc,kr->rc", near, kernels)
+            by_place = by_place.reshape(_SCATTERER_SAMPLES, len(values), n_cells)
+            answers[first : first + _FRAMES_AT_ONCE] = by_place.transpose(1, 2, 0)
+        return answers.reshape(len(scatterers), n_cells * _SCATTERER_SAMPLES)[
+            :, lead : lead + self.n_samples
+        ]
 
 
 @functools.cache
 def _near_scatterers(first_cell: int, n_cells: int) -> NDArray[np.int64]:
-    """Return which normals reach the samples of each cell, shape (4 * _REACH, n_cells).
+    """Return which normals reach the samples of each cell: (4 * _REACH, _FRAMES_AT_ONCE, n_cells).
 
-    Nearest range first; first of the scatterers' real, then of their imaginary parts.
+    Nearest range first; first of the scatterers' real, then of their imaginary parts; numbered
+    through frames that follow each other.
     """
     scatterer = first_cell + np.arange(n_cells) + np.arange(1 - _REACH, 1 + _REACH)[:, np.newaxis]
     scatterer %= _SCATTERERS
-    return np.concatenate([scatterer, scatterer + _SCATTERERS])
+    normals = np.concatenate([scatterer, scatterer + _SCATTERERS])
+    frames = np.arange(_FRAMES_AT_ONCE)[:, np.newaxis]
+    return normals[:, np.newaxis, :] + 2 * _SCATTERERS * frames
 
 
 def _kernels() -> dict[int, NDArray[np.float64]]:
@@ -436,6 +467,17 @@ def _kernels() -> dict[int, NDArray[np.float64]]:
 
 
 _KERNELS = _kernels()
+
+
+def highest_rate_hz(capture: CaptureSettings) -> float:
+    """Return how many frames the chip can sweep in a second (protocol reference 9.6)."""
+    return x4.fps_max(
+        iterations=capture.iterations,
+        pulses_per_step=capture.pulses_per_step,
+        dac_min=capture.dac_min,
+        dac_max=capture.dac_max,
+        dac_step=capture.dac_step,
+    )
 
 
 def one_count(capture: CaptureSettings) -> float:
@@ -512,6 +554,7 @@ class Receiver:
             counts += normalisation.dac_offset
             counts *= per_count
             np.rint(counts, out=counts)
-            np.clip(counts, 0, normalisation.max_counter, out=counts)
+            np.maximum(counts, 0, out=counts)
+            np.minimum(counts, normalisation.max_counter, out=counts)
             counters[part] = counts
         return counters

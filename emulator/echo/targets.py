@@ -117,11 +117,7 @@ class Scintillation:
 
     def factors(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return factors on the amplitude at scene times, shape (n_frames,)."""
-        instants, fractions = self._noise.instants_before(t_ns)
-        before, after = self._noise.values_at(np.concatenate([instants, instants + 1])).reshape(
-            2, len(t_ns), 2
-        )
-        x, y = (before + fractions[:, np.newaxis] * (after - before)).T
+        x, y = self._noise.values_at(t_ns).T
         factors: NDArray[np.float64]
         if self._spec.law == "lognormal":
             factors = np.exp(_NEPERS_PER_DB * self._spec.sigma_db * x)

@@ -16,6 +16,7 @@ from hil_tests.unit.emulator.rooms import PAPER
 from xethru_protocol.wire.x4 import BASEBAND_DECIMATION, CARRIER_HZ, RF_BIN_M, SAMPLING_RATE_HZ
 
 CAPTURE = PAPER
+FAST = replace(PAPER, pulses_per_step=10)
 CORRELATION_S = 4.8
 FAR_APART_NS = 30_000_000_000
 SERIAL = 202305070101
@@ -100,10 +101,13 @@ def test_its_memory_is_the_scenes_correlation_time() -> None:
 @given(
     cuts=st.lists(st.integers(1, 39), max_size=6, unique=True),
     step_ns=st.sampled_from([2_500_000, 58_823_529, 200_000_000, 7_000_000_000]),
+    pace=st.sampled_from([PAPER, FAST]),
 )
-def test_block_size_and_order_never_change_a_value(cuts: list[int], step_ns: int) -> None:
+def test_block_size_and_order_never_change_a_value(
+    cuts: list[int], step_ns: int, pace: CaptureSettings
+) -> None:
     times_ns = np.arange(40, dtype=np.int64) * step_ns
-    capture = replace(CAPTURE, n_samples=64)
+    capture = replace(pace, n_samples=64)
     whole = clutter(times_ns, capture)
     field = ClutterField(ClutterSpec(sigma=1.0, correlation_s=CORRELATION_S), seed=0, serial=SERIAL)
     signal = np.zeros_like(whole)
@@ -137,11 +141,13 @@ def test_it_remembers_nothing_of_an_earlier_frame_area() -> None:
     field = ClutterField(ClutterSpec(sigma=1.0, correlation_s=CORRELATION_S), seed=0, serial=SERIAL)
     rows = (
         CAPTURE,
+        FAST,
+        replace(FAST, first_sample_m=0.8),
         replace(CAPTURE, tx_center_frequency=4),
         replace(CAPTURE, first_sample_m=0.8),
         replace(CAPTURE, n_samples=100),
     )
-    for step in range(12):  # so that a change falls on an instant that is kept
+    for step in range(18):  # so that a change falls on an instant that is kept
         time_ns = np.array([step * 60_000_000], dtype=np.int64)
         capture = rows[step % len(rows)]
         signal = np.zeros((1, capture.n_samples))
@@ -164,8 +170,13 @@ def test_strength_and_gain_are_factors_and_the_number_of_pulses_is_none() -> Non
     )
     assert not clutter(times_ns, sigma=0.0).any()
     assert not clutter(times_ns, gain=0.0).any()
-    few = replace(CAPTURE, iterations=8, pulses_per_step=100)
+    few = replace(CAPTURE, iterations=8, pulses_per_step=300)
     np.testing.assert_array_equal(clutter(times_ns, few), clutter(times_ns))
+
+
+def test_frames_that_follow_fast_are_made_in_another_way_and_are_the_same() -> None:
+    times_ns = np.arange(80, dtype=np.int64) * 12_500_000
+    np.testing.assert_allclose(clutter(times_ns, FAST), clutter(times_ns), atol=1e-13)
 
 
 def test_baseband_hears_the_share_of_it_that_its_filter_passes() -> None:
