@@ -212,8 +212,10 @@ class RobustBackEnd:
         """
         antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
+        doubt_m = self.parameters.ranges.association_sigma_m
         widened = [
-            scan.with_added_sigma(self.parameters.ranges.association_sigma_m) for scan in scans
+            scan.with_added_sigma(math.hypot(doubt_m, self.state.range_errors.added_m))
+            for scan in scans
         ]
         matches, seen = self._associate(scans, widened, antennas, sure_m)
         continued, nis, likelihoods = self._correct(matches, seen, scans, antennas)
@@ -348,7 +350,13 @@ class RobustBackEnd:
         sigmas = np.array([of_radar[radar].sigma(index, noise.sigma_m) for radar, index in pairs])
         variances = np.square(sigmas) + np.square(state.feature_added_sigmas_m[landmarks])
         gain, weighted, white, scales = kernels.weigh(
-            state.P.columns(matches.at), matches.at, H, innovations_m, variances, noise.huber_sigmas
+            state.P.columns(matches.at),
+            matches.at,
+            H,
+            innovations_m,
+            variances,
+            noise.huber_sigmas,
+            state.range_errors.variance_share,
         )
         span_m = noise.max_range_m - noise.min_range_m
         likelihoods = [
@@ -411,6 +419,8 @@ class RobustBackEnd:
     def _place(self, tracklet: Tracklet) -> None:
         state = self.state
         point = tracklet.body_point()
+        share = max(state.range_errors.variance_share, 1.0)
+        point = replace(point, covariance=share * point.covariance)
         if tracklet.label is not None:
             known = self._landmark_of_label.get(tracklet.label)
             row = None if known is None else state.landmark_ids.index(known)

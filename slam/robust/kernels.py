@@ -423,18 +423,24 @@ def assign(
 
 @kernel(
     "Tuple((f8[:,::1], f8[::1], f8[::1], f8[::1]))"
-    "(f8[:,::1], i8[::1], f8[:,::1], f8[::1], f8[::1], f8)"
+    "(f8[:,::1], i8[::1], f8[:,::1], f8[::1], f8[::1], f8, f8)"
 )
 def weigh(
-    covariance: Array, at: Indices, H: Array, innovations: Array, variances: Array, huber: float
+    covariance: Array,
+    at: Indices,
+    H: Array,
+    innovations: Array,
+    variances: Array,
+    huber: float,
+    share: float,
 ) -> tuple[Array, Array, Array, Array]:
     """Return the gain of k measurements, those far off weighted by Huber.
 
     ``covariance`` (m, c) are the columns ``at`` (c,) of P, for which H (k, c) has entries. With
     S = H P H^T + R = L L^T: first for the ``variances`` R as they are, then with those enlarged
     whose innovations exceed ``huber`` standard deviations, so that the information falls by Huber's
-    weight and what they move grows no further. Source: Huber, Annals of Mathematical Statistics
-    35(1), 1964.
+    weight and what they move grows no further, and all then multiplied by ``share``, for ranges of
+    one passage err alike. Source: Huber, Annals of Mathematical Statistics 35(1), 1964.
 
     Returns W = P H^T L^-T (m, k) and L^-1 innovations, both with the weights; and without, L^-1
     innovations and the diagonal of L.
@@ -463,6 +469,8 @@ def weigh(
             excess = abs(nu) / (huber * math.sqrt(whole))
             if again == 1 and excess > 1.0:
                 variance = whole * excess - prior[i, i]
+            if again == 1:
+                variance *= share
             for j in range(i + 1):
                 value = 0.5 * (prior[i, j] + prior[j, i])
                 if i == j:

@@ -144,6 +144,10 @@ class RelinearisationRule:
     turn_rad: float = 0.02
     shift_m: float = 0.04
     every: int = 20  # fewest frames between two solutions
+    # Most frames between two, and as a share of the run: all solutions together cost in proportion
+    # to it then
+    at_least_every: int = 50
+    run_share: float = 0.1
     iterations: int = 10  # most steps of one solution
     # Ranges further off than this are left out from that iteration on
     outlier_sigmas: float = 4.0

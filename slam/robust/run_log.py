@@ -65,7 +65,7 @@ class Problem:
     range_antennas: Array
     range_turns: Array
     ranges_m: Array
-    range_sigmas_m: Array  # shape (m,), noise of the ranges
+    range_sigmas_m: Array  # shape (m,), noise of single ranges
     # shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin, and a
     # matrix that makes their noise white
     point_poses: Indices
@@ -73,6 +73,7 @@ class Problem:
     points: Array
     point_roots: Array
     huber_sigmas: float = math.inf  # residuals beyond it weigh less
+    variance_share: float = 1.0  # see `RangeErrors`
 
     @property
     def is_walking(self) -> bool:
@@ -91,7 +92,7 @@ def prior_sigmas(layout: Layout, parameters: BackEndParameters) -> Array:
     sigmas[layout.offsets] = max(noise.offset_sigma_m, _LEAST_SIGMA)
     sigmas[layout.mounts] = noise.mount_sigma_m
     if layout.has_radii:
-        sigmas[layout.landmarks.start + 2 : layout.landmarks.stop : 3] = noise.radius_sigma_m
+        sigmas[layout.radii] = noise.radius_sigma_m
     return sigmas
 
 
@@ -317,6 +318,7 @@ class RunLog:
             points=points["point"].copy(),
             point_roots=points["root"].copy(),
             huber_sigmas=parameters.ranges.huber_sigmas,
+            variance_share=state.range_errors.variance_share,
         )
 
     def starts(self, state: State, problem: Problem) -> list[Estimate]:

@@ -33,17 +33,33 @@ from slam.robust.run_log import (
     motion_covariances,
     motions_by_calibration,
 )
-from slam.robust.state import HEAD_SIZE, HEADING, Array, Indices, State, SymmetricMatrix
+from slam.robust.state import (
+    HEAD_SIZE,
+    HEADING,
+    Array,
+    Indices,
+    RangeErrors,
+    State,
+    SymmetricMatrix,
+)
 
 # Columns of the border
 POSE, CALIBRATION = slice(0, 3), slice(3, HEAD_SIZE)
 _LEAST_WALK_SHARE = 1e-5
+# The standard deviation of normal noise over its median magnitude; beyond how many a residual is
+# taken for that many, and fewer ranges than that choose nothing
+_SIGMA_PER_MEDIAN, _MOST_SIGMAS, _FEWEST_RANGES = 1.4826, 3.0, 200
+# Keyframes whose ranges of one landmark may err alike; as how many such groups what all landmarks
+# have in common counts for one; and limits of `RangeErrors.variance_share`
+_KEYS_PER_PASSAGE, _PRIOR_PASSAGES, _LEAST_SHARE, _MOST_SHARE = 5, 5, 0.5, 50.0
+_PRIOR_GROUPS = 30  # as how many groups it counts that ranges err as told
 _UNKNOWN = 100.0
 # The decrease of the cost that ends a search, what rounding may add to it, and how often a step is
 # halved
 _TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
 # What share of its price a slip must gain to be tried, and among how many neighbours on either side
 _FIRST_SHARE, _NEIGHBOURS = 0.25, 4
+_THIN_M = 2e-3  # radii below it are alike
 # What keeps a direction finite where a landmark stands at an antenna, or at the robot, and a root
 # where nothing walks
 _LEAST_RANGE_M, _LEAST_RANGE_M2, _TINY = 1e-9, 1e-18, 1e-300
@@ -270,7 +286,7 @@ class NormalEquations:
             summed = np.bincount(flat.ravel(), values.ravel(), n_border * n_border)
             self.C += summed.reshape(n_border, n_border)
 
-    def add_prior(self, sigmas: Array, away: Array) -> None:
+    def add_prior(self, away: Array, sigmas: Array) -> None:
         """Add the prior of first pose and what is fixed, given how far they are from its mean."""
         information = sigmas**-2.0
         gradient = information * away
@@ -390,7 +406,9 @@ class Smoother:
 
     def __init__(self, problem: Problem, rule: RelinearisationRule) -> None:
         self._problem, self._rule = problem, rule
-        first = problem.keys[:-1]
+        first, layout = problem.keys[:-1], problem.layout
+        self._radii = layout.radii if layout.has_radii else slice(0, 0)
+        self._radius_m = float(problem.prior_sigmas[self._radii].max(initial=0.0))
         chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))
         covariances = motion_covariances(chain, problem.step_covariances)
         # W with W C W^T = I, shape (k, 3, 3)
@@ -455,12 +473,16 @@ class Smoother:
         """
         problem = self._problem
         away = np.minimum(np.abs(measurement_residuals(problem, estimate).residual), limit)
-        bound = problem.huber_sigmas
-        total = float(np.sum(away**2 - np.maximum(away - bound, 0.0) ** 2))
+        costs = away**2 - np.maximum(away - problem.huber_sigmas, 0.0) ** 2
+        total = float(costs @ self._shares(len(costs)))
         as_wheels, slipped = self._motion_costs(motion_residuals(problem, estimate).residual)
         total += float(np.sum(np.where(slips, slipped, as_wheels)))
         total += float(np.sum(self._walk_residual(estimate) ** 2))
-        return total + float(np.sum((self._from_prior(estimate) / problem.prior_sigmas) ** 2))
+        away, sigmas = self._from_prior(estimate)
+        costs = (away / sigmas) ** 2
+        # The cost 2 rho / tau of an exponential prior is more than its quadratic's by as much.
+        excess_m = np.maximum(away[self._radii] - _THIN_M, 0.0)
+        return total + float(np.sum(costs) + np.sum(excess_m) / max(self._radius_m, _TINY))
 
     def start_cost(self, estimate: Estimate) -> float:
         """Return the cost of values to start from: any motion may be a slip."""
@@ -512,15 +534,32 @@ class Smoother:
             return np.zeros((0, 3))
         return np.asarray(np.diff(estimate.calibration, axis=0) * self._walk_roots)
 
-    def _from_prior(self, estimate: Estimate) -> Array:
+    def _from_prior(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Return how far values are from the prior's mean, and the standard deviations of that.
+
+        Radii have an exponential prior, which takes most of them for thin: by the quadratic that
+        touches it, as Huber's weights are.
+        """
+        problem = self._problem
         first = np.concatenate([estimate.poses[0], estimate.calibration[0], estimate.fixed])
-        return np.asarray(first - self._problem.prior_mean)
+        away, sigmas = first - problem.prior_mean, problem.prior_sigmas.copy()
+        radii = away[self._radii]
+        rounded = np.sqrt(self._radius_m * np.maximum(radii, _THIN_M))
+        sigmas[self._radii] = np.where(radii < 0.0, np.minimum(_THIN_M, rounded), rounded)
+        return away, sigmas
 
     def weights(self, residual: Array, limit: float) -> Array:
         """Return roots of the weights of white residuals, shape (m,)."""
         away = np.abs(residual)
-        roots = np.sqrt(np.minimum(self._problem.huber_sigmas / np.maximum(away, _TINY), 1.0))
+        weights = np.minimum(self._problem.huber_sigmas / np.maximum(away, _TINY), 1.0)
+        roots = np.sqrt(weights * self._shares(len(away)))
         return np.asarray(np.where(away <= limit, roots, 0.0))
+
+    def _shares(self, n_rows: int) -> Array:
+        """Return what one measurement counts for, shape (m,): of correlated ranges, less."""
+        shares = np.ones(n_rows)
+        shares[: len(self._problem.ranges_m)] /= self._problem.variance_share
+        return shares
 
     def _equations(
         self, estimate: Estimate, slips: NDArray[np.bool_], limit: float
@@ -537,7 +576,7 @@ class Smoother:
             equations.add_steps(steps)
         rows = measurement_residuals(problem, estimate)
         equations.add_rows(rows, self.weights(rows.residual, limit))
-        equations.add_prior(problem.prior_sigmas, self._from_prior(estimate))
+        equations.add_prior(*self._from_prior(estimate))
         return equations
 
 
@@ -564,6 +603,8 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
     rule = parameters.relinearisation
     if log.since_solved < rule.every or not state.feature_ids:
         return False
+    if log.since_solved >= max(rule.at_least_every, rule.run_share * log.n_poses):
+        return True
     shift_m, turn_rad = log.parted(state.pose)
     return turn_rad > rule.turn_rad or shift_m > rule.shift_m
 
@@ -578,7 +619,47 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
         return False
     _replace(state, solution)
     log.solved(problem, solution.estimate)
+    learn_noise(problem, solution.estimate, state)
     return True
+
+
+def learn_noise(problem: Problem, estimate: Estimate, state: State) -> None:
+    """Let the residuals of a solution choose the noise of ranges, of each landmark and of all.
+
+    The variance of single ranges is that of their median residual. A landmark's own is believed in
+    proportion to its passages, for ranges of one passage err alike. That shows in the sums of
+    residuals over some keyframes: had all ranges errors of their own, the variance of a sum would
+    be the number of its terms.
+    """
+    n = len(problem.ranges_m)
+    if n < _FEWEST_RANGES:
+        return
+    ids, at = state.feature_ids, problem.range_landmarks
+    residual = measurement_residuals(problem, estimate).residual[:n]
+    added = np.array([state.added_sigmas_m.get(id_, 0.0) for id_ in ids])
+    told_m = np.sqrt(np.maximum(problem.range_sigmas_m**2 - added[at] ** 2, _LEAST_RANGE_M2))
+    ratio = residual * problem.range_sigmas_m / told_m
+    of_all = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio)))) ** 2
+    block = problem.range_poses // _KEYS_PER_PASSAGE
+    own = np.zeros(len(ids))
+    for row, id_ in enumerate(ids):
+        mine = np.flatnonzero(at == row)
+        if not len(mine):
+            continue
+        n_passages = len(np.unique(block[mine]))
+        raw = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio[mine])))) ** 2
+        believed = (n_passages * raw + _PRIOR_PASSAGES * of_all) / (n_passages + _PRIOR_PASSAGES)
+        own[row] = math.sqrt(max(believed - 1.0, 0.0)) * float(np.median(told_m[mine]))
+        state.added_sigmas_m[id_] = own[row]
+    sigmas_m = np.hypot(told_m, own[at])
+    white = np.clip(ratio * told_m / sigmas_m, -_MOST_SIGMAS, _MOST_SIGMAS)
+    groups = np.unique(block * len(ids) + at, return_inverse=True)[1]
+    sums = np.bincount(groups, white)
+    n_groups = len(sums)
+    share = (n_groups * float(np.sum(sums**2)) / n + _PRIOR_GROUPS) / (n_groups + _PRIOR_GROUPS)
+    share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
+    added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(told_m))
+    state.range_errors = RangeErrors(added_m, share)
 
 
 def solve_whole_run(

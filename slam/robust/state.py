@@ -255,6 +255,16 @@ def quarter_turn(points: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
+class RangeErrors:
+    """What the residuals of a solution say of the errors of ranges."""
+
+    added_m: float = 0.0  # what is added in squares to the sigmas of ranges of no known landmark
+    # By how much the variance of a range must be larger where many are averaged: those of one
+    # passage err alike. Below 1, they err less than was told.
+    variance_share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class Layout:
     """Where everything lies in the error."""
 
@@ -282,6 +292,11 @@ class Layout:
     def landmarks(self) -> slice:
         first = self.mounts.stop
         return slice(first, first + self.landmark_size * self.n_landmarks)
+
+    @property
+    def radii(self) -> slice:
+        """Return where the radii are, if they are unknown."""
+        return slice(self.landmarks.start + 2, self.landmarks.stop, 3)
 
     @property
     def walls(self) -> slice:
@@ -326,6 +341,7 @@ class State:
         "position_m",
         "radii_m",
         "radius_sigma_m",
+        "range_errors",
         "wall_ids",
         "walls",
     )
@@ -352,6 +368,7 @@ class State:
         self.wall_ids: list[int] = []  # from the same sequence as the landmarks'
         # By id: what is added in squares to the sigmas of a feature's ranges
         self.added_sigmas_m: dict[int, float] = {}
+        self.range_errors = RangeErrors()
         self.next_id = 0
         sigmas = [0.0, 0.0, 0.0, *calibration_sigmas, *offset_sigmas_m]
         if mount_sigma_m:
@@ -516,7 +533,7 @@ class State:
     def take_calibration(self, other: State) -> None:
         """Take over all of a state that is no pose or landmark, in a state without landmarks."""
         self.calibration, self.offsets_m = other.calibration.copy(), other.offsets_m.copy()
-        self.mounts_m = other.mounts_m.copy()
+        self.mounts_m, self.range_errors = other.mounts_m.copy(), other.range_errors
         known = np.arange(CALIBRATION.start, self.n_fixed)
         P = self.P.full()
         P[np.ix_(known, known)] = other.P.block(known)

@@ -210,7 +210,7 @@ def moved_by(nu: float, prior: float, sigma: float, huber: float) -> float:
     """Return how far a scalar state of a standard deviation is moved by an innovation."""
     one, variance = np.ones((1, 1)), np.array([sigma**2])
     P, at = np.full((1, 1), prior**2), np.zeros(1, dtype=np.intp)
-    gain, weighted, _, _ = kernels.weigh(P, at, one, np.array([nu]), variance, huber)
+    gain, weighted, _, _ = kernels.weigh(P, at, one, np.array([nu]), variance, huber, 1.0)
     return float(gain[0, 0] * weighted[0])
 
 

@@ -76,9 +76,12 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
     start = 1e-2 * rng.standard_normal(layout.size)
     start[layout.landmarks].reshape(-1, layout.landmark_size)[:, :2] += marks
     start[layout.walls] += (math.pi / 2, 2.0)
+    mean = np.concatenate([np.zeros(6), start[6:] + 1e-3])
+    if has_radii:
+        mean[layout.radii] = start[layout.radii] = 0.0
     problem = Problem(
         layout=layout,
-        prior_mean=np.concatenate([np.zeros(6), start[6:] + 1e-3]),
+        prior_mean=mean,
         prior_sigmas=sigmas,
         steps=np.array([between(*pair) for pair in pairwise(poses)])
         + 1e-3 * rng.standard_normal((N_STEPS, 3)),
@@ -129,14 +132,32 @@ def along(steps: Array, calibration: Complex, noise: Complex | None = None) -> C
     return np.append(place, heading)
 
 
-def white_residuals(problem: Problem, n_cal: int, x: Complex) -> Complex:
-    """Return the white residuals of the prior, all motions and all measurements."""
+def white_radius(rho: complex, tau: float, *, is_exact: bool) -> complex:
+    """Return the root of -2 ln exp(-rho / tau), quadratic below 2 mm; or of what touches it."""
+    thin = 2e-3
+    if rho.real < 0.0:
+        return rho / min(thin, math.sqrt(tau * thin))
+    if rho.real < thin:
+        return rho / math.sqrt(tau * thin)
+    if is_exact:
+        return complex(np.sqrt((2.0 * rho - thin) / tau))
+    return rho / math.sqrt(tau * rho.real)
+
+
+def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool = False) -> Complex:
+    """Return the white residuals of the prior, all motions and all measurements.
+
+    Of the radii's prior they are those of the quadratic that touches it, unless ``is_exact``.
+    """
     layout, keys = problem.layout, problem.keys
     n_poses = len(keys)
     poses, rest = x[: 3 * n_poses].reshape(-1, 3), x[3 * n_poses :]
     calibration, fixed = rest[: 3 * n_cal].reshape(-1, 3), rest[3 * n_cal :]
     v = np.concatenate([poses[0], calibration[0], fixed])
     result = [np.asarray((v - problem.prior_mean) / problem.prior_sigmas, dtype=np.complex128)]
+    if layout.has_radii:
+        at = np.arange(layout.size)[layout.radii]
+        result[0][at] = [white_radius(v[i], problem.prior_sigmas[i], is_exact=is_exact) for i in at]
     for k in range(n_poses - 1):
         own = slice(keys[k], keys[k + 1])
         c = calibration[k if n_cal > 1 else 0]
@@ -241,7 +262,7 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(
         return white_residuals(problem, n_cal, y)
 
     def real(x: Array) -> Array:
-        return residuals(x.astype(np.complex128)).real
+        return white_residuals(problem, n_cal, x.astype(np.complex128), is_exact=True).real
 
     oracle = least_squares(real, packed(start), xtol=1e-15, ftol=1e-15, gtol=1e-12, x_scale="jac")
     assert solution.cost == pytest.approx(2.0 * oracle.cost, rel=1e-6)
@@ -269,7 +290,7 @@ def test_huber_weights_are_those_of_the_solution_itself() -> None:
     n_rows = len(ranges_m) + 2 * len(problem.points)
 
     def real(x: Array) -> Array:
-        white = white_residuals(problem, 1, x.astype(np.complex128)).real
+        white = white_residuals(problem, 1, x.astype(np.complex128), is_exact=True).real
         tail = white[-n_rows:]
         huber = np.where(np.abs(tail) <= 2.0, tail, np.sqrt(np.abs(4.0 * np.abs(tail) - 4.0)))
         return np.concatenate([white[:-n_rows], huber])
