@@ -56,7 +56,7 @@ def test_the_numbers_are_those_of_the_source() -> None:
     assert found["slam.robust.parameters.ContinuationRule.gates"] == [9.0, 13.8]
     assert found["slam.config.WheelNoise.along_m_per_sqrt_m"] == 2e-3
     assert found["slam.robust.map._RADIUS_STEPS"] == 6
-    assert found["slam.front_end.matched_filter._ECHO_LEVEL"] == 12.25
+    assert found["slam.front_end.kernels._ECHO_LEVEL"] == 12.25
     assert found["slam.front_end.pulse._SPEED_OF_LIGHT_MPS"] == 299_792_458.0
     assert len(found) >= 190
     assert json.loads(json.dumps(found)) == found
