@@ -79,10 +79,10 @@ def test_front_end_per_frame(benchmark: BenchmarkFixture, name: FrontEnd) -> Non
 def test_front_end_of_a_scene(benchmark: BenchmarkFixture, name: str) -> None:
     """Frames as the scene has them: its clutter, echoes that overlap, pulses that are cut."""
     scene = load_scene(name)
-    radars = open_loopback(scene, seed=5)
-    radars.start(RAW_CONFIG, FRAME_RATE_HZ)
-    ticks = radars.scans(400, StopFlag())
-    scans = [scan.frames for tick, scan in enumerate(ticks) if tick % 8 == 0]
+    with open_loopback(scene, seed=5) as radars:
+        radars.start(RAW_CONFIG, FRAME_RATE_HZ)
+        ticks = radars.scans(400, StopFlag())
+        scans = [scan.frames for tick, scan in enumerate(ticks) if tick % 8 == 0]
     detector = make_detector(load_preset("robust"))
 
     def detect() -> int:
