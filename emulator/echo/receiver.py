@@ -78,6 +78,7 @@ SPACINGS_PER_E_FOLD = 1.185
 _KNOTS = 5
 _FIVE = np.arange(_KNOTS)
 _KNOTS_AHEAD = 8
+_INSTANTS_AHEAD = 3
 _SCALE = (151 / 315) ** -0.5 / UNITS_PER_SIGMA
 # Knot indices must not be negative, while a clock that is early may ask for a time before 0.
 _FIRST_KNOT = 1 << 40
@@ -168,18 +169,20 @@ class SlowNoise:
         kept: Mapping[int, _T],
         make: Callable[[NDArray[np.float64]], Iterable[_T]],
     ) -> dict[int, _T]:
-        """Return what belongs to instants and their successors, in order: kept, or made now.
+        """Return what belongs to instants, their successors and perhaps a few more.
 
-        ``make`` gets the values at some of them, shape (m, n_values).
+        What was kept from the last call is taken from there; ``make`` gets the values at others,
+        shape (m, n_values).
         """
         wanted = sorted({*instants.tolist(), *(instants + 1).tolist()})
         missing = [instant for instant in wanted if instant not in kept]
-        found = dict(kept)
-        if missing:
-            times_ns = np.array(missing, dtype=np.int64) * self._instant_ns
-            times_ns -= self._instants_offset_ns
-            found.update(zip(missing, make(self.values_at(times_ns)), strict=True))
-        return {instant: found[instant] for instant in wanted}
+        if not missing:
+            return dict(kept)
+        missing += range(wanted[-1] + 1, wanted[-1] + 1 + _INSTANTS_AHEAD)
+        times_ns = np.array(missing, dtype=np.int64) * self._instant_ns
+        times_ns -= self._instants_offset_ns
+        made = dict(zip(missing, make(self.values_at(times_ns)), strict=True))
+        return {instant: kept[instant] for instant in wanted if instant in kept} | made
 
     def values_at(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the values at scene times of shape (n,): shape (n, n_values), float64."""
@@ -268,11 +271,6 @@ def _cubic_weights(u: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArra
     return weights
 
 
-def _last_two(of_instants: Mapping[int, _T]) -> dict[int, _T]:
-    """Return what the frames that follow need, too."""
-    return dict(list(of_instants.items())[-2:])
-
-
 class CarrierJitter:
     """The jitter of one radar."""
 
@@ -311,13 +309,12 @@ class CarrierJitter:
         phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad
         if self._spec.slow_rad > 0:
             instants, fractions = self._slow.instants_before(scene_times_ns)
-            slow_rad = self._slow.at_instants(
+            slow_rad = self._slow_rad = self._slow.at_instants(
                 instants, self._slow_rad, lambda values: values[:, 0].tolist()
             )
             before = np.array([slow_rad[instant] for instant in instants.tolist()])
             after = np.array([slow_rad[instant + 1] for instant in instants.tolist()])
             phases_rad += before + fractions * (after - before)
-            self._slow_rad = _last_two(slow_rad)
         return phases_rad
 
     def _white_at(self, index: int) -> float:
@@ -375,7 +372,7 @@ class ClutterField:
             self._answers if (row, strength) == self._answers_are_of else {},
             lambda values: row.answers(strength * values),
         )
-        self._answers, self._answers_are_of = _last_two(answers), (row, strength)
+        self._answers, self._answers_are_of = answers, (row, strength)
         at: int | None = None
         clutter = np.empty(capture.n_samples)
         # frame by frame: one stays in the processor's cache, a block does not
