@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,8 @@ def pytest_report_collectionfinish() -> list[str]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if "slam.compiled" in sys.modules:  # or the time of one test would be that of compiling
+        sys.modules["slam.compiled"].compile_kernels()
     if not config.pluginmanager.hasplugin("timeout") or config.getoption("timeout") is not None:
         return
     usual_s = float(config.getini("timeout") or 0)

@@ -70,7 +70,8 @@ def kernel(signature: str) -> Callable[[_Function], _Function]:
     return decorate
 
 
-def compile_kernels() -> None:
+def compile_kernels(before_each: Callable[[], object] = lambda: None) -> None:
     """Compile or load every kernel of the modules imported so far: seconds the first time."""
     for each in _KERNELS:
+        before_each()
         each.compiled()

@@ -68,7 +68,7 @@ def run_demo(
             from slam.app.view.panels import RerunView  # a second, while the emulator starts
 
             if config.back_end is BackEnd.ROBUST:
-                compile_kernels()  # seconds the first time
+                compile_kernels(before_each=stop.check)  # seconds the first time
 
             emulator.wait_until_ready(stop)
             odometry = read_odometry_socket(emulator.odometry_socket)
