@@ -26,7 +26,7 @@ Decision
     explains more ranges than the main one and its evidence is larger by its price, and dropped
     when it has not after some steps. Nothing is forgotten before that, and the main back end goes
     on. The robot is reported as lost only while the empty map explains the scans better than the
-    main one by the price of a carry, although it began with nothing, and no place for it is found.
+    main one does with what it knew then, by the price of a carry, and no place for it is found.
     With fewer landmarks in a map than a placement takes there is nothing to be found, and the main
     back end goes on with new ones.
 
@@ -96,14 +96,14 @@ class Tally:
         least = -self._rule.most_against
         return math.fsum(min(max(nats, least), most) for nats in self._of_landmark.values())
 
-    def gain(self, other: Tally, most: float = math.inf) -> float:
+    def gain(self, other: Tally, most: float, *, same_map: bool = True) -> float:
         """Return how much likelier this is than the other, each landmark saying at most so much.
 
         Nothing is likelier by explaining less: where little is certain, little can be missed.
         """
         more = 2.0 * (self._explained - other._explained)
-        if most == math.inf:
-            return min(self.total() - other.total(), more)
+        if not same_map:
+            return min(self.total(most) - other.total(most), more)
         mine, theirs = self._of_landmark, other._of_landmark
         differences = [
             mine.get(landmark_id, 0.0) - theirs.get(landmark_id, 0.0)
@@ -115,7 +115,8 @@ class Tally:
 class Alternative:
     """A back end that takes the steps from ``since`` on, and its evidence against the main one's.
 
-    One ``set_down`` begins at the end of the first of these motions, which it does not take.
+    One that ``is_new`` began with an empty map. One ``set_down`` begins at the end of the first of
+    these motions, which it does not take.
     ``slipping`` is the step to whose noise a slip is added, if any.
     """
 
@@ -127,6 +128,7 @@ class Alternative:
         *,
         set_down: bool = False,
         slipping: int | None = None,
+        is_new: bool = False,
     ) -> None:
         self.back_end = back_end
         self.since = self.next_step = since
@@ -134,8 +136,8 @@ class Alternative:
         self.set_down = set_down
         self._rule = rule
         self._slipping = slipping
-        self._next_id = back_end.state.next_id
-        self._is_new = not self._next_id
+        self._next_id = 0  # landmarks known when it began have smaller ids
+        self._is_new = is_new
         self._own, self._main = Tally(rule), Tally(rule)
 
     @property
@@ -143,12 +145,10 @@ class Alternative:
         """Return by how much this is likelier than the main one since it began, in nats.
 
         Three landmarks must be for it if that is to exceed the price, and it must be as much
-        likelier than that the robot is elsewhere. A map of its own has nothing to compare.
+        likelier than that the robot is elsewhere. A map of its own begins with nothing.
         """
-        if self._is_new:
-            return self._own.gain(self._main)
-        most_for = self._rule.most_for
-        return min(self._own.gain(self._main, self.price / 2.0), self._own.total(most_for))
+        gain = self._own.gain(self._main, self.price / 2.0, same_map=not self._is_new)
+        return gain if self._is_new else min(gain, self._own.total(self._rule.most_for))
 
     def take(self, step: Step) -> None:
         rule, back_end, number = self._rule, self.back_end, self.next_step
@@ -161,10 +161,12 @@ class Alternative:
         begins = self._slipping is not None and number < self.since + rule.steps
         sure_m = 4.0 * rule.slip_m if begins else None
         report = back_end.update(step.scans, sure_m=sure_m, solve=False)
-        # What a back end maps after it went wrong explains the ranges there, too.
+        # What the main one maps after it went wrong explains the ranges there, too.
+        if not self.next_step - self.since:
+            self._next_id = step.next_id
         known = math.inf if self._is_new else self._next_id
         self._own.add([one for one in report.evidence if one[0] < known])
-        self._main.add([one for one in step.evidence if one[0] < known])
+        self._main.add([one for one in step.evidence if one[0] < self._next_id])
         self.next_step += 1
 
 
@@ -423,7 +425,9 @@ class Branches:
     def _begin_carry(self, since: int) -> None:
         before = self._at(since)
         if len(before.reported_rows()) >= self._rule.least_landmarks:
-            fresh = Alternative(before.with_empty_map(), since, self._rule, set_down=True)
+            fresh = Alternative(
+                before.with_empty_map(), since, self._rule, set_down=True, is_new=True
+            )
             self._carry = Carry(map=before, fresh=fresh, search_from=self._now)
 
     def _search(self, carry: Carry) -> None:

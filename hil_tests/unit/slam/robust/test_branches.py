@@ -199,7 +199,7 @@ def test_two_landmarks_do_not_say_where_the_robot_is() -> None:
     main, most = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20), RULE.carry_price / 2.0
     two = tally(*[(id_, 3.0) for id_ in (1, 2)] * 50, *[(3, -3.0)] * 20)
     three = tally(*[(id_, 3.0) for id_ in (1, 2, 3)] * 50)
-    assert two.gain(main) > RULE.carry_price
+    assert two.gain(main, 100.0) > RULE.carry_price
     assert two.gain(main, most) <= RULE.carry_price
     assert three.gain(main, most) > RULE.carry_price
 
@@ -216,8 +216,8 @@ def test_a_place_that_explains_less_is_not_likelier() -> None:
     main = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20, *[(4, 3.0)] * 5)
     silent, better = tally(), tally(*[(id_, 3.0) for id_ in (1, 2, 3, 5)] * 20)
     assert silent.total() > main.total()
-    assert silent.gain(main) < 0.0
-    assert better.gain(main) > RULE.carry_price
+    assert silent.gain(main, 100.0) < 0.0
+    assert better.gain(main, 100.0) > RULE.carry_price
 
 
 def test_evidence_is_the_likelihood_of_the_ranges() -> None:
