@@ -242,6 +242,26 @@ def assess(
         table[row, 4] = left / expected
 
 
+@kernel("i8(f8[:,::1], f8, i8)")
+def keep(table: Array, least: float, n_bins: int) -> int:
+    """Sort the echoes that are high enough and in the frame to the top; return how many."""
+    n = 0
+    for row in range(len(table)):
+        if table[row, 1] > least and -0.5 <= table[row, 0] < n_bins - 0.5:
+            for column in range(COLUMNS):
+                table[n, column], table[row, column] = table[row, column], table[n, column]
+            for at in range(n, 0, -1):
+                if table[at - 1, 0] <= table[at, 0]:
+                    break
+                for column in range(COLUMNS):
+                    table[at - 1, column], table[at, column] = (
+                        table[at, column],
+                        table[at - 1, column],
+                    )
+            n += 1
+    return n
+
+
 @kernel("void(f8, f8, f8, f8[:,::1])")
 def raise_deviations(sigma_y: float, s: float, wrong: float, table: Array) -> None:
     """Raise the deviation of each echo of a table by what wrong pulses of the others leave."""

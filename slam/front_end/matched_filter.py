@@ -281,9 +281,8 @@ def refit(
             group = _fitted(group, others, filtered, split)
         groups.append(group)
     table = np.concatenate(groups)
-    inside = (table[:, POSITION] >= -0.5) & (table[:, POSITION] < pulse_filter.n_bins - 0.5)
-    table = table[inside & (table[:, AMPLITUDE] > pulse_filter.threshold * filtered.sigma_y)]
-    table = table[np.argsort(table[:, POSITION])]
+    least = pulse_filter.threshold * filtered.sigma_y
+    table = table[: kernels.keep(table, least, pulse_filter.n_bins)]
     _assess(table, filtered, within)
     return table
 
