@@ -131,8 +131,10 @@ def smoothed_of(t_ns: int, row: NDArray[np.float64]) -> SmoothedRun:
     Raises
     ------
     ValueError
-        The row's length does not fit its first two numbers.
+        The row's length does not fit its first two numbers, or one of them is not finite.
     """
+    if not np.isfinite(row).all():
+        raise ValueError("a smoothed run has numbers that are not finite")
     n_states, n_landmarks = (int(value) for value in row[:_COUNTS])
     ends = np.cumsum([_COUNTS, _PER_STATE * n_states, _PER_LANDMARK * n_landmarks])
     if min(n_states - 1, n_landmarks) < 0 or ends[-1] != len(row):

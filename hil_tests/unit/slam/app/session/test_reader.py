@@ -27,6 +27,7 @@ from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
     settings_text,
     smoothed_of,
+    smoothed_row,
     snapshot_of,
     state_row,
 )
@@ -200,6 +201,13 @@ def test_smoothed_runs_come_back_to_the_last_bit(tmp_path: Path) -> None:
 def test_a_smoothed_run_of_another_length_than_it_says_is_refused(row: list[float]) -> None:
     with pytest.raises(ValueError, match="numbers says it has"):
         smoothed_of(0, np.array(row))
+
+
+def test_a_smoothed_run_that_is_not_finite_is_refused() -> None:
+    row = smoothed_row(smoothed_run(3))
+    row[2] = np.nan  # a time
+    with pytest.raises(ValueError, match="not finite"):
+        smoothed_of(0, row)
 
 
 def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:
