@@ -44,7 +44,7 @@ from slam.robust.initialisation import (
 from slam.robust.map import Existence, apply_merge, find_merge, judge
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.run_log import RunLog
-from slam.robust.smoother import is_due, relinearise, solve_whole_run
+from slam.robust.smoother import find_split, is_due, relinearise, solve_whole_run
 from slam.robust.state import (
     HEAD_SIZE,
     Array,
@@ -60,6 +60,8 @@ from slam.robust.walls import WallKeeper
 # know of the pose it leads to; the latter set nothing.
 _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 _FREE_M, _FREE_RAD = 1.0, 1.0
+# Variance of a new landmark's place until the run is solved for with it
+_ANYWHERE_M2 = 1.0
 
 
 @dataclass(slots=True)
@@ -274,8 +276,22 @@ class RobustBackEnd:
         return landmark_id
 
     def relinearise(self) -> bool:
-        """Solve for all poses and replace the belief; return whether that worked."""
-        return relinearise(self._log, self.state, self.parameters)
+        """Solve for all poses and replace the belief; return whether that worked.
+
+        If ranges disagree with the landmark that they were taken for, they become one of their own,
+        and all poses are solved for again.
+        """
+        if not relinearise(self._log, self.state, self.parameters):
+            return False
+        split = find_split(self._log, self.state, self.parameters)
+        if split is not None:
+            state = self.state
+            size = state.layout.landmark_size
+            cross = np.zeros((state.P.size, size))
+            landmark_id = state.augment(split.point_m, cross, _ANYWHERE_M2 * np.eye(size))
+            self._existence.hit(landmark_id, self._log.split_off(split.rows, landmark_id))
+            relinearise(self._log, self.state, self.parameters)
+        return True
 
     def _associate(
         self,

@@ -30,8 +30,9 @@ _LEAST_SIGMA = 1e-7
 # Of the first pose [m, rad], where a run's own map begins
 _POSE_SIGMA = 1e-6
 _LEAST_WAY_M = 1e-9
+_GAP_POSES = 50  # a landmark not seen for longer is in another passage when it is seen again
 # Of a feature's place [m], and of a wall's direction [rad]
-_ANYWHERE_M = 1e3
+_ANYWHERE_M = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,6 +61,7 @@ class Problem:
     range_poses: Indices
     range_radars: Indices
     range_landmarks: Indices
+    range_rows: Indices  # shape (m,): which row of the log it is
     # shapes (m, 2) and (m,): antenna in the body frame of the keyframe, its mount being where the
     # rig has it, and the turn of the robot from the keyframe to the sample
     range_antennas: Array
@@ -192,13 +194,16 @@ class RunLog:
         self._is_key.append(True)
         self._causal = PackedRows(np.dtype(np.float64), 3)
         self._causal.append(np.zeros(3))
-        whose = [("pose", np.int32), ("radar", np.int16), ("landmark", np.int32)]
-        where = [("antenna", np.float64, 2), ("turn_rad", np.float32)]
+        whose = [("pose", np.int32), ("landmark", np.int32), ("passage", np.int32)]
+        where = [("radar", np.int16), ("antenna", np.float64, 2), ("turn_rad", np.float32)]
         measured = [("range_m", np.float64), ("sigma_m", np.float32)]
         self._ranges = PackedRows(np.dtype([*whose, *where, *measured]))
         seen = [("point", np.float64, 2), ("root", np.float64, (2, 2))]
         self._points = PackedRows(np.dtype([("pose", np.int32), ("landmark", np.int32), *seen]))
         self._names: dict[int, int | None] = {}
+        # By landmark: its newest passage, and the last pose of that
+        self._passages: dict[int, tuple[int, int]] = {}
+        self._n_passages = 0
         self.since_solved = 0
         """How many steps ago the trajectory was last solved for, or that was tried."""
         self._stored_pose: Array = np.zeros(3)
@@ -252,7 +257,13 @@ class RunLog:
         ``antenna`` is in the body frame of the pose, its mount being where the rig has it, and
         ``turn_rad`` the robot's from the pose to the sample.
         """
-        self._ranges.append((pose, radar, landmark_id, antenna, turn_rad, range_m, sigma_m))
+        passage, last = self._passages.get(landmark_id, (0, -_GAP_POSES - 1))
+        if pose - last > _GAP_POSES:
+            passage = self._n_passages
+            self._n_passages += 1
+        self._passages[landmark_id] = passage, max(pose, last)
+        whose = (pose, landmark_id, passage, radar)
+        self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m))
 
     def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
         root = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -265,6 +276,17 @@ class RunLog:
     def drop(self, landmark_id: int) -> None:
         """Leave out all of a landmark's measurements."""
         self._names[landmark_id] = None
+
+    def edges(self, rows: Indices) -> tuple[Indices, Indices]:
+        """Return what ranges, by row of the log, were taken for: first landmark and passage."""
+        ranges = self._ranges.rows[rows]
+        return ranges["landmark"].astype(np.intp), ranges["passage"].astype(np.intp)
+
+    def split_off(self, rows: Indices, landmark_id: int) -> int:
+        """Take ranges from their landmark and give them to a new one; return of how many poses."""
+        ranges = self._ranges.rows
+        ranges["landmark"][rows] = landmark_id
+        return len(np.unique(ranges["pose"][rows]))
 
     def _keys(self, rule: RelinearisationRule) -> Indices:
         """Return which poses are keyframes; as the run goes on, those that were remain."""
@@ -281,7 +303,8 @@ class RunLog:
         ranges, points = self._ranges.rows, self._points.rows
         of_range = self._rows_of(ranges["landmark"], rows)
         of_point = self._rows_of(points["landmark"], rows)
-        ranges, of_range = ranges[of_range >= 0], of_range[of_range >= 0]
+        range_rows = np.flatnonzero(of_range >= 0)
+        ranges, of_range = ranges[range_rows], of_range[range_rows]
         points, of_point = points[of_point >= 0], of_point[of_point >= 0]
         sigmas_m = ranges["sigma_m"].astype(np.float64)
         if state.added_sigmas_m:
@@ -309,6 +332,7 @@ class RunLog:
             range_poses=key[pose],
             range_radars=ranges["radar"].astype(np.intp),
             range_landmarks=of_range,
+            range_rows=range_rows,
             range_antennas=antennas,
             range_turns=turn[pose] + ranges["turn_rad"],
             ranges_m=ranges["range_m"].copy(),

@@ -16,7 +16,7 @@ by its larger part: Olson and Agarwal, IJRR 32(7), 2013).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +57,14 @@ _UNKNOWN = 100.0
 # The decrease of the cost that ends a search, what rounding may add to it, and how often a step is
 # halved
 _TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
+_SETTLED_SHARE = 0.01  # decrease of the cost, as a share, from which on outliers are left out
 # What share of its price a slip must gain to be tried, and among how many neighbours on either side
 _FIRST_SHARE, _NEIGHBOURS = 0.25, 4
-_THIN_M = 2e-3  # radii below it are alike
+_THIN_M, _RADIUS_SCALE_M = 2e-3, 3e-3  # radii below the first are alike; tau of their prior
+# A group of ranges is looked at from that mean cost on, if it has as many; what its own place must
+# gain [nats]; where that is searched from, and in how many steps
+_SUSPECT_MEAN, _FEWEST_OF_GROUP, _SPLIT_NATS, _ALONE_STEPS = 4.0, 15, 20.0, 8
+_TRIED_M = ((0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2))
 # What keeps a direction finite where a landmark stands at an antenna, or at the robot, and a root
 # where nothing walks
 _LEAST_RANGE_M, _LEAST_RANGE_M2, _TINY = 1e-9, 1e-18, 1e-300
@@ -408,7 +413,6 @@ class Smoother:
         self._problem, self._rule = problem, rule
         first, layout = problem.keys[:-1], problem.layout
         self._radii = layout.radii if layout.has_radii else slice(0, 0)
-        self._radius_m = float(problem.prior_sigmas[self._radii].max(initial=0.0))
         chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))
         covariances = motion_covariances(chain, problem.step_covariances)
         # W with W C W^T = I, shape (k, 3, 3)
@@ -432,15 +436,17 @@ class Smoother:
         """
         estimate, limit, rule = start, math.inf, self._rule
         slips = np.zeros(len(self._roots), dtype=np.bool_)
-        cost = self.cost(estimate, slips, limit)
+        cost, decrease = self.cost(estimate, slips, limit), math.inf
         for iteration in range(1, rule.iterations + 1):
-            # A slip far from where it was looks like many small ones; an outlier like a slip.
-            before = slips
+            # A slip far from where it was looks like many small ones; an outlier like a slip. And
+            # far from the solution, what is right may look like an outlier.
+            before, was = slips, limit
             if iteration >= rule.slips_from:
                 slips = self._slips(estimate, slips, is_first=iteration == rule.slips_from)
-            if iteration == rule.outliers_from:
+            is_settled = decrease <= _SETTLED_SHARE * cost or iteration > 2 * rule.outliers_from
+            if iteration >= rule.outliers_from and is_settled:
                 limit = rule.outlier_sigmas
-            is_other = iteration == rule.outliers_from or bool(np.any(slips != before))
+            is_other = limit != was or bool(np.any(slips != before))
             if is_other:
                 cost = self.cost(estimate, slips, limit)
             try:
@@ -457,7 +463,7 @@ class Smoother:
             else:
                 new_cost, better = cost, estimate
             decrease, cost, estimate = cost - new_cost, new_cost, better
-            if decrease < tolerance and iteration >= rule.outliers_from and not is_other:
+            if decrease < tolerance and limit == rule.outlier_sigmas and not is_other:
                 break
         try:
             information = eliminate(self._equations(estimate, slips, limit)).information
@@ -480,9 +486,13 @@ class Smoother:
         total += float(np.sum(self._walk_residual(estimate) ** 2))
         away, sigmas = self._from_prior(estimate)
         costs = (away / sigmas) ** 2
-        # The cost 2 rho / tau of an exponential prior is more than its quadratic's by as much.
-        excess_m = np.maximum(away[self._radii] - _THIN_M, 0.0)
-        return total + float(np.sum(costs) + np.sum(excess_m) / max(self._radius_m, _TINY))
+        # Of a radius the cost is 2 ln(tau + rho), and quadratic where it is thin.
+        radii = np.maximum(away[self._radii], _THIN_M)
+        thin = np.clip(away[self._radii], 0.0, _THIN_M)
+        costs[self._radii] = thin**2 / (_THIN_M * (_RADIUS_SCALE_M + _THIN_M))
+        costs[self._radii] += 2.0 * np.log((_RADIUS_SCALE_M + radii) / (_RADIUS_SCALE_M + _THIN_M))
+        below = np.minimum(away[self._radii], 0.0)
+        return total + float(np.sum(costs) + np.sum((below / _THIN_M) ** 2))
 
     def start_cost(self, estimate: Estimate) -> float:
         """Return the cost of values to start from: any motion may be a slip."""
@@ -537,15 +547,16 @@ class Smoother:
     def _from_prior(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return how far values are from the prior's mean, and the standard deviations of that.
 
-        Radii have an exponential prior, which takes most of them for thin: by the quadratic that
-        touches it, as Huber's weights are.
+        Radii have a prior 1 / (tau + rho), which takes most of them for thin, and of those that are
+        not every size for likely: by the quadratic that touches it, as Huber's weights are.
         """
         problem = self._problem
         first = np.concatenate([estimate.poses[0], estimate.calibration[0], estimate.fixed])
         away, sigmas = first - problem.prior_mean, problem.prior_sigmas.copy()
         radii = away[self._radii]
-        rounded = np.sqrt(self._radius_m * np.maximum(radii, _THIN_M))
-        sigmas[self._radii] = np.where(radii < 0.0, np.minimum(_THIN_M, rounded), rounded)
+        least = np.maximum(radii, _THIN_M)
+        rounded = np.sqrt(least * (_RADIUS_SCALE_M + least))
+        sigmas[self._radii] = np.where(radii < 0.0, _THIN_M, rounded)
         return away, sigmas
 
     def weights(self, residual: Array, limit: float) -> Array:
@@ -621,6 +632,82 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state)
     return True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Split:
+    """Ranges that are not of the landmark that they were taken for."""
+
+    landmark_id: int
+    rows: Indices  # of the log
+    point_m: Array  # shape (2,): where they lie, map frame
+
+
+def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Split | None:
+    """Return the passage, or the landmark merged into another, that disagrees most with the rest.
+
+    To be called after a solution, whose poses are taken for true: of a group of ranges of one
+    landmark, the smaller part, the cost must fall by more than chance and `_SPLIT_NATS` explain
+    where the group has a place of its own.
+    """
+    problem = log.problem(state, parameters)
+    estimate, n = log.starts(state, problem)[0], len(problem.ranges_m)
+    residual = measurement_residuals(problem, estimate).residual[:n]
+    limit, layout = parameters.relinearisation.outlier_sigmas, problem.layout
+    costs = np.minimum(residual**2, limit**2)
+    found: list[tuple[float, Split]] = []
+    for edges in log.edges(problem.range_rows):
+        order = np.lexsort((edges, problem.range_landmarks))
+        keys = np.column_stack([problem.range_landmarks, edges])[order]
+        starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1))
+        sizes = np.diff(np.append(starts, n))
+        means = np.add.reduceat(costs[order], starts) / sizes
+        wholes = np.bincount(problem.range_landmarks)[keys[starts, 0]]
+        suspects = (means > _SUSPECT_MEAN) & (sizes >= _FEWEST_OF_GROUP) & (2 * sizes <= wholes)
+        for k in np.flatnonzero(suspects & (keys[starts, 0] < layout.n_landmarks)).tolist():
+            at = order[starts[k] : starts[k] + sizes[k]]
+            point_m, alone = _place_alone(problem, estimate, at, limit)
+            gain = (float(costs[at].sum()) - alone) / problem.variance_share
+            if gain > 2.0 * _SPLIT_NATS and alone < 0.5 * float(costs[at].sum()):
+                id_ = state.landmark_ids[int(keys[starts[k], 0])]
+                rows = problem.range_rows[at]
+                found.append((gain, Split(landmark_id=id_, rows=rows, point_m=point_m)))
+    return max(found, key=lambda pair: pair[0])[1] if found else None
+
+
+def _place_alone(
+    problem: Problem, estimate: Estimate, at: Indices, limit: float
+) -> tuple[Array, float]:
+    """Return where some ranges of one landmark lie, and what they cost there, poses being known."""
+    few = replace(
+        problem,
+        **{
+            column.name: getattr(problem, column.name)[at]
+            for column in fields(Problem)
+            if column.name.startswith("range")
+        },
+        point_poses=problem.point_poses[:0],
+        point_landmarks=problem.point_landmarks[:0],
+        points=problem.points[:0],
+        point_roots=problem.point_roots[:0],
+    )
+    first = int(problem.layout.first_columns(problem.range_landmarks[at[:1]])[0]) - HEAD_SIZE
+    best_m, least = estimate.fixed[first : first + 2], math.inf
+    # The antennas see it from one side; where the ranges cross may lie on the other.
+    for away in _TRIED_M:
+        fixed = estimate.fixed.copy()
+        fixed[first : first + 2] += away
+        for _ in range(_ALONE_STEPS):
+            rows = measurement_residuals(few, replace(estimate, fixed=fixed))
+            J = rows.by_border[:, 1:3]
+            weight = 1.0 / np.maximum(np.abs(rows.residual), 1.0)
+            information = (J.T * weight) @ J + np.eye(2)
+            fixed[first : first + 2] -= np.linalg.solve(information, (J.T * weight) @ rows.residual)
+        residual = measurement_residuals(few, replace(estimate, fixed=fixed)).residual
+        cost = float(np.minimum(residual**2, limit**2).sum())
+        if cost < least:
+            best_m, least = fixed[first : first + 2].copy(), cost
+    return best_m, least
 
 
 def learn_noise(problem: Problem, estimate: Estimate, state: State) -> None:
