@@ -35,6 +35,7 @@ PLANTED = {
     "slam-core": ("slam/front_end/__init__.py", "import xethru_protocol"),
     "slam-app-on-top": ("slam/robust/__init__.py", "import slam.app"),
     "pure": ("slam/paper/__init__.py", "import time"),
+    "numba-once": ("slam/front_end/__init__.py", "import numba"),
     "rerun-once": ("slam/app/run/__init__.py", "import rerun"),
 }
 

@@ -253,10 +253,11 @@ def keep(table: Array, least: float, n_bins: int) -> int:
             for at in range(n, 0, -1):
                 if table[at - 1, 0] <= table[at, 0]:
                     break
+                before = at - 1
                 for column in range(COLUMNS):
-                    table[at - 1, column], table[at, column] = (
+                    table[before, column], table[at, column] = (
                         table[at, column],
-                        table[at - 1, column],
+                        table[before, column],
                     )
             n += 1
     return n
@@ -656,6 +657,7 @@ def fit_whole(
     while size < max_echoes:
         signal = math.sqrt(max(explained, 0.0))
         needed = (math.sqrt(threshold) * sigma_y + model_error * signal) ** 2
+        at_least = explained + needed
         found = -math.inf
         starts = 1
         if size == 1:
@@ -676,16 +678,7 @@ def fit_whole(
             if not _apart(now[U], size + 1, separation):
                 continue
             reached = polish(
-                around,
-                s,
-                sigma_y,
-                first,
-                last,
-                separation,
-                COARSE,
-                explained + needed,
-                states,
-                size + 1,
+                around, s, sigma_y, first, last, separation, COARSE, at_least, states, size + 1
             )
             if reached > found:
                 found = reached
