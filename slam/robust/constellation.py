@@ -25,7 +25,7 @@ from scipy.special import chdtri
 
 from slam.geometry import align_se2, compose, transform
 from slam.robust.association import density_per_m2
-from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
+from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, BranchRule
 from slam.robust.state import HEADING, Array, State, quarter_turn, rotation
 
 Pairs = tuple[tuple[int, int], ...]
@@ -85,12 +85,12 @@ def find_placement(here: Constellation, there: Constellation, rule: BranchRule) 
         if placement is not None and len(placement.pairs) >= least:
             found[placement.pairs] = placement
     ranked = sorted(found.values(), key=lambda one: -one.evidence)
-    if not ranked or ranked[0].evidence < rule.evidence:
+    if not ranked or ranked[0].evidence < MARGIN_NATS:
         return None
     best = ranked[0]
     middle = here.points_m.mean(axis=0)
     for rival in ranked[1:]:
-        if best.evidence - rival.evidence >= rule.evidence:
+        if best.evidence - rival.evidence >= MARGIN_NATS:
             break
         if differ(best.motion, rival.motion, middle, rule):
             return None

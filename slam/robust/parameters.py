@@ -184,10 +184,9 @@ class BranchRule:
     slip_m: float = 0.015
     slip_rad: float = 0.035
     steps: int = 15  # over which a slip is looked for, and an alternative proves itself
-    # Fewest landmarks that say where a map lies on another, least evidence [nats] of that against
-    # new landmarks and against every other place, and how far lengths and places may differ
+    # Fewest landmarks that say where a map lies on another, and how far lengths and places may
+    # differ in a guess
     least_landmarks: int = 3
-    evidence: float = 8.0
     reach_m: float = 0.2
     # Standard deviation that is stated of the position while it is not known
     lost_position_m: float = 5.0

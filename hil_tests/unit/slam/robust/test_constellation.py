@@ -84,8 +84,7 @@ def test_evidence_is_the_likelihood_with_the_motion_integrated_out() -> None:
     sigma_m = 0.02
     places = np.array([[0.0, 0.0], [1.0, 0.0], [0.2, 0.8]])
     noisy = places + np.array([[0.01, -0.005], [0.0, 0.012], [-0.008, 0.004]])
-    rule = BranchRule(evidence=-math.inf)
-    found = find_placement(known(noisy, sigma_m), known(places, sigma_m), rule)
+    found = find_placement(known(noisy, sigma_m), known(places, sigma_m), RULE)
     assert found is not None
     steps = np.linspace(-0.1, 0.1, 61)
     total, variance = 0.0, 2 * sigma_m**2
