@@ -60,7 +60,7 @@ _TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
 _SETTLED_SHARE = 0.01  # decrease of the cost, as a share, from which on outliers are left out
 # What share of its price a slip must gain to be tried, and among how many neighbours on either side
 _FIRST_SHARE, _NEIGHBOURS = 0.25, 4
-_THIN_M, _RADIUS_SCALE_M = 2e-3, 3e-3  # radii below the first are alike; tau of their prior
+_THIN_M, _RADIUS_SCALE_M = 1e-3, 1e-3  # radii below the first are alike; tau of their prior
 # A group of ranges is looked at from that mean cost on, if it has as many; what its own place must
 # gain [nats]; where that is searched from, and in how many steps
 _SUSPECT_MEAN, _FEWEST_OF_GROUP, _SPLIT_NATS, _ALONE_STEPS = 4.0, 15, 20.0, 8

@@ -134,8 +134,8 @@ def along(steps: Array, calibration: Complex, noise: Complex | None = None) -> C
 
 
 def white_radius(rho: complex, *, is_exact: bool) -> complex:
-    """Return the root of 2 ln(tau + rho), quadratic below 2 mm; or of what touches it."""
-    thin, tau = 2e-3, 3e-3
+    """Return the root of 2 ln(tau + rho), quadratic below 1 mm; or of what touches it."""
+    thin, tau = 1e-3, 1e-3
     if rho.real < 0.0:
         return rho / thin
     if rho.real < thin:
