@@ -55,6 +55,11 @@ from slam.robust.state import Array
 _SNAPSHOT_EVERY, _SNAPSHOTS = 50, 9
 # Steps between two looks for suspicion, and how many an alternative that lags behind takes a step
 _LOOK_EVERY, _CATCH_UP = 5, 10
+# How many sigmas of a slip a prediction may be unsure by after one, windows of steps that a slip
+# and a place may take to prove themselves, how far after its likely step a slip is tried, two landmarks
+# make up a price but do not exceed it, and landmarks are old and new ones
+_SLIPPING_SIGMAS, _SLIP_PATIENCE, _PLACE_PATIENCE, _STARTS_AFTER = 4.0, 3, 4, 2
+_LANDMARKS_OF_PRICE, _OLD_AND_NEW = 2.0, 2
 # How many of the newest landmarks are looked for among all others
 _NEWEST = 8
 # A missing range counts as one three standard deviations off. How fast what is usual is forgotten
@@ -147,7 +152,9 @@ class Alternative:
         Three landmarks must be for it if that is to exceed the price, and it must be as much
         likelier than that the robot is elsewhere. A map of its own begins with nothing.
         """
-        gain = self._own.gain(self._main, self.price / 2.0, same_map=not self._is_new)
+        gain = self._own.gain(
+            self._main, self.price / _LANDMARKS_OF_PRICE, same_map=not self._is_new
+        )
         return gain if self._is_new else min(gain, self._own.total(self._rule.most_for))
 
     def take(self, step: Step) -> None:
@@ -159,7 +166,7 @@ class Alternative:
                 covariance = back_end.step_covariance(step.increment, covariance) + np.diag(slip)
             back_end.predict(step.increment, covariance)
         begins = self._slipping is not None and number < self.since + rule.steps
-        sure_m = 4.0 * rule.slip_m if begins else None
+        sure_m = _SLIPPING_SIGMAS * rule.slip_m if begins else None
         report = back_end.update(step.scans, sure_m=sure_m, solve=False)
         # What the main one maps after it went wrong explains the ranges there, too.
         if not self.next_step - self.since:
@@ -315,7 +322,7 @@ class Branches:
             if slip.gain > slip.price:
                 self._adopt(slip)
                 return False
-            if self._now - slip.since > 3 * rule.steps:
+            if self._now - slip.since > _SLIP_PATIENCE * rule.steps:
                 self._slip = None
         if placed is not None and self._is_up_to_date(placed):
             if placed.gain > placed.price:
@@ -392,7 +399,7 @@ class Branches:
         main, rule, first = self.main, self._rule, max(min(self._snapshots), self._judged)
         rows, ids = main.reported_rows(), main.state.landmark_ids
         oldest_id = self._steps[first].next_id if first < self._now else main.state.next_id
-        newest = sorted(rows, key=lambda row: -ids[row])[: min(_NEWEST, len(rows) // 2)]
+        newest = sorted(rows, key=lambda row: -ids[row])[: min(_NEWEST, len(rows) // _OLD_AND_NEW)]
         new = [row for row in newest if ids[row] >= oldest_id]
         new_ids = {ids[row] for row in new}
         if new_ids <= self._recognised_ids:
@@ -412,9 +419,9 @@ class Branches:
 
     def _begin_slip(self, since: int) -> None:
         """Go back to about a step, try a slip at each of some steps around it; keep the best."""
-        width, oldest = self._rule.steps // 3, min(self._snapshots)
+        width, oldest = _LOOK_EVERY, min(self._snapshots)
         back_end, tried = self._at(max(since - width, oldest)), []
-        for start in range(max(since - width, oldest), min(since + 2, self._now)):
+        for start in range(max(since - width, oldest), min(since + _STARTS_AFTER, self._now)):
             slip = Alternative(back_end.copy(), start, self._rule, slipping=start)
             for number in range(start, self._now):
                 slip.take(self._steps[number])
@@ -447,4 +454,4 @@ class Branches:
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)
         self._placed = Alternative(back_end, carry.fresh.since, rule, set_down=True)
-        self._tried_until = carry.search_from = self._now + 4 * rule.steps
+        self._tried_until = carry.search_from = self._now + _PLACE_PATIENCE * rule.steps

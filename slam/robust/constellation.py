@@ -25,13 +25,15 @@ from scipy.special import chdtri
 
 from slam.geometry import align_se2, compose, transform
 from slam.robust.association import density_per_m2
-from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, BranchRule
+from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
 from slam.robust.state import HEADING, Array, State, quarter_turn, rotation
 
 Pairs = tuple[tuple[int, int], ...]
 
 # How far around its outermost landmarks, and around each of them, a map reaches
 _SURROUNDINGS_M = 1.5
+# Least evidence [nats] of a placement, and by how much it must beat every other place
+_EVIDENCE = 8.0
 # Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
 # that keeps the matrix regular
 _STEPS, _LEAST_CHANGE, _VARIANCE_FLOOR_M2 = 5, 1e-9, 1e-10
@@ -85,12 +87,12 @@ def find_placement(here: Constellation, there: Constellation, rule: BranchRule) 
         if placement is not None and len(placement.pairs) >= least:
             found[placement.pairs] = placement
     ranked = sorted(found.values(), key=lambda one: -one.evidence)
-    if not ranked or ranked[0].evidence < MARGIN_NATS:
+    if not ranked or ranked[0].evidence < _EVIDENCE:
         return None
     best = ranked[0]
     middle = here.points_m.mean(axis=0)
     for rival in ranked[1:]:
-        if best.evidence - rival.evidence >= MARGIN_NATS:
+        if best.evidence - rival.evidence >= _EVIDENCE:
             break
         if differ(best.motion, rival.motion, middle, rule):
             return None
