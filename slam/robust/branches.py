@@ -56,8 +56,8 @@ _SNAPSHOT_EVERY, _SNAPSHOTS = 50, 9
 # Steps between two looks for suspicion, and how many an alternative that lags behind takes a step
 _LOOK_EVERY, _CATCH_UP = 5, 10
 # How many sigmas of a slip a prediction may be unsure by after one, windows of steps that a slip
-# and a place may take to prove themselves, how far after its likely step a slip is tried, two landmarks
-# make up a price but do not exceed it, and landmarks are old and new ones
+# and a place may take to prove themselves, how far after its likely step a slip is tried; two
+# landmarks make up a price but do not exceed it; landmarks are old and new ones
 _SLIPPING_SIGMAS, _SLIP_PATIENCE, _PLACE_PATIENCE, _STARTS_AFTER = 4.0, 3, 4, 2
 _LANDMARKS_OF_PRICE, _OLD_AND_NEW = 2.0, 2
 # How many of the newest landmarks are looked for among all others
