@@ -81,21 +81,21 @@ def test_where_a_map_has_its_origin_does_not_matter() -> None:
 
 def test_evidence_is_the_likelihood_with_the_motion_integrated_out() -> None:
     """Against the sum over a grid of motions, three landmarks of known places."""
-    sigma_m = 0.02
+    sigma_m = 0.002
     places = np.array([[0.0, 0.0], [1.0, 0.0], [0.2, 0.8]])
-    noisy = places + np.array([[0.01, -0.005], [0.0, 0.012], [-0.008, 0.004]])
+    noisy = places + np.array([[1e-3, -5e-4], [0.0, 1.2e-3], [-8e-4, 4e-4]])
     found = find_placement(known(noisy, sigma_m), known(places, sigma_m), RULE)
     assert found is not None
-    steps = np.linspace(-0.1, 0.1, 61)
+    steps = np.linspace(-0.01, 0.01, 61)
     total, variance = 0.0, 2 * sigma_m**2
-    for turn in np.linspace(-0.2, 0.2, 61):
+    for turn in np.linspace(-0.02, 0.02, 61):
         c, s = math.cos(turn), math.sin(turn)
         residual = noisy @ np.array([[c, -s], [s, c]]).T - places
         x = residual[:, 0, None, None] + steps[:, None]
         y = residual[:, 1, None, None] + steps[None, :]
         squares = (x**2 + y**2).sum(axis=0)
         total += float(np.exp(-squares / (2 * variance)).sum()) / (math.tau * variance) ** 3
-    total *= (0.2 / 60) ** 2 * (0.4 / 60)
+    total *= (0.02 / 60) ** 2 * (0.04 / 60)
     area_m2 = (1.0 + 3.0) * (0.8 + 3.0)
     expected = math.log(total / (math.tau * area_m2)) - 3 * math.log(density_per_m2(places, 1.5))
     assert found.evidence == pytest.approx(expected, abs=0.05)
