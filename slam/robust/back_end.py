@@ -43,8 +43,8 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import Existence, apply_merge, find_merge, judge
 from slam.robust.parameters import BackEndParameters, PointRule
-from slam.robust.run_log import RunLog
-from slam.robust.smoother import find_split, is_due, relinearise, solve_whole_run
+from slam.robust.solver.revision import find_split, is_due, relinearise, solve_whole_run
+from slam.robust.solver.run_log import RunLog
 from slam.robust.state import (
     HEAD_SIZE,
     Array,

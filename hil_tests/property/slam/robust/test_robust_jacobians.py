@@ -36,8 +36,8 @@ from slam.robust.initialisation import (
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.run_log import Estimate, Problem
-from slam.robust.smoother import measurement_residuals, motion_residuals
+from slam.robust.solver.run_log import Estimate, Problem
+from slam.robust.solver.smoother import measurement_residuals, motion_residuals
 from slam.robust.state import Layout, calibrated_motion, left_jacobian, predict, rotation
 
 WHEELS = WheelNoise(walk_per_sqrt_m=0.0)

@@ -21,7 +21,8 @@ from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
-from slam.robust.run_log import (
+from slam.robust.solver.revision import is_determined, relinearise
+from slam.robust.solver.run_log import (
     Estimate,
     Problem,
     RunLog,
@@ -30,7 +31,7 @@ from slam.robust.run_log import (
     motion_covariances,
     motions_by_calibration,
 )
-from slam.robust.smoother import Smoother, is_determined, measurement_residuals, relinearise
+from slam.robust.solver.smoother import Smoother, measurement_residuals
 from slam.robust.state import Layout, State, calibrated_motion, predict
 
 Array = NDArray[np.float64]

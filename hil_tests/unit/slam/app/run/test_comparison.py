@@ -107,18 +107,18 @@ def test_numbers_that_differ_are_the_reason() -> None:
 def test_recorded_rules_are_taken_over_and_other_numbers_compared() -> None:
     recorded = slam_constants() | {
         "slam.robust.parameters.MapRule.report_hits": 3,
-        "slam.robust.parameters.ContinuationRule.gates": [8.0, 12.5],
+        "slam.robust.parameters.ContinuationRule.tight_sigmas": 1.5,
         "slam.robust.parameters.MapRule.gone": 7.0,
-        "slam.robust.map._KNOTS": 9,
+        "slam.robust.branches._NEWEST": 9,
     }
     del recorded["slam.front_end.matched_filter._REACH"]
     rules = recorded_rules(recorded)
     assert rules.map == replace(MapRule(), report_hits=3)
-    assert rules.continuation.gates == (8.0, 12.5)
+    assert rules.continuation.tight_sigmas == 1.5
     assert rules.tracklets == BackEndParameters().tracklets
     assert different_constants(recorded) == [
         "slam.front_end.matched_filter._REACH none, here 3.0",
-        "slam.robust.map._KNOTS 9, here 8",
+        "slam.robust.branches._NEWEST 9, here 8",
         "slam.robust.parameters.MapRule.gone 7.0, here none",
     ]
 

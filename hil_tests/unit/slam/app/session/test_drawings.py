@@ -482,6 +482,10 @@ RARE = {  # in few sessions
     "/radar/<name>/tx": "std_msgs/msg/UInt8MultiArray",
     "/radar/<name>/detections": "std_msgs/msg/Float64MultiArray",
     "/session/gap": "std_msgs/msg/String",
+    "/slam/smoothed": "std_msgs/msg/Float64MultiArray",
+    "/slam/smoothed_landmarks": "sensor_msgs/msg/PointCloud2",
+    "/slam/smoothed_path": "nav_msgs/msg/Path",
+    "/slam/smoothed_path_points": "sensor_msgs/msg/PointCloud2",
 }
 
 

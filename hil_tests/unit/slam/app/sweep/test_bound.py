@@ -42,8 +42,8 @@ from slam.geometry import Mount, Rig, between, compose, mount_at, paper_rig
 from slam.paper.ekf import start
 from slam.results import StepResult
 from slam.robust.parameters import BackEndParameters, RangeNoise, RelinearisationRule
-from slam.robust.run_log import Estimate, Problem, prior_sigmas
-from slam.robust.smoother import Smoother, Solution
+from slam.robust.solver.run_log import Estimate, Problem, prior_sigmas
+from slam.robust.solver.smoother import Smoother, Solution
 from slam.robust.state import Layout
 
 Array = NDArray[np.float64]

@@ -16,44 +16,30 @@ by its larger part: Olson and Agarwal, IJRR 32(7), 2013).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dtbtrs
 
 from slam.geometry import wrap_angles
-from slam.robust.parameters import BackEndParameters, RelinearisationRule
-from slam.robust.run_log import (
+from slam.robust.parameters import RelinearisationRule
+from slam.robust.solver.run_log import (
     Estimate,
     Problem,
-    RunLog,
-    all_poses,
     chain_of,
     motion_covariances,
     motions_by_calibration,
 )
 from slam.robust.state import (
     HEAD_SIZE,
-    HEADING,
     Array,
     Indices,
-    RangeErrors,
-    State,
-    SymmetricMatrix,
 )
 
 # Columns of the border
 POSE, CALIBRATION = slice(0, 3), slice(3, HEAD_SIZE)
 _LEAST_WALK_SHARE = 1e-5
-# The standard deviation of normal noise over its median magnitude; beyond how many a residual is
-# taken for that many, and fewer ranges than that choose nothing
-_SIGMA_PER_MEDIAN, _MOST_SIGMAS, _FEWEST_RANGES = 1.4826, 3.0, 200
-# Keyframes whose ranges of one landmark may err alike; as how many such groups what all landmarks
-# have in common counts for one; and limits of `RangeErrors.variance_share`
-_KEYS_PER_PASSAGE, _PRIOR_PASSAGES, _LEAST_SHARE, _MOST_SHARE = 5, 5, 0.5, 50.0
-_PRIOR_GROUPS = 30  # as how many groups it counts that ranges err as told
-_UNKNOWN = 100.0
 # The decrease of the cost that ends a search, what rounding may add to it, and how often a step is
 # halved
 _TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
@@ -61,10 +47,6 @@ _SETTLED_SHARE = 0.01  # decrease of the cost, as a share, from which on outlier
 # What share of its price a slip must gain to be tried, and among how many neighbours on either side
 _FIRST_SHARE, _NEIGHBOURS = 0.25, 4
 _THIN_M, _RADIUS_SCALE_M = 1e-3, 1e-3  # radii below the first are alike; tau of their prior
-# A group of ranges is looked at from that mean cost on, if it has as many; what its own place must
-# gain [nats]; where that is searched from, and in how many steps
-_SUSPECT_MEAN, _FEWEST_OF_GROUP, _SPLIT_NATS, _ALONE_STEPS = 4.0, 15, 20.0, 8
-_TRIED_M = ((0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2))
 # What keeps a direction finite where a landmark stands at an antenna, or at the robot, and a root
 # where nothing walks
 _LEAST_RANGE_M, _LEAST_RANGE_M2, _TINY = 1e-9, 1e-18, 1e-300
@@ -607,207 +589,3 @@ def _moved(estimate: Estimate, change: tuple[Array, Array], share: float) -> Est
         calibration=calibration,
         fixed=estimate.fixed + share * border[HEAD_SIZE:],
     )
-
-
-def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Return whether the pose is too far from the stored trajectory."""
-    rule = parameters.relinearisation
-    if log.since_solved < rule.every or not state.feature_ids:
-        return False
-    if log.since_solved >= max(rule.at_least_every, rule.run_share * log.n_poses):
-        return True
-    shift_m, turn_rad = log.parted(state.pose)
-    return turn_rad > rule.turn_rad or shift_m > rule.shift_m
-
-
-def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Solve for all poses and replace the belief by the result; return whether it worked."""
-    log.since_solved = 0
-    problem = log.problem(state, parameters)
-    smoother = Smoother(problem, parameters.relinearisation)
-    solution = smoother.solve(min(log.starts(state, problem), key=smoother.start_cost))
-    if solution is None or not is_determined(solution.information):
-        return False
-    _replace(state, solution)
-    log.solved(problem, solution.estimate)
-    learn_noise(problem, solution.estimate, state)
-    return True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Split:
-    """Ranges that are not of the landmark that they were taken for."""
-
-    landmark_id: int
-    rows: Indices  # of the log
-    point_m: Array  # shape (2,): where they lie, map frame
-
-
-def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Split | None:
-    """Return the passage, or the landmark merged into another, that disagrees most with the rest.
-
-    To be called after a solution, whose poses are taken for true: of a group of ranges of one
-    landmark, the smaller part, the cost must fall by more than chance and `_SPLIT_NATS` explain
-    where the group has a place of its own.
-    """
-    problem = log.problem(state, parameters)
-    estimate, n = log.starts(state, problem)[0], len(problem.ranges_m)
-    residual = measurement_residuals(problem, estimate).residual[:n]
-    limit, layout = parameters.relinearisation.outlier_sigmas, problem.layout
-    costs = np.minimum(residual**2, limit**2)
-    found: list[tuple[float, Split]] = []
-    for edges in log.edges(problem.range_rows):
-        order = np.lexsort((edges, problem.range_landmarks))
-        keys = np.column_stack([problem.range_landmarks, edges])[order]
-        starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1))
-        sizes = np.diff(np.append(starts, n))
-        means = np.add.reduceat(costs[order], starts) / sizes
-        wholes = np.bincount(problem.range_landmarks)[keys[starts, 0]]
-        suspects = (means > _SUSPECT_MEAN) & (sizes >= _FEWEST_OF_GROUP) & (2 * sizes <= wholes)
-        for k in np.flatnonzero(suspects & (keys[starts, 0] < layout.n_landmarks)).tolist():
-            at = order[starts[k] : starts[k] + sizes[k]]
-            point_m, alone = _place_alone(problem, estimate, at, limit)
-            gain = (float(costs[at].sum()) - alone) / problem.variance_share
-            if gain > 2.0 * _SPLIT_NATS and alone < 0.5 * float(costs[at].sum()):
-                id_ = state.landmark_ids[int(keys[starts[k], 0])]
-                rows = problem.range_rows[at]
-                found.append((gain, Split(landmark_id=id_, rows=rows, point_m=point_m)))
-    return max(found, key=lambda pair: pair[0])[1] if found else None
-
-
-def _place_alone(
-    problem: Problem, estimate: Estimate, at: Indices, limit: float
-) -> tuple[Array, float]:
-    """Return where some ranges of one landmark lie, and what they cost there, poses being known."""
-    few = replace(
-        problem,
-        **{
-            column.name: getattr(problem, column.name)[at]
-            for column in fields(Problem)
-            if column.name.startswith("range")
-        },
-        point_poses=problem.point_poses[:0],
-        point_landmarks=problem.point_landmarks[:0],
-        points=problem.points[:0],
-        point_roots=problem.point_roots[:0],
-    )
-    first = int(problem.layout.first_columns(problem.range_landmarks[at[:1]])[0]) - HEAD_SIZE
-    best_m, least = estimate.fixed[first : first + 2], math.inf
-    # The antennas see it from one side; where the ranges cross may lie on the other.
-    for away in _TRIED_M:
-        fixed = estimate.fixed.copy()
-        fixed[first : first + 2] += away
-        for _ in range(_ALONE_STEPS):
-            rows = measurement_residuals(few, replace(estimate, fixed=fixed))
-            J = rows.by_border[:, 1:3]
-            weight = 1.0 / np.maximum(np.abs(rows.residual), 1.0)
-            information = (J.T * weight) @ J + np.eye(2)
-            fixed[first : first + 2] -= np.linalg.solve(information, (J.T * weight) @ rows.residual)
-        residual = measurement_residuals(few, replace(estimate, fixed=fixed)).residual
-        cost = float(np.minimum(residual**2, limit**2).sum())
-        if cost < least:
-            best_m, least = fixed[first : first + 2].copy(), cost
-    return best_m, least
-
-
-def learn_noise(problem: Problem, estimate: Estimate, state: State) -> None:
-    """Let the residuals of a solution choose the noise of ranges, of each landmark and of all.
-
-    The variance of single ranges is that of their median residual. A landmark's own is believed in
-    proportion to its passages, for ranges of one passage err alike. That shows in the sums of
-    residuals over some keyframes: had all ranges errors of their own, the variance of a sum would
-    be the number of its terms.
-    """
-    n = len(problem.ranges_m)
-    if n < _FEWEST_RANGES:
-        return
-    ids, at = state.feature_ids, problem.range_landmarks
-    residual = measurement_residuals(problem, estimate).residual[:n]
-    added = np.array([state.added_sigmas_m.get(id_, 0.0) for id_ in ids])
-    told_m = np.sqrt(np.maximum(problem.range_sigmas_m**2 - added[at] ** 2, _LEAST_RANGE_M2))
-    ratio = residual * problem.range_sigmas_m / told_m
-    of_all = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio)))) ** 2
-    block = problem.range_poses // _KEYS_PER_PASSAGE
-    own = np.zeros(len(ids))
-    for row, id_ in enumerate(ids):
-        mine = np.flatnonzero(at == row)
-        if not len(mine):
-            continue
-        n_passages = len(np.unique(block[mine]))
-        raw = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio[mine])))) ** 2
-        believed = (n_passages * raw + _PRIOR_PASSAGES * of_all) / (n_passages + _PRIOR_PASSAGES)
-        own[row] = math.sqrt(max(believed - 1.0, 0.0)) * float(np.median(told_m[mine]))
-        state.added_sigmas_m[id_] = own[row]
-    sigmas_m = np.hypot(told_m, own[at])
-    white = np.clip(ratio * told_m / sigmas_m, -_MOST_SIGMAS, _MOST_SIGMAS)
-    groups = np.unique(block * len(ids) + at, return_inverse=True)[1]
-    sums = np.bincount(groups, white)
-    n_groups = len(sums)
-    share = (n_groups * float(np.sum(sums**2)) / n + _PRIOR_GROUPS) / (n_groups + _PRIOR_GROUPS)
-    share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
-    added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(told_m))
-    state.range_errors = RangeErrors(added_m, share)
-
-
-def solve_whole_run(
-    log: RunLog, state: State, parameters: BackEndParameters
-) -> tuple[Array, Array, Array, Array] | None:
-    """Return poses (n + 1, 3) and covariances, features (m, 2) and covariances; None if it fails.
-
-    Errors are additive. Nothing is changed.
-    """
-    if log.n_poses < 2:
-        return None
-    problem = log.problem(state, parameters)
-    smoother = Smoother(problem, parameters.relinearisation)
-    found = [smoother.solve(start) for start in log.starts(state, problem)]
-    solutions = [solution for solution in found if solution is not None]
-    if not solutions:
-        return None
-    solution = min(solutions, key=lambda each: each.cost)
-    best = solution.estimate
-    try:
-        of_keys, border = smoother.covariances(best, solution.slips)
-    except np.linalg.LinAlgError:
-        return None
-    first = problem.layout.first_columns(np.arange(len(state.feature_ids)))
-    columns = np.column_stack([first, first + 1])
-    blocks = border[columns[:, :, None], columns[:, None, :]]
-    poses, of_poses = all_poses(problem, best, of_keys)
-    return poses, of_poses, best.fixed[columns - HEAD_SIZE], blocks
-
-
-def is_determined(information: Array) -> bool:
-    """Return whether all unknowns of a solution are known to better than 100 m, rad or 1.
-
-    A landmark all of whose ranges were left out as too far off has no information but rounding;
-    its covariance would be of 1e14 m^2, and have negative eigenvalues.
-    """
-    variances = np.linalg.inv(information).diagonal()
-    return bool(np.all((variances > 0.0) & (variances < _UNKNOWN**2)))
-
-
-def _replace(state: State, solution: Solution) -> None:
-    estimate, layout = solution.estimate, state.layout
-    pose = estimate.poses[-1]
-    state.position_m = pose[:2].copy()
-    state.heading_rad = math.remainder(float(pose[2]), math.tau)
-    state.calibration = estimate.calibration[-1].copy()
-    values = np.concatenate([np.zeros(HEAD_SIZE), estimate.fixed])
-    state.offsets_m = values[layout.offsets].copy()
-    if layout.has_mounts:
-        state.mounts_m = values[layout.mounts].reshape(-1, 2).copy()
-    landmarks = values[layout.landmarks].reshape(-1, layout.landmark_size)
-    state.landmarks_m = landmarks[:, :2].copy()
-    if layout.has_radii:
-        state.radii_m = landmarks[:, 2].copy()
-    state.walls = values[layout.walls].reshape(-1, 2).copy()
-    # The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...)
-    additive = np.linalg.inv(solution.information)
-    order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
-    additive = additive[np.ix_(order, order)]
-    # e_p = e_add,p - J p e_th, landmarks likewise
-    T = state.additive_transform()
-    T[1:, HEADING] *= -1.0
-    P = T @ additive @ T.T
-    state.P = SymmetricMatrix(np.asarray((P + P.T) / 2))
