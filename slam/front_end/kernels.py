@@ -22,41 +22,41 @@ ComplexArray = NDArray[np.complex128]
 
 # Bins from one value of y to the next.
 BINS_PER_STEP = 2
-# Columns of a table of echoes; one that is not to be looked at has the misfit NaN, and the last
-# says whether a single pulse leaves more than noise and a wrong pulse would
+# Columns of a table of echoes. The misfit is NaN where it is not computed; SEVERAL is 1 where one
+# pulse leaves more than noise and a wrong pulse explain, else 0.
 POSITION, AMPLITUDE, PHASE, SIGMA, MISFIT, SEVERAL = range(6)
 COLUMNS = 6
 # Most echoes that a group is taken apart into.
 MAX_ECHOES = 4
-# On either side of a step, how many it takes to interpolate there
+# Steps on either side of one from which y is interpolated around it
 REACH_STEPS = 4
-# Behind the filter an echo is wider: beyond, 1e-7 of its height, and beyond the other nothing.
+# Envelope sigmas from an echo behind the filter to 1e-7 of its height, and to 2e-16, taken as zero
 FILTERED_REACH, _NOTHING = 8.0, 12.0
 
 # Cells this many times the first guess of sigma_y**2 hold an echo, and so do two on either side.
 _ECHO_LEVEL = 3.5**2
 _FLANK_CELLS = 2
-# Below one part in so many of its cells left, a frame is taken as a whole.
+# If at most one in so many cells is away from echoes, the noise is estimated from all cells.
 _LEAST_QUIET = 8
 
 _MAX_STEPS = 30
-# Of the envelope's sigma.
+# The largest step of a position, in envelope sigmas
 _LARGEST_STEP = 0.5
-# Damping of the first step, by what it is multiplied after a step that helped and one that did
-# not, its least part, as a share of the largest information, and where the search ends since it
-# presses against a limit
+# Damping of the first step, its factors after a step that helped and after one that did not, the
+# least damping as a share of the largest information, and the damping at which a search ends
 _DAMPING, _EASED, _STIFFENED, _LEAST_DAMPING, _HOPELESS = 1e-3, 0.1, 10.0, 1e-12, 1e3
-# Shares of a pulse's norm and information below which a position explains nothing of its own
+# Least share of a pulse's norm that other echoes do not explain, and least information of a
+# position, as a share of the largest
 _LEAST_NORM, _LEAST_INFORMATION = 1e-3, 1e-12
-# What keeps the matrix of cut pulses regular, as a share and where no sample is known
+# Added to the diagonal of the Gram matrix: a share of it, and what remains if no sample is known
 _RIDGE, _LEAST_GRAM = 1e-13, 1e-12
-# Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last, where
-# it is a hundredth of a standard deviation of a position.
+# Gains of twice the log-likelihood at which a search ends: while echoes are counted, and at last,
+# where it is a hundredth of a standard deviation of a position
 COARSE, FINE = 1.0, 1e-4
-# How many times its forecast a search may gain, at most.
+# At most so many times the gain that it forecasts is expected of a search.
 _OPTIMISM = 10.0
 
-# Rows of a state: positions, amplitudes, gradient, and from these on a matrix each
+# Rows of a state: positions, amplitudes, half the gradient; then one, one and three matrices
 U, REAL, IMAG, CLIMB, _KNOWN, INFORMATION, _WORK = 0, 1, 2, 3, 4, 8, 12
 ROWS = 24
 # States of one fit: the best so far, a search, one step of it, and the best search
@@ -66,7 +66,7 @@ STATES = 4
 
 @kernel("f8(f8[::1], i8)")
 def _median(values: Array, size: int) -> float:
-    """Return the value that half of the first ``size`` are below; they are reordered (Hoare)."""
+    """Return the (upper) median of the first ``size`` values, which are reordered (Hoare)."""
     low, high, middle = 0, size - 1, size // 2
     while low < high:
         pivot = values[(low + high) // 2]
@@ -98,8 +98,7 @@ def noise_power(y: ComplexArray, stride: int, cells: Array) -> float:
         powers[k] = y[k * stride].real ** 2 + y[k * stride].imag ** 2
         sorted_[k] = powers[k]
     first = _median(sorted_, n) / (2.0 * math.log(2.0))
-    quiet = 0
-    end = 0  # of an echo's flank
+    quiet, end = 0, 0  # how many cells are quiet, and the first behind the last echo
     for k in range(n):
         for ahead in range(k, min(k + _FLANK_CELLS + 1, n)):
             if powers[ahead] > _ECHO_LEVEL * first:
@@ -117,20 +116,20 @@ def _power_at(table: Array, n: int, position: float, s: float) -> float:
     """Return the sum of A**2 rho**2 of n echoes, ascending, at a position."""
     total = 0.0
     for k in range(n):
-        away = (position - table[k, 0]) / s
+        away = (position - table[k, POSITION]) / s
         if abs(away) < _NOTHING:
-            total += math.exp(-0.5 * away * away) * table[k, 1] ** 2
+            total += math.exp(-0.5 * away * away) * table[k, AMPLITUDE] ** 2
     return total
 
 
 @kernel("c16(f8[:,::1], i8, f8, f8, f8)")
 def _pulse(table: Array, row: int, position: float, s: float, carrier: float) -> complex:
     """Return an echo of a table behind the filter at a position."""
-    away = position - table[row, 0]
+    away = position - table[row, POSITION]
     if abs(away) > _NOTHING * s:
         return 0j
-    height = table[row, 1] * math.exp(-0.25 * (away / s) ** 2)
-    turn = carrier * away + table[row, 2]
+    height = table[row, AMPLITUDE] * math.exp(-0.25 * (away / s) ** 2)
+    turn = carrier * away + table[row, PHASE]
     return complex(height * math.cos(turn), height * math.sin(turn))
 
 
@@ -172,13 +171,13 @@ def single_pulses(
         offset = 0.5 * BINS_PER_STEP * (low - high) / (low - 2.0 * top + high)
         height = math.hypot(y[at].real, y[at].imag)
         amplitude = height * math.exp((offset / (2.0 * s)) ** 2)
-        table[n, 0] = BINS_PER_STEP * at + offset
-        table[n, 1] = amplitude
-        table[n, 2] = math.atan2(y[at].imag, y[at].real) + carrier * offset
-        table[n, 3] = math.sqrt(2.0) * s * sigma_y / amplitude
-        table[n, 4] = math.nan
-        table[n, 5] = 0.0
-        if first < table[n, 0] < last:
+        table[n, POSITION] = BINS_PER_STEP * at + offset
+        table[n, AMPLITUDE] = amplitude
+        table[n, PHASE] = math.atan2(y[at].imag, y[at].real) + carrier * offset
+        table[n, SIGMA] = math.sqrt(2.0) * s * sigma_y / amplitude
+        table[n, MISFIT] = math.nan
+        table[n, SEVERAL] = 0.0
+        if first < table[n, POSITION] < last:
             left = 0.0
             # Turned back by the peak's phase and the carrier, a pulse is real.
             back = y[at].conjugate() / height
@@ -188,20 +187,20 @@ def single_pulses(
                 away = (bins - offset) / s
                 real = value.real - amplitude * math.exp(-0.25 * away * away)
                 left += real * real + value.imag * value.imag
-            table[n, 4] = left
+            table[n, MISFIT] = left
             beyond_noise = left > max_misfit * sigma_y**2 * noise
             if beyond_noise and left > wrong**2 * energy * amplitude**2:
-                table[n, 5] = 1.0
+                table[n, SEVERAL] = 1.0
         n += 1
     for row in range(n):
-        if not math.isnan(table[row, 4]):
+        if not math.isnan(table[row, MISFIT]):
             # the highest value is within a bin of the vertex
-            at = round(table[row, 0] / BINS_PER_STEP)
+            at = round(table[row, POSITION] / BINS_PER_STEP)
             expected = sigma_y**2 * noise
             for k in range(probes.size):
                 position = float(BINS_PER_STEP * (at + probes[k]))
                 expected += wrong**2 * _power_at(table, n, position, s)
-            table[row, 4] /= expected
+            table[row, MISFIT] /= expected
     return n
 
 
@@ -219,16 +218,16 @@ def assess(
     last: float,
     table: Array,
 ) -> None:
-    """Write the misfit of the echoes of a table between two positions, where all are the model.
+    """Write the misfit of each echo of a table between two positions; all echoes are the model.
 
-    Without ``subtract`` the echoes are no longer in y.
+    Without ``subtract``, y is the residual: the echoes are subtracted already.
     """
     n = len(table)
     for row in range(n):
-        table[row, 4] = math.nan
-        if not first < table[row, 0] < last:
+        table[row, MISFIT] = math.nan
+        if not first < table[row, POSITION] < last:
             continue
-        at = round(table[row, 0] / BINS_PER_STEP)
+        at = round(table[row, POSITION] / BINS_PER_STEP)
         left = 0.0
         expected = sigma_y**2 * noise
         for k in range(probes.size):
@@ -239,7 +238,7 @@ def assess(
                     value -= _pulse(table, each, position, s, carrier)
             left += value.real**2 + value.imag**2
             expected += wrong**2 * _power_at(table, n, position, s)
-        table[row, 4] = left / expected
+        table[row, MISFIT] = left / expected
 
 
 @kernel("i8(f8[:,::1], f8, i8)")
@@ -247,28 +246,24 @@ def keep(table: Array, least: float, n_bins: int) -> int:
     """Sort the echoes that are high enough and in the frame to the top; return how many."""
     n = 0
     for row in range(len(table)):
-        if table[row, 1] > least and -0.5 <= table[row, 0] < n_bins - 0.5:
-            for column in range(COLUMNS):
-                table[n, column], table[row, column] = table[row, column], table[n, column]
+        if table[row, AMPLITUDE] > least and -0.5 <= table[row, POSITION] < n_bins - 0.5:
+            for k in range(COLUMNS):
+                table[n, k], table[row, k] = table[row, k], table[n, k]
             for at in range(n, 0, -1):
-                if table[at - 1, 0] <= table[at, 0]:
+                if table[at - 1, POSITION] <= table[at, POSITION]:
                     break
-                before = at - 1
-                for column in range(COLUMNS):
-                    table[before, column], table[at, column] = (
-                        table[at, column],
-                        table[before, column],
-                    )
+                for k in range(COLUMNS):
+                    table[at - 1, k], table[at, k] = table[at, k], table[at - 1, k]
             n += 1
     return n
 
 
 @kernel("void(f8, f8, f8, f8[:,::1])")
 def raise_deviations(sigma_y: float, s: float, wrong: float, table: Array) -> None:
-    """Raise the deviation of each echo of a table by what wrong pulses of the others leave."""
+    """Raise the deviation of each echo by the part ``wrong`` of the others at its position."""
     for row in range(len(table)):
-        others = _power_at(table, len(table), table[row, 0], s) - table[row, 1] ** 2
-        table[row, 3] *= math.sqrt(1.0 + (wrong / sigma_y) ** 2 * max(others, 0.0))
+        others = _power_at(table, len(table), table[row, POSITION], s) - table[row, AMPLITUDE] ** 2
+        table[row, SIGMA] *= math.sqrt(1.0 + (wrong / sigma_y) ** 2 * max(others, 0.0))
 
 
 @kernel("void(f8[:,::1], i8, f8[:,::1], f8[:,::1])")
@@ -282,16 +277,14 @@ def _invert(matrix: Array, size: int, inverse: Array, scaled: Array) -> None:
     inverse[1, 1] = scale * matrix[0, 0]
     inverse[0, 1] = inverse[1, 0] = -scale * matrix[0, 1]
     for k in range(2, size):
-        left = matrix[k, k]
-        taken = 0.0
+        explained = 0.0
         for i in range(k):
             border = 0.0
             for j in range(k):
                 border += inverse[i, j] * matrix[k, j]
             scaled[0, i] = border
-        for i in range(k):
-            taken += scaled[0, i] * matrix[k, i]
-        scale = 1.0 / (left - taken)
+            explained += border * matrix[k, i]
+        scale = 1.0 / (matrix[k, k] - explained)
         for i in range(k):
             for j in range(k):
                 inverse[i, j] += scaled[0, i] * (scale * scaled[0, j])
@@ -302,17 +295,17 @@ def _invert(matrix: Array, size: int, inverse: Array, scaled: Array) -> None:
 
 @kernel("f8(c16[:,::1], f8, f8[:,::1], i8)")
 def _evaluate_samples(window: ComplexArray, s: float, state: Array, size: int) -> float:
-    """Do what `evaluate` does for a window of samples.
+    """Fit as `evaluate` does, to a window of samples.
 
     Its columns are the samples, and cosine and sine of the carrier as one complex number; both are
     zero where a sample is unknown. The amplitudes are b and d, and there is no ``_KNOWN``.
     """
     n = len(window)
     envelopes = np.empty((n, MAX_ECHOES))
-    gram, inverse = np.zeros((2 * MAX_ECHOES, 2 * MAX_ECHOES)), np.zeros((8, 8))
-    scaled, tangents = np.empty((1, 2 * MAX_ECHOES)), np.empty(MAX_ECHOES)
+    gram = np.zeros((2 * MAX_ECHOES, 2 * MAX_ECHOES))
+    inverse, scaled = np.zeros_like(gram), np.empty((1, 2 * MAX_ECHOES))
     matched, linear = np.zeros(2 * MAX_ECHOES), np.empty(2 * MAX_ECHOES)
-    mixed = np.zeros((MAX_ECHOES, 2 * MAX_ECHOES))
+    mixed, tangents = np.zeros((MAX_ECHOES, 2 * MAX_ECHOES)), np.empty(MAX_ECHOES)
     information = state[INFORMATION:]
     for at in range(n):
         x, c, d = window[at, 0].real, window[at, 1].real, window[at, 1].imag
@@ -402,8 +395,8 @@ def evaluate(around: ComplexArray, s: float, state: Array, size: int) -> float:
             value = value * offset + around[nearest - REACH_STEPS, power]
         seen_real[k], seen_imag[k] = value.real, value.imag
         climb_real[k], climb_imag[k] = climb.real / BINS_PER_STEP, climb.imag / BINS_PER_STEP
-    inverse = state[_KNOWN:]
-    _invert(overlap, size, inverse, state[INFORMATION:])
+    inverse, information = state[_KNOWN:], state[INFORMATION:]
+    _invert(overlap, size, inverse, information)
     explained = 0.0
     for k in range(size):
         real = imag = 0.0
@@ -412,14 +405,12 @@ def evaluate(around: ComplexArray, s: float, state: Array, size: int) -> float:
             imag += inverse[k, m] * seen_imag[m]
         state[REAL, k], state[IMAG, k] = real, imag
         explained += real * seen_real[k] + imag * seen_imag[k]
-    information = state[INFORMATION:]
     for k in range(size):
-        real, imag = climb_real[k], climb_imag[k]
-        taken_real = taken_imag = 0.0
+        known_real = known_imag = 0.0
         for m in range(size):
-            taken_real += slope[k, m] * state[REAL, m]
-            taken_imag += slope[k, m] * state[IMAG, m]
-        real, imag = real - taken_real, imag - taken_imag
+            known_real += slope[k, m] * state[REAL, m]
+            known_imag += slope[k, m] * state[IMAG, m]
+        real, imag = climb_real[k] - known_real, climb_imag[k] - known_imag
         state[CLIMB, k] = state[REAL, k] * real + state[IMAG, k] * imag
     for k in range(size):
         for m in range(size):  # row k of D R^-1, in what held the derivatives of z
@@ -473,10 +464,10 @@ def polish(
     states: Array,
     size: int,
 ) -> float:
-    """Lead the state `NOW` to the best fit by Levenberg-Marquardt; return what it explains.
+    """Improve the state `NOW` by Levenberg-Marquardt; return the energy that it explains.
 
-    Positions stay between limits and apart. A search is given up when its own forecast, many times
-    over, stays short of ``at_least``.
+    Positions stay within the limits and ``separation`` [bins] apart. A search ends early when
+    `_OPTIMISM` times the gain that it forecasts does not reach ``at_least``.
     """
     now, tried = states[NOW], states[_TRIED]
     explained = evaluate(around, s, now, size)
@@ -526,7 +517,7 @@ def polish(
 def _best_pair(
     around: ComplexArray, low: int, high: int, s: float, separation: float, positions: Array
 ) -> None:
-    """Write the two steps of the grid that explain most, far enough apart; or its two ends."""
+    """Write the two steps, ``separation`` apart, that explain most; the ends if there are none."""
     best = 0.0
     positions[0] = BINS_PER_STEP * (low + REACH_STEPS)
     positions[1] = BINS_PER_STEP * (high - 1 + REACH_STEPS)
@@ -557,7 +548,7 @@ def _one_more(
     fit: Array,
     size: int,
 ) -> float:
-    """Return where one more echo explains most of the residual; -1 where it cannot be enough."""
+    """Return where one more echo explains most of the residual; -1 if ``needed`` is too much."""
     overlap = np.empty(MAX_ECHOES)
     most, best, chosen = 0.0, -2.0, low
     for step in range(low, high):
@@ -606,7 +597,7 @@ def interpolate(
     for k in range(n):
         z[k] = y[begin + k]
     for row in range(len(others)):
-        if start - FILTERED_REACH * s < others[row, 0] < end + FILTERED_REACH * s:
+        if start - FILTERED_REACH * s < others[row, POSITION] < end + FILTERED_REACH * s:
             for k in range(n):
                 z[k] -= _pulse(others, row, start + BINS_PER_STEP * k, s, carrier)
     for k in range(n):
@@ -701,8 +692,8 @@ def fit_whole(
     for k in range(size):
         variance = now[_KNOWN + k, k] if regular else math.inf
         position, real, imag = now[U, k], now[REAL, k], now[IMAG, k]
-        table[k, 0] = position
-        table[k, 1] = math.hypot(real, imag)
-        table[k, 2] = math.atan2(imag, real) + carrier * position
-        table[k, 3] = sigma_y * math.sqrt(variance) if variance > 0.0 else math.inf
+        table[k, POSITION] = position
+        table[k, AMPLITUDE] = math.hypot(real, imag)
+        table[k, PHASE] = math.atan2(imag, real) + carrier * position
+        table[k, SIGMA] = sigma_y * math.sqrt(variance) if variance > 0.0 else math.inf
     return size

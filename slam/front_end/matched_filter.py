@@ -92,12 +92,12 @@ OVERLAP = 4.3
 # weak echo nearer than that to a strong one makes no peak of its own.
 _MARGIN = 5.0
 _SEARCH = 3.5
-# With fewer usable samples than this many envelope sigmas a fit says nothing.
+# A fit needs usable samples over at least this many envelope sigmas.
 _LEAST_SAMPLES = 2.0
 # What a wrong pulse may leave near the peak of one that is fitted, over its relative error: 0.46 to
 # 0.50 for a wrong width, 0.27 for skew, 0.37 for ringing, 0.45 for all of them; and a quarter more
 _NEAR_PEAK = 0.625
-# A float32 frame says its samples to this part of the largest; noise is never less.
+# Resolution of a float32 frame, as a part of its largest sample; sigma_y is never less.
 _RESOLUTION = float(np.finfo(np.float32).eps)
 
 
@@ -134,18 +134,18 @@ class PulseFilter:
         # The whole spectrum at once is real: the pulse is even but for its carrier.
         spectrum = np.fft.fft(placed).real
         self.noise_gain = math.sqrt(2 / energy)
-        """sigma_y over sigma of white noise per RF sample, behind the equaliser if there is one."""
-        self.told_noise_gain = self.noise_gain
-        """The same before the equaliser."""
+        """sigma_y over sigma of white noise per equalised sample."""
+        self.raw_noise_gain = self.noise_gain
+        """sigma_y over sigma of white noise per sample of the module, before the equaliser."""
         self._spectrum = (spectrum[: self.n_fft // 2] / BINS_PER_STEP).astype(np.complex128)
         self.n_steps = math.ceil(n_bins / BINS_PER_STEP)
         self._equaliser = None if taps is None else _spectrum_of(taps, self.n_fft)
         self.spectrum = self._spectrum
-        """Of the filter behind the equaliser: factors on the first half of `numpy.fft.rfft`."""
+        """Equaliser and filter together: factors on the first half of `numpy.fft.rfft`."""
         if self._equaliser is not None:
             self.spectrum = self._spectrum * self._equaliser[: self._spectrum.size]
             power = float(np.sum(np.abs(BINS_PER_STEP * self.spectrum) ** 2)) / self.n_fft
-            self.told_noise_gain = math.sqrt(0.5 * power)
+            self.raw_noise_gain = math.sqrt(0.5 * power)
         self.table = np.empty((self.n_steps // 2 + 1, COLUMNS))
         """Where the peaks of a frame are written."""
         self.stride = max(1, int(_STRIDE_SIGMAS * self.sigma_bins / BINS_PER_STEP))
@@ -173,7 +173,7 @@ class PulseFilter:
     def apply(self, samples: Array) -> ComplexArray:
         """Return y of frames of shape (..., n_bins) at every second bin, shape (..., n_steps).
 
-        The frames are equalised, if there is an equaliser.
+        The frames are `equalised` already.
         """
         return correlate(samples, self._spectrum, self)
 
@@ -527,7 +527,7 @@ class MatchedFilterDetector:
             for row, k in enumerate(chosen):
                 samples, usable, largest = prepared[row]
                 configured = self.config.matched_filter.noise_sigma
-                sigma_y = configured * filters[k].told_noise_gain
+                sigma_y = configured * filters[k].raw_noise_gain
                 if not configured:
                     sigma_y = math.sqrt(
                         kernels.noise_power(y[row], filters[k].stride, filters[k].cells)
