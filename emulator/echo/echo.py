@@ -205,25 +205,25 @@ class ScenePaths:
         direct = [direct_reflections(each, view) for each in scatterers]
         if self._wander:
             direct[0] = self._wander.applied(direct[0], self._targets.steady, view)
-        mirrored: list[Reflections] = []
-        if heights.floor_reflection or heights.ceiling_reflection:
-            mirrored = [mirrored_reflections(each, view, heights) for each in scatterers]
         walls: list[Reflections] = []
         ghosts: list[Reflections] = []
+        shares: list[NDArray[np.float64] | float] = [1.0] * len(scatterers)
         if self._walled:
             walls.append(face_reflections(self._faces, view, wavelength_m))
             if self._scene.multipath.corners:
                 walls.append(corner_reflections(self._faces, self._pairs, view, wavelength_m))
             for number, each in enumerate(scatterers):
-                share = direct_share(self._faces, each, view, wavelength_m)
+                share = shares[number] = direct_share(self._faces, each, view, wavelength_m)
                 amplitude = direct[number].amplitude * share * share
                 direct[number] = replace(direct[number], amplitude=amplitude)
-                if mirrored:
-                    ways = mirrored[number].amplitude.shape[1] // share.shape[1]
-                    amplitude = mirrored[number].amplitude * np.tile(share * share, ways)
-                    mirrored[number] = replace(mirrored[number], amplitude=amplitude)
                 if self._scene.multipath.double_bounce:
                     ghosts.append(ghost_reflections(self._faces, each, view, share, wavelength_m))
+        mirrored: list[Reflections] = []
+        if heights.floor_reflection or heights.ceiling_reflection:
+            mirrored = [
+                mirrored_reflections(each, view, heights, share)
+                for each, share in zip(scatterers, shares, strict=True)
+            ]
         leakage = Reflections(
             range_m=np.full((len(t_ns), 1), self._scene.leakage.range_m),
             amplitude=np.full((len(t_ns), 1), self._scene.leakage.amplitude),

@@ -126,10 +126,21 @@ class Scintillation:
         return factors
 
 
-def mirrored_reflections(scatterers: Scatterers, view: Viewpoint, spec: HeightsSpec) -> Reflections:
-    """Return echoes of scatterers by way of floor and ceiling, shape (n_frames, m), free of walls.
+def mirrored_reflections(
+    scatterers: Scatterers,
+    view: Viewpoint,
+    spec: HeightsSpec,
+    share: NDArray[np.float64] | float,
+) -> Reflections:
+    """Return echoes of scatterers by way of floor and ceiling, shape (n_frames, m).
 
     m is k times the number of ways: each way has the k scatterers in their order.
+
+    Parameters
+    ----------
+    share
+        Shape (n_frames, k), or 1 without walls: the share of the amplitude that they let pass on
+        the straight leg, one way.
     """
     dx, dy = scatterers.x_m - view.x_m, scatterers.y_m - view.y_m
     axis_m = np.sqrt(dx * dx + dy * dy)
@@ -156,7 +167,8 @@ def mirrored_reflections(scatterers: Scatterers, view: Viewpoint, spec: HeightsS
         cos_out, cos_back = (cos_angle * surface_m / leg_m for leg_m in (out_m, back_m))
         antenna_m = (view.antenna_m(cos_out) + view.antenna_m(cos_back)) / 2
         range_m.append((out_m + back_m) / 2 + antenna_m)
-        amplitude.append(strength * np.sqrt(beam_gain(cos_out) * beam_gain(cos_back)))
+        both_legs = np.sqrt(beam_gain(cos_out) * beam_gain(cos_back))
+        amplitude.append(strength * both_legs * (share * share))
         phase_rad.append(scatterers.phase_rad + math.pi * n_mirrors)
 
     for height, reflection in mirrors:

@@ -173,6 +173,15 @@ def test_a_wall_shades_images_as_it_shades_the_target() -> None:
     np.testing.assert_allclose(shaded.amplitude, 0.25 * free.amplitude, rtol=0.02)
 
 
+def test_walls_and_a_floor_need_no_target() -> None:
+    side = wall((-50.0, 1.0), (50.0, 1.0))
+    floor = HeightsSpec(antenna_m=0.5, floor_reflection=0.5)
+    bare = heard(FORWARD, walls=(side,))
+    floored = heard(FORWARD, walls=(side,), heights=floor)
+    np.testing.assert_array_equal(floored.range_m, bare.range_m)
+    np.testing.assert_array_equal(floored.amplitude, bare.amplitude)
+
+
 def test_the_antenna_is_below_the_ceiling() -> None:
     with pytest.raises(ValidationError, match="antenna_m: must be less"):
         HeightsSpec(antenna_m=2.0, ceiling_m=1.0)
