@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ from slam.robust import kernels
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, BackEndParameters, RangeNoise
 from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
-# No radar ranges as far; keeps squares finite whatever a front end says.
+# No radar ranges as far; keeps squares finite whatever a front end reports.
 LONGEST_M = 1e6
 # Two pulses closer than this in range are hard to tell apart: the width of one at half height.
 BLUR_M = 0.12
@@ -76,14 +76,7 @@ class RangeScan:
     def with_added_sigma(self, sigma_m: float) -> RangeScan:
         if self.sigmas_m is None or not sigma_m:
             return self
-        return RangeScan(
-            radar=self.radar,
-            ranges_m=self.ranges_m,
-            labels=self.labels,
-            sigmas_m=tuple([math.hypot(s, sigma_m) for s in self.sigmas_m]),
-            moved=self.moved,
-            blurred_m=self.blurred_m,
-        )
+        return replace(self, sigmas_m=tuple([math.hypot(s, sigma_m) for s in self.sigmas_m]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +89,7 @@ class Antennas:
     position_m: Array
     yaw_rad: Array
     has_frame: NDArray[np.bool_]
-    told_m: Array  # shape (r, 2): positions if every mount were where the rig has it
+    nominal_m: Array  # shape (r, 2): positions if every mount were where the rig has it
     turns_rad: Array  # shape (r,): of the robot from the pose to the sample
 
 
@@ -110,8 +103,8 @@ def antennas_of(
     """
     s, w = calibration[:2].tolist()
     mounts = rig.mounts
-    told = np.array([[mount.x_m, mount.y_m] for mount in mounts])
-    position = told.copy() if moved_m is None else told + moved_m
+    nominal = np.array([[mount.x_m, mount.y_m] for mount in mounts])
+    position = nominal.copy() if moved_m is None else nominal + moved_m
     yaw = np.array([mount.yaw_rad for mount in mounts])
     turns = np.zeros(len(mounts))
     has_frame = np.zeros(len(mounts), dtype=bool)
@@ -122,11 +115,11 @@ def antennas_of(
             way = np.array(scan.moved[:2]) / (1.0 + s)
             turned = rotation(turn)
             position[scan.radar] = way + turned @ position[scan.radar]
-            told[scan.radar] = way + turned @ told[scan.radar]
+            nominal[scan.radar] = way + turned @ nominal[scan.radar]
             yaw[scan.radar] += turn
             turns[scan.radar] = turn
     return Antennas(
-        position_m=position, yaw_rad=yaw, has_frame=has_frame, told_m=told, turns_rad=turns
+        position_m=position, yaw_rad=yaw, has_frame=has_frame, nominal_m=nominal, turns_rad=turns
     )
 
 
@@ -229,6 +222,26 @@ def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Ro
     )
 
 
+def crossings(
+    first_m: Sequence[float], second_m: Sequence[float], a: float, b: float
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Return where circles of radii a and b [m] about two points cross, or None.
+
+    The first crossing is on the left of the way from the first point to the second.
+    """
+    dx, dy = second_m[0] - first_m[0], second_m[1] - first_m[1]
+    base = math.hypot(dx, dy)
+    if base == 0.0:
+        return None
+    along = (a**2 - b**2 + base**2) / (2.0 * base)
+    square = a**2 - along**2
+    if square <= 0.0:
+        return None
+    dx, dy, across = dx / base, dy / base, math.sqrt(square)
+    x, y = first_m[0] + along * dx, first_m[1] + along * dy
+    return (x - across * dy, y + across * dx), (x + across * dy, y - across * dx)
+
+
 def fix_of_pair(
     first_m: Array, second_m: Array, range_first_m: float, range_second_m: float, ahead: Array
 ) -> Array | None:
@@ -238,19 +251,11 @@ def fix_of_pair(
     """
     if not (0.0 < range_first_m < LONGEST_M and 0.0 < range_second_m < LONGEST_M):
         return None
-    base = second_m - first_m
-    length = math.hypot(base[0], base[1])
-    if length == 0.0:
+    fixes = crossings(first_m.tolist(), second_m.tolist(), range_first_m, range_second_m)
+    if fixes is None:
         return None
-    along = base / length
-    x = (range_first_m**2 - range_second_m**2 + length**2) / (2.0 * length)
-    square = range_first_m**2 - x**2
-    if square <= 0.0:
-        return None
-    across = np.array([-along[1], along[0]])
-    if across @ ahead < 0.0:
-        across = -across
-    return np.asarray(first_m + x * along + math.sqrt(square) * across)
+    is_left = quarter_turn(second_m - first_m) @ ahead >= 0.0
+    return np.array(fixes[0] if is_left else fixes[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -214,11 +214,9 @@ class RobustBackEnd:
         """
         antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
-        doubt_m = self.parameters.ranges.association_sigma_m
-        widened = [
-            scan.with_added_sigma(math.hypot(doubt_m, self.state.range_errors.added_m))
-            for scan in scans
-        ]
+        association_m = self.parameters.ranges.association_sigma_m
+        added_m = math.hypot(association_m, self.state.range_errors.added_m)
+        widened = [scan.with_added_sigma(added_m) for scan in scans]
         matches, seen = self._associate(scans, widened, antennas, sure_m)
         continued, nis, likelihoods = self._correct(matches, seen, scans, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
@@ -387,7 +385,7 @@ class RobustBackEnd:
             )
             if (n_ranges := len(of_radar[radar].ranges_m))
         ]
-        told_m, turns_rad = antennas.told_m.tolist(), antennas.turns_rad.tolist()
+        nominal_m, turns_rad = antennas.nominal_m.tolist(), antennas.turns_rad.tolist()
         for (radar, _, landmark_id), range_m, sigma_m in zip(
             continued, z.tolist(), sigmas.tolist(), strict=True
         ):
@@ -395,7 +393,7 @@ class RobustBackEnd:
                 self._log.n_poses - 1,
                 radar,
                 landmark_id,
-                antenna=told_m[radar],
+                antenna=nominal_m[radar],
                 turn_rad=turns_rad[radar],
                 range_m=range_m,
                 sigma_m=sigma_m,
@@ -457,7 +455,7 @@ class RobustBackEnd:
         for pose, radar, antenna, turn_rad, range_m, sigma_m in zip(
             seen.poses.tolist(),
             seen.radars.tolist(),
-            seen.told_m.tolist(),
+            seen.nominal_m.tolist(),
             seen.turns_rad.tolist(),
             seen.measured_m.tolist(),
             seen.sigmas_m.tolist(),

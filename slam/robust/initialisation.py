@@ -50,6 +50,7 @@ from slam.robust.association import (
     Antennas,
     RangeScan,
     certain,
+    crossings,
     density_per_m2,
     identity,
 )
@@ -99,7 +100,7 @@ class Sightings:
     # were its mount where the rig has it (k, 2), the robot's turn from the pose to the sample,
     # range [m] and standard deviation (k,)
     poses: Indices
-    told_m: Array
+    nominal_m: Array
     turns_rad: Array
     measured_m: Array
     sigmas_m: Array
@@ -132,7 +133,7 @@ class UnassignedRanges:
         self._way = np.zeros(2)  # metres and radians, always growing
         self._newest, self._count = -1, 0
         self._places = np.zeros((capacity, n_radars, 3))
-        self._mounts_m, self._told_m = np.zeros((2, capacity, n_radars, 2))
+        self._mounts_m, self._nominal_m = np.zeros((2, capacity, n_radars, 2))
         self._turns_rad = np.zeros((capacity, n_radars))
         self._poses, self._ways = np.zeros((capacity, 3)), np.zeros((capacity, 2))
         self._pose_indices = np.zeros(capacity, dtype=np.intp)
@@ -178,7 +179,7 @@ class UnassignedRanges:
         self._places[f, :, :2] = antennas.position_m @ turn.T + self._pose[:2]
         self._places[f, :, 2] = antennas.yaw_rad + self._pose[2]
         self._mounts_m[f], self._has_frame[f] = antennas.position_m, antennas.has_frame
-        self._told_m[f], self._turns_rad[f] = antennas.told_m, antennas.turns_rad
+        self._nominal_m[f], self._turns_rad[f] = antennas.nominal_m, antennas.turns_rad
         self._poses[f], self._ways[f], self._pose_indices[f] = self._pose, self._way, pose_index
         self._ranges_m[f], self._labels[f] = np.nan, _NO_LABEL
         for scan in scans:
@@ -254,7 +255,7 @@ class UnassignedRanges:
             variances=np.square(self._sigmas_m[at]) + drift,
             radars=radars,
             poses=self._pose_indices[f],
-            told_m=self._told_m[f, radars],
+            nominal_m=self._nominal_m[f, radars],
             turns_rad=self._turns_rad[f, radars],
             measured_m=self._ranges_m[at],
             sigmas_m=self._sigmas_m[at],
@@ -404,7 +405,7 @@ def point_guesses(
         for (a, label), (b, other) in product(unassigned.newest(one), unassigned.newest(two)):
             if label != other:
                 continue
-            for x, y in _fixes(first, second, a, b):
+            for x, y in crossings(first, second, a, b) or ():
                 if all(
                     abs(math.remainder(math.atan2(y - at[1], x - at[0]) - at[2], math.tau)) <= limit
                     for at in (first, second)
@@ -416,23 +417,6 @@ def point_guesses(
 def _guess(x: float, y: float, spread: Array, label: int = _NO_LABEL) -> Guess:
     known = None if label == _NO_LABEL else label
     return Guess(target=np.array([x, y]), covariance=spread, label=known)
-
-
-def _fixes(
-    first: tuple[float, float, float], second: tuple[float, float, float], a: float, b: float
-) -> list[tuple[float, float]]:
-    """Return where circles of radii a and b about two antennas meet."""
-    dx, dy = second[0] - first[0], second[1] - first[1]
-    base = math.hypot(dx, dy)
-    if base == 0.0:
-        return []
-    along = (a**2 - b**2 + base**2) / (2.0 * base)
-    square = a**2 - along**2
-    if square <= 0.0:
-        return []
-    dx, dy, across = dx / base, dy / base, math.sqrt(square)
-    x, y = first[0] + along * dx, first[1] + along * dy
-    return [(x - across * dy, y + across * dx), (x + across * dy, y - across * dx)]
 
 
 def _guesses_on_arcs(unassigned: UnassignedRanges, radar: int) -> list[Guess]:
@@ -490,7 +474,10 @@ class Tracker:
             self._rule.gate_sigmas**2,
         )
         least = (_KNOWN_SHARE * self._noise.sigma_m) ** 2
-        self._radars_known = float(radar_covariance.diagonal().max(initial=0.0)) <= least
+        # None where the unknowns of the radars are as good as known
+        self._free_covariance: Array | None = self._radar_covariance
+        if float(radar_covariance.diagonal().max(initial=0.0)) <= least:
+            self._free_covariance = None
 
     @property
     def min_hits_per_radar(self) -> int:
@@ -523,7 +510,7 @@ class Tracker:
             dof=len(members) - 2,
             label=guess.label,
         )
-        if not self._radars_known:
+        if self._free_covariance is not None:
             tracklet = self._with_free_radars(tracklet, guess.covariance)
         if tracklet.chi_square > chi_square_limit(tracklet.dof, self._rule.excess_sigmas):
             return None
@@ -553,10 +540,6 @@ class Tracker:
             by_offsets=by_offsets,
             chi_square=fit.chi_square,
         )
-
-    @property
-    def _free_covariance(self) -> Array | None:
-        return None if self._radars_known else self._radar_covariance
 
     def _turned(self, seen: Sightings) -> float:
         """Return the variance of the heading over the way of the members."""

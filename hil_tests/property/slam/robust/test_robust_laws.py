@@ -26,7 +26,7 @@ ANTENNAS = Antennas(
     position_m=PLACES,
     yaw_rad=np.array([1.0, 1.0, -1.0, -1.0]) * math.pi / 2,
     has_frame=np.ones(4, dtype=bool),
-    told_m=PLACES,
+    nominal_m=PLACES,
     turns_rad=np.zeros(4),
 )
 few = settings(max_examples=30, deadline=None)

@@ -354,7 +354,7 @@ def sightings(antennas: Array, ranges: Array, radars: Indices | None = None) -> 
         variances=np.full(k, SHARP_SIGMA_M**2),
         radars=np.zeros(k, dtype=np.intp) if radars is None else radars,
         poses=np.arange(k),
-        told_m=np.zeros((k, 2)),
+        nominal_m=np.zeros((k, 2)),
         turns_rad=np.zeros(k),
         measured_m=ranges,
         sigmas_m=np.full(k, SHARP_SIGMA_M),
