@@ -107,6 +107,10 @@ class WallCells:
         here = math.floor(along_m / self._cell_m)
         return self._cell_m * min(abs(here - cell) for cell in cells)
 
+    def is_near(self, wall_id: int, along_m: Array, reach_m: float) -> bool:
+        """Return whether any of some places, shape (k,), is within reach of an echo of a wall."""
+        return any(self.distance_m(wall_id, place) <= reach_m for place in along_m.tolist())
+
     def surrounds(self, wall_id: int, along_m: float) -> bool:
         cells = self._cells.get(wall_id, set())
         here = math.floor(along_m / self._cell_m)
@@ -162,8 +166,7 @@ def match_wall(
     beta = max(len(state.wall_ids), 1) / (math.tau * parameters.ranges.max_range_m)
     found = []
     for row, wall_id in enumerate(state.wall_ids):
-        along = along_wall(state, row, feet)
-        if min(cells.distance_m(wall_id, float(place)) for place in along) <= reach_m:
+        if cells.is_near(wall_id, along_wall(state, row, feet), reach_m):
             rows = wall_rows(state, row, seen)
             found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
     best = certain(found)
@@ -179,9 +182,9 @@ def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule
         if abs(wrap_angle(phi_seen - phi)) > rule.resolution_rad:
             continue
         apart = np.abs(feet @ np.array([math.cos(phi), math.sin(phi)]) - d)
-        along = along_wall(state, row, feet)
-        near = [cells.distance_m(wall_id, float(place)) <= rule.reach_m for place in along]
-        if float(apart.max()) <= rule.resolution_m and any(near):
+        if float(apart.max()) > rule.resolution_m:
+            continue
+        if cells.is_near(wall_id, along_wall(state, row, feet), rule.reach_m):
             return True
     return False
 
@@ -255,8 +258,7 @@ class WallKeeper:
                 continue
             feet = seen.antennas_m + ranges[:, None] * n
             places = state.position_m + feet @ rotation(state.heading_rad).T
-            along = along_wall(state, row, places).tolist()
-            if min(self.cells.distance_m(wall_id, place) for place in along) <= rule.reach_m:
+            if self.cells.is_near(wall_id, along_wall(state, row, places), rule.reach_m):
                 return True
         return False
 
