@@ -3,7 +3,7 @@
 Wheels slip and robots are carried. Both make the ranges of known landmarks unlikely, and are the
 same question with two prices: is there a motion the wheels did not report that explains the ranges
 better? The back end itself believes its odometry. Around it, ``Branches`` keep the last motions and
-scans, and what each range said for the pose (``UpdateReport.evidence``).
+scans, and the evidence of each range for the pose (``UpdateReport.evidence``).
 
 Suspicion
     The evidence since each step is summed over the landmarks known then, at most so much against
@@ -66,13 +66,13 @@ _NEWEST = 8
 # per step, how many ranges as predicted it begins with, and by how many standard deviations of
 # chi-square the innovations must be too large for a slip to be looked for
 _MISSED_SQUARE, _FADING, _USUAL_COUNT, _STRAINED = 9.0, 0.998, 20.0, 4.0
-# By how much the covariance of a map that says where the robot was set down is enlarged
+# By how much the covariance of the points is enlarged by which the robot is set down
 _WEAKENED = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
-    """One motion with the scans at its end, and what they said for the pose of the main one."""
+    """One motion with the scans at its end, and their evidence for the main back end's pose."""
 
     increment: Array
     covariance: Array | None
@@ -102,7 +102,7 @@ class Tally:
         return math.fsum(min(max(nats, least), most) for nats in self._of_landmark.values())
 
     def gain(self, other: Tally, most: float, *, same_map: bool = True) -> float:
-        """Return how much likelier this is than the other, each landmark saying at most so much.
+        """Return how much likelier this is than the other, each landmark counting at most so much.
 
         Nothing is likelier by explaining less: where little is certain, little can be missed.
         """
@@ -168,8 +168,8 @@ class Alternative:
         begins = self._slipping is not None and number < self.since + rule.steps
         sure_m = _SLIPPING_SIGMAS * rule.slip_m if begins else None
         report = back_end.update(step.scans, sure_m=sure_m, solve=False)
-        # What the main one maps after it went wrong explains the ranges there, too.
-        if not self.next_step - self.since:
+        # Landmarks that the main one mapped after it went wrong explain the ranges there, too.
+        if number == self.since:
             self._next_id = step.next_id
         known = math.inf if self._is_new else self._next_id
         self._own.add([one for one in report.evidence if one[0] < known])
@@ -182,11 +182,11 @@ class Carry:
     """The question whether, and whereto, the robot was carried before a step."""
 
     map: RobustBackEnd  # the main back end after the step before
-    fresh: Alternative  # with an empty map at first
+    new: Alternative  # with an empty map at first
     search_from: int  # the step from which on its place is searched for
 
 
-class Strain:
+class InnovationTest:
     """Whether the innovations of the last steps are larger than they were all along."""
 
     def __init__(self, steps: int) -> None:
@@ -203,7 +203,7 @@ class Strain:
             self._usual_square = _FADING * self._usual_square + square
             self._usual_count = _FADING * self._usual_count + count
 
-    def settle(self) -> None:
+    def restart(self) -> None:
         self._last.clear()
 
     def steps_ago(self) -> int | None:
@@ -237,7 +237,7 @@ class Branches:
         self._carry: Carry | None = None
         self._no_slip_until = self._tried_until = self._judged = 0
         self._recognised_ids: set[int] = set()  # new landmarks that were searched for
-        self._strain = Strain(self._rule.steps)
+        self._innovations = InnovationTest(self._rule.steps)
         self.is_lost = False
 
     @property
@@ -278,7 +278,7 @@ class Branches:
         self._now += 1
         if any(scan.labels is not None for scan in scans):
             return report
-        self._strain.add(report)
+        self._innovations.add(report)
         was_lost = self.is_lost
         carried = self._decide()
         if self._now % _LOOK_EVERY == 0:
@@ -292,7 +292,7 @@ class Branches:
             del self._snapshots[old]
         needed = min(self._snapshots)
         if self._carry is not None:
-            needed = min(needed, self._carry.fresh.since)
+            needed = min(needed, self._carry.new.since)
         for old in [number for number in self._steps if number < needed]:
             del self._steps[old]
 
@@ -331,11 +331,11 @@ class Branches:
                 return not was_lost
             if self._now > self._tried_until:
                 self._placed = None
-        if carry is not None and self._is_up_to_date(carry.fresh):
-            gain = carry.fresh.gain
+        if carry is not None and self._is_up_to_date(carry.new):
+            gain = carry.new.gain
             self.is_lost = gain > (0.0 if self.is_lost else rule.carry_price)
             if gain < -rule.carry_price and self._placed is None:
-                # What spoke against the pose until now has been judged.
+                # The evidence against the pose until now has been judged.
                 self._carry, self._judged = None, self._now
         return False
 
@@ -345,19 +345,19 @@ class Branches:
         self._slip = self._placed = self._carry = None
         self.is_lost = False
         self._snapshots = {self._now: self.main.copy()}
-        self._strain.settle()
+        self._innovations.restart()
         self._no_slip_until = self._judged = self._now
 
     def _look(self) -> None:
-        """Look for reasons to doubt the pose, and begin alternatives."""
+        """Look for evidence against the pose, and begin alternatives."""
         rule = self._rule
-        ago = self._strain.steps_ago() or 0
-        # A few steps later it shows where it began, and what comes of it.
+        ago = self._innovations.steps_ago() or 0
+        # Some steps after it began, its begin and its effect are clearer.
         if ago > _LOOK_EVERY and not self.is_lost and self._now - ago > self._no_slip_until:
             self._begin_slip(self._now - ago)
             self._no_slip_until = self._now - _LOOK_EVERY
         if self._carry is None:
-            since, against = self._doubt()
+            since, against = self._evidence_of_carry()
             if against <= rule.suspicious:
                 since = self._recognised()
             if since < self._now:
@@ -365,7 +365,7 @@ class Branches:
         elif self._placed is None and self._now >= self._carry.search_from:
             self._search(self._carry)
 
-    def _doubt(self) -> tuple[int, float]:
+    def _evidence_of_carry(self) -> tuple[int, float]:
         """Return the step before which the robot may have been carried, and the evidence of that.
 
         More than one landmark must be against the pose: one alone may be hidden or taken away.
@@ -432,15 +432,15 @@ class Branches:
     def _begin_carry(self, since: int) -> None:
         before = self._at(since)
         if len(before.reported_rows()) >= self._rule.least_landmarks:
-            fresh = Alternative(
+            new = Alternative(
                 before.with_empty_map(), since, self._rule, set_down=True, is_new=True
             )
-            self._carry = Carry(map=before, fresh=fresh, search_from=self._now)
+            self._carry = Carry(map=before, new=new, search_from=self._now)
 
     def _search(self, carry: Carry) -> None:
-        """Search for the place of the fresh map; set a copy of the old one down there."""
-        rule, fresh = self._rule, carry.fresh.back_end
-        here = constellation_of(fresh.state, fresh.reported_rows(), rule.model_sigma_m)
+        """Search for the new map's place on the old one; set a copy of the old one down there."""
+        rule, new = self._rule, carry.new.back_end
+        here = constellation_of(new.state, new.reported_rows(), rule.model_sigma_m)
         there = constellation_of(carry.map.state, carry.map.reported_rows(), rule.model_sigma_m)
         placement = find_placement(here, there, rule)
         if placement is None:
@@ -448,10 +448,10 @@ class Branches:
         points = []
         for row, own in placement.pairs:
             block = slice(2 * own, 2 * own + 2)
-            # The same ranges are taken once more: what they said here may hardly count.
+            # The same ranges are taken once more, so this use of them must hardly count.
             covariance = _WEAKENED * here.covariance_m2[block, block]
             points.append((there.ids[row], here.points_m[own], covariance))
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)
-        self._placed = Alternative(back_end, carry.fresh.since, rule, set_down=True)
+        self._placed = Alternative(back_end, carry.new.since, rule, set_down=True)
         self._tried_until = carry.search_from = self._now + _PLACE_PATIENCE * rule.steps

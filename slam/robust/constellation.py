@@ -1,4 +1,4 @@
-"""Where one map lies on another, or on itself, told by the constellation of their landmarks.
+"""Where one map lies on another, or on itself, from the constellation of their landmarks.
 
 Two landmarks of either map with equal distances give a motion T that lays one pair on the other;
 all pairs of landmarks that then lie together test it. Its evidence is the likelihood of their
@@ -11,7 +11,8 @@ against ln beta for each landmark that would otherwise be new, beta the density 
 landmarks, and against every other T.
 
 A loop is closed by the same search between the landmarks of the last stretch and older ones. There
-the state itself says how uncertain T is, and the likelihood of the residuals is that of the merge.
+the covariance of the state gives the uncertainty of T, and the likelihood of the residuals is that
+of the merge.
 """
 
 from __future__ import annotations
@@ -78,11 +79,7 @@ def find_placement(here: Constellation, there: Constellation, rule: BranchRule) 
     if len(here.ids) < least or len(there.ids) < least:
         return None
     found: dict[Pairs, Placement] = {}
-    tried: set[Pairs] = set()
-    for _, pairs in _guesses(here.points_m, there.points_m, rule):
-        if pairs in tried:
-            continue
-        tried.add(pairs)
+    for pairs in dict.fromkeys(_guesses(here.points_m, there.points_m, rule)):
         placement = _judged(here, there, pairs)
         if placement is not None and len(placement.pairs) >= least:
             found[placement.pairs] = placement
@@ -94,25 +91,25 @@ def find_placement(here: Constellation, there: Constellation, rule: BranchRule) 
     for rival in ranked[1:]:
         if best.evidence - rival.evidence >= _EVIDENCE:
             break
-        if differ(best.motion, rival.motion, middle, rule):
+        if _differ(best.motion, rival.motion, middle, rule):
             return None
     return best
 
 
-def differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:
+def _differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:
     """Return whether two motions (3,) bring a point to different places, or turn it otherwise."""
     away = transform(one, point) - transform(other, point)
     turn = math.remainder(float(one[2] - other[2]), math.tau)
     return math.hypot(away[0], away[1]) > rule.reach_m or abs(turn) > rule.reach_m / _LEAST_BASE_M
 
 
-def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[tuple[Array, Pairs]]:
-    """Return motions that two landmarks of either map lead to, with the pairs that then agree."""
+def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[Pairs]:
+    """Return the pairs that agree when two landmarks of either map are laid on each other."""
     gaps = targets[None, :] - targets[:, None]
     lengths = np.hypot(gaps[..., 0], gaps[..., 1])
     angles = np.arctan2(gaps[..., 1], gaps[..., 0])
     long_enough = lengths >= _LEAST_BASE_M
-    found = []
+    found: list[Pairs] = []
     for a in range(len(points)):
         for b in range(a + 1, len(points)):
             gap = points[b] - points[a]
@@ -128,8 +125,8 @@ def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[tuple[Arra
                 away = np.hypot(*np.moveaxis(targets[:, None] - moved[None, :], -1, 0))
                 pairs = _nearest(away, rule.reach_m)
                 if len(pairs) >= min(rule.least_landmarks, len(points)):
-                    found.append((np.array([middle[0], middle[1], turn]), pairs))
-    found.sort(key=lambda guess: -len(guess[1]))
+                    found.append(pairs)
+    found.sort(key=lambda pairs: -len(pairs))
     return found[:_MOST_TRIED]
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from slam.config import WheelNoise
 from slam.geometry import FieldOfView
 
-# Of what is true, one in so many is thrown away by a test.
+# Probability that a test rejects what is true
 TAIL_PROBABILITY = 1e-3
-# How many times likelier than any other an explanation must be to be acted upon, in nats: twenty
+# Logarithm of how many times likelier than any other an explanation must be: twenty times
 MARGIN_NATS = 3.0
 
 
@@ -168,8 +168,8 @@ class BranchRule:
     # included: what the scattering centre of a body may wander, added in squares
     miss_sigmas: float = 3.0
     model_sigma_m: float = 0.01
-    # Over so many steps the errors of the ranges of one target hang together: their evidence counts
-    # as often less
+    # Over so many steps the errors of the ranges of one target are correlated: their evidence is
+    # divided by that number
     correlated_steps: float = 2.0
     # Most evidence [nats] that one landmark gives against a place (it may have been taken away) and
     # for it (other ranges may lie near its prediction for long)
@@ -184,11 +184,11 @@ class BranchRule:
     slip_m: float = 0.015
     slip_rad: float = 0.035
     steps: int = 15  # over which a slip is looked for, and an alternative proves itself
-    # Fewest landmarks that say where a map lies on another, and how far lengths and places may
+    # Fewest landmarks that place a map on another, and how far lengths and places may
     # differ in a guess
     least_landmarks: int = 3
     reach_m: float = 0.2
-    # Standard deviation that is stated of the position while it is not known
+    # Standard deviation reported for the position while the robot is lost
     lost_position_m: float = 5.0
 
 
