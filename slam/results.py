@@ -163,11 +163,6 @@ class UpdateReport:
     carried: bool = False
     lost: bool = False
 
-    @property
-    def log_likelihood(self) -> float:
-        """Return the sum of all evidence, in nats."""
-        return math.fsum(nats for _, nats in self.evidence)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepResult:

@@ -1,20 +1,8 @@
-"""Map management: existence, merging, and whether a target is a point or a wall.
+"""Map management: existence and merging.
 
-Merging
-    The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
-    merging after a loop bends the trajectory back, and everything correlated with it. It is made
-    late, when one merge, or two disjoint ones together, stand out from all competitors.
-Points and walls
-    The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in
-    the antenna's position a; a point's is a hyperbola::
-
-        point at b:     r = |b - a|
-        wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
-
-    For ranges, a corner of two walls is a point. Both laws have two unknowns, so the difference of
-    their chi-squares is twice the logarithm of the likelihood ratio (and that of their BIC). Over a
-    short displacement, or at a great distance, it is near zero. Source: Leonard and Durrant-Whyte,
-    "Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
+The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
+merging after a loop bends the trajectory back, and everything correlated with it. It is made late,
+when one merge, or two disjoint ones together, stand out from all competitors.
 """
 
 from __future__ import annotations
@@ -60,9 +48,6 @@ class Existence:
 
     def lost(self) -> list[int]:
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
-
-    def hits(self, landmark_id: int) -> int:
-        return self._records[landmark_id].hits
 
     def is_reported(self, landmark_id: int) -> bool:
         return self._records[landmark_id].hits >= self._rule.report_hits

@@ -256,11 +256,11 @@ def quarter_turn(points: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class RangeErrors:
-    """What the residuals of a solution say of the errors of ranges."""
+    """Errors of ranges as the residuals of a solution show them."""
 
     added_m: float = 0.0  # what is added in squares to the sigmas of ranges of no known landmark
     # By how much the variance of a range must be larger where many are averaged: those of one
-    # passage err alike. Below 1, they err less than was told.
+    # passage err alike. Below 1, errors are smaller than their standard deviations.
     variance_share: float = 1.0
 
 
@@ -403,11 +403,6 @@ class State:
     @property
     def feature_ids(self) -> list[int]:
         return self.landmark_ids + self.wall_ids
-
-    @property
-    def features(self) -> Array:
-        """Return landmarks and walls in the order of their columns, shape (n + w, 2)."""
-        return np.vstack([self.landmarks_m, self.walls])
 
     @property
     def feature_radii_m(self) -> Array:

@@ -9,11 +9,7 @@ import numpy as np
 
 from slam.robust.parameters import BackEndParameters
 from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
-from slam.robust.solver.smoother import (
-    Smoother,
-    Solution,
-    measurement_residuals,
-)
+from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
 from slam.robust.state import (
     HEAD_SIZE,
     HEADING,
@@ -30,7 +26,7 @@ _SIGMA_PER_MEDIAN, _MOST_SIGMAS, _FEWEST_RANGES = 1.4826, 3.0, 200
 # Keyframes whose ranges of one landmark may err alike; as how many such groups what all landmarks
 # have in common counts for one; and limits of `RangeErrors.variance_share`
 _KEYS_PER_PASSAGE, _PRIOR_PASSAGES, _LEAST_SHARE, _MOST_SHARE = 5, 5, 0.5, 50.0
-_PRIOR_GROUPS = 30  # as how many groups it counts that ranges err as told
+_PRIOR_GROUPS = 30  # as how many groups it counts that errors are as large as their sigmas
 _UNKNOWN = 100.0
 # A group of ranges is looked at from that mean cost on, if it has as many; what its own place must
 # gain [nats]; where that is searched from, and in how many steps
@@ -68,7 +64,6 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
 class Split:
     """Ranges that are not of the landmark that they were taken for."""
 
-    landmark_id: int
     rows: Indices  # of the log
     point_m: Array  # shape (2,): where they lie, map frame
 
@@ -96,16 +91,14 @@ def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Spli
         suspects = (means > _SUSPECT_MEAN) & (sizes >= _FEWEST_OF_GROUP) & (2 * sizes <= wholes)
         for k in np.flatnonzero(suspects & (keys[starts, 0] < layout.n_landmarks)).tolist():
             at = order[starts[k] : starts[k] + sizes[k]]
-            point_m, alone = _place_alone(problem, estimate, at, limit)
-            gain = (float(costs[at].sum()) - alone) / problem.variance_share
-            if gain > 2.0 * _SPLIT_NATS and alone < 0.5 * float(costs[at].sum()):
-                id_ = state.landmark_ids[int(keys[starts[k], 0])]
-                rows = problem.range_rows[at]
-                found.append((gain, Split(landmark_id=id_, rows=rows, point_m=point_m)))
+            point_m, apart = _place_apart(problem, estimate, at, limit)
+            gain = (float(costs[at].sum()) - apart) / problem.variance_share
+            if gain > 2.0 * _SPLIT_NATS and apart < 0.5 * float(costs[at].sum()):
+                found.append((gain, Split(rows=problem.range_rows[at], point_m=point_m)))
     return max(found, key=lambda pair: pair[0])[1] if found else None
 
 
-def _place_alone(
+def _place_apart(
     problem: Problem, estimate: Estimate, at: Indices, limit: float
 ) -> tuple[Array, float]:
     """Return where some ranges of one landmark lie, and what they cost there, poses being known."""
@@ -154,8 +147,8 @@ def learn_noise(problem: Problem, estimate: Estimate, state: State, roughness_m:
     ids, at = state.feature_ids, problem.range_landmarks
     residual = measurement_residuals(problem, estimate).residual[:n]
     added = np.array([state.added_sigmas_m.get(id_, 0.0) for id_ in ids])
-    told_m = np.sqrt(np.maximum(problem.range_sigmas_m**2 - added[at] ** 2, _LEAST_VARIANCE_M2))
-    ratio = residual * problem.range_sigmas_m / told_m
+    given_m = np.sqrt(np.maximum(problem.range_sigmas_m**2 - added[at] ** 2, _LEAST_VARIANCE_M2))
+    ratio = residual * problem.range_sigmas_m / given_m
     of_all = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio)))) ** 2
     block = problem.range_poses // _KEYS_PER_PASSAGE
     own = np.zeros(len(ids))
@@ -166,18 +159,18 @@ def learn_noise(problem: Problem, estimate: Estimate, state: State, roughness_m:
         n_passages = len(np.unique(block[mine]))
         raw = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio[mine])))) ** 2
         believed = (n_passages * raw + _PRIOR_PASSAGES * of_all) / (n_passages + _PRIOR_PASSAGES)
-        own[row] = math.sqrt(max(believed - 1.0, 0.0)) * float(np.median(told_m[mine]))
+        own[row] = math.sqrt(max(believed - 1.0, 0.0)) * float(np.median(given_m[mine]))
         if id_ in state.wall_ids:
             own[row] = max(own[row], roughness_m)
         state.added_sigmas_m[id_] = own[row]
-    sigmas_m = np.hypot(told_m, own[at])
-    white = np.clip(ratio * told_m / sigmas_m, -_MOST_SIGMAS, _MOST_SIGMAS)
+    sigmas_m = np.hypot(given_m, own[at])
+    white = np.clip(ratio * given_m / sigmas_m, -_MOST_SIGMAS, _MOST_SIGMAS)
     groups = np.unique(block * len(ids) + at, return_inverse=True)[1]
     sums = np.bincount(groups, white)
     n_groups = len(sums)
     share = (n_groups * float(np.sum(sums**2)) / n + _PRIOR_GROUPS) / (n_groups + _PRIOR_GROUPS)
     share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
-    added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(told_m))
+    added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
     state.range_errors = RangeErrors(added_m, share)
 
 

@@ -1,9 +1,10 @@
 """The log of one run, and the problem of solving for all of it.
 
 Every step, range and point of the run is kept. The problem is stated in *keyframes*, every few
-centimetres or degrees: ranges from the poses between two of them hang on the nearer one, through
-odometry as the calibration corrects it. With steps (d_i, a_i) and headings h_i within a segment of
-several steps, and e_i = Rot(h_i) d_i, odometry says of the segment's end in the frame of its begin
+centimetres or degrees: ranges from the poses between two of them are referred to the nearer one,
+through odometry as the calibration corrects it. With steps (d_i, a_i) and headings h_i within a
+segment of several steps, and e_i = Rot(h_i) d_i, odometry measures the segment's end in the frame
+of its begin as
 
     rel = (sum e_i, sum a_i),   noise A_i = [Rot(h_i), J (end - q_i); 0, 1] of step i,
 
@@ -128,8 +129,7 @@ def chain_of(steps: Array, keys: Indices, calibration: Array) -> Chain:
     lengths = np.hypot(d[:, 0], d[:, 1])
     turns = (steps[:, 2] - kappa * lengths) / (1.0 + w)
     headings = _before(turns, first, segment)
-    c, sn = np.cos(headings), np.sin(headings)
-    moved = np.column_stack([c * d[:, 0] - sn * d[:, 1], sn * d[:, 0] + c * d[:, 1]])
+    moved = _turned(d, headings)
     after = _before(moved, first, segment) + moved
     return Chain(
         first=first,
@@ -140,6 +140,13 @@ def chain_of(steps: Array, keys: Indices, calibration: Array) -> Chain:
         headings=headings,
         after=after,
     )
+
+
+def _turned(points: Array, angles_rad: Array) -> Array:
+    """Return points (k, 2), each turned by its own angle."""
+    c, s = np.cos(angles_rad), np.sin(angles_rad)
+    x, y = points.T
+    return np.column_stack([c * x - s * y, s * x + c * y])
 
 
 def _before(values: Array, first: Indices, segment: Indices) -> Array:
@@ -215,7 +222,7 @@ class RunLog:
     def add_motion(self, increment: Array, motion: Motion, *, is_loose: bool = False) -> None:
         """Append a step as reported; ``motion`` is the step as the calibration corrects it.
 
-        No range hangs on a keyframe through a loose step: its noise is not the wheels'.
+        No range is referred to a keyframe through a loose step: its noise is not the wheels'.
         """
         if is_loose:
             self._is_key.rows[-1] = True
@@ -312,11 +319,9 @@ class RunLog:
         keys = self._keys(parameters.relinearisation)
         steps = self._steps.rows.copy()
         chain = chain_of(steps, keys, state.calibration[None, :])
-        key, place, turn = _hung(chain, keys)
+        key, place, turn = _from_keyframes(chain, keys)
         pose = ranges["pose"]
-        c, s = np.cos(turn[pose]), np.sin(turn[pose])
-        mx, my = ranges["antenna"].T
-        antennas = place[pose] + np.column_stack([c * mx - s * my, s * mx + c * my])
+        antennas = place[pose] + _turned(ranges["antenna"], turn[pose])
         layout, prior_mean = state.layout, np.zeros(state.layout.size)
         of_landmark = prior_mean[layout.landmarks].reshape(-1, layout.landmark_size)
         of_landmark[:, :2] = state.landmarks_m
@@ -369,7 +374,6 @@ class RunLog:
         """Store the trajectory of a solution."""
         self._causal.rows[:] = all_poses(problem, estimate)[0]
         self._stored_pose = estimate.poses[-1].copy()
-        self.since_solved = 0
 
     def _rows_of(self, ids: NDArray[np.int32], rows: dict[int, int]) -> Indices:
         """Return the present row of each id, shape (m,), -1 for landmarks that are gone."""
@@ -393,7 +397,7 @@ def fixed_values(state: State) -> Array:
     return np.concatenate([state.offsets_m, mounts, landmarks.ravel(), state.walls.ravel()])
 
 
-def _hung(chain: Chain, keys: Indices) -> tuple[Indices, Array, Array]:
+def _from_keyframes(chain: Chain, keys: Indices) -> tuple[Indices, Array, Array]:
     """Return for each of n + 1 poses its keyframe, and place (n + 1, 2) and turn in its frame."""
     ends, n = chain.ends, len(chain.turns)
     way = _way(chain)
@@ -402,11 +406,10 @@ def _hung(chain: Chain, keys: Indices) -> tuple[Indices, Array, Array]:
     key, place, turn = np.zeros(n + 1, dtype=np.intp), np.zeros((n + 1, 2)), np.zeros(n + 1)
     key[1:] = chain.segment + from_end
     heading = chain.headings + chain.turns
-    back = chain.after - ends[chain.segment, :2]
-    c, s = np.cos(ends[chain.segment, 2]), np.sin(ends[chain.segment, 2])
-    back = np.column_stack([c * back[:, 0] + s * back[:, 1], c * back[:, 1] - s * back[:, 0]])
+    end = ends[chain.segment]
+    back = _turned(chain.after - end[:, :2], -end[:, 2])
     place[1:] = np.where(from_end[:, None], back, chain.after)
-    turn[1:] = np.where(from_end, heading - ends[chain.segment, 2], heading)
+    turn[1:] = np.where(from_end, heading - end[:, 2], heading)
     return key, place, turn
 
 
@@ -420,16 +423,15 @@ def all_poses(
     calibration = estimate.calibration
     chain = chain_of(problem.steps, problem.keys, calibration[: len(problem.keys) - 1])
     begin, end, at = estimate.poses[:-1], estimate.poses[1:], chain.segment
-    c, s = np.cos(begin[:, 2]), np.sin(begin[:, 2])
-    dx, dy = (end - begin)[:, :2].T
-    missed = np.column_stack([c * dx + s * dy, c * dy - s * dx, end[:, 2] - begin[:, 2]])
-    missed -= chain.ends
+    gone = end - begin
+    missed = np.column_stack([_turned(gone[:, :2], -begin[:, 2]), gone[:, 2]]) - chain.ends
     missed[:, 2] = wrap_angles(missed[:, 2])
     way = _way(chain)
     share = way / np.maximum(way[problem.keys[1:] - 1][at], _LEAST_WAY_M)
     within = np.column_stack([chain.after, chain.headings + chain.turns])
     within += share[:, None] * missed[at]
     poses = np.empty((len(problem.steps) + 1, 3))
+    c, s = np.cos(begin[:, 2]), np.sin(begin[:, 2])
     poses[1:, 0] = begin[at, 0] + c[at] * within[:, 0] - s[at] * within[:, 1]
     poses[1:, 1] = begin[at, 1] + s[at] * within[:, 0] + c[at] * within[:, 1]
     poses[1:, 2] = wrap_angles(begin[at, 2] + within[:, 2])

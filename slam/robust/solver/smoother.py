@@ -31,11 +31,7 @@ from slam.robust.solver.run_log import (
     motion_covariances,
     motions_by_calibration,
 )
-from slam.robust.state import (
-    HEAD_SIZE,
-    Array,
-    Indices,
-)
+from slam.robust.state import HEAD_SIZE, Array, Indices
 
 # Columns of the border
 POSE, CALIBRATION = slice(0, 3), slice(3, HEAD_SIZE)
@@ -54,7 +50,7 @@ _LEAST_RANGE_M, _LEAST_RANGE_M2, _TINY = 1e-9, 1e-18, 1e-300
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rows:
-    """White scalar rows of measurements: residual and derivatives; shapes (m,) unless said."""
+    """White scalar rows of measurements: residual (m,) and derivatives."""
 
     poses: Indices
     residual: Array

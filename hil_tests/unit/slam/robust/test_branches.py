@@ -236,7 +236,6 @@ def test_evidence_is_the_likelihood_of_the_ranges() -> None:
         assert all(
             nats == pytest.approx(math.log(1 - noise.detection_probability)) for _, nats in missed
         )
-        assert report.log_likelihood == pytest.approx(sum(nats for _, nats in report.evidence))
         if report.dof == 1:
             [(radar, _, landmark_id)] = report.continued
             [variance] = [

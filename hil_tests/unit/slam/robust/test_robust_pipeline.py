@@ -174,8 +174,8 @@ def test_a_blurred_echo_is_no_miss_of_what_it_may_hide_and_an_empty_frame_is() -
         for report in (result.report, unheard.report):
             assert not report.carried
             assert not report.lost
-        against += result.report.log_likelihood
-        unheard_against += unheard.report.log_likelihood
+        against += sum(nats for _, nats in result.report.evidence)
+        unheard_against += sum(nats for _, nats in unheard.report.evidence)
     assert len(hidden.back_end.reported_rows()) == known
     assert against == 0.0
     assert unheard_against < 30 * math.log(1 - ROBUST.robust.detection_probability)

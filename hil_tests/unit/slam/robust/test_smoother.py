@@ -402,7 +402,7 @@ def test_keyframes_remain_as_the_run_goes_on_and_a_loose_step_is_between_two() -
     assert 15 < len(before) < 80
 
 
-def test_a_range_hangs_on_its_keyframe_as_on_its_own_pose() -> None:
+def test_a_range_is_the_same_from_its_keyframe_as_from_its_own_pose() -> None:
     """With perfect odometry both predict the same, its mount off or not."""
     state = State((0.01,) * 3, (0.01,) * N_RADARS, mount_sigma_m=0.01, radius_sigma_m=0.01)
     state.calibration = np.array([0.02, -0.01, 0.05])
