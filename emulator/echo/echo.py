@@ -305,7 +305,7 @@ class SceneEcho:
         times_ns = self._clock.scene_times_ns(taken_ns)
         jitter_rad = self._jitter.phases_rad(indices, times_ns)
         signal = self.echo(capture, taken_ns, jitter_rad)
-        self._bursts.add_to(signal, indices, capture)
+        self._bursts.add_to(signal, indices, capture, self._gain)
         if self._others:
             view = self._paths.view(times_ns)
             self._others.add_to(signal, view, times_ns, capture, self._gain)

@@ -2,18 +2,7 @@
 
 Each is off unless the scene's tables ask for it. The laws are of the project; strengths that the
 stresses of ``uwb-slam sweep`` use stand in ``slam.app.sweep``. Formulas are on the model page,
-``emulator.echo.echo``, too.
-
-Wander of a scattering centre, for a target seen under the bearing beta (from target to radar)::
-
-    range     + a (0.7 cos(2 beta + phi_1) + 0.5 cos(5 beta + phi_2)) - rho
-    amplitude * max(0.1, 1 + c cos(3 beta + phi_3) + c / 2 cos(9 beta + phi_4))
-    phase     + b cos(4 beta + phi_1)
-
-phi_k are uniform in [0, 2 pi), drawn per target from the seed; all radars see the same body.
-
-Echo by way of two targets i, j that are d <= 1 m apart: range (r_i + r_j + d) / 2, amplitude
-g sqrt(A_i A_j) sqrt(0.1 m / d), phases added.
+``emulator.echo.echo``.
 """
 
 from __future__ import annotations
@@ -28,7 +17,6 @@ from scipy.special import ndtri
 from emulator.chip.chip import CaptureSettings
 from emulator.echo.reflections import PulseShape, Reflections, Scatterers, Viewpoint, sum_of_pulses
 from emulator.scene.philox import (
-    TARGET_STREAM,
     UNITS_PER_SIGMA,
     Purpose,
     counter_normals,
@@ -39,7 +27,7 @@ from emulator.scene.philox import (
 from emulator.scene.scene import RadarSpec, TargetSpec
 
 PAIR_REACH_M = 1.0
-"""Targets farther apart send no echo by way of each other."""
+"""Distance up to which two targets send an echo by way of each other."""
 PAIR_AT_M = 0.1
 """Distance of two targets at which the echo by way of both has the strength that the scene says."""
 
@@ -56,16 +44,16 @@ class Wander:
         specs = [target.wander for target in targets]
         rows = [(spec.range_m, spec.inside_m, spec.fading, spec.phase_rad) for spec in specs]
         self._strengths = np.array(rows).reshape(-1, 4).T
-        streams = range(TARGET_STREAM, TARGET_STREAM + len(targets))
+        streams = [stream_of(number, Purpose.WANDER) for number in range(len(targets))]
         phases = [math.tau * uniforms(4, seed=seed, stream=stream) for stream in streams]
         self._phases_rad = np.array(phases).reshape(-1, 4).T
 
     def __bool__(self) -> bool:
-        """Tell whether any target's echo differs from the ideal one."""
+        """Return whether any target's echo differs from the ideal one."""
         return bool(self._strengths.any())
 
     def applied(self, direct: Reflections, targets: Scatterers, view: Viewpoint) -> Reflections:
-        """Return the direct echoes, shape (n_frames, k), as the targets really send them."""
+        """Return the direct echoes of k targets, shape (n_frames, k), changed by the law."""
         beta = np.arctan2(view.y_m - targets.y_m, view.x_m - targets.x_m)
         range_m, inside_m, fading, phase_rad = self._strengths
         first, second, third, fourth = self._phases_rad
@@ -91,7 +79,7 @@ class TargetPairs:
         self._gain = strength * np.sqrt(PAIR_AT_M / self._between_m)
 
     def __bool__(self) -> bool:
-        """Tell whether there are any."""
+        """Return whether there are any."""
         return len(self._gain) > 0
 
     def reflections(self, direct: Reflections) -> Reflections:
@@ -111,15 +99,21 @@ class Bursts:
     def __init__(self, radar: RadarSpec, pulse: PulseShape, seed: int) -> None:
         self._spec = radar.bursts
         self._pulse = pulse
-        self._gain = 10.0 ** (radar.gain_db / 20)
         self._seed = seed
         serial = int(radar.serial)
         self._chances, self._noise = (stream_of(serial, Purpose.BURSTS, part) for part in (0, 1))
 
     def add_to(
-        self, signal: NDArray[np.float64], indices: NDArray[np.int64], capture: CaptureSettings
+        self,
+        signal: NDArray[np.float64],
+        indices: NDArray[np.int64],
+        capture: CaptureSettings,
+        gain: float,
     ) -> None:
-        """Add them in place to frames of the shape (n_frames, capture.n_samples)."""
+        """Add them in place to frames of shape (n_frames, capture.n_samples), with these indices.
+
+        ``gain`` is the receiver's: of the pulses, not of the noise.
+        """
         spec = self._spec
         if not (spec.echo_share or spec.noise_share):
             return
@@ -143,7 +137,7 @@ class Bursts:
         signal += sum_of_pulses(
             frame=frame,
             position=where[frame, pulse] * (capture.n_samples - 1),
-            amplitude=spec.amplitude * self._gain * size,
+            amplitude=spec.amplitude * gain * size,
             phase_rad=math.tau * phase[frame, pulse],
             tx_center_frequency=capture.tx_center_frequency,
             shape=signal.shape,
@@ -157,7 +151,7 @@ class Bursts:
 
 
 class Stamps:
-    """How far the times at which frames are taken lie from those that their reader believes."""
+    """How far the times at which frames are taken lie from those that their reader assumes."""
 
     def __init__(self, radar: RadarSpec, seed: int) -> None:
         self._sigma_ns = radar.stamp_sigma_ms * 1e6
@@ -166,7 +160,7 @@ class Stamps:
     def taken_ns(
         self, scene_times_ns: NDArray[np.int64], indices: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Return when frames are truly taken, from the believed times and the frames' indices."""
+        """Return when frames are taken, shape (n_frames,) [ns], from assumed times and indices."""
         if not self._sigma_ns:
             return scene_times_ns
         normals = counter_normals(indices, seed=self._seed, stream=self._stream)

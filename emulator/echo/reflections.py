@@ -283,9 +283,10 @@ class Scatterers:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Viewpoint:
-    """A radar's phase centre and boresight (a unit vector): shape (n_frames, 1), world frame.
+    """A radar's phase centre and boresight (a unit vector), world frame.
 
-    ``antenna`` is how its phase centre depends on the angle.
+    Shape (n_frames, 1) each, or (m,) as `take` returns them. ``antenna`` is how the phase centre
+    depends on the angle.
     """
 
     x_m: NDArray[np.float64]
@@ -293,6 +294,18 @@ class Viewpoint:
     boresight_x: NDArray[np.float64]
     boresight_y: NDArray[np.float64]
     antenna: AntennaSpec
+
+    def towards(
+        self, x_m: NDArray[np.float64], y_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return distances of points of the world frame, and cosines of their angles off boresight.
+
+        A cosine takes a distance below `NEAREST_M` as `NEAREST_M`.
+        """
+        dx, dy = x_m - self.x_m, y_m - self.y_m
+        distance_m = np.sqrt(dx * dx + dy * dy)
+        along_m = dx * self.boresight_x + dy * self.boresight_y
+        return distance_m, along_m / np.maximum(distance_m, NEAREST_M)
 
     def antenna_m(self, cos_angle: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how much farther a path appears whose ways out and back leave at an angle."""
@@ -388,12 +401,8 @@ def curved_spread(
 
 def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
     """Return the echoes by the straight way there and back; nothing stands in between."""
-    dx = scatterers.x_m - view.x_m
-    dy = scatterers.y_m - view.y_m
-    range_m = np.sqrt(dx * dx + dy * dy)
-    near_m = np.maximum(range_m, NEAREST_M)
-    cos_angle = (dx * view.boresight_x + dy * view.boresight_y) / near_m
-    surface_m = near_m
+    range_m, cos_angle = view.towards(scatterers.x_m, scatterers.y_m)
+    surface_m = np.maximum(range_m, NEAREST_M)
     round_ones = scatterers.radius_m > 0
     strength = scatterers.strength
     if round_ones.any():

@@ -33,13 +33,16 @@ _NEPERS_PER_DB = math.log(10) / 20
 
 
 class Targets:
-    """The scatterers that a scene's targets are."""
+    """A scene's targets as scatterers; ``steady`` are those of one echo, before scintillation."""
 
     def __init__(self, targets: tuple[TargetSpec, ...], seed: int) -> None:
         whole = target_scatterers(targets)
         is_body = np.array([bool(target.points) for target in targets], dtype=np.bool_)
         self.steady = replace(whole, strength=np.where(is_body, 0.0, whole.strength))
-        self._points, self._body_of_point = _scattering_points(targets)
+        # scatterers, and which target each of them belongs to
+        self._groups = [(self.steady, np.arange(len(targets)))]
+        if is_body.any():
+            self._groups.append(_scattering_points(targets))
         self._fades = [
             (number, Scintillation(target.scintillation, seed=seed, target=number))
             for number, target in enumerate(targets)
@@ -51,19 +54,15 @@ class Targets:
 
         The first has a row for each target, of strength 0 for one that has points.
         """
-        found = [self.steady]
-        if len(self._body_of_point):
-            found.append(self._points)
         if not self._fades:
-            return found
+            return [scatterers for scatterers, _ in self._groups]
         factor = np.ones((len(t_ns), len(self.steady.x_m)))
         for number, fade in self._fades:
             factor[:, number] = fade.factors(t_ns)
-        found[0] = replace(found[0], strength=found[0].strength * factor)
-        if len(self._body_of_point):
-            strength = self._points.strength * factor[:, self._body_of_point]
-            found[1] = replace(self._points, strength=strength)
-        return found
+        return [
+            replace(scatterers, strength=scatterers.strength * factor[:, target])
+            for scatterers, target in self._groups
+        ]
 
 
 def _scattering_points(
@@ -142,10 +141,7 @@ def mirrored_reflections(
         Shape (n_frames, k), or 1 without walls: the share of the amplitude that they let pass on
         the straight leg, one way.
     """
-    dx, dy = scatterers.x_m - view.x_m, scatterers.y_m - view.y_m
-    axis_m = np.sqrt(dx * dx + dy * dy)
-    near_m = np.maximum(axis_m, NEAREST_M)
-    cos_angle = (dx * view.boresight_x + dy * view.boresight_y) / near_m
+    axis_m, cos_angle = view.towards(scatterers.x_m, scatterers.y_m)
     surface_m = np.maximum(axis_m - scatterers.swell_m, NEAREST_M)
     mirrors = [
         (height, reflection)

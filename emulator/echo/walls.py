@@ -358,7 +358,7 @@ def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Refl
     strength = np.concatenate(amplitude, axis=1)
     x, y = np.concatenate(at_x, axis=1), np.concatenate(at_y, axis=1)
     ranges = np.concatenate(range_m, axis=1)
-    cos_angle = _cos_angle(view, x, y)
+    _, cos_angle = view.towards(x, y)
     strength *= beam_gain(cos_angle)
     ranges += view.antenna_m(cos_angle)
     frame, path = np.nonzero(strength)
@@ -454,7 +454,7 @@ def corner_reflections(
     start1 = one.along(x, y)
     bounce1 = start1 + (one.along(x2, y2) - start1) * share1
     x1, y1 = one.at(_between(bounce1, near1, far1))
-    cos1, cos2 = _cos_angle(seen_from, x1, y1), _cos_angle(seen_from, x2, y2)
+    (_, cos1), (_, cos2) = seen_from.towards(x1, y1), seen_from.towards(x2, y2)
     gain1, gain2 = np.sqrt(beam_gain(cos1)), np.sqrt(beam_gain(cos2))
     half_m[frame, pair] += 0.5 * (seen_from.antenna_m(cos1) + seen_from.antenna_m(cos2))
 
@@ -510,13 +510,6 @@ def _seen_part(
 
 def _between(value: Array, one: Array, other: Array) -> Array:
     return np.clip(value, np.minimum(one, other), np.maximum(one, other))
-
-
-def _cos_angle(view: Viewpoint, x: Array, y: Array) -> Array:
-    dx, dy = x - view.x_m, y - view.y_m
-    range_m = np.maximum(length(dx, dy), NEAREST_M)
-    cosine: Array = (dx * view.boresight_x + dy * view.boresight_y) / range_m
-    return cosine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -622,8 +615,8 @@ def _legs(
 ) -> _Legs:
     x, y = _targets(scatterers, view)
     straight_x, straight_y = view.x_m - x, view.y_m - y
-    straight_m = np.maximum(length(straight_x, straight_y), NEAREST_M)
-    straight_cos = -(straight_x * view.boresight_x + straight_y * view.boresight_y) / straight_m
+    straight_m, straight_cos = view.towards(x, y)
+    straight_m = np.maximum(straight_m, NEAREST_M)
     straight_gain = share * np.sqrt(beam_gain(straight_cos))
 
     # All candidates as flat lists in the order frame, target, face.
@@ -639,7 +632,8 @@ def _legs(
     candidate &= (scatterers.strength > 0)[..., np.newaxis]
     frame, target, number = np.nonzero(candidate)
     face = faces.take(number)
-    radar_x, radar_y = view.x_m[frame, 0], view.y_m[frame, 0]
+    seen_from = view.take(frame)
+    radar_x, radar_y = seen_from.x_m, seen_from.y_m
     target_x, target_y = x[frame, target], y[frame, target]
     image_x, image_y = face.mirrored(radar_x, radar_y)
     to_x, to_y = image_x - target_x, image_y - target_y
@@ -650,9 +644,7 @@ def _legs(
     start = face.along(radar_x, radar_y)
     bounce = start + (face.along(target_x, target_y) - start) * height_r / (height_r + height_t)
     bounce_x, bounce_y = face.at(np.clip(bounce, 0.0, face.length_m))
-    dx, dy = bounce_x - radar_x, bounce_y - radar_y
-    cos_angle = dx * view.boresight_x[frame, 0] + dy * view.boresight_y[frame, 0]
-    cos_angle /= np.maximum(length(dx, dy), NEAREST_M)
+    _, cos_angle = seen_from.towards(bounce_x, bounce_y)
     gain = np.sqrt(beam_gain(cos_angle))
     closed = closed_ends(faces, radar_height)[frame, number]
     lost = np.zeros(len(gain), dtype=np.complex128)

@@ -9,7 +9,7 @@ to 2**-20; one normal is the sum of two such entries. The sum is what makes the 
 
 A stream is keyed by (seed, stream number). Frame ``k`` owns the k-th block of a stream, so its
 noise depends neither on how many frames are asked for at once nor on their order. The streams of a
-module are numbered by its serial number and what they are for (`Purpose`).
+module or a target are numbered by `stream_of`.
 """
 
 from __future__ import annotations
@@ -46,12 +46,8 @@ _FRAMES_AT_ONCE = 16  # their bits stay in the processor's cache
 _UNIFORMS_PER_NORMAL = 12  # their sum has variance 1
 
 
-TARGET_STREAM = 1 << 60
-"""Added to the number of a target: its stream, the same for all radars."""
-
-
 class Purpose(IntEnum):
-    """What a module's random streams are for."""
+    """What the random streams of a module or a target are for."""
 
     RECEIVER_NOISE = 0
     JITTER_WHITE = 1
@@ -60,10 +56,14 @@ class Purpose(IntEnum):
     STAMPS = 4
     BURSTS = 5
     SCINTILLATION = 6
+    WANDER = 4096  # not 7: published results hold these streams
 
 
 def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:
-    """Return the number of a module's stream; ``part``, 0 ... 255, numbers those of one purpose.
+    """Return the number of a stream; ``part``, 0 ... 255, numbers those of one purpose.
+
+    ``serial`` is a module's serial number, or a target's place in its scene, from 0: what belongs
+    to a target is the same for all radars.
 
     >>> stream_of(202305070101, Purpose.RECEIVER_NOISE)
     202305070101

@@ -83,10 +83,9 @@ def drift(
     x, y, heading = 0.0, 0.0, 0.0
     reported = [(x, y, heading)]
     true_steps = np.diff(true_poses, axis=0)
+    slips = _slips(n_steps, model, seed=seed)
     if unseen is not None:
         true_steps[unseen] = 0.0
-    slips = slips_of(n_steps, model, seed=seed)
-    if unseen is not None:
         slips[unseen] = 0.0
     steps = true_steps.tolist()
     headings = true_poses[:, 2].tolist()
@@ -114,7 +113,7 @@ def drift(
     return np.array(reported, dtype=np.float64)
 
 
-def slips_of(n_steps: int, model: OdometrySpec, *, seed: int) -> NDArray[np.float64]:
+def _slips(n_steps: int, model: OdometrySpec, *, seed: int) -> NDArray[np.float64]:
     """Return what wheels report too much at each step, shape (n_steps, 2): [m forward, rad]."""
     slips = np.zeros((n_steps, 2))
     if model.slips_per_s == 0.0:
