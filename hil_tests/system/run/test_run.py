@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,6 +71,22 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 def run_command(robot: Robot, out: Path, *more: str) -> list[str]:
     options = ["--rig", str(robot.rig), "--ports", *robot.ports, "--out", str(out)]
     return [*COMMAND, "run", *options, *more]
+
+
+@contextmanager
+def running(robot: Robot, out: Path, n_scans: int) -> Iterator[subprocess.Popen[str]]:
+    """Start a run; yield its process when the session has ``n_scans`` scans or more."""
+    with subprocess.Popen(
+        run_command(robot, out, "--odometry", robot.odometry),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        session = out / "session.mcap"
+        # The file has its settings and scans; how many go into a kilobyte depends on lost frames.
+        wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
+        wait_until(lambda: len(list(open_session(session).scans())) >= n_scans, process)
+        yield process
 
 
 def replayed(out: Path, again: Path, said: pytest.CaptureFixture[str]) -> str:
@@ -144,16 +161,7 @@ def test_a_signal_leaves_a_session_that_replays(
 ) -> None:
     """After SIGINT with map and numbers; after kill -9 all but the last second."""
     out = tmp_path / "out"
-    with subprocess.Popen(
-        run_command(robot, out, "--odometry", robot.odometry),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        session = out / "session.mcap"
-        # The file has its settings and scans; how many go into a kilobyte depends on lost frames.
-        wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
-        wait_until(lambda: len(list(open_session(session).scans())) > 10, process)
+    with running(robot, out, n_scans=11) as process:
         process.send_signal(which)
         said = process.communicate(timeout=seconds(30))[1]
     assert process.returncode == code
@@ -178,15 +186,8 @@ def test_a_signal_leaves_a_session_that_replays(
 
 def test_sigusr1_writes_the_smoothed_path_while_it_runs(robot: Robot, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with subprocess.Popen(
-        run_command(robot, out, "--odometry", robot.odometry),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        session = out / "session.mcap"
-        wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
-        wait_until(lambda: len(list(open_session(session).scans())) > 25, process)
+    session = out / "session.mcap"
+    with running(robot, out, n_scans=26) as process:
         process.send_signal(signal.SIGUSR1)
         wait_until((out / "smoothed.tum").exists, process)
         n_early = len((out / "smoothed.tum").read_text().splitlines())
