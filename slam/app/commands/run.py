@@ -264,7 +264,7 @@ class SmoothingRequests(SessionObserver):
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         if self._asked_s is None:
-            return  # the end of the run, whose results are written by others
+            return  # the end of the run: `finish` writes its results
         path, took_s = self._out / SMOOTHED, time.monotonic() - self._asked_s
         self._asked_s = None
         try:

@@ -29,6 +29,7 @@ from slam.app.run.pictures import (
 )
 from slam.app.sweep import CLEAN
 from slam.app.sweep.statistics import (
+    carries_text,
     group_name,
     in_band,
     in_band_text,
@@ -324,10 +325,7 @@ def _scenes(groups: Sequence[Group]) -> Result:
         ],
         "worse than wheels": [f"{row['runs_above_odometry']} of {row['runs']}" for row in rows],
         "lost": [str(row["runs_lost"]) for row in rows],
-        "carries found": [
-            f"{row['carries_in_time']} of {row['carries']}" if row["carries"] else "-"
-            for row in rows
-        ],
+        "carries found": [carries_text(row) for row in rows],
         "ANEES": [f"{row['anees_mean']:.1f}" for row in rows],
         "in band": [in_band_text(group) for group in groups],
         "NIS": ["-" if row["nis_mean"] is None else f"{row['nis_mean']:.2f}" for row in rows],
@@ -359,7 +357,7 @@ def _scenes(groups: Sequence[Group]) -> Result:
 
 
 def _common(group: Group) -> Group:
-    """Return what both tables say of a group: ratios are per run, in units of its own wheels."""
+    """Return the numbers of a group that both tables have; ratios are per run, to its wheels."""
     keys = ("ratio", "runs_below_odometry", "runs_above_odometry", "runs_lost", "runs_lost_at_end")
     smoothed = group["smoothed"]
     return {

@@ -194,8 +194,7 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
             return score
         return replace(score, true=None, observable=None, precision=None, recall=None)
 
-    smoothed = record.whole_smoothed
-    return Summary(
+    summary = Summary(
         scene=info.scene,
         preset=info.preset,
         seed=info.seed,
@@ -203,22 +202,21 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
         duration_s=record.duration_ns / NS_PER_S,
         realtime_factor=record.duration_ns / NS_PER_S / record.wall_s,
         ate_rmse_m=ate_rmse_m(estimate[:, :2], truth_xy),
-        smoothed_ate_rmse_m=None
-        if smoothed is None
-        else ate_rmse_m(smoothed.poses[:, :2], truth_xy),
         ate_icp_rmse_m=icp_ate_rmse_m(estimate[:, :2], truth_in_map[:, :2]),
         odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
         final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
         landmarks=score(last.landmarks_m, estimate),
-        smoothed_landmarks=None
-        if smoothed is None
-        else score(smoothed.landmarks_m, smoothed.poses),
         nees_pose=_nees(record, truth_in_map, estimate, states.pose_covariances),
-        smoothed_nees_pose=None
-        if smoothed is None
-        else _nees(record, truth_in_map, smoothed.poses, smoothed.pose_covariances),
         nis_mean=sum(states.nis.tolist()) / dof if (dof := int(states.nis_dof.sum())) else None,
         nis_times=_nis_times(record),
+    )
+    if (smoothed := record.whole_smoothed) is None:
+        return summary
+    return replace(
+        summary,
+        smoothed_ate_rmse_m=ate_rmse_m(smoothed.poses[:, :2], truth_xy),
+        smoothed_landmarks=score(smoothed.landmarks_m, smoothed.poses),
+        smoothed_nees_pose=_nees(record, truth_in_map, smoothed.poses, smoothed.pose_covariances),
     )
 
 

@@ -163,7 +163,8 @@ class Comparison(SessionObserver):
         self._gaps: list[Gap] = []
         self._n_before_gap: int | None = None
         self._first_other_ns: int | None = None
-        self._smoothed: tuple[int, bytes] | None = None  # of the last one its last time, and digest
+        # session time of its last state [ns], and digest, of the last one
+        self._smoothed: tuple[int, bytes] | None = None
         self._smoothed_again: tuple[int, bytes] | None = None
 
     def expect(self, snapshot: Snapshot) -> None:
@@ -219,7 +220,7 @@ class Comparison(SessionObserver):
     def _smoothed_verdict(self) -> str:
         expected, found = self._smoothed, self._smoothed_again
         if expected is None or found is None or expected[0] != found[0]:
-            return ""  # of a run that was killed, or smooths nothing
+            return ""  # the recorded run was killed, or has no smoothed path
         if expected == found:
             return ", and so did the smoothed path"
         return f"; the smoothed path did not: {self._reason()}"

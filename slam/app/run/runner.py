@@ -54,7 +54,7 @@ def make_slam(
     replaces the front end that the configuration names, ``rules`` those of the robust back end.
     """
     if config.back_end is BackEnd.ROBUST:
-        compile_kernels()  # or the first scans would wait for it
+        compile_kernels()  # so that the first scans need not wait
         return RobustSlam(config, rig, wheels, detector, rules)
     return UwbRadarSlam(config, rig, detector)
 

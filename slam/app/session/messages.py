@@ -51,13 +51,6 @@ _PER_LANDMARK = 7
 def state_row(snapshot: Snapshot) -> NDArray[np.float64]:
     """Return the row of a state, shape (23 + 7 n_landmarks + n_nis,)."""
     n_landmarks, n_nis = len(snapshot.landmark_ids), len(snapshot.nis_per_dof)
-    landmarks = np.column_stack(
-        [
-            snapshot.landmark_ids,
-            snapshot.landmarks_m.reshape(-1, 2),
-            snapshot.landmark_covariances_m2.reshape(-1, 4),
-        ]
-    )
     parts = (
         [n_landmarks, n_nis],
         snapshot.truth,
@@ -65,7 +58,7 @@ def state_row(snapshot: Snapshot) -> NDArray[np.float64]:
         snapshot.estimate,
         snapshot.world_from_map,
         snapshot.pose_covariance.ravel(),
-        landmarks.ravel(),
+        _landmark_rows(snapshot).ravel(),
         snapshot.nis_per_dof,
     )
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
@@ -86,7 +79,7 @@ def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
     _, truth, odometry, estimate, world_from_map, covariance, landmarks, nis, _ = np.split(
         row, ends
     )
-    table = landmarks.reshape(-1, _PER_LANDMARK)
+    ids, landmarks_m, covariances_m2 = _landmarks_of(landmarks)
     return Snapshot(
         counter=counter,
         t_ns=t_ns,
@@ -95,9 +88,9 @@ def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
         estimate=estimate,
         world_from_map=world_from_map,
         pose_covariance=covariance.reshape(3, 3),
-        landmark_ids=table[:, 0].astype(np.int64),
-        landmarks_m=table[:, 1:3],
-        landmark_covariances_m2=table[:, 3:].reshape(-1, 2, 2),
+        landmark_ids=ids,
+        landmarks_m=landmarks_m,
+        landmark_covariances_m2=covariances_m2,
         nis_per_dof=tuple(nis.tolist()),
     )
 
@@ -114,13 +107,7 @@ def smoothed_row(smoothed: SmoothedRun) -> NDArray[np.float64]:
             smoothed.pose_covariances.reshape(-1, 9),
         ]
     )
-    landmarks = np.column_stack(
-        [
-            np.array(smoothed.landmark_ids, dtype=np.float64),
-            smoothed.landmarks_m.reshape(-1, 2),
-            smoothed.landmark_covariances_m2.reshape(-1, 4),
-        ]
-    )
+    landmarks = _landmark_rows(smoothed)
     head = [float(len(states)), float(len(landmarks))]
     return np.concatenate([head, states.ravel(), landmarks.ravel()])
 
@@ -140,15 +127,35 @@ def smoothed_of(t_ns: int, row: NDArray[np.float64]) -> SmoothedRun:
     if min(n_states - 1, n_landmarks) < 0 or ends[-1] != len(row):
         raise ValueError(f"a smoothed run of {len(row)} numbers says it has {ends[-1]}")
     _, states, landmarks, _ = np.split(row, ends)
-    states, landmarks = states.reshape(-1, _PER_STATE), landmarks.reshape(-1, _PER_LANDMARK)
+    states = states.reshape(-1, _PER_STATE)
+    ids, landmarks_m, covariances_m2 = _landmarks_of(landmarks)
     return SmoothedRun(
         t_ns=t_ns + states[:, 0].astype(np.int64),
         poses=states[:, 1:4],
         pose_covariances=states[:, 4:].reshape(-1, 3, 3),
-        landmark_ids=tuple(landmarks[:, 0].astype(np.int64).tolist()),
-        landmarks_m=landmarks[:, 1:3],
-        landmark_covariances_m2=landmarks[:, 3:].reshape(-1, 2, 2),
+        landmark_ids=tuple(ids.tolist()),
+        landmarks_m=landmarks_m,
+        landmark_covariances_m2=covariances_m2,
     )
+
+
+def _landmark_rows(of: Snapshot | SmoothedRun) -> NDArray[np.float64]:
+    """Return id, place and covariance of each landmark, shape (n_landmarks, 7)."""
+    return np.column_stack(
+        [
+            np.asarray(of.landmark_ids, dtype=np.float64),
+            of.landmarks_m.reshape(-1, 2),
+            of.landmark_covariances_m2.reshape(-1, 4),
+        ]
+    )
+
+
+def _landmarks_of(
+    numbers: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return ids (n,), places (n, 2) [m] and covariances (n, 2, 2) [m^2] of 7 n numbers."""
+    rows = numbers.reshape(-1, _PER_LANDMARK)
+    return rows[:, 0].astype(np.int64), rows[:, 1:3], rows[:, 3:].reshape(-1, 2, 2)
 
 
 ODOMETRY = "nav_msgs/msg/Odometry"

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 CLEAN = "clean"
 
 FAMILIES = ("pillars", "office", "dense", "loop", "sparse", "people", "rig")
-"""Of random rooms (`emulator.scene.rooms`, which loads NumPy)."""
+"""Families of random rooms; `emulator.scene.rooms` would load NumPy."""
 
 Table = Mapping[str, object]
 """Keys of a table of a scene, and their values."""
@@ -22,8 +22,8 @@ Table = Mapping[str, object]
 class Stress:
     """The stress of a run; random choices depend on the run's seed alone.
 
-    SLAM knows nothing of the stress; frames carry the time at which they were really taken. The
-    only stress that enters behind the front end are outliers: no reflector gives such echoes.
+    SLAM does not get these values. Frames have their true times, but for the errors of stamps in
+    ``radars``. Only outliers enter behind the front end: no reflector gives such echoes.
     """
 
     help: str
@@ -35,11 +35,11 @@ class Stress:
     silent_share: float = 0.0  # of the run, in one piece that begins between 15 and 75 % of it
     dead_radars: frozenset[int] = frozenset()  # indices of radars that never send a frame
     offset_sigma_m: float = 0.0  # of every radar's own constant range error
-    # of where every radar truly is about where SLAM believes it, per axis and in yaw
+    # of every radar's true mount about that of the rig which SLAM gets, per axis and in yaw
     mount_sigma_m: float = 0.0
     mount_sigma_deg: float = 0.0
-    # what every table of a kind says in this stress beside what the scene has: keys of `RadarSpec`,
-    # `TargetSpec`, `MultipathSpec` and `OdometrySpec` (`emulator.scene.scene`)
+    # keys that replace those of every such table of the scene: of `RadarSpec`, `TargetSpec`,
+    # `MultipathSpec` and `OdometrySpec` (`emulator.scene.scene`)
     radars: Table = field(default_factory=dict)
     targets: Table = field(default_factory=dict)
     multipath: Table = field(default_factory=dict)
@@ -50,7 +50,7 @@ class Stress:
 
 _SKEWS_MS = (0.0, 190.0, 100.0, 150.0)
 
-# Of model error, each with the strength of the project's laws (`emulator.echo.model_error`).
+# Strengths of model error, as in the project's laws (`emulator.echo.model_error`).
 _OFFSET_SIGMA_M, _MOUNT_SIGMA_M, _MOUNT_SIGMA_DEG = 0.02, 0.005, 1.0
 _SKEWED_PULSE: Table = {"pulse": {"width": 1.15, "skew": 0.15, "ringing": 0.15}}
 _BURSTS: Table = {"bursts": {"echo_share": 0.15, "noise_share": 0.05}}
@@ -94,12 +94,12 @@ STRESSES: Mapping[str, Stress] = {
         carried_skips=0.15,
     ),
     "pulse_wide": Stress(
-        help="all pulses a tenth wider than SLAM believes", radars={"pulse": {"width": 1.1}}
+        help="all pulses a tenth wider than SLAM assumes", radars={"pulse": {"width": 1.1}}
     ),
     "pulse": Stress(help="pulses 1.15 times as wide, skewed and ringing", radars=_SKEWED_PULSE),
     "wander_3": Stress(
-        help="targets of 2 cm radius, scattering centre, amplitude and phase of which change with "
-        "aspect, the range by 3 mm",
+        help="a scattering centre 2 cm inside each target, whose range (3 mm), amplitude and phase "
+        "change with aspect",
         targets=_wander(0.003),
     ),
     "wander_10": Stress(help="the same, the range by 10 mm", targets=_wander(0.01)),

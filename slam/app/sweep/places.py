@@ -1,4 +1,4 @@
-"""Whether the robot knew where it was: how long it was lost, and how soon after a carry found."""
+"""For how many states a robot was lost, and when its pose was right again after a carry."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from slam.app.run.runner import RunRecord
 from slam.geometry import Rig, between, transform, wrap_angles
 
 LANDMARKS_TO_FIND = 3
-"""So many in view tell where a robot is on a map of points; ranges to two leave a mirror image."""
+"""Landmarks in view that determine a pose on a map of points: two leave its mirror image."""
 FOUND_WITHIN_S = 20.0
-"""What it may take from then on."""
+"""Longest time from then until the pose is right [s]."""
 FOUND_M, FOUND_RAD = 0.3, 0.2
-"""Errors within which a place is the right one, and no other: a carry is longer."""
+"""Largest errors of a right pose [m, rad]; a carry is longer."""
 FOUND_FOR_S = 5.0
-"""So long it must be right, to be no chance."""
+"""How long a pose must stay right [s], so that chance does not count."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,14 +35,14 @@ class Carry:
 
     @property
     def in_time(self) -> bool | None:
-        """Whether it was found in time; None where it had too little to see or time to tell."""
+        """Whether it was found in time; None where fewer than three landmarks came into view."""
         if self.three_seen_s is None:
             return None
         return self.found_s is not None and self.found_s - self.three_seen_s <= FOUND_WITHIN_S
 
 
 class LostStates(SessionObserver):
-    """Keeps of every state whether SLAM said that it was lost."""
+    """Keeps of every state whether SLAM reported the robot as lost."""
 
     def __init__(self) -> None:
         self.of_states: list[bool] = []

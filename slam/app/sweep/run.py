@@ -74,7 +74,7 @@ Key = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
 
 
 def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
-    """Return the scene with what a row plants in it: its tables, and what is drawn for the run.
+    """Return the scene with the keys of a stress in its tables, and what is drawn for the run.
 
     A radar beyond those that have a skew in the row takes them from the first again.
     """
@@ -128,7 +128,7 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
 
 
 def _with(table: TableT, values: Table) -> TableT:
-    """Return a table of a scene with other values of some keys, checked as those of a file."""
+    """Return a table of a scene with these values of some keys, validated as those of a file."""
     return type(table).model_validate(table.model_dump() | dict(values)) if values else table
 
 
@@ -258,9 +258,9 @@ class Case:
         return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
 
     def with_seeds(self, count: int, first: int = 0) -> list[Case]:
-        """Return so many runs: seeds from ``first``, those of a random room from its number more.
+        """Return ``count`` runs with seeds from ``first``; a random room adds its number.
 
-        Wheels and noise of two rooms of a family are never alike.
+        So no two rooms of a family share the errors of wheels and the noise.
         """
         number, step = (0, 1) if self.room is None else (self.room[1], MOST_ROOMS)
         return [replace(self, seed=first + number + step * run) for run in range(count)]
@@ -273,8 +273,8 @@ class SweepRun(Summary):
     ``settings`` are those of the preset that were replaced, dotted keys; ``false`` and
     ``confident_false`` count the landmarks of the map where nothing stands, and those of them that
     claim to be known to 5 cm; ``bound`` is on the same data, where it was asked for; ``family`` is
-    that of a random room; ``lost_share`` is of the states that SLAM reported as lost, and ``carry``
-    what became of a robot that was carried.
+    that of a random room; ``lost_share`` is the share of states reported as lost, and ``carry``
+    whether a robot that was carried was found again.
     """
 
     settings: dict[str, str] = field(default_factory=dict)
@@ -293,7 +293,7 @@ class SweepRun(Summary):
 
     @property
     def group(self) -> Key:
-        """What it has in common with the runs that its statistics are of."""
+        """Key of the group of `summarise_groups` that has this run."""
         return (self.family or self.scene, *self.key[1:-1], None)
 
 

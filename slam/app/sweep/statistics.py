@@ -27,8 +27,8 @@ def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
     were claimed to be known), the mean NEES over runs (ANEES) and the mean NIS per degree of
     freedom at each of the ten times with their 95 % bands, ATE and mean NEES of the `smoothed`
     paths where there are any, and the same errors of the known-association bound where it was
-    computed. `ratio` is of the runs' ATE in units of their own odometry's, `outcomes` counts what
-    went wrong.
+    computed. `ratio` is the spread of each run's ATE over its own odometry's; the counts are those
+    of `outcomes`.
     """
     groups = dict.fromkeys(run.group for run in runs)
     return [_group([run for run in runs if run.group == group]) for group in groups]
@@ -83,7 +83,7 @@ def group_line(group: dict[str, Any]) -> str:
 def outcomes_text(counts: Mapping[str, Any]) -> str:
     """Return in words how many runs failed, of a group or of `outcomes`."""
     n_runs = counts["runs"]
-    words = [
+    parts = [
         f"{counts[key]} of {n_runs} runs {what}"
         for key, what in (
             ("runs_above_odometry", "worse than their wheels"),
@@ -92,15 +92,24 @@ def outcomes_text(counts: Mapping[str, Any]) -> str:
         )
     ]
     if counts["carries"]:
-        words.append(
+        parts.append(
             f"{counts['carries_in_time']} of {counts['carries']} carries found within "
             f"{FOUND_WITHIN_S:g} s of the third landmark in view"
         )
-    return ", ".join(words)
+    return ", ".join(parts)
+
+
+def carries_text(counts: Mapping[str, Any]) -> str:
+    """Return how many of the carries were found in time, for a cell of a table.
+
+    >>> carries_text({"carries": 5, "carries_in_time": 4}), carries_text({"carries": 0})
+    ('4 of 5', '-')
+    """
+    return f"{counts['carries_in_time']} of {counts['carries']}" if counts["carries"] else "-"
 
 
 def in_band_text(group: Mapping[str, Any]) -> str:
-    """Return how often the mean NEES is in its band, and how wide that is: few runs say little.
+    """Return how often the mean NEES is in its band, and that band, which is wide for few runs.
 
     >>> in_band_text({"anees_pose": [[1.0, 2.0], [2.0, 6.0]], "anees_band_95": [1.25, 5.5]})
     '1 of 2 in 1.2-5.5'
@@ -140,10 +149,11 @@ def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
 
 
 def outcomes(runs: Sequence[SweepRun]) -> dict[str, int]:
-    """Return how many runs there are, and how many of them failed, and how.
+    """Return the number of runs, and how many failed in each way.
 
-    ``runs_lost`` were never carried and reported themselves lost; ``carries_in_time`` are those of
-    ``carries`` that were found in time, of which one with less to see than that does not count.
+    ``runs_lost`` counts runs without a carry in which SLAM reported the robot as lost; ``carries``
+    those with a carry and three landmarks in view after it, ``carries_in_time`` those of them that
+    were found in time.
     """
     carries = [run.carry.in_time for run in runs if run.carry and run.carry.in_time is not None]
     return {
@@ -191,7 +201,7 @@ def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
 def _smoothed(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
     """Return the numbers of the smoothed paths; None where no run has one.
 
-    `ratio` is of the runs' ATE in units of their own odometry's.
+    `ratio` is the spread of each run's ATE over its own odometry's.
     """
     ates = [run.smoothed_ate_rmse_m for run in runs if run.smoothed_ate_rmse_m is not None]
     if not ates:
@@ -286,10 +296,7 @@ def stress_table(
         ],
         "worse": [str(row["runs_above_odometry"]) for row in rows],
         "lost": [str(row["runs_lost"]) for row in rows],
-        "carries found": [
-            f"{row['carries_in_time']} of {row['carries']}" if row["carries"] else "-"
-            for row in rows
-        ],
+        "carries found": [carries_text(row) for row in rows],
         "mean NEES": [f"{row['anees_mean']:.2f}" for row in rows],
         "ANEES in band": [in_band_text(row) for row in rows],
         "no duplicate": [f"{row['without_duplicates']:.0%}" for row in rows],
