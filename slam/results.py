@@ -155,8 +155,8 @@ class UpdateReport:
     dof: int
     # Every range of a landmark, not of walls, that took part, measured or not
     predicted: tuple[PredictedRange, ...] = ()
-    # What each range of a landmark, and each landmark that had none, says for the pose: its id, and
-    # the logarithm of how much likelier that is where the map has the robot than elsewhere
+    # Of each range of a landmark, and of each landmark that gave none: its id, and the logarithm of
+    # the likelihood ratio [nats] of the estimated pose to any other
     evidence: tuple[tuple[int, float], ...] = ()
     # Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
     # and covariance say nothing but that
