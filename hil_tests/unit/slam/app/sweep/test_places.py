@@ -63,7 +63,7 @@ def found(wrong_until: int, lost_until: int, landmarks: Sequence[tuple[float, fl
     return carry
 
 
-def test_a_robot_is_found_when_it_is_right_and_says_so() -> None:
+def test_a_robot_is_found_when_its_pose_is_right_and_not_reported_as_lost() -> None:
     carry = found(25, 30, LANDMARKS)
     assert carry.found_s == 20.0  # state 30, 10 s after which it was set down
     # at 2.6 m, state 26: 0.1 m ahead of the base stands the front antenna
@@ -86,7 +86,7 @@ def test_a_place_that_is_right_for_a_moment_is_not_found() -> None:
     assert carry.in_time is False
 
 
-def test_fewer_than_three_landmarks_tell_nothing() -> None:
+def test_fewer_than_three_landmarks_in_view_give_no_result() -> None:
     assert found(25, 0, LANDMARKS[:2]).in_time is None
     empty = record_of(TRUTH[:5], TRUTH[:5])
     assert (

@@ -169,7 +169,7 @@ MISMATCH = (
 
 
 def test_model_error_has_the_strengths_of_its_laws() -> None:
-    """Every number stands in the table of laws; SLAM gets the same rig and wheels as without."""
+    """The numbers are those of the project's laws; SLAM gets the same rig and wheels as without."""
     lab = load_scene("lab")
     for name in (*MISMATCH, "pulse_wide", "wander_3", "mismatch"):
         scene = stressed_scene(lab, STRESSES[name], 4)

@@ -28,7 +28,7 @@ N_SCANS = 200
 
 
 def planted(scene: Scene) -> Scene:
-    """Return a world that differs in all that a robot's user cannot know: only the told stays."""
+    """Return a world with other values of every key that is no input of SLAM."""
     radars = tuple(
         radar.model_copy(
             update={
