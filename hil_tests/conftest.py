@@ -57,7 +57,7 @@ def pytest_report_collectionfinish() -> list[str]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if "slam.compiled" in sys.modules:  # or the time of one test would be that of compiling
+    if "slam.compiled" in sys.modules:  # not within the time limit of the first test
         sys.modules["slam.compiled"].compile_kernels()
     if not config.pluginmanager.hasplugin("timeout") or config.getoption("timeout") is not None:
         return

@@ -32,7 +32,7 @@ class _Kernel:
         return self.compiled()(*args)
 
     def _compiled(self) -> Callable[..., Any]:
-        import numba  # half a second, and not every process calls a kernel
+        import numba  # takes half a second, and not every process calls a kernel
 
         function = self._function
         known = dict(function.__globals__)

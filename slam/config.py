@@ -190,8 +190,9 @@ class MatchedFilterConfig(_Model):
     noise_sigma: NonNegative = 0.0
     # Unexplained over expected energy from which ``joint`` looks for several pulses.
     max_single_misfit: Positive = 4.0
-    # Relative error of the pulse: energy of its difference from the real one over its own, root. A
-    # width 10 % off is 0.07. Less is no second echo, and five eighths of it are no misfit.
+    # Relative error of the pulse: root of the energy of its difference from the real pulse, as a
+    # share of the pulse's energy; 0.07 for a width 10 % off. A difference of this size is no second
+    # echo, and near the peak no misfit.
     model_error: NonNegative = 0.08
 
 

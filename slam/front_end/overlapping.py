@@ -192,7 +192,7 @@ class SplitTest:
 
     max_echoes: int = 4  # most echoes of a window
     false_split: float = 1e-3  # probability that noise alone makes one more echo in a window
-    # Amplitude error of the pulse model, relative. 0.08 covers a bandwidth wrong by 10 %.
+    # Relative error of the pulse model; 0.08 covers a bandwidth wrong by 10 %.
     model_error: float = 0.08
     min_separation: float = 0.5  # closest echoes told apart, in standard deviations of the envelope
 

@@ -2,8 +2,8 @@
 
 An echo of amplitude and phase in one complex number a, at position u, is Re{a q(n - u)} with
 q(x) = T(x) exp(j kappa x): carrier, and complex envelope T, which the pulse model takes for a
-Gaussian and which filters and antennas of a module widen, skew and let ring. T is estimated from
-strong echoes that stand alone, and a frame is then equalised: behind the filter
+Gaussian; filters and antennas of a module widen it, skew it and let it ring. T is estimated from
+strong isolated echoes, and a frame is then equalised: behind the filter
 
     G(f) = F_Gauss(f) conj F_T(f) / (|F_T(f)|**2 + delta max |F_T|**2)
 
@@ -33,8 +33,8 @@ Choice
     what it is. That of all radars together replaces the nominal pulse, that of one radar replaces
     theirs: modules of one kind differ less from each other than from the data sheet.
 Origin
-    Echoes do not tell delay from range. Zero of T is where the nominal filter has its peak, so an
-    echo alone keeps its range when the pulse changes.
+    A delay of the pulse and a range cannot be separated. Zero of T is where the nominal filter has
+    its peak, so an isolated echo keeps its range when the pulse changes.
 
 All of it depends on the frames alone, in their order.
 """
@@ -58,28 +58,27 @@ Array = NDArray[np.float64]
 _STEP_SIGMAS, _STEPS = 0.75, 12
 # Beyond the first distance an envelope is faded out, to nothing at the second [steps].
 _FADE_STEPS = 9.5, 12.5
-# Half the length of a window in sigmas: no stronger peak is nearer.
+# Half the length of a window in sigmas: an isolated peak has no stronger one within it.
 _REACH_SIGMAS = _STEP_SIGMAS * _STEPS
-# What may be looked at: heights over sigma_y and over that of the nearest other peaks
+# Least height of an isolated peak, over sigma_y; largest of others within reach, over its own
 _LEAST_SNR, _LARGEST_NEIGHBOUR = 30.0, 0.4
 # Frames of one radar from one echo to the next, bins that it must have moved, echoes kept
 _FRAMES_APART, _BINS_APART, _CAPACITY = 3, 1.0, 150
-# First number of echoes of an estimate, and by what share more it takes for the next
+# Echoes of the first estimate, and how many times as many the next one needs
 _FIRST, _MORE = 60, 1.5
 _ROUNDS, _GROUPS = 10, 8
-# Real errors are so many times those of the jackknife, and at least the second: neighbours last
-# longer than its blocks.
+# Real error over that of the jackknife, since neighbours last longer than its blocks; least error
 _ERROR_SHARE, _LEAST_ERROR = 2.5, 0.015
 # Least difference from the pulse used so far, relative, and in standard deviations of the estimate
 _LEAST_CHANGE, _ERRORS = 0.05, 2.0
-# Samples near the peak, of how many of the windows the best are taken, and what part of the energy
-# that the estimate leaves of the worst of them is its own error
+# Steps that are near the peak; quantile of what the estimate leaves of the windows there, and the
+# part of that energy which is the estimate's own error
 _NEAR_STEPS, _AGREEING, _LEFT_SHARE = 4, 0.3, 0.5
 # Noise that the equaliser allows for, as a part of the largest power of the pulse
 _REGULARISATION = 3e-3
 # Widths of the Gaussian that a pulse is turned into, as a share of the nominal one
 _WIDTHS = np.linspace(0.7, 1.5, 161)
-# Newton steps towards the peak of a pulse behind the nominal filter, and one that is the last
+# Most Newton steps to the peak of a pulse behind the nominal filter, and a step that is converged
 _PEAK_STEPS, _NO_STEP = 20, 1e-10
 # Half the length of an equaliser in sigmas; the transform that it comes from is 4 times as long.
 _TAPS_SIGMAS = 16.0
@@ -89,7 +88,7 @@ _NEAR = np.abs(_AT_STEPS) <= _NEAR_STEPS
 # Power of the noise of a window over sigma_y**2: both bands, and both quadratures
 _NOISE_GAIN = 2 * math.sqrt(math.pi) / _STEP_SIGMAS
 _ENERGY = float(np.sum(_NOMINAL.real**2))
-# Transforms of envelopes are of this length, so they do not wrap round.
+# Length of the transforms of envelopes; 25 steps moved by a few do not wrap round.
 _N_FFT = 64
 _RAD_PER_STEP = math.tau * np.fft.fftfreq(_N_FFT)
 _FADE = 0.5 + 0.5 * np.cos(
@@ -100,7 +99,7 @@ _FADE = 0.5 + 0.5 * np.cos(
 _TINY = 1e-9
 
 
-def baseband(
+def _baseband(
     samples: Array, position_bins: float, pulse: PulseModel, bin_length_m: float
 ) -> ComplexArray:
     """Return the samples around a position as an envelope at 25 steps, carrier turned back.
@@ -130,15 +129,15 @@ def _band(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Envelope:
+class _Envelope:
     """An envelope at the 25 steps, 1 behind the nominal filter and there at its peak."""
 
     samples: ComplexArray  # shape (25,)
     relative_error: float  # norm of its expected error over its own
 
 
-def estimate_envelope(windows: ComplexArray, sigma_y: Array) -> Envelope:
-    """Return the envelope that windows (n, 25) of `baseband` have in common, n >= 3.
+def _estimate_envelope(windows: ComplexArray, sigma_y: Array) -> _Envelope:
+    """Return the envelope that windows (n, 25) of `_baseband` have in common, n >= 3.
 
     Those with the same neighbours follow on each other; ``sigma_y`` (n,) is the noise of each
     behind the nominal filter.
@@ -167,7 +166,7 @@ def estimate_envelope(windows: ComplexArray, sigma_y: Array) -> Envelope:
     disagreement = _LEFT_SHARE * max(float(np.quantile(left, _AGREEING)), 0.0)
     variance = _ERROR_SHARE**2 * _jackknife(weighted * cleared, weighted) + disagreement
     error = math.sqrt(variance)
-    return Envelope(samples=envelope, relative_error=max(error, _LEAST_ERROR))
+    return _Envelope(samples=envelope, relative_error=max(error, _LEAST_ERROR))
 
 
 def _jackknife(weighted: ComplexArray, weights: Array) -> float:
@@ -185,7 +184,7 @@ def _jackknife(weighted: ComplexArray, weights: Array) -> float:
     return (len(blocks) - 1) / len(blocks) * float(spread)
 
 
-def relative_difference(one: ComplexArray, other: ComplexArray) -> float:
+def _relative_difference(one: ComplexArray, other: ComplexArray) -> float:
     """Return the norm of the difference of two envelopes (25,) over that of the second."""
     return float(np.linalg.norm(one - other) / np.linalg.norm(other))
 
@@ -252,13 +251,13 @@ def module_pulse(received: ReceivedPulse, nominal: PulseModel, bin_length_m: flo
 class PulseEstimator:
     """The pulses of the modules of a rig, learnt from their frames.
 
-    ``told`` are those to begin with, by radar; where there is none, or None, the nominal one.
+    ``received`` are those to begin with, by radar; where there is none, or None, the nominal one.
     """
 
-    def __init__(self, nominal: PulseModel, told: Sequence[ReceivedPulse | None] = ()) -> None:
+    def __init__(self, nominal: PulseModel, received: Sequence[ReceivedPulse | None] = ()) -> None:
         self._nominal = nominal
-        self._told = tuple(told)
-        self._common: ReceivedPulse | None = None
+        self._received = tuple(received)
+        self._common: ReceivedPulse | None = None  # of all radars together
         self._own: dict[int, ReceivedPulse | None] = {}
         self._estimates: dict[int | None, ReceivedPulse] = {}  # by radar; None: of all
         self._echoes: dict[int, list[tuple[ComplexArray, float]]] = {}
@@ -267,19 +266,23 @@ class PulseEstimator:
         self._needed: dict[int | None, int] = {}  # echoes for the next estimate, by radar or of all
 
     def pulse(self, radar: int) -> ReceivedPulse | None:
-        """Return the pulse of a radar as far as it is known; None: the nominal one."""
-        return self._own.get(radar) or self._begun(radar)
+        """Return the pulse that the frames of a radar are equalised by; None: the nominal one."""
+        return self._own.get(radar) or self._before_own(radar)
 
     def estimate(self, radar: int) -> ReceivedPulse | None:
         """Return the last estimate of a radar's own pulse, used or not; None: too few echoes."""
         return self._estimates.get(radar)
+
+    def off_nominal(self, pulse: ReceivedPulse) -> float:
+        """Return the norm of the difference of a pulse from the nominal one, relative to that."""
+        return _relative_difference(self._at_steps(pulse), _NOMINAL)
 
     def echoes(self, radar: int) -> int:
         """Return how many echoes of a radar have been taken."""
         return len(self._echoes.get(radar, ()))
 
     def is_due(self, radar: int) -> bool:
-        """Return whether `take` would use an echo of the next frame of a radar; it counts them."""
+        """Return whether `take` would use an echo of this frame of a radar; call once per frame."""
         wait = self._waits.get(radar, 0)
         self._waits[radar] = max(0, wait - 1)
         return not wait and len(self._echoes.get(radar, ())) < _CAPACITY
@@ -300,7 +303,7 @@ class PulseEstimator:
         ``position_bins`` and ``amplitude`` (k,) are its peaks behind the filter, ``sigma_y`` the
         noise there.
         """
-        at = _lone_peak(
+        at = _isolated_peak(
             position_bins,
             amplitude,
             _LEAST_SNR * sigma_y,
@@ -314,7 +317,7 @@ class PulseEstimator:
             return False
         self._last[radar] = position
         self._waits[radar] = _FRAMES_APART - 1
-        window = baseband(samples, position, self._nominal, bin_length_m)
+        window = _baseband(samples, position, self._nominal, bin_length_m)
         self._echoes.setdefault(radar, []).append((window, sigma_y))
         return self._learn(None) | self._learn(radar)
 
@@ -326,7 +329,7 @@ class PulseEstimator:
             return False
         self._needed[radar] = math.ceil(_MORE * len(echoes))
         windows, sigma_y = (np.array(column) for column in zip(*echoes, strict=True))
-        envelope = estimate_envelope(windows, sigma_y)
+        envelope = _estimate_envelope(windows, sigma_y)
         step_m = _STEP_SIGMAS * self._nominal.sigma_m
         estimate = ReceivedPulse(
             step_m=step_m,
@@ -339,46 +342,40 @@ class PulseEstimator:
             before, self._common = self._common, self._choice(estimate, envelope, None)
             return self._common is not before
         before = self._own.get(radar)
-        own = self._choice(estimate, envelope, self._begun(radar))
+        own = self._choice(estimate, envelope, self._before_own(radar))
         self._own[radar] = own
         return own is not before
 
     def _choice(
-        self, estimate: ReceivedPulse, envelope: Envelope, begun: ReceivedPulse | None
+        self, estimate: ReceivedPulse, envelope: _Envelope, before: ReceivedPulse | None
     ) -> ReceivedPulse | None:
-        """Return the estimate if it is better than what was begun with, None otherwise."""
-        doubt = math.hypot(estimate.relative_error, begun.relative_error if begun else 0.0)
-        known = envelope_at_steps(begun, self._nominal)
-        change = relative_difference(envelope.samples, known)
-        return estimate if change > max(_LEAST_CHANGE, _ERRORS * doubt) else None
+        """Return the estimate if it is significantly different from the pulse before, or None."""
+        error = math.hypot(estimate.relative_error, before.relative_error if before else 0.0)
+        change = _relative_difference(envelope.samples, self._at_steps(before))
+        return estimate if change > max(_LEAST_CHANGE, _ERRORS * error) else None
 
-    def _begun(self, radar: int) -> ReceivedPulse | None:
-        told = self._told[radar] if radar < len(self._told) else None
-        return told or self._common
+    def _before_own(self, radar: int) -> ReceivedPulse | None:
+        """Return the pulse of a radar without an estimate of its own; None: the nominal one."""
+        received = self._received[radar] if radar < len(self._received) else None
+        return received or self._common
 
-
-def envelope_at_steps(pulse: ReceivedPulse | None, nominal: PulseModel) -> ComplexArray:
-    """Return the envelope of a pulse at the 25 steps; None: the nominal one."""
-    if pulse is None:
-        return _NOMINAL
-    samples: ComplexArray = np.array(pulse.real) + 1j * np.array(pulse.imaginary)
-    half = samples.size // 2
-    # band-limited interpolation, from samples that are as many steps of their own apart
-    at = _STEP_SIGMAS * nominal.sigma_m / pulse.step_m * _AT_STEPS
-    weights = np.sinc(at[:, np.newaxis] - np.arange(-half, half + 1))
-    found: ComplexArray = np.einsum("mk,k->m", weights, samples)
-    return found
-
-
-def off_nominal(pulse: ReceivedPulse, nominal: PulseModel) -> float:
-    """Return the norm of the difference of a pulse from the nominal one, relative to that."""
-    return relative_difference(envelope_at_steps(pulse, nominal), _NOMINAL)
+    def _at_steps(self, pulse: ReceivedPulse | None) -> ComplexArray:
+        """Return the envelope of a pulse at the 25 steps; None: the nominal one."""
+        if pulse is None:
+            return _NOMINAL
+        samples: ComplexArray = np.array(pulse.real) + 1j * np.array(pulse.imaginary)
+        half = samples.size // 2
+        # band-limited interpolation; the samples may have another step
+        at = _STEP_SIGMAS * self._nominal.sigma_m / pulse.step_m * _AT_STEPS
+        weights = np.sinc(at[:, np.newaxis] - np.arange(-half, half + 1))
+        envelope: ComplexArray = np.einsum("mk,k->m", weights, samples)
+        return envelope
 
 
-def _lone_peak(
+def _isolated_peak(
     position_bins: Array, amplitude: Array, least_amplitude: float, reach: float, n_bins: int
 ) -> int | None:
-    """Return the strongest peak that stands alone and whole; None where none does."""
+    """Return the strongest peak isolated within ``reach`` [bins], ends included; None: no such."""
     for at in np.argsort(-amplitude, kind="stable"):
         if amplitude[at] < least_amplitude:
             return None

@@ -77,7 +77,7 @@ def test_front_end_per_frame(benchmark: BenchmarkFixture, name: FrontEnd) -> Non
     timer=time.process_time,
 )
 def test_front_end_of_a_scene(benchmark: BenchmarkFixture, name: str) -> None:
-    """Frames as the scene has them: its clutter, echoes that overlap, pulses that are cut."""
+    """Frames of a scene have clutter, echoes that overlap, and pulses that are cut."""
     scene = load_scene(name)
     with open_loopback(scene, seed=5) as radars:
         radars.start(RAW_CONFIG, FRAME_RATE_HZ)

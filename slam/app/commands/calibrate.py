@@ -34,8 +34,7 @@ from slam.calibration.tracks import UNASSIGNED, RangeSet
 from slam.config import FrontEnd, SlamConfig, override
 from slam.frames import Detection, RadarFrame
 from slam.front_end.matched_filter import MatchedFilterDetector
-from slam.front_end.pulse import PulseModel
-from slam.front_end.pulse_estimation import PulseEstimator, off_nominal
+from slam.front_end.pulse_estimation import PulseEstimator
 from slam.geometry import Rig
 from xethru_protocol.system import StopFlag, json_text, one_line, read_bounded
 from xethru_protocol.transport import is_network_port
@@ -50,10 +49,6 @@ _FRONT_END = override(
         "detection.min_range_m": 0.3,
         "detection.max_range_m": 2.5,
     },
-)
-_NOMINAL_PULSE = PulseModel(
-    carrier_hz=_FRONT_END.matched_filter.carrier_hz,
-    bandwidth_hz=_FRONT_END.matched_filter.bandwidth_hz,
 )
 _YAW_LIMIT_DEG = 2.0
 _GAIN_LIMIT_DB = 1.0
@@ -86,7 +81,7 @@ def run_calibrate(
     _planted(recorded.rig, scene)
     if rig is not None:
         _check_rig_place(rig, session)
-    detector = _taught(recorded, stop)
+    detector = _detector_of(recorded, stop)
     report = _report_of(_drive_of(recorded, detector, stop), known, detector.estimator)
     if recorded.cut_at_byte is not None:
         cut = f"{session}: cut at byte {recorded.cut_at_byte}; read up to there"
@@ -102,7 +97,7 @@ def run_calibrate(
             print_text("\n".join(one_line(line) for line in _lines(report, planted)))
 
 
-def _taught(session: RecordedSession, stop: StopFlag) -> MatchedFilterDetector:
+def _detector_of(session: RecordedSession, stop: StopFlag) -> MatchedFilterDetector:
     """Return a detector that has estimated the modules' pulses from all frames of a session."""
     detector = MatchedFilterDetector(_FRONT_END)
     for record in session.records():
@@ -270,7 +265,7 @@ def _facts(report: _Report, planted: Mapping[str, tuple[float, float]]) -> dict[
         }
         if (estimate := report.pulses.estimate(index)) is not None:
             row |= {
-                "pulse_off_nominal": off_nominal(estimate, _NOMINAL_PULSE),
+                "pulse_off_nominal": report.pulses.off_nominal(estimate),
                 "pulse_error": estimate.relative_error,
             }
         if mount.name in planted:
@@ -347,14 +342,15 @@ def _lines(report: _Report, planted: Mapping[str, tuple[float, float]]) -> Itera
 
 
 def _pulse_lines(report: _Report) -> Iterable[str]:
+    pulses = report.pulses
     for index, mount in enumerate(report.drive.rig.mounts):
-        estimate = report.pulses.estimate(index)
+        estimate = pulses.estimate(index)
         if estimate is None:
-            text = f"{report.pulses.echoes(index)} lone strong echoes are too few for an estimate"
+            text = f"{pulses.echoes(index)} isolated strong echoes are too few for an estimate"
         else:
-            off = f"{100 * off_nominal(estimate, _NOMINAL_PULSE):.1f}"
+            off = f"{100 * pulses.off_nominal(estimate):.1f}"
             text = f"{off} +- {100 * estimate.relative_error:.1f} % off the data sheet's"
-        stored = "" if report.pulses.pulse(index) is None else "; a rig file has the estimate"
+        stored = "" if pulses.pulse(index) is None else "; stored in a rig file"
         yield f"pulse of {mount.name}: {text}{stored}"
 
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Self
@@ -50,10 +50,10 @@ from xethru_protocol.wire.messages import SystemGetInfo
 _Sigma = Annotated[StrictFloat, Field(ge=0, le=10, allow_inf_nan=False)]
 _Sample = Annotated[StrictFloat, Field(ge=-2, le=2)]
 _Envelope = Annotated[tuple[_Sample, ...], Field(min_length=5, max_length=201)]
-_DECIMALS = 4
-# Least height of the middle of a pulse, of its largest sample
-_LEAST_MIDDLE = 0.7
 _Number = Annotated[StrictFloat, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+_DECIMALS = 4
+# Least height of the middle of a pulse, as a share of its largest sample
+_LEAST_MIDDLE = 0.7
 
 
 class RigPulse(Table):
@@ -67,8 +67,7 @@ class RigPulse(Table):
     @model_validator(mode="after")
     def _is_a_pulse(self) -> Self:
         received = self.received
-        pairs = zip(received.real, received.imaginary, strict=True)
-        heights = [math.hypot(*pair) for pair in pairs]
+        heights = list(map(math.hypot, received.real, received.imaginary))
         middle = heights[len(heights) // 2]
         if middle < _LEAST_MIDDLE * max(*heights, 1.0):
             raise ValueError(
@@ -211,19 +210,18 @@ def write_rig(path: Path, rig: RigFile) -> None:
     """Write a rig file that `load_rig` reads back with the same floats."""
     tables = []
     for radar in rig.radars:
-        # a JSON string of these names is a TOML string
-        known = radar.model_dump(exclude_none=True, exclude={"pulse"})
-        lines = [f"{key} = {json.dumps(value)}" for key, value in known.items()]
-        tables.append("\n".join(["[[radars]]", *lines]))
+        tables.append(_toml("[[radars]]", radar.model_dump(exclude_none=True, exclude={"pulse"})))
         if radar.pulse is not None:
-            pulse = radar.pulse.model_dump()
-            lines = [f"{key} = {json.dumps(value)}" for key, value in pulse.items()]
-            tables.append("\n".join(["[radars.pulse]", *lines]))
+            tables.append(_toml("[radars.pulse]", radar.pulse.model_dump()))
     if rig.wheels != RigWheels():
-        lines = [f"{key} = {json.dumps(value)}" for key, value in rig.wheels.model_dump().items()]
-        tables.append("\n".join(["[wheels]", *lines]))
+        tables.append(_toml("[wheels]", rig.wheels.model_dump()))
     with naming(path), written_whole(path) as fresh:
         fresh.write_text("\n\n".join(tables) + "\n", encoding="utf-8")
+
+
+def _toml(header: str, values: Mapping[str, object]) -> str:
+    # a JSON string of these names is a TOML string
+    return "\n".join([header, *(f"{key} = {json.dumps(value)}" for key, value in values.items())])
 
 
 class _Module:

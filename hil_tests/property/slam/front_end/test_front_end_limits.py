@@ -125,8 +125,8 @@ def test_a_pulse_ten_percent_off_explains_an_echo_however_strong(
     assert np.mean(misfits < 1.5) >= 0.9
 
 
-def test_an_echo_that_is_two_has_a_misfit_however_strong_the_pulses_error_may_be() -> None:
-    """8 cm apart, 1.5 sigmas: of one pulse fitted to both half of the cases leave far more."""
+def test_one_pulse_fitted_to_two_echoes_has_a_misfit() -> None:
+    """They are 8 cm apart, 1.5 sigmas; at some phases one pulse does explain both."""
     rng = np.random.default_rng(8)
     first_m = places(rng, 80)
     frames = frames_of(np.hstack([first_m, first_m + 0.08]), 0.02, rng)
@@ -139,7 +139,7 @@ def test_an_echo_that_is_two_has_a_misfit_however_strong_the_pulses_error_may_be
 
 
 def test_the_deviation_grows_by_what_a_wrong_pulse_of_a_neighbour_leaves() -> None:
-    """Two echoes 4.3 sigmas apart, the other 20 times as strong: 5 % of what it has there."""
+    """Two echoes 4.3 sigmas apart, one 20 times as strong: 5 % of its height at the other count."""
     row = np.zeros(N_BINS)
     x = np.arange(N_BINS)
     for range_m, amplitude in ((0.9, 0.005), (1.12, 0.1)):

@@ -325,7 +325,7 @@ def test_whole_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, A
         # far less than the noise that the fit was told of, 1e-3, would move them
         assert abs(fit.position_bins - position) < 0.1 * fit.sigma_bins
     assert [fit.amplitude for fit in fits] == pytest.approx(amplitudes, rel=2e-4)
-    turns = [turn(fit.phase_rad, told) for fit, told in zip(fits, phases, strict=True)]
+    turns = [turn(fit.phase_rad, phase) for fit, phase in zip(fits, phases, strict=True)]
     assert max(turns) < 2e-3
 
 
@@ -361,8 +361,10 @@ def polynomials(samples: Array) -> kernels.ComplexArray:
     """Return z of a whole frame of samples as the kernels take it."""
     y = FILTER.apply(samples)
     around = np.empty((y.size - 8, 9), dtype=np.complex128)
-    nobody = np.empty((0, COLUMNS))
-    kernels.interpolate(y, nobody, 0, MODEL_SIGMA, MODEL_CARRIER, _TAYLOR, np.empty_like(y), around)
+    no_others = np.empty((0, COLUMNS))
+    kernels.interpolate(
+        y, no_others, 0, MODEL_SIGMA, MODEL_CARRIER, _TAYLOR, np.empty_like(y), around
+    )
     return around
 
 

@@ -99,10 +99,10 @@ def drive(
             yield frame(radar, counter, samples(shape, echoes, noise))
 
 
-def taught(
-    frames: Iterator[RadarFrame], told: tuple[ReceivedPulse | None, ...] = ()
+def trained(
+    frames: Iterator[RadarFrame], received: tuple[ReceivedPulse | None, ...] = ()
 ) -> MatchedFilterDetector:
-    detector = MatchedFilterDetector(CONFIG, told)
+    detector = MatchedFilterDetector(CONFIG, received)
     for each in frames:
         detector.learn(each)
     return detector
@@ -111,7 +111,7 @@ def taught(
 @cache
 def bad_pulse() -> ReceivedPulse:
     """Return the pulse that two modules with the same bad one have after 200 frames each."""
-    pulse = taught(drive([BAD] * 2, 200)).estimator.pulse(0)
+    pulse = trained(drive([BAD] * 2, 200)).estimator.pulse(0)
     assert pulse is not None
     return pulse
 
@@ -131,7 +131,7 @@ def error(pulse: ReceivedPulse, shape: Shape) -> float:
 
 @pytest.mark.parametrize("shape", [WIDE, BAD])
 def test_a_planted_pulse_is_estimated_to_within_its_own_error(shape: Shape) -> None:
-    detector = taught(drive([shape] * 2, 200))
+    detector = trained(drive([shape] * 2, 200))
     for radar in range(2):
         pulse = detector.estimator.pulse(radar)
         assert pulse is not None
@@ -146,10 +146,10 @@ def strongest(detector: MatchedFilterDetector, values: NDArray[np.float32]) -> D
 
 def test_an_echo_alone_keeps_its_range_and_phase_when_the_pulse_changes() -> None:
     nominal = MatchedFilterDetector(override(CONFIG, {"detection.front_end": "matched_filter"}))
-    told = MatchedFilterDetector(CONFIG, (bad_pulse(),))
+    equalised = MatchedFilterDetector(CONFIG, (bad_pulse(),))
     for position in (300.0, 411.3, 520.75):
         echo = samples(BAD, [(position, 0.02, 0.7)])
-        before, after = strongest(nominal, echo), strongest(told, echo)
+        before, after = strongest(nominal, echo), strongest(equalised, echo)
         assert after.range_m == pytest.approx(before.range_m, abs=0.3e-3)
         assert math.remainder(after.phase_rad - before.phase_rad, math.tau) == pytest.approx(
             0, abs=0.05
@@ -158,15 +158,15 @@ def test_an_echo_alone_keeps_its_range_and_phase_when_the_pulse_changes() -> Non
 
 
 def test_equalised_echoes_have_no_misfit_and_do_not_fall_apart() -> None:
-    told = MatchedFilterDetector(CONFIG, (bad_pulse(),))
+    equalised = MatchedFilterDetector(CONFIG, (bad_pulse(),))
     noise = NOISE * np.random.default_rng(5).standard_normal(N_BINS)
     echoes = [(300.0, 0.02, 0.7), (300.0 + 3.2 * SIGMA_BINS, 0.01, 2.0), (500.0, 0.03, 0.1)]
     echo = frame(0, 0, samples(BAD, echoes, noise))
-    found = told.detect(echo)
+    found = equalised.detect(echo)
     assert len(found) == 3
     assert max(each.misfit for each in found) < 1.5
-    lone = strongest(told, samples(BAD, echoes[:1]))
-    assert found[0].range_m == pytest.approx(lone.range_m, abs=1.5e-3)
+    single = strongest(equalised, samples(BAD, echoes[:1]))
+    assert found[0].range_m == pytest.approx(single.range_m, abs=1.5e-3)
     apart = found[1].range_m - found[0].range_m
     assert apart == pytest.approx(3.2 * SIGMA_BINS * BIN_M, abs=3e-3)
 
@@ -181,12 +181,12 @@ def test_a_nominal_pulse_stays_and_detections_are_the_same_to_the_last_bit() -> 
 
 
 def test_blends_alone_are_no_pulse() -> None:
-    detector = taught(drive([Shape()] * 4, 300, blend=True))
+    detector = trained(drive([Shape()] * 4, 300, blend=True))
     assert [detector.estimator.pulse(radar) for radar in range(4)] == [None] * 4
 
 
 def test_a_module_that_differs_from_the_others_gets_its_own_pulse() -> None:
-    detector = taught(drive([BAD, BAD, BAD, Shape()], 280))
+    detector = trained(drive([BAD, BAD, BAD, Shape()], 280))
     pulses = [detector.estimator.pulse(radar) for radar in range(4)]
     for pulse, shape in zip(pulses, [BAD, BAD, BAD, Shape()], strict=True):
         assert pulse is not None
@@ -194,20 +194,20 @@ def test_a_module_that_differs_from_the_others_gets_its_own_pulse() -> None:
 
 
 def test_the_same_frames_give_the_same_bits() -> None:
-    assert taught(drive([BAD] * 2, 200)).estimator.pulse(0) == bad_pulse()
+    assert trained(drive([BAD] * 2, 200)).estimator.pulse(0) == bad_pulse()
 
 
-def test_a_told_pulse_holds_unless_the_echoes_differ() -> None:
-    told = (bad_pulse(),)
-    assert taught(drive([BAD], 200, seed=2), told).estimator.pulse(0) is told[0]
-    learnt = taught(drive([WIDE], 200, seed=2), told).estimator.pulse(0)
+def test_a_given_pulse_is_kept_unless_the_echoes_differ() -> None:
+    given = (bad_pulse(),)
+    assert trained(drive([BAD], 200, seed=2), given).estimator.pulse(0) is given[0]
+    learnt = trained(drive([WIDE], 200, seed=2), given).estimator.pulse(0)
     assert learnt is not None
     assert error(learnt, WIDE) < 0.04
 
 
-def test_a_robot_that_stands_still_teaches_nothing() -> None:
+def test_of_a_robot_that_stands_still_one_echo_is_taken() -> None:
     still = next(drive([BAD], 1))
-    detector = taught(iter([replace(still, counter=counter) for counter in range(400)]))
+    detector = trained(iter([replace(still, counter=counter) for counter in range(400)]))
     assert detector.estimator.echoes(0) == 1
 
 
@@ -222,6 +222,6 @@ def test_a_pulse_of_another_step_is_the_same_pulse() -> None:
     )
     detector = MatchedFilterDetector(CONFIG, (pulse,))
     found = strongest(detector, samples(BAD, [(400.0, 0.02, 0.3)]))
-    # zero of this envelope is where it is planted, so ranges have no bias
+    # the middle of this envelope is where it is planted, so ranges have no bias
     assert found.range_m == pytest.approx(START_M + 400 * BIN_M, abs=0.2e-3)
     assert PulseModel().sigma_bins(BIN_M) == pytest.approx(SIGMA_BINS)
