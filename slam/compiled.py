@@ -1,9 +1,8 @@
 """Functions of numbers and arrays that are compiled by numba when they are first called.
 
-The same input gives the same bits on every machine: no fast mathematics, no threads, nothing
-reordered. What is compiled is kept beside the source, or, where that cannot be written, in the
-user's cache folder (``NUMBA_CACHE_DIR`` names another), and otherwise compiled again by the next
-process.
+The same input gives the same bits: no fast mathematics, no threads, nothing reordered. What is
+compiled is kept beside the source, or, where that cannot be written, in the user's cache folder
+(``NUMBA_CACHE_DIR`` names another). If neither can be written, each process compiles again.
 """
 
 from __future__ import annotations
@@ -60,7 +59,8 @@ class _Kernel:
 def kernel(signature: str) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles a function for a signature when it is first called.
 
-    A kernel may call kernels of its own module. Arrays are C-contiguous.
+    A kernel may call kernels and read constants of its own module only: what is kept on disk is
+    renewed when that file changes. Arrays are C-contiguous.
     """
 
     def decorate(function: _Function) -> _Function:

@@ -95,7 +95,7 @@ _SEARCH = 3.5
 # A fit needs usable samples over at least this many envelope sigmas.
 _LEAST_SAMPLES = 2.0
 # What a wrong pulse may leave near the peak of one that is fitted, over its relative error: 0.46 to
-# 0.50 for a wrong width, 0.27 for skew, 0.37 for ringing, 0.45 for all of them; and a quarter more
+# 0.50 for a width 10 or 15 % off, less for skew, ringing and all of them together; a quarter more
 _NEAR_PEAK = 0.625
 # Resolution of a float32 frame, as a part of its largest sample; sigma_y is never less.
 _RESOLUTION = float(np.finfo(np.float32).eps)

@@ -146,19 +146,16 @@ def test_the_deviation_grows_by_what_a_wrong_pulse_of_a_neighbour_leaves() -> No
         at = (range_m - START_M) / BIN_M
         row += amplitude * np.exp(-0.5 * ((x - at) / S) ** 2) * np.cos(CARRIER * (x - at))
     row += 1e-4 * np.random.default_rng(9).standard_normal(N_BINS)
-    config = override(SlamConfig(), {"detection.front_end": "joint"})
-    weak, strong = make_detector(config).detect(frame_of(row.astype(np.float32)))
-
-    def ratio(model_error: float) -> float:
-        exact = override(config, {"matched_filter.model_error": model_error})
-        found = make_detector(exact).detect(frame_of(row.astype(np.float32)))
-        return weak.sigma_m / found[0].sigma_m
-
-    rho = math.exp(-0.25 * ((strong.range_m - weak.range_m) / (S * BIN_M)) ** 2)
-    sigma_y = weak.sigma_m / ratio(0.0) * weak.amplitude / (math.sqrt(2) * S * BIN_M)
-    expected = math.hypot(1.0, 0.05 * strong.amplitude * rho / sigma_y)
+    config = override(
+        SlamConfig(), {"detection.front_end": "joint", "matched_filter.noise_sigma": 1e-4}
+    )
+    weak, _ = make_detector(config).detect(frame_of(row.astype(np.float32)))
+    rho = math.exp(-0.25 * (0.22 / (S * BIN_M)) ** 2)
+    sigma_y = 1e-4 * math.sqrt(2 / (S * math.sqrt(math.pi)))
+    bound_m = math.sqrt(2) * S * BIN_M * sigma_y / 0.005
+    expected = math.hypot(1.0, 0.05 * 0.1 * rho / sigma_y)
     assert expected > 1.5
-    assert ratio(0.0) == pytest.approx(expected, rel=0.02)
+    assert weak.sigma_m == pytest.approx(bound_m * expected, rel=0.02)
 
 
 def test_two_equal_echoes_ten_centimetres_apart_are_resolved() -> None:
