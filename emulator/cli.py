@@ -358,7 +358,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     serve.add_argument(
-        "scene", nargs="?", metavar="SCENE", help="name or .toml file of a scene, or pillars:3"
+        "scene",
+        nargs="?",
+        metavar="SCENE",
+        help="name of a scene or a random room (pillars:3), or a .toml file",
     )
     serve.add_argument("--bare", action="store_true", help="stock modules in an empty room")
     serve.add_argument(

@@ -18,6 +18,7 @@ from emulator.chip.chip import CaptureSettings
 from emulator.echo.reflections import PulseShape, Reflections, Scatterers, Viewpoint, sum_of_pulses
 from emulator.scene.philox import (
     UNITS_PER_SIGMA,
+    WORDS_PER_BLOCK,
     Purpose,
     counter_normals,
     frame_noise_units,
@@ -29,12 +30,12 @@ from emulator.scene.scene import RadarSpec, TargetSpec
 PAIR_REACH_M = 1.0
 """Distance up to which two targets send an echo by way of each other."""
 PAIR_AT_M = 0.1
-"""Distance of two targets at which the echo by way of both has the strength that the scene says."""
+"""Distance of two targets at which the echo by way of both has the strength of the scene."""
 
 _MOST_PULSES = 3
-_WORDS_PER_FRAME = 12
-"""Three blocks of Philox: the chance and number of pulses, of noise, and three for each pulse."""
-_BLOCKS_PER_FRAME = 3
+_WORDS_PER_FRAME = 3 + 3 * _MOST_PULSES
+"""Chance of pulses, their number, chance of noise; then places, phases and sizes of pulses."""
+_BLOCKS_PER_FRAME = -(-_WORDS_PER_FRAME // WORDS_PER_BLOCK)
 
 
 class Wander:

@@ -47,11 +47,10 @@ from xethru_protocol.wire.x4 import (
     FRAME_SAMPLES,
     MODULE_SPEED_MPS,
     SAMPLING_RATE_HZ,
+    SWEEP_SHARE,
 )
 
 _SIGMA_SAMPLES = SIGMA_S * SAMPLING_RATE_HZ
-_SWEEP_SHARE = 0.95
-"""Of the frame period at the highest rate that `highest_rate_hz` gives."""
 _SHORT_DRIFT = 1.0
 # Gauss and Legendre's: for a drift of a sample the mean of either carrier is off by 2e-9 at most
 _NODES, _WEIGHTS = (each / 2 for each in np.polynomial.legendre.leggauss(5))
@@ -83,11 +82,11 @@ class OtherModules:
         view
             Where the radar is in each frame.
         times_ns
-            Shape (n_frames,), int64: when it truly took each frame, scene time.
+            Shape (n_frames,), int64: scene time of each frame by a true clock [ns].
         gain
-            Of its receiver.
+            Factor of the radar's receiver on amplitudes.
         """
-        sweep_s = _SWEEP_SHARE / highest_rate_hz(capture)
+        sweep_s = SWEEP_SHARE / highest_rate_hz(capture)
         rate_hz = SAMPLING_RATE_HZ * self._radar.clock.rate
         first = capture.first_sample_m * (2 * SAMPLING_RATE_HZ / MODULE_SPEED_MPS)
         for module in self._modules:
@@ -125,7 +124,9 @@ def mean_of_drifting_pulses(
     drift
         How many samples it moves during a sweep.
     amplitude
-        Shape (n_frames,): of a pulse that stands.
+        Shape (n_frames,): of a pulse that does not drift.
+    phase_rad
+        Phase of the carrier at a pulse's centre.
     """
     frames = np.arange(len(position))
     if abs(drift) < _SHORT_DRIFT:

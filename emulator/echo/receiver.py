@@ -108,6 +108,11 @@ class KnotGrid:
     spacing_ns: int
     sigma: float
 
+    @classmethod
+    def falling_in(cls, correlation_s: float, sigma: float) -> KnotGrid:
+        """Return the member whose autocorrelation is 1/e after ``correlation_s``."""
+        return cls(spacing_ns=round(correlation_s / SPACINGS_PER_E_FOLD * 1e9), sigma=sigma)
+
 
 class SlowNoise:
     """Several slow processes of the same kind, independent of each other.
@@ -224,14 +229,11 @@ class SlowNoise:
         place = held.numbers.searchsorted(first_knot)
         if not held.have(first_knot, place):
             numbers = np.unique(first_knot[:, np.newaxis] + _FIVE)
-            before = held.numbers.searchsorted(numbers)
-            known = np.append(held.numbers, -_FIRST_KNOT)[before] == numbers
-            if known.any():  # frames follow each other: make some for those to come
+            if np.isin(numbers, held.numbers).any():  # frames follow each other: some for the next
                 numbers = np.append(numbers, numbers[-1] + 1 + np.arange(_KNOTS_AHEAD))
-                before = held.numbers.searchsorted(numbers)
-                known = np.append(held.numbers, -_FIRST_KNOT)[before] == numbers
+            known = np.isin(numbers, held.numbers)
             values = np.empty((len(numbers), self._n_values))
-            values[known] = held.values[before[known]]
+            values[known] = held.values[held.numbers.searchsorted(numbers[known])]
             values[~known] = frame_noise_units(
                 _FIRST_KNOT + numbers[~known],
                 self._n_values,
@@ -278,9 +280,8 @@ class CarrierJitter:
         self._spec = spec
         self._seed = seed
         self._white = stream_of(serial, Purpose.JITTER_WHITE)
-        spacing_s = spec.slow_correlation_s / SPACINGS_PER_E_FOLD
         self._slow = SlowNoise(
-            (KnotGrid(spacing_ns=round(spacing_s * 1e9), sigma=spec.slow_rad),),
+            (KnotGrid.falling_in(spec.slow_correlation_s, sigma=spec.slow_rad),),
             1,
             instants_per_knot=_JITTER_INSTANTS_PER_KNOT,
             seed=seed,

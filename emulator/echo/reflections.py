@@ -6,7 +6,7 @@ How long, how strong and in which phase a path is: formulas and sources are on t
 One pulse is ``A exp(-(t - tau)**2 / (2 sigma**2)) cos(2 pi fc (t - tau) + phase)``: a Gaussian
 envelope on a carrier, sampled at 23.328 GHz. The carrier is an exact fraction of the sampling
 rate, 5/16 or 3/8 (protocol reference 9.2). The -10 dB bandwidth of 1.4 GHz is assumed, as that
-reference proposes. `PulseShape` says how a module's own pulse differs from that.
+reference proposes. `PulseShape` holds how a module's own pulse differs from that.
 
 Arithmetic is float64 additions and multiplications per sample; cosines are taken once per pulse.
 """
@@ -18,6 +18,7 @@ import hashlib
 import math
 from dataclasses import dataclass, fields
 from fractions import Fraction
+from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
@@ -397,6 +398,17 @@ def curved_spread(
     """
     spread = np.sqrt((1 + radius_m) / (surface_m + radius_m))
     return np.where(radius_m > 0, spread, 1.0)
+
+
+def mirrored_ways(n_legs: int) -> list[tuple[int, int]]:
+    """Return pairs of legs, out and back, of which at most one is leg 0, the straight one.
+
+    A pair stands for both orders.
+
+    >>> mirrored_ways(3)
+    [(0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    """
+    return [*combinations_with_replacement(range(n_legs), 2)][1:]
 
 
 def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.receiver import SPACINGS_PER_E_FOLD, KnotGrid, SlowNoise
+from emulator.echo.receiver import KnotGrid, SlowNoise
 from emulator.echo.reflections import (
     NEAREST_M,
     RANGE_EXPONENT,
@@ -22,6 +21,7 @@ from emulator.echo.reflections import (
     Viewpoint,
     beam_gain,
     curved_spread,
+    mirrored_ways,
     reflection_phase_rad,
     target_scatterers,
 )
@@ -104,9 +104,8 @@ class Scintillation:
 
     def __init__(self, spec: ScintillationSpec, *, seed: int, target: int) -> None:
         self._spec = spec
-        spacing_ns = round(spec.correlation_s / SPACINGS_PER_E_FOLD * 1e9)
         self._noise = SlowNoise(
-            (KnotGrid(spacing_ns=spacing_ns, sigma=1.0),),
+            (KnotGrid.falling_in(spec.correlation_s, sigma=1.0),),
             2,
             instants_per_knot=_INSTANTS_PER_KNOT,
             seed=seed,
@@ -152,21 +151,8 @@ def mirrored_reflections(
         if reflection > 0
     ]
     is_point = np.broadcast_to(scatterers.exponent == RANGE_EXPONENT["point"], cos_angle.shape)
-    range_m, amplitude, phase_rad = [], [], []
-
-    def add(
-        out_m: NDArray[np.float64],
-        back_m: NDArray[np.float64],
-        strength: NDArray[np.float64],
-        n_mirrors: int,
-    ) -> None:
-        cos_out, cos_back = (cos_angle * surface_m / leg_m for leg_m in (out_m, back_m))
-        antenna_m = (view.antenna_m(cos_out) + view.antenna_m(cos_back)) / 2
-        range_m.append((out_m + back_m) / 2 + antenna_m)
-        both_legs = np.sqrt(beam_gain(cos_out) * beam_gain(cos_back))
-        amplitude.append(strength * both_legs * (share * share))
-        phase_rad.append(scatterers.phase_rad + math.pi * n_mirrors)
-
+    # legs out and back, strength, number of mirrors
+    ways: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]] = []
     for height, reflection in mirrors:
         slant_m = np.sqrt(surface_m**2 + height * height)
         spread = np.where(
@@ -175,15 +161,25 @@ def mirrored_reflections(
             1 / (surface_m * np.sqrt(slant_m)),
         )
         outside = axis_m > scatterers.radius_m
-        add(slant_m, slant_m, ~is_point * outside * reflection * scatterers.strength * spread, 1)
+        strength = ~is_point * outside * reflection * scatterers.strength * spread
+        ways.append((slant_m, slant_m, strength, 1))
     legs = [(0.0, 1.0), *((2 * height, reflection) for height, reflection in mirrors)]
-    for one, other in list(combinations_with_replacement(range(len(legs)), 2))[1:]:
+    for one, other in mirrored_ways(len(legs)):
         (rise_out, out), (rise_back, back) = legs[one], legs[other]
         out_m, back_m = (np.sqrt(surface_m**2 + rise * rise) for rise in (rise_out, rise_back))
         # out by one and back by the other, and the reverse: equally long, so they add
         both_ways = 1.0 if one == other else 2.0
         strength = both_ways * out * back * scatterers.strength / (out_m * back_m)
-        add(out_m, back_m, is_point * strength, (one > 0) + (other > 0))
+        ways.append((out_m, back_m, is_point * strength, (one > 0) + (other > 0)))
+
+    range_m, amplitude, phase_rad = [], [], []
+    for out_m, back_m, strength, n_mirrors in ways:
+        cos_out, cos_back = (cos_angle * surface_m / leg_m for leg_m in (out_m, back_m))
+        antenna_m = (view.antenna_m(cos_out) + view.antenna_m(cos_back)) / 2
+        range_m.append((out_m + back_m) / 2 + antenna_m)
+        both_legs = np.sqrt(beam_gain(cos_out) * beam_gain(cos_back))
+        amplitude.append(strength * both_legs * (share * share))
+        phase_rad.append(scatterers.phase_rad + math.pi * n_mirrors)
     return Reflections(
         range_m=np.concatenate(range_m, axis=1),
         amplitude=np.concatenate(amplitude, axis=1),

@@ -31,7 +31,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fresnel
 
-from emulator.echo.reflections import NEAREST_M, Reflections, Scatterers, Viewpoint, beam_gain
+from emulator.echo.reflections import (
+    NEAREST_M,
+    Reflections,
+    Scatterers,
+    Viewpoint,
+    beam_gain,
+    mirrored_ways,
+)
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M, ObjectSpec, WallSpec
 
 Array = NDArray[np.float64]
@@ -559,7 +566,7 @@ def ghost_reflections(
     """
     legs = _legs(faces, scatterers, view, share, wavelength_m)
     n_frames, n_targets, n_legs = legs.gain.shape
-    ways = [(out, back) for out in range(n_legs) for back in range(max(out, 1), n_legs)]
+    ways = mirrored_ways(n_legs)
     out, back = np.array(ways, dtype=np.int64).reshape(-1, 2).T
     gain = legs.gain.transpose(0, 2, 1)
     amplitude = gain[:, out] * gain[:, back]

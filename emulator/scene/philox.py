@@ -37,9 +37,11 @@ UNITS_PER_SIGMA = (2 * _TABLE_VARIANCE) ** 0.5
 LARGEST_UNITS = 2 * int(_TABLE[-1])
 """Largest magnitude a noise value can take, in its integer units."""
 
-# Two 16 bit words per sample; one Philox block is four 64 bit words.
+WORDS_PER_BLOCK = 4
+"""64 bit words of one block of Philox."""
+# Two 16 bit words per sample.
 _WORDS_PER_FRAME = 2 * MAX_SAMPLES * _TABLE_BITS // 64
-_BLOCKS_PER_FRAME = _WORDS_PER_FRAME // 4
+_BLOCKS_PER_FRAME = _WORDS_PER_FRAME // WORDS_PER_BLOCK
 
 _FRAMES_AT_ONCE = 16  # their bits stay in the processor's cache
 
@@ -122,17 +124,19 @@ def counter_normals(counters: NDArray[np.int64], *, seed: int, stream: int) -> N
     """
     units = np.empty(len(counters), dtype=np.int32)
     for start, stop in _runs(counters):
-        words = _philox(seed, stream, int(counters[start])).random_raw(4 * (stop - start))
-        halves = _half_words(words).reshape(stop - start, 16)
+        words = _philox(seed, stream, int(counters[start])).random_raw(
+            WORDS_PER_BLOCK * (stop - start)
+        )
+        halves = _half_words(words).reshape(stop - start, -1)
         units[start:stop] = _TABLE[halves[:, 0]] + _TABLE[halves[:, 1]]
     normals: NDArray[np.float64] = units / UNITS_PER_SIGMA
     return normals
 
 
 def uniforms(count: int, *, seed: int, stream: int, block: int = 0) -> NDArray[np.float64]:
-    """Return numbers in [0, 1) from a block of a stream on, shape (count,).
+    """Return numbers in [0, 1), shape (count,): those of a stream from a block on.
 
-    A block is four words, and a number takes one: blocks of a caller must not overlap.
+    A number takes one of the `WORDS_PER_BLOCK` words of a block.
     """
     words: NDArray[np.uint64] = _philox(seed, stream, block).random_raw(count)
     return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53

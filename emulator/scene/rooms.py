@@ -1,8 +1,8 @@
 """Random rooms: families of scenes that differ in course, targets and rig, a room for each number.
 
-``pillars:3`` names room 3 of the family ``pillars`` wherever a scene is named. Nothing about SLAM
-may be chosen by looking at single rooms; they show what a method does where nobody tuned it. The
-same name gives the same room as long as NumPy keeps the streams of its generators.
+``pillars:3`` names room 3 of the family ``pillars`` wherever a scene is named. They show what a
+method does in rooms that it was not tuned for, so nothing about SLAM may be chosen by looking at
+single ones. The same name gives the same room as long as NumPy keeps the streams of its generators.
 
 A room is the tables of a scene file as plain values; `emulator.scene.scene` checks them. Lengths
 are metres, angles degrees; the robot drives its closed course twice, with the lab's noise and, but

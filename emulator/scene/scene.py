@@ -75,8 +75,8 @@ class BurstSpec(Table):
 class AntennaSpec(Table):
     """How much farther than on boresight an echo appears at an angle off it.
 
-    ``sin2_m`` times the squared sine of the angle, and what a table says: ``range_m`` at the
-    angles ``angle_deg``, straight between them (``emulator.echo.echo``).
+    It is ``sin2_m`` times the squared sine of the angle, plus a table: ``range_m`` at the angles
+    ``angle_deg``, linear between them (``emulator.echo.echo``).
     """
 
     sin2_m: Annotated[Number, Field(ge=-0.1, le=0.1)] = 0.0
@@ -102,9 +102,9 @@ class RadarSpec(Table):
     how much later than the nominal scene time of a frame this radar samples, and ``clock_ppm`` how
     fast its clock is: its frames come earlier and its bins are shorter
     (``emulator.chip.chip``). ``mount_error_m`` (x, y) and ``mount_error_deg`` are added to place
-    and boresight: where the radar truly is, while the robot's user believes the other three
-    numbers. ``stamp_sigma_ms`` is the standard deviation of the time at which a frame is truly
-    taken about the time that its reader believes, new with every frame.
+    and boresight of the radar, but not to the rig that SLAM gets. A frame is taken at a time
+    that differs from its nominal one by a normal number of standard deviation
+    ``stamp_sigma_ms``, drawn for each frame.
     """
 
     name: Name

@@ -222,6 +222,10 @@ def frame_time_ns(counter: int, rate_hz: float) -> int:
     return whole + (2 * rest + whole % 2 > frames)
 
 
+SWEEP_SHARE = 0.95
+"""Share of a frame period that the chip sweeps at the highest rate; the rest is a reserve."""
+
+
 def fps_max(
     *,
     iterations: int,
@@ -245,7 +249,7 @@ def fps_max(
             "no frame rate without a sweep: iterations, pulses per step and "
             "dac_max - dac_min must be positive"
         )
-    return float(0.95 * COMMON_PLL_HZ / prf_div / sweep)
+    return float(SWEEP_SHARE * COMMON_PLL_HZ / prf_div / sweep)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

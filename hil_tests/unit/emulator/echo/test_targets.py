@@ -111,7 +111,7 @@ def test_it_depends_on_scene_time_alone() -> None:
 # --- floor and ceiling
 
 
-def test_a_point_is_heard_by_its_images() -> None:
+def test_a_point_is_received_by_its_images() -> None:
     heights = HeightsSpec(
         antenna_m=0.4, ceiling_m=2.0, floor_reflection=0.5, ceiling_reflection=0.3
     )
@@ -218,12 +218,12 @@ def test_ways_out_and_back_count_half_each() -> None:
 
 
 @pytest.mark.parametrize(
-    ("refused", "says"),
+    ("refused", "message"),
     [
         ({"angle_deg": (0.0, 10.0), "range_m": (0.0,)}, "range_m: must have one number for each"),
         ({"angle_deg": (10.0, 10.0), "range_m": (0.0, 0.0)}, "angle_deg: must ascend"),
     ],
 )
-def test_a_table_that_is_none_is_refused(refused: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValidationError, match=says):
+def test_a_broken_table_of_the_antenna_is_refused(refused: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         AntennaSpec.model_validate(refused)

@@ -68,7 +68,7 @@ def test_targets_stand_beside_the_course_and_apart(
         assert apart >= apart_m - 2e-4
 
 
-def test_families_differ_in_what_they_say() -> None:
+def test_families_hold_what_their_descriptions_promise() -> None:
     radii = {t.radius_m for number in range(10) for t in load_scene(f"pillars:{number}").targets}
     assert radii == {0.0, 0.02, 0.05, 0.08, 0.12, 0.15}
     lab, sparse = load_scene("lab").odometry, load_scene("sparse:4").odometry
@@ -82,6 +82,16 @@ def test_families_differ_in_what_they_say() -> None:
         assert 3 <= len(yaws) <= 6
         assert 60 <= yaws[0] <= 120
         assert -120 <= yaws[1] <= -60
+
+
+def test_sensors_and_rig_are_those_of_the_lab() -> None:
+    lab, loop = load_scene("lab"), load_scene("loop:4")
+    sensors = {"noise", "clutter", "jitter", "leakage"}
+    assert loop.model_dump(include=sensors) == lab.model_dump(include=sensors)
+    mounts = [
+        {(radar.x_m, radar.y_m, radar.yaw_deg) for radar in scene.radars} for scene in (lab, loop)
+    ]
+    assert mounts[0] == mounts[1]
 
 
 def test_rooms_are_those_that_results_were_published_for() -> None:
