@@ -17,6 +17,7 @@ from slam.geometry import Mount, paper_rig
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
+from slam.robust.branches import Branches
 from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.state import Motion, calibrated_motion
 
@@ -86,7 +87,7 @@ def simulate(
     laps: int = LAPS,
     labelled: bool = False,
 ) -> Run:
-    """Return one run; ``labelled`` ranges tell which landmark they are of, clutter left out.
+    """Return one run; ``labelled`` ranges have their landmarks as labels, clutter left out.
 
     ``offset_m`` is the standard deviation of each radar's constant offset.
     """
@@ -188,7 +189,9 @@ def parameters_for(room: Room, sigma_m: float, walk_per_sqrt_m: float = 0.0) -> 
 
 
 def follow(
-    back_end: RobustBackEnd, increments: Iterable[Array], scans: Iterable[list[RangeScan]]
+    back_end: RobustBackEnd | Branches,
+    increments: Iterable[Array],
+    scans: Iterable[list[RangeScan]],
 ) -> Iterator[UpdateReport]:
     """Give a back end steps and what the radars saw at their ends; yield its reports."""
     for increment, of_pose in zip(increments, scans, strict=True):

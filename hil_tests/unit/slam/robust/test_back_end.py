@@ -96,13 +96,13 @@ def test_a_relinearised_belief_stays_where_the_filter_was_in_a_linear_regime() -
     assert again == pytest.approx(sigmas, rel=0.2)
 
 
-def told(scans: list[RangeScan], sigma_m: float) -> list[RangeScan]:
-    """Return scans of which a front end tells how sure each range is."""
+def with_sigmas(scans: list[RangeScan], sigma_m: float) -> list[RangeScan]:
+    """Return scans whose ranges have standard deviations from a front end."""
     return [replace(scan, sigmas_m=(sigma_m,) * len(scan.ranges_m)) for scan in scans]
 
 
-def test_a_doubtful_range_is_taken_for_what_it_may_be_and_weighs_less() -> None:
-    """One range 5 mm off, told to be sure to 1 mm: inside the gate with a doubt of 2 mm only."""
+def test_a_range_of_uncertain_association_is_used_and_weighs_less() -> None:
+    """One range 5 mm off, predicted to 1 mm: inside the gate only with 2 mm for association."""
     rig, sigma_m = paper_rig(), 1e-3
     run = cut(simulate(LAB, 1, sigma_m), 150)
     parameters = parameters_for(LAB, sigma_m)
@@ -113,7 +113,7 @@ def test_a_doubtful_range_is_taken_for_what_it_may_be_and_weighs_less() -> None:
     for increment, scans in zip(run.increments, run.scans, strict=True):
         back_end.predict(increment)
         before = copy.deepcopy(back_end)
-        report = back_end.update(told(scans, sigma_m))
+        report = back_end.update(with_sigmas(scans, sigma_m))
     radar, index, landmark_id = report.continued[0]
     scan = next(scan for scan in scans if scan.radar == radar)
     ranges_m = list(scan.ranges_m)
@@ -124,7 +124,7 @@ def test_a_doubtful_range_is_taken_for_what_it_may_be_and_weighs_less() -> None:
         """Return whether the range was used, how far it moved its landmark, and the NIS."""
         twin = copy.deepcopy(before)
         twin.parameters = replace(parameters, ranges=replace(parameters.ranges, **changes))
-        report = twin.update(told(off, sigma_m))
+        report = twin.update(with_sigmas(off, sigma_m))
         row = twin.state.landmark_ids.index(landmark_id)
         moved = twin.state.landmarks_m[row] - before.state.landmarks_m[row]
         return (radar, index, landmark_id) in report.continued, math.hypot(*moved), report.nis
@@ -178,7 +178,7 @@ def test_a_landmark_known_to_two_centimetres_is_given_up_where_nothing_answers(
     back_end = RobustBackEnd(paper_rig(), BackEndParameters())
     # 0.4 m straight in front of both left radars' middle; too unsure for single ranges
     point = RangeBearing(range_m=0.6, bearing_rad=np.pi / 2, covariance=np.diag([4e-4, 4e-4]))
-    # others answer on the right, so the robot knows that it is where it thinks
+    # others answer on the right, so the pose of the robot is certain
     known = [
         RangeBearing(range_m=0.6, bearing_rad=bearing, covariance=np.diag([1e-6, 1e-6]))
         for bearing in (-1.5, -1.7)

@@ -1,16 +1,20 @@
 """A robot that slips or is carried away: both are noticed, and put right from what was measured."""
 
 import math
-from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pytest
 
-from hil_tests.unit.slam.robust.range_world import LAB, Run, parameters_for, reported, scans_of
+from hil_tests.unit.slam.robust.range_world import (
+    LAB,
+    Run,
+    follow,
+    parameters_for,
+    reported,
+    scans_of,
+)
 from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig
-from slam.results import UpdateReport
-from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches, Tally
 from slam.robust.parameters import BackEndParameters, BranchRule
@@ -21,14 +25,6 @@ PLACES = np.array(
     [[0.1, 0.9], [0.55, 0.7], [0.95, 1.1], [1.5, 0.8], [0.3, -0.8], [0.8, -1.0], [1.25, -0.7]]
 )
 RULE = BranchRule()
-
-
-def led(
-    branches: Branches, increments: Iterable[Array], scans: Iterable[list[RangeScan]]
-) -> Iterator[UpdateReport]:
-    for increment, of_pose in zip(increments, scans, strict=True):
-        branches.predict(increment)
-        yield branches.update(of_pose)
 
 
 def straight(n: int) -> Array:
@@ -68,7 +64,7 @@ def test_a_carried_robot_finds_itself_on_the_map() -> None:
     run, cut = carried_run(0)
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
     carried, lost = [], []
-    for k, report in enumerate(led(branches, run.increments, run.scans), start=1):
+    for k, report in enumerate(follow(branches, run.increments, run.scans), start=1):
         if report.carried:
             carried.append(k)
         if report.lost:
@@ -88,7 +84,7 @@ def test_a_carried_robot_finds_itself_on_the_map() -> None:
 def test_a_motion_the_wheels_report_is_no_kidnapping() -> None:
     run, cut = carried_run(1)
     branches = Branches(paper_rig(), BackEndParameters())
-    for report in led(branches, run.increments[: cut - 1], run.scans[: cut - 1]):
+    for report in follow(branches, run.increments[: cut - 1], run.scans[: cut - 1]):
         assert not report.carried
         assert not report.lost
 
@@ -98,33 +94,26 @@ def test_a_slip_is_taken_back() -> None:
     slip = np.array([0.04, 0.0, math.radians(4.0)])
     run = slipped_run(2, slip)
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
-    alone = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
-    for report, increment, scans in zip(
-        led(branches, run.increments, run.scans), run.increments, run.scans, strict=True
-    ):
+    plain = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for report in follow(branches, run.increments, run.scans):
         assert not report.carried
         assert not report.lost
-        alone.predict(increment)
-        alone.update(scans)
+    list(follow(plain, run.increments, run.scans))
     end, back_end = run.poses[-1], branches.main
     assert error_m(back_end.pose, end) < 0.015
     assert abs(back_end.pose[2]) < math.radians(1.0)
     assert nees_pose(back_end.pose, back_end.pose_covariance, end) < 16.0
-    assert error_m(back_end.pose, end) < 0.5 * error_m(alone.pose, end)
+    assert error_m(back_end.pose, end) < 0.5 * error_m(plain.pose, end)
 
 
-def test_without_slip_or_carry_the_back_end_is_alone() -> None:
-    """Nothing that branches do shows in its numbers."""
+def test_without_slip_or_carry_branches_change_no_bit_of_the_back_end() -> None:
     run, cut = carried_run(3)
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
-    alone = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
-    for _ in led(branches, run.increments[: cut - 1], run.scans[: cut - 1]):
-        pass
-    for increment, scans in zip(run.increments[: cut - 1], run.scans[: cut - 1], strict=True):
-        alone.predict(increment)
-        alone.update(scans)
-    assert np.array_equal(branches.main.pose, alone.pose)
-    assert np.array_equal(branches.main.state.P.full(), alone.state.P.full())
+    plain = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for one in (branches, plain):
+        list(follow(one, run.increments[: cut - 1], run.scans[: cut - 1]))
+    assert np.array_equal(branches.main.pose, plain.pose)
+    assert np.array_equal(branches.main.state.P.full(), plain.state.P.full())
 
 
 def test_the_same_steps_give_the_same_bits() -> None:
@@ -132,7 +121,7 @@ def test_the_same_steps_give_the_same_bits() -> None:
     ends = []
     for _ in range(2):
         branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
-        reports = list(led(branches, run.increments, run.scans))
+        reports = list(follow(branches, run.increments, run.scans))
         ends.append((branches.main.pose.tobytes(), branches.main.state.P.full().tobytes(), reports))
     assert ends[0] == ends[1]
 
@@ -140,18 +129,11 @@ def test_the_same_steps_give_the_same_bits() -> None:
 def test_a_copy_goes_on_by_itself() -> None:
     run, cut = carried_run(5)
     back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
-    steps = list(zip(run.increments[:cut], run.scans[:cut], strict=True))
-    for increment, scans in steps[:100]:
-        back_end.predict(increment)
-        back_end.update(scans)
+    list(follow(back_end, run.increments[:100], run.scans[:100]))
     copied, before = back_end.copy(), back_end.state.P.full()
-    for increment, scans in steps[100:]:
-        copied.predict(increment)
-        copied.update(scans)
+    list(follow(copied, run.increments[100:cut], run.scans[100:cut]))
     assert np.array_equal(back_end.state.P.full(), before)
-    for increment, scans in steps[100:]:
-        back_end.predict(increment)
-        back_end.update(scans)
+    list(follow(back_end, run.increments[100:cut], run.scans[100:cut]))
     assert np.array_equal(back_end.pose, copied.pose)
     assert np.array_equal(back_end.state.P.full(), copied.state.P.full())
 
@@ -159,9 +141,7 @@ def test_a_copy_goes_on_by_itself() -> None:
 def test_a_robot_set_down_is_as_certain_as_the_points_it_sees() -> None:
     run, cut = carried_run(6)
     back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
-    for increment, scans in zip(run.increments[: cut - 1], run.scans[: cut - 1], strict=True):
-        back_end.predict(increment)
-        back_end.update(scans)
+    list(follow(back_end, run.increments[: cut - 1], run.scans[: cut - 1]))
     landmarks, ids = back_end.state.landmarks_m.copy(), list(back_end.state.landmark_ids)
     pose = np.array([0.7, 0.2, 2.0])
     unknown = back_end.copy()
@@ -194,8 +174,8 @@ def test_ranges_that_lie_near_by_chance_for_long_do_not_make_a_place() -> None:
     assert chance.total(RULE.most_for) < 0.0
 
 
-def test_two_landmarks_do_not_say_where_the_robot_is() -> None:
-    """They have a say in two of three unknowns; a third one must confirm them."""
+def test_two_landmarks_do_not_make_a_place() -> None:
+    """Alone they do not exceed the price; a third one must confirm them."""
     main, most = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20), RULE.carry_price / 2.0
     two = tally(*[(id_, 3.0) for id_ in (1, 2)] * 50, *[(3, -3.0)] * 20)
     three = tally(*[(id_, 3.0) for id_ in (1, 2, 3)] * 50)
@@ -204,7 +184,7 @@ def test_two_landmarks_do_not_say_where_the_robot_is() -> None:
     assert three.gain(main, most) > RULE.carry_price
 
 
-def test_one_landmark_alone_says_only_so_much_against_a_place() -> None:
+def test_the_evidence_of_one_landmark_against_a_place_is_bounded() -> None:
     gone, most = tally(*[(1, -3.0)] * 100), RULE.most_against
     assert gone.total() == pytest.approx(-most)
     several = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 100)
@@ -267,7 +247,7 @@ def test_a_robot_carried_to_where_nothing_is_missed_recognises_the_place() -> No
     carried = [
         k
         for k, report in enumerate(
-            led(branches, increments, scans_of(poses, PLACES, rng, SIGMA_M)), start=1
+            follow(branches, increments, scans_of(poses, PLACES, rng, SIGMA_M)), start=1
         )
         if report.carried
     ]

@@ -1,4 +1,4 @@
-"""Where one map lies on another, told by the constellation of their landmarks."""
+"""Where one map lies on another, from the constellation of their landmarks."""
 
 import math
 
@@ -33,7 +33,7 @@ def seen_from(pose: Array, places: Array) -> Constellation:
     return known(transform(between(pose, np.zeros(3)), places))
 
 
-def test_a_constellation_tells_where_the_robot_is() -> None:
+def test_a_constellation_gives_the_pose_of_the_robot() -> None:
     truth = np.array([0.6, 0.1, 2.0])
     found = find_placement(seen_from(truth, PLACES[[0, 1, 2, 5]]), known(PLACES), RULE)
     assert found is not None
@@ -51,14 +51,14 @@ def test_a_landmark_that_moved_is_left_out() -> None:
     assert found.motion == pytest.approx(truth, abs=1e-9)
 
 
-def test_a_constellation_that_fits_twice_tells_nothing() -> None:
+def test_a_constellation_that_fits_twice_gives_no_placement() -> None:
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     assert find_placement(known(square), known(square), RULE) is None
     lopsided = np.vstack([square, [0.3, 0.55]])
     assert find_placement(known(lopsided), known(lopsided), RULE) is not None
 
 
-def test_two_landmarks_or_a_strange_place_tell_nothing() -> None:
+def test_two_landmarks_or_an_unknown_place_give_no_placement() -> None:
     assert find_placement(known(PLACES[:2]), known(PLACES), RULE) is None
     assert find_placement(known(PLACES), known(PLACES[:2]), RULE) is None
     strange = np.array([[0.0, 0.0], [0.61, 0.1], [0.2, 0.47], [1.3, 0.9]])

@@ -100,7 +100,7 @@ def test_of_two_points_four_fixes_and_two_tracklets() -> None:
         assert tracklet.target == pytest.approx(target - [0.28, 0.0], abs=0.03)
 
 
-def test_offsets_that_are_told_to_be_doubtful_cost_no_tracklet() -> None:
+def test_uncertain_offsets_cost_no_tracklet() -> None:
     """Both radars 30 mm off in opposite directions: no point at rest, unless that may be."""
     target, offsets = np.array([[0.15, 0.6]]), np.array([0.03, -0.03, 0.0, 0.0])
     assert tracklets(driven(target, offsets)) == []
@@ -111,7 +111,7 @@ def test_offsets_that_are_told_to_be_doubtful_cost_no_tracklet() -> None:
 
 
 @pytest.mark.parametrize("dead", [0, 1])
-def test_a_radar_alone_gives_birth_where_its_partner_is_dead(dead: int) -> None:
+def test_a_radar_initialises_landmarks_where_its_partner_is_dead(dead: int) -> None:
     rng = np.random.default_rng(0)
     poses = true_path(LAB)[:90]
     target = np.array([[0.5, 0.8]])
@@ -140,7 +140,7 @@ def test_a_merge_must_stand_out_from_its_rivals() -> None:
     merge = find_merge(state, existence, rule)
     assert merge is not None
     assert merge.pairs == ((0, 1),)
-    # A third one as near as the second: which are one cannot be told.
+    # A third one as near as the second: which two are one is not certain.
     state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [-0.03, 1.0]]))
     assert find_merge(state, existence, rule) is None
 
@@ -169,11 +169,11 @@ def test_what_was_seen_whole_together_is_never_merged() -> None:
     assert find_merge(state, existence, MapRule()) is None
 
 
-def test_two_merges_together_tell_what_each_alone_does_not() -> None:
+def test_two_merges_together_are_certain_where_each_by_itself_is_not() -> None:
     """All landmarks shifted alike: each fits two, both together fit one way only."""
     places = np.array([[0.0, 1.0], [0.6, 1.0], [0.3, 1.0], [0.9, 1.02]])
     state, existence = mapped(places, 0.01)
-    # The later two were seen after a loop: 0.3 m of doubt common to both, along the wall.
+    # The later two were seen after a loop: an error of 0.3 m common to both, along the wall.
     P = state.P.full()
     first = state.landmark_columns(np.array([2]))[0]
     along = np.zeros(state.P.size)
@@ -235,9 +235,9 @@ def test_far_from_it_a_range_moves_the_state_no_further_than_at_the_bound(
     assert moved == pytest.approx(2.0 * prior**2 / math.sqrt(S), rel=1e-9)
 
 
-def test_a_doubt_is_added_to_what_the_front_end_tells_and_to_nothing_else() -> None:
-    told = RangeScan(radar=0, ranges_m=(1.0, 2.0), sigmas_m=(3e-3, 4e-3))
-    assert told.with_added_sigma(4e-3).sigmas_m == pytest.approx((5e-3, np.sqrt(32) * 1e-3))
-    assert told.with_added_sigma(0.0) is told
+def test_an_association_sigma_is_added_to_predicted_sigmas_only() -> None:
+    scan = RangeScan(radar=0, ranges_m=(1.0, 2.0), sigmas_m=(3e-3, 4e-3))
+    assert scan.with_added_sigma(4e-3).sigmas_m == pytest.approx((5e-3, np.sqrt(32) * 1e-3))
+    assert scan.with_added_sigma(0.0) is scan
     untold = RangeScan(radar=0, ranges_m=(1.0,))
     assert untold.with_added_sigma(4e-3) is untold

@@ -281,15 +281,15 @@ def test_every_key_of_the_table_reaches_the_back_end() -> None:
         "detection.min_range_m": 0.2,
         "detection.max_range_m": 1.5,
     }
-    told = back_end_parameters(override(ROBUST, settings), WheelNoise(scale_sigma=0.01))
-    ranges = told.ranges
+    found = back_end_parameters(override(ROBUST, settings), WheelNoise(scale_sigma=0.01))
+    ranges = found.ranges
     assert ranges.field_of_view_rad == math.radians(50.0)
     assert (ranges.sigma_m, ranges.offset_sigma_m) == (4e-3, 0.02)
     assert ranges.detection_probability == 0.7
     assert (ranges.association_sigma_m, ranges.huber_sigmas) == (3e-3, 2.5)
     assert ranges.clutter_per_m == pytest.approx(0.2)
     assert (ranges.min_range_m, ranges.max_range_m) == (0.2, 1.5)
-    assert (told.wheels.scale_sigma, told.wheels.walk_per_sqrt_m) == (0.01, 0.15)
+    assert (found.wheels.scale_sigma, found.wheels.walk_per_sqrt_m) == (0.01, 0.15)
 
 
 def test_the_table_refuses_what_makes_no_sense() -> None:
