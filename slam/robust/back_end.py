@@ -409,7 +409,7 @@ class RobustBackEnd:
             radars = [radar for radar in side if self._silent[radar] <= rule.partner_silence]
             if not radars or not all(self._unassigned.newest(radar) for radar in radars):
                 continue
-            is_alone = len(radars) == 1
+            is_single = len(radars) == 1
             guesses = point_guesses(self._unassigned, radars, self.parameters.ranges, rule)
             if not guesses:
                 continue
@@ -418,7 +418,7 @@ class RobustBackEnd:
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
             search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
-            if is_alone:
+            if is_single:
                 search = Search(
                     radars=radars,
                     window=rule.single_window,
@@ -426,7 +426,7 @@ class RobustBackEnd:
                     most_sigma_m=rule.single_max_sigma_m,
                 )
             tracker = self._walls.tracker(is_wall=False)
-            is_point = None if is_alone else self._walls.is_point
+            is_point = None if is_single else self._walls.is_point
             for tracklet in find_tracklets(tracker, guesses, self._unassigned, search, is_point):
                 self._place(tracklet)
 

@@ -55,13 +55,16 @@ from slam.robust.state import Array
 _SNAPSHOT_EVERY, _SNAPSHOTS = 50, 9
 # Steps between two looks for suspicion, and how many an alternative that lags behind takes a step
 _LOOK_EVERY, _CATCH_UP = 5, 10
-# How many sigmas of a slip a prediction may be unsure by after one, windows of steps that a slip
-# and a place may take to prove themselves, how far after its likely step a slip is tried; two
-# landmarks make up a price but do not exceed it; landmarks are old and new ones
-_SLIPPING_SIGMAS, _SLIP_PATIENCE, _PLACE_PATIENCE, _STARTS_AFTER = 4.0, 3, 4, 2
-_LANDMARKS_OF_PRICE, _OLD_AND_NEW = 2.0, 2
-# How many of the newest landmarks are looked for among all others
-_NEWEST = 8
+# How many sigmas of a slip a prediction may be uncertain by after one
+_SLIPPING_SIGMAS = 4.0
+# After how many times `BranchRule.steps` a slip, and a place, are dropped
+_SLIP_PATIENCE, _PLACE_PATIENCE = 3, 4
+# How many steps after the likeliest one a slip is tried
+_STARTS_AFTER = 2
+# This many landmarks may give the evidence of a whole price, but not more than it
+_LANDMARKS_OF_PRICE = 2.0
+# How many of the newest landmarks are looked for among all others; at most one in two is new
+_NEWEST, _OLD_AND_NEW = 8, 2
 # A missing range counts as one three standard deviations off. How fast what is usual is forgotten
 # per step, how many ranges as predicted it begins with, and by how many standard deviations of
 # chi-square the innovations must be too large for a slip to be looked for
@@ -101,20 +104,26 @@ class Tally:
         least = -self._rule.most_against
         return math.fsum(min(max(nats, least), most) for nats in self._of_landmark.values())
 
-    def gain(self, other: Tally, most: float, *, same_map: bool = True) -> float:
+    def gain(self, other: Tally, most: float) -> float:
         """Return how much likelier this is than the other, each landmark counting at most so much.
 
-        Nothing is likelier by explaining less: where little is certain, little can be missed.
+        Both have the same landmarks. Nothing is likelier by explaining less: where little is
+        certain, little can be missed.
         """
-        more = 2.0 * (self._explained - other._explained)
-        if not same_map:
-            return min(self.total(most) - other.total(most), more)
         mine, theirs = self._of_landmark, other._of_landmark
         differences = [
             mine.get(landmark_id, 0.0) - theirs.get(landmark_id, 0.0)
             for landmark_id in mine.keys() | theirs.keys()
         ]
-        return min(math.fsum(min(max(one, -most), most) for one in differences), more)
+        bounded = math.fsum(min(max(one, -most), most) for one in differences)
+        return min(bounded, self._more(other))
+
+    def gain_over_other_map(self, other: Tally, most: float) -> float:
+        """Return what ``gain`` does where the two have no landmark in common."""
+        return min(self.total(most) - other.total(most), self._more(other))
+
+    def _more(self, other: Tally) -> float:
+        return 2.0 * (self._explained - other._explained)
 
 
 class Alternative:
@@ -152,10 +161,10 @@ class Alternative:
         Three landmarks must be for it if that is to exceed the price, and it must be as much
         likelier than that the robot is elsewhere. A map of its own begins with nothing.
         """
-        gain = self._own.gain(
-            self._main, self.price / _LANDMARKS_OF_PRICE, same_map=not self._is_new
-        )
-        return gain if self._is_new else min(gain, self._own.total(self._rule.most_for))
+        most = self.price / _LANDMARKS_OF_PRICE
+        if self._is_new:
+            return self._own.gain_over_other_map(self._main, most)
+        return min(self._own.gain(self._main, most), self._own.total(self._rule.most_for))
 
     def take(self, step: Step) -> None:
         rule, back_end, number = self._rule, self.back_end, self.next_step
@@ -413,8 +422,8 @@ class Branches:
             return self._now
         if main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs]):
             return self._now
-        born = min(here.ids[own] for _, own in placement.pairs)
-        steps = [n for n in range(first, self._now) if self._steps[n].next_id <= born]
+        oldest_new_id = min(here.ids[own] for _, own in placement.pairs)
+        steps = [n for n in range(first, self._now) if self._steps[n].next_id <= oldest_new_id]
         return max(steps[-1] - rule.steps, first)
 
     def _begin_slip(self, since: int) -> None:

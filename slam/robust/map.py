@@ -163,8 +163,7 @@ def _candidates(
 
 def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
     """Return d^2 of the statement that pairs of rows, shape (k, 2), are one landmark each."""
-    start = state.landmark_columns(np.zeros(1, dtype=np.intp))[0]
-    i, j = start + state.layout.landmark_size * pairs.T
+    i, j = state.layout.first_columns(pairs).T
 
     def spread(a: int, b: int) -> Array:
         entries = state.P.entries

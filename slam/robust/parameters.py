@@ -87,7 +87,7 @@ class TrackletRule:
     single_window: int = 40
     single_min_frames: int = 20
     single_max_sigma_m: float = 0.1
-    partner_silence: int = 20  # after how many frames without its partner a radar counts as alone
+    partner_silence: int = 20  # a radar whose partner has sent nothing for so many frames is single
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

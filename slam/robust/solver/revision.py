@@ -20,16 +20,16 @@ from slam.robust.state import (
     SymmetricMatrix,
 )
 
-# The standard deviation of normal noise over its median magnitude; beyond how many a residual is
-# taken for that many, and fewer ranges than that choose nothing
+# The standard deviation of normal noise over its median magnitude; the largest white residual that
+# counts; and with fewer ranges than that the noise stays as it is
 _SIGMA_PER_MEDIAN, _MOST_SIGMAS, _FEWEST_RANGES = 1.4826, 3.0, 200
-# Keyframes whose ranges of one landmark may err alike; as how many such groups what all landmarks
-# have in common counts for one; and limits of `RangeErrors.variance_share`
+# Over so many keyframes the errors of the ranges of one landmark are correlated; the weight of the
+# noise of all landmarks in that of one, in such groups; and limits of `RangeErrors.variance_share`
 _KEYS_PER_PASSAGE, _PRIOR_PASSAGES, _LEAST_SHARE, _MOST_SHARE = 5, 5, 0.5, 50.0
-_PRIOR_GROUPS = 30  # as how many groups it counts that errors are as large as their sigmas
-_UNKNOWN = 100.0
-# A group of ranges is looked at from that mean cost on, if it has as many; what its own place must
-# gain [nats]; where that is searched from, and in how many steps
+_PRIOR_GROUPS = 30  # weight, in groups, of the prior that errors are as large as their sigmas
+_UNKNOWN = 100.0  # standard deviation of what is not determined
+# A group of at least so many ranges is examined from that mean cost on; the evidence [nats] for a
+# place of its own; and steps of the search for it, from each of some displacements
 _SUSPECT_MEAN, _FEWEST_OF_GROUP, _SPLIT_NATS, _ALONE_STEPS = 4.0, 15, 20.0, 8
 _TRIED_M = ((0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2))
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing

@@ -124,7 +124,7 @@ def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     mx, my = problem.range_antennas.T
     of_offset = layout.offsets.start + radars
-    columns, by_mount = [of_offset, first, first + 1], []
+    columns = [of_offset, first, first + 1]
     if layout.has_mounts:
         # A mount that is elsewhere shifts the antenna as the robot stood when it sampled.
         of_mount = layout.mounts.start + 2 * radars
