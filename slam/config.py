@@ -368,14 +368,15 @@ class RobustConfig(_Model):
     association_doubt_m: NonNegative = 0.0
     # Innovations of more standard deviations weigh less.
     huber_sigmas: Annotated[float, Field(gt=0)] = math.inf
-    # What the front end says of its own ranges, if anything: an echo that one pulse does not
-    # explain is of several targets, and lies between them.
+    # Limits on the misfit and deviation that the front end reports, if it does: an echo that one
+    # pulse does not explain is of several targets, and lies between them.
     max_misfit: Positive = 1.5
     max_predicted_sigma_m: Positive = 8e-3
     # Standard deviation of each radar's unknown constant range offset.
     offset_sigma_m: NonNegative = 0.0
     detection_probability: Annotated[float, Field(gt=0, lt=1)] = 0.95
-    # Standard deviation of where an antenna is, along each axis, and of the radius of a target.
+    # Standard deviations of an antenna's position along each axis, and of a target's radius; 0: the
+    # position is that of the rig, targets are points.
     mount_sigma_m: NonNegative = 0.0
     radius_sigma_m: NonNegative = 0.0
     # Ranges of nothing that stands there, per radar and frame.

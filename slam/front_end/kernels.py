@@ -47,7 +47,7 @@ _LARGEST_STEP = 0.5
 _DAMPING, _EASED, _STIFFENED, _LEAST_DAMPING, _HOPELESS = 1e-3, 0.1, 10.0, 1e-12, 1e3
 # Least share of a pulse's norm that other echoes do not explain, and least information of a
 # position, as a share of the largest
-_LEAST_NORM, _LEAST_INFORMATION = 1e-3, 1e-12
+LEAST_NORM, _LEAST_INFORMATION = 1e-3, 1e-12
 # Added to the diagonal of the Gram matrix: a share of it, and what remains if no sample is known
 _RIDGE, _LEAST_GRAM = 1e-13, 1e-12
 # Gains of twice the log-likelihood at which a search ends: while echoes are counted, and at last,
@@ -566,7 +566,7 @@ def _one_more(
             for m in range(size):
                 row += fit[_KNOWN + k, m] * overlap[m]
             norm -= overlap[k] * row
-        explained = (left.real**2 + left.imag**2) / max(norm, _LEAST_NORM)
+        explained = (left.real**2 + left.imag**2) / max(norm, LEAST_NORM)
         most = max(most, explained)
         if nearest < separation:
             explained = -1.0

@@ -63,7 +63,6 @@ from slam.front_end.kernels import (
     AMPLITUDE,
     BINS_PER_STEP,
     COLUMNS,
-    MAX_ECHOES,
     PHASE,
     POSITION,
     SEVERAL,
@@ -162,7 +161,7 @@ class PulseFilter:
         """Energy of a pulse of amplitude 1 at the probes."""
         self.probe_noise = float(np.sum(2 - (2 + 0.5 * probe_sigmas**2) * rho_sq))
         """Energy at the probes, over sigma_y**2, that noise leaves once a pulse is fitted."""
-        self.split = SplitTest(max_echoes=MAX_ECHOES, model_error=module.error)
+        self.split = SplitTest(model_error=module.error)
         self.single = SplitTest(max_echoes=1)
         self.left_near_peak = _NEAR_PEAK * module.error
         """What a wrong pulse leaves near the peak, relative to the amplitude."""

@@ -61,6 +61,7 @@ from slam.front_end.kernels import (
     FINE,
     IMAG,
     INFORMATION,
+    LEAST_NORM,
     MAX_ECHOES,
     NOW,
     POSITION,
@@ -74,8 +75,6 @@ from slam.front_end.pulse import ComplexArray
 
 Array = NDArray[np.float64]
 
-# The share of a pulse's norm below which a position explains nothing of its own
-_LEAST_NORM = 1e-3
 # How far from the ends of a window echoes are looked for, in envelope sigmas
 _OFF_THE_ENDS = 1.5
 _LARGEST_RISE = 200.0
@@ -158,7 +157,7 @@ def _one_more(data: Window, fit: _Fit, grid: Array, *, sigma: float, separation:
     known = np.linalg.solve(weighted @ mine.T + TINY * np.eye(n), mixed)
     left = norm - (mixed * known).sum(axis=0)
     far = np.abs(grid - positions[:, np.newaxis]).min(axis=0) >= separation
-    explained = np.where(far, np.abs(matched) ** 2 / np.maximum(left, _LEAST_NORM * norm), -1.0)
+    explained = np.where(far, np.abs(matched) ** 2 / np.maximum(left, LEAST_NORM * norm), -1.0)
     starts = [np.append(positions, grid[explained.argmax()])]
     for k in range(n):
         split = np.insert(positions, k, positions[k] - 0.5 * sigma)
@@ -180,7 +179,7 @@ class EchoFit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnownPulse:
-    """What the fit knows of the pulse."""
+    """The pulse that is fitted."""
 
     envelope_sigma_bins: float  # standard deviation of the Gaussian envelope, in bins
     carrier_rad_per_bin: float  # advance of the carrier's phase per bin
@@ -190,11 +189,11 @@ class KnownPulse:
 class SplitTest:
     """When one more echo is accepted."""
 
-    max_echoes: int = 4  # most echoes of a window
+    max_echoes: int = MAX_ECHOES  # most echoes of a window
     false_split: float = 1e-3  # probability that noise alone makes one more echo in a window
     # Relative error of the pulse model; 0.08 covers a bandwidth wrong by 10 %.
     model_error: float = 0.08
-    min_separation: float = 0.5  # closest echoes told apart, in standard deviations of the envelope
+    min_separation: float = 0.5  # of two echoes, in standard deviations of the envelope
 
 
 def fit_echoes(
