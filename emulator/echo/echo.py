@@ -10,10 +10,10 @@ with the leakage among the paths i, and the chip counts ``clip(round((x[n] + N /
 max)``. Elevation of targets, polarisation, and paths of more bounces than named here are left out.
 
 Pulse p
-    Gaussian envelope on the carrier (``emulator.echo.reflections``). Where the scene's table
-    ``pulse`` of a radar says so, the standard deviation is width (1 - skew) sigma before the peak
-    and width (1 + skew) sigma after it, and ringing times the same pulse follows 3.2 sigma later,
-    its carrier 1 rad ahead. All that this radar receives has this pulse, except for its clutter.
+    Gaussian envelope on the carrier (``emulator.echo.reflections``). Where a radar of the scene
+    has a table ``pulse``, the standard deviation is width (1 - skew) sigma before the peak and
+    width (1 + skew) sigma after it, and ringing times the same pulse follows 3.2 sigma later, its
+    carrier 1 rad ahead. All that this radar receives has this pulse, except for its clutter.
     The form is assumed; real pulses of the X4 are a little asymmetric and ring.
 Time t
     Nominal time of the frame, made earlier by the module's fast clock and later by its start
@@ -174,7 +174,7 @@ _TX_AMPLITUDE = {0: 0.0, 1: math.sqrt(0.5), 2: 1.0, 3: math.sqrt(2.0)}
 class ScenePaths:
     """The paths of one radar of a scene. What does not move is worked out once."""
 
-    def __init__(self, scene: Scene, radar: RadarSpec, seed: int = 0) -> None:
+    def __init__(self, scene: Scene, radar: RadarSpec, seed: int) -> None:
         self._scene = scene
         self._radar = radar
         self._trajectory = scene.trajectory()

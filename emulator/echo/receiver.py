@@ -43,9 +43,9 @@ fitted to the ten farthest bins of one real recording (`GRIDS`). It falls to 1/e
 ``correlation_s``, steeply at first and slowly later. Linear interpolation between instants takes
 0.3 % off the variance.
 
-What it leaves out: it does not know that the robot moves, or which way the radar looks; a real
-room's clutter is the same for two radars side by side and changes as the robot drives, this is
-independent of both. Its strength does not fall with range.
+What it leaves out: a real room's clutter is the same for two radars side by side and changes as
+the robot drives; this one is independent from radar to radar, and of place and boresight.
+Its strength does not fall with range.
 """
 
 from __future__ import annotations

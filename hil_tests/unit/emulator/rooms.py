@@ -85,7 +85,7 @@ class Heard:
 
 
 def heard(radar: RadarSpec, *, t_ns: int = 0, **parts: Any) -> Heard:  # noqa: ANN401 - fields of the spec
-    paths = ScenePaths(room(radar, **parts), radar).reflections(np.array([t_ns]), WAVELENGTH_M)
+    paths = ScenePaths(room(radar, **parts), radar, 0).reflections(np.array([t_ns]), WAVELENGTH_M)
     there = np.flatnonzero(paths.amplitude[0] > 0)
     there = there[np.argsort(paths.range_m[0, there], kind="stable")]
     phase_rad = np.broadcast_to(paths.phase_rad, paths.range_m.shape)
