@@ -393,12 +393,12 @@ class State:
 
     @property
     def offsets(self) -> slice:
-        return slice(HEAD_SIZE, HEAD_SIZE + len(self.offsets_m))
+        return self.layout.offsets
 
     @property
     def n_fixed(self) -> int:
         """Return how many rows of the error come before those of the features."""
-        return HEAD_SIZE + len(self.offsets_m) * (3 if self.mount_sigma_m else 1)
+        return int(self.layout.landmarks.start)
 
     @property
     def feature_ids(self) -> list[int]:
@@ -426,8 +426,8 @@ class State:
         self.heading_rad = wrap_angle(self.heading_rad + angle)
         self.position_m = turn @ self.position_m + V @ error[POSITION]
         self.calibration = self.calibration + error[CALIBRATION]
-        self.offsets_m = self.offsets_m + error[self.offsets]
         layout = self.layout
+        self.offsets_m = self.offsets_m + error[layout.offsets]
         if layout.has_mounts:
             self.mounts_m = self.mounts_m + error[layout.mounts].reshape(-1, 2)
         shifts = error[layout.landmarks].reshape(-1, layout.landmark_size)
