@@ -50,6 +50,7 @@ from slam.robust.state import (
     Array,
     Indices,
     Motion,
+    RangeErrors,
     State,
     calibrated_motion,
     predict,
@@ -97,6 +98,7 @@ class RobustBackEnd:
             parameters.ranges.mount_sigma_m,
             parameters.ranges.radius_sigma_m,
         )
+        self.state.range_errors = RangeErrors(variance_share=parameters.ranges.variance_share)
         self._sides = rig.sides(parameters.ranges.field_of_view)
         self._side_of = np.zeros(len(rig.mounts), dtype=np.intp)
         for number, side in enumerate(self._sides):
@@ -180,11 +182,6 @@ class RobustBackEnd:
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
 
-    def step_covariance(self, increment: Array, covariance: Array | None = None) -> Array:
-        """Return the covariance (3, 3) that ``predict`` takes the noise of an increment to have."""
-        wheels, calibration = self.parameters.wheels, self.state.calibration
-        return calibrated_motion(increment, calibration, wheels, covariance).covariance
-
     def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
         """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
 
@@ -204,29 +201,28 @@ class RobustBackEnd:
             update_with_point(state, state.landmark_ids.index(landmark_id), point)
         self._log.set_causal(state.pose)
 
-    def update(
-        self, scans: Sequence[RangeScan], *, sure_m: float | None = None, solve: bool = True
-    ) -> UpdateReport:
+    def update(self, scans: Sequence[RangeScan], *, solve: bool = True) -> UpdateReport:
         """Take in the scans of one time; a radar without a frame is absent, not empty.
 
-        ``sure_m`` replaces how sure a prediction must be for a range to continue a track. Without
-        ``solve`` the solution over all poses waits for a later time.
+        Without ``solve`` merges and the solution over all poses wait for a later time.
         """
         antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         widened = [scan.with_added_sigma(added_m) for scan in scans]
-        matches, seen = self._associate(scans, widened, antennas, sure_m)
+        matches, seen = self._associate(scans, widened, antennas)
         continued, nis, likelihoods = self._correct(matches, seen, scans, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
         self._delete_vanished()
-        self._merge()
-        if solve and is_due(self._log, self.state, self.parameters):
-            self.relinearise()
+        self._n_updates += 1
+        if solve:
+            self._merge()
+            if is_due(self._log, self.state, self.parameters):
+                self.relinearise()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
@@ -296,7 +292,6 @@ class RobustBackEnd:
         scans: Sequence[RangeScan],
         widened: Sequence[RangeScan],
         antennas: Antennas,
-        sure_m: float | None,
     ) -> tuple[Matches | None, View]:
         """Find the ranges of known landmarks among the ``widened`` scans; count hits and misses."""
         state, existence = self.state, self._existence
@@ -304,8 +299,7 @@ class RobustBackEnd:
         if not state.feature_ids:
             return None, seen
         seen = self._walls.look(seen, antennas)
-        if sure_m is None:
-            sure_m = self.parameters.continuation.tight_sigmas * self.parameters.ranges.sigma_m
+        sure_m = self.parameters.continuation.tight_sigmas * self.parameters.ranges.sigma_m
         known = find_known(state, seen, widened, self._side_of, self.parameters, sure_m=sure_m)
         if known is None:
             return None, seen
@@ -484,7 +478,6 @@ class RobustBackEnd:
 
     def _merge(self) -> None:
         """Merge landmarks where that is certain."""
-        self._n_updates += 1
         rule = self.parameters.map
         if self._landmark_of_label or self._n_updates % rule.merge_every:
             return

@@ -1,34 +1,26 @@
-"""Slips and kidnapping: alternatives to where the main back end has the robot.
+"""Kidnapping: the question whether the robot was carried, and whereto.
 
-Wheels slip and robots are carried. Both make the ranges of known landmarks unlikely, and are the
-same question with two prices: is there a motion the wheels did not report that explains the ranges
-better? The back end itself believes its odometry. Around it, ``Branches`` keep the last motions and
-scans, and the evidence of each range for the pose (``UpdateReport.evidence``).
+The back end itself believes its odometry. ``Branches`` keep its last motions and scans, and the
+evidence of each range for its pose (``UpdateReport.evidence``).
 
 Suspicion
     The evidence since each step is summed over the landmarks known then, at most so much against
     each: a cumulative sum test (Page, Biometrika 41, 1954). The step with the largest sum against
-    the pose is where the robot may have been carried. It may have slipped where the innovations
-    grow beyond what they were all along.
-Slip
-    Copies of the main back end go back to a few steps before that, and take the motions and scans
-    since once more, a slip added to the noise of one step, another one for each copy.
+    the pose is where the robot may have been carried.
 Recognition
     Where nothing is known that could be missed, landmarks of the last steps may yet lie on older
-    ones as a constellation. If the map lets them be the same, they are merged, and a loop is
-    closed; if not, the robot may have been carried before it saw the first of them.
-Carry
+    ones as a constellation. If the whole run can be solved with them merged, a loop is closed; if
+    not, the robot may have been carried before it saw the first of them.
+Search
     A back end with an empty map takes the motions and scans since. Where its landmarks lie on the
     map of the main back end as it was then is searched for (`slam.robust.constellation`). A copy of
     that back end is set down there, and takes the motions and scans since.
 Decision
-    Every back end is judged by the evidence of the same scans. An alternative is adopted when it
-    explains more ranges than the main one and its evidence is larger by its price, and dropped
-    when it has not after some steps. Nothing is forgotten before that, and the main back end goes
-    on. The robot is reported as lost only while the empty map explains the scans better than the
-    main one does with what it knew then, by the price of a carry, and no place for it is found.
-    With fewer landmarks in a map than a placement takes there is nothing to be found, and the main
-    back end goes on with new ones.
+    Both are judged by the evidence of the same scans. The place is adopted when it explains more
+    ranges than the main back end does and its evidence is larger by the price of a carry, and
+    dropped when it has not after some steps. Nothing is forgotten before that, and the main back
+    end goes on. The robot is reported as lost while the landmarks known before the carry, three or
+    more of them, are against its pose by that price. The question ends when they are for it.
 
 While nothing is suspicious that costs a copy of the back end now and then.
 """
@@ -36,13 +28,12 @@ While nothing is suspicious that costs a copy of the back end now and then.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.geometry import Rig
+from slam.geometry import Rig, compose
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
@@ -55,22 +46,16 @@ from slam.robust.state import Array
 _SNAPSHOT_EVERY, _SNAPSHOTS = 50, 9
 # Steps between two looks for suspicion, and how many an alternative that lags behind takes a step
 _LOOK_EVERY, _CATCH_UP = 5, 10
-# How many sigmas of a slip a prediction may be uncertain by after one
-_SLIPPING_SIGMAS = 4.0
-# After how many times `BranchRule.steps` a slip, and a place, are dropped
-_SLIP_PATIENCE, _PLACE_PATIENCE = 3, 4
-# How many steps after the likeliest one a slip is tried
-_STARTS_AFTER = 2
+# After how many times `BranchRule.steps` a place is dropped
+_PLACE_PATIENCE = 4
 # This many landmarks may give the evidence of a whole price, but not more than it
 _LANDMARKS_OF_PRICE = 2.0
 # How many of the newest landmarks are looked for among all others; at most one in two is new
 _NEWEST, _OLD_AND_NEW = 8, 2
-# A missing range counts as one three standard deviations off. How fast what is usual is forgotten
-# per step, how many ranges as predicted it begins with, and by how many standard deviations of
-# chi-square the innovations must be too large for a slip to be looked for
-_MISSED_SQUARE, _FADING, _USUAL_COUNT, _STRAINED = 9.0, 0.998, 20.0, 4.0
 # By how much the covariance of the points is enlarged by which the robot is set down
 _WEAKENED = 4.0
+# An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
+_IDS_APART = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,108 +66,58 @@ class Step:
     covariance: Array | None
     scans: Sequence[RangeScan]
     next_id: int  # landmarks known before it have smaller ids
-    evidence: tuple[tuple[int, float], ...]
-    table: Array  # the evidence, shape (k, 2): ids and nats
+    evidence: Array  # shape (k, 2): ids and nats
 
 
-class Tally:
-    """The evidence of some steps for one back end."""
-
-    def __init__(self, rule: BranchRule) -> None:
-        self._rule = rule
-        self._of_landmark: dict[int, float] = {}
-        self._explained = 0.0  # by ranges, those missed left out
-
-    def add(self, evidence: Sequence[tuple[int, float]]) -> None:
-        for landmark_id, nats in evidence:
-            share = nats / self._rule.correlated_steps
-            self._of_landmark[landmark_id] = self._of_landmark.get(landmark_id, 0.0) + share
-            self._explained += max(share, 0.0)
-
-    def total(self, most: float = math.inf) -> float:
-        """Return the sum over the landmarks, each between ``-most_against`` and a bound."""
-        least = -self._rule.most_against
-        return math.fsum(min(max(nats, least), most) for nats in self._of_landmark.values())
-
-    def gain(self, other: Tally, most: float) -> float:
-        """Return how much likelier this is than the other, each landmark counting at most so much.
-
-        Both have the same landmarks. Nothing is likelier by explaining less: where little is
-        certain, little can be missed.
-        """
-        mine, theirs = self._of_landmark, other._of_landmark
-        differences = [
-            mine.get(landmark_id, 0.0) - theirs.get(landmark_id, 0.0)
-            for landmark_id in mine.keys() | theirs.keys()
-        ]
-        bounded = math.fsum(min(max(one, -most), most) for one in differences)
-        return min(bounded, self._more(other))
-
-    def gain_over_other_map(self, other: Tally, most: float) -> float:
-        """Return what ``gain`` does where the two have no landmark in common."""
-        return min(self.total(most) - other.total(most), self._more(other))
-
-    def _more(self, other: Tally) -> float:
-        return 2.0 * (self._explained - other._explained)
+def evidence_table(report: UpdateReport) -> Array:
+    return np.array(report.evidence).reshape(-1, 2)
 
 
-class Alternative:
-    """A back end that takes the steps from ``since`` on, and its evidence against the main one's.
+def totals_of(tables: Iterable[Array], known_before: int, correlated_steps: float) -> Array:
+    """Return ids and summed evidence [nats], (n, 2), of the landmarks below an id.
 
-    One that ``is_new`` began with an empty map. One ``set_down`` begins at the end of the first of
-    these motions, which it does not take.
-    ``slipping`` is the step to whose noise a slip is added, if any.
+    The errors of so many steps are taken to be one.
     """
+    table = np.concatenate([np.empty((0, 2)), *tables])
+    table = table[table[:, 0] < known_before]
+    ids, place = np.unique(table[:, 0], return_inverse=True)
+    return np.column_stack([ids, np.bincount(place, table[:, 1], len(ids)) / correlated_steps])
 
-    def __init__(
-        self,
-        back_end: RobustBackEnd,
-        since: int,
-        rule: BranchRule,
-        *,
-        set_down: bool = False,
-        slipping: int | None = None,
-        is_new: bool = False,
-    ) -> None:
+
+def gain(own: Array, main: Array, rule: BranchRule) -> float:
+    """Return by how much a place is likelier than the main back end's pose, in nats.
+
+    ``own`` and ``main`` are totals of the same landmarks. Three of them must be for it if that is
+    to exceed the price, and it must be as much likelier than that the robot is elsewhere. Nothing
+    is likelier by explaining less: where little is certain, little can be missed.
+    """
+    ids = np.union1d(own[:, 0], main[:, 0])
+    mine, theirs = np.zeros(len(ids)), np.zeros(len(ids))
+    mine[np.searchsorted(ids, own[:, 0])] = own[:, 1]
+    theirs[np.searchsorted(ids, main[:, 0])] = main[:, 1]
+    most = rule.carry_price / _LANDMARKS_OF_PRICE
+    return min(
+        float(np.clip(mine - theirs, -most, most).sum()),
+        float(np.clip(mine, -rule.most_against, rule.most_for).sum()),
+        2.0 * float(np.maximum(mine, 0.0).sum() - np.maximum(theirs, 0.0).sum()),
+    )
+
+
+class Placed:
+    """The map before a carry with the robot set down on it; it takes the steps since."""
+
+    def __init__(self, back_end: RobustBackEnd, carry: Carry, until: int) -> None:
         self.back_end = back_end
-        self.since = self.next_step = since
-        self.price = rule.carry_price if set_down else rule.slip_price
-        self.set_down = set_down
-        self._rule = rule
-        self._slipping = slipping
-        self._next_id = 0  # landmarks known when it began have smaller ids
-        self._is_new = is_new
-        self._own, self._main = Tally(rule), Tally(rule)
+        self.until = until  # step at which it is dropped
+        self.next_step = carry.since
+        self.evidence: list[Array] = []
 
-    @property
-    def gain(self) -> float:
-        """Return by how much this is likelier than the main one since it began, in nats.
-
-        Three landmarks must be for it if that is to exceed the price, and it must be as much
-        likelier than that the robot is elsewhere. A map of its own begins with nothing.
-        """
-        most = self.price / _LANDMARKS_OF_PRICE
-        if self._is_new:
-            return self._own.gain_over_other_map(self._main, most)
-        return min(self._own.gain(self._main, most), self._own.total(self._rule.most_for))
-
-    def take(self, step: Step) -> None:
-        rule, back_end, number = self._rule, self.back_end, self.next_step
-        if number > self.since or not self.set_down:
-            covariance = step.covariance
-            if number == self._slipping:
-                slip = np.square([rule.slip_m, rule.slip_m, rule.slip_rad])
-                covariance = back_end.step_covariance(step.increment, covariance) + np.diag(slip)
-            back_end.predict(step.increment, covariance)
-        begins = self._slipping is not None and number < self.since + rule.steps
-        sure_m = _SLIPPING_SIGMAS * rule.slip_m if begins else None
-        report = back_end.update(step.scans, sure_m=sure_m, solve=False)
-        # Landmarks that the main one mapped after it went wrong explain the ranges there, too.
-        if number == self.since:
-            self._next_id = step.next_id
-        known = math.inf if self._is_new else self._next_id
-        self._own.add([one for one in report.evidence if one[0] < known])
-        self._main.add([one for one in step.evidence if one[0] < self._next_id])
+    def take(self, step: Step, *, is_first: bool) -> None:
+        """Take a step; of the first one the motion is the carry."""
+        if not is_first:
+            self.back_end.predict(step.increment, step.covariance)
+        report = self.back_end.update(step.scans, solve=False)
+        self.evidence.append(evidence_table(report))
         self.next_step += 1
 
 
@@ -190,46 +125,17 @@ class Alternative:
 class Carry:
     """The question whether, and whereto, the robot was carried before a step."""
 
+    since: int
+    next_id: int  # landmarks known before it have smaller ids
     map: RobustBackEnd  # the main back end after the step before
-    new: Alternative  # with an empty map at first
+    new: RobustBackEnd  # with an empty map at first
+    next_step: int  # that the new map has not taken yet
     search_from: int  # the step from which on its place is searched for
-
-
-class InnovationTest:
-    """Whether the innovations of the last steps are larger than they were all along."""
-
-    def __init__(self, steps: int) -> None:
-        self._last: deque[tuple[float, int]] = deque(maxlen=2 * steps)
-        self._steps = steps
-        self._usual_square, self._usual_count = _USUAL_COUNT, _USUAL_COUNT
-
-    def add(self, report: UpdateReport) -> None:
-        """Count the ranges of a scan; one that is missing is as bad as one far off."""
-        missed = len(report.evidence) - report.dof
-        self._last.append((report.nis + _MISSED_SQUARE * missed, report.dof + missed))
-        square, count = self._last[0]
-        if len(self._last) == self._last.maxlen:
-            self._usual_square = _FADING * self._usual_square + square
-            self._usual_count = _FADING * self._usual_count + count
-
-    def restart(self) -> None:
-        self._last.clear()
-
-    def steps_ago(self) -> int | None:
-        """Return how many steps ago they began to be too large; None if they are not."""
-        usual = max(self._usual_square / self._usual_count, 1.0)
-        total, count, most, begin = 0.0, 0, 0.0, None
-        for ago, (square, n) in enumerate(reversed(self._last), start=1):
-            total += square - usual * n
-            count += n
-            excess = total / (usual * math.sqrt(2.0 * max(count, 1)))
-            if excess > most:
-                most, begin = excess, ago
-        return begin if most > _STRAINED else None
+    placed: Placed | None = None
 
 
 class Branches:
-    """The main back end, its alternatives, and the decision between them.
+    """The main back end, the question of a carry, and its decision.
 
     ``predict`` and ``update`` alternate as in ``RobustBackEnd``.
     """
@@ -241,12 +147,9 @@ class Branches:
         self._now = 0  # number of the next step
         self._motion: tuple[Array, Array | None] | None = None
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
-        self._slip: Alternative | None = None
-        self._placed: Alternative | None = None
         self._carry: Carry | None = None
-        self._no_slip_until = self._tried_until = self._judged = 0
+        self._judged = 0  # the evidence of the steps before it has been judged
         self._recognised_ids: set[int] = set()  # new landmarks that were searched for
-        self._innovations = InnovationTest(self._rule.steps)
         self.is_lost = False
 
     @property
@@ -255,12 +158,16 @@ class Branches:
         return self._carry.map if self.is_lost and self._carry is not None else self.main
 
     @property
-    def lost_covariance(self) -> Array | None:
-        """Return the covariance (3, 3) of the pose while the robot is lost, None else."""
-        if not self.is_lost:
+    def lost_pose(self) -> tuple[Array, Array] | None:
+        """Return pose (3,) and covariance (3, 3) to report while the robot is lost, None else.
+
+        The pose is that before the carry, moved by odometry since.
+        """
+        if not self.is_lost or self._carry is None:
             return None
         sigma_m = self._rule.lost_position_m
-        return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
+        covariance = np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
+        return compose(self._carry.map.pose, self._carry.new.pose), covariance
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
@@ -281,18 +188,16 @@ class Branches:
             covariance=covariance,
             scans=scans,
             next_id=next_id,
-            evidence=report.evidence,
-            table=np.array(report.evidence).reshape(-1, 2),
+            evidence=evidence_table(report),
         )
         self._now += 1
         if any(scan.labels is not None for scan in scans):
             return report
-        self._innovations.add(report)
         was_lost = self.is_lost
-        carried = self._decide()
+        moved = self._carry is not None and self._decide(self._carry)
         if self._now % _LOOK_EVERY == 0:
             self._look()
-        carried |= self.is_lost and not was_lost
+        carried = (moved or self.is_lost) and not was_lost
         return replace(report, carried=carried, lost=self.is_lost)
 
     def _keep_snapshot(self) -> None:
@@ -301,7 +206,7 @@ class Branches:
             del self._snapshots[old]
         needed = min(self._snapshots)
         if self._carry is not None:
-            needed = min(needed, self._carry.new.since)
+            needed = min(needed, self._carry.since)
         for old in [number for number in self._steps if number < needed]:
             del self._steps[old]
 
@@ -309,69 +214,65 @@ class Branches:
         """Return a copy of the main back end as it was before a step."""
         begin = max(kept for kept in self._snapshots if kept <= number)
         back_end = self._snapshots[begin].copy()
-        self._lead(back_end, begin, number)
-        return back_end
-
-    def _lead(self, back_end: RobustBackEnd, begin: int, end: int) -> None:
-        for number in range(begin, end):
-            step = self._steps[number]
+        for step in (self._steps[between] for between in range(begin, number)):
             back_end.predict(step.increment, step.covariance)
             back_end.update(step.scans, solve=False)
+        return back_end
 
-    def _is_up_to_date(self, other: Alternative) -> bool:
-        """Let an alternative take some of its steps; return whether none is left."""
-        for number in range(other.next_step, min(other.next_step + _CATCH_UP, self._now)):
-            other.take(self._steps[number])
-        return other.next_step == self._now
-
-    def _decide(self) -> bool:
-        """Adopt or drop alternatives; return whether the robot was carried elsewhere."""
-        rule, slip, carry, placed = self._rule, self._slip, self._carry, self._placed
-        if slip is not None and self._is_up_to_date(slip):
-            if slip.gain > slip.price:
-                self._adopt(slip)
-                return False
-            if self._now - slip.since > _SLIP_PATIENCE * rule.steps:
-                self._slip = None
-        if placed is not None and self._is_up_to_date(placed):
-            if placed.gain > placed.price:
-                was_lost = self.is_lost
-                self._adopt(placed)
-                return not was_lost
-            if self._now > self._tried_until:
-                self._placed = None
-        if carry is not None and self._is_up_to_date(carry.new):
-            gain = carry.new.gain
-            self.is_lost = gain > (0.0 if self.is_lost else rule.carry_price)
-            if gain < -rule.carry_price and self._placed is None:
-                # The evidence against the pose until now has been judged.
-                self._carry, self._judged = None, self._now
+    def _decide(self, carry: Carry) -> bool:
+        """Answer the question of a carry, if that can be; return whether a place is adopted."""
+        rule, placed = self._rule, carry.placed
+        for number in range(carry.next_step, min(carry.next_step + _CATCH_UP, self._now)):
+            step = self._steps[number]
+            if number > carry.since:
+                carry.new.predict(step.increment, step.covariance)
+            carry.new.update(step.scans, solve=False)
+            carry.next_step = number + 1
+        if placed is not None:
+            for number in range(placed.next_step, min(placed.next_step + _CATCH_UP, self._now)):
+                placed.take(self._steps[number], is_first=number == carry.since)
+            if placed.next_step == self._now:
+                own = totals_of(placed.evidence, carry.next_id, rule.correlated_steps)
+                main = self._totals(carry, carry.since)
+                if gain(own, main, rule) > rule.carry_price:
+                    self._adopt(placed.back_end)
+                    return True
+            if self._now > placed.until:
+                carry.placed = None
+        # What one landmark says is bounded: it may be hidden or gone, or others may look like it.
+        of_landmarks = self._totals(carry, max(carry.since, self._now - rule.lost_steps))[:, 1]
+        bounded = np.clip(of_landmarks, -rule.most_against, rule.most_for)
+        total = float(bounded.sum())
+        if self.is_lost:
+            self.is_lost = total < 0.0
+        else:
+            n_against = np.count_nonzero(bounded < 0.0)
+            self.is_lost = total < -rule.carry_price and n_against >= rule.least_landmarks
+        is_answered = total > rule.carry_price and carry.placed is None
+        if is_answered or self._now - carry.since > rule.carry_steps:
+            self._carry, self._judged, self.is_lost = None, self._now, False
         return False
 
-    def _adopt(self, other: Alternative) -> None:
+    def _totals(self, carry: Carry, first: int) -> Array:
+        """Return the evidence since a step of the landmarks known before a carry, (n, 2)."""
+        tables = (self._steps[number].evidence for number in range(first, self._now))
+        return totals_of(tables, carry.next_id, self._rule.correlated_steps)
+
+    def _adopt(self, back_end: RobustBackEnd) -> None:
         """Let an alternative be the main back end."""
-        self.main = other.back_end
-        self._slip = self._placed = self._carry = None
-        self.is_lost = False
+        self.main, self._carry, self.is_lost = back_end, None, False
         self._snapshots = {self._now: self.main.copy()}
-        self._innovations.restart()
-        self._no_slip_until = self._judged = self._now
+        self._judged = self._now
 
     def _look(self) -> None:
-        """Look for evidence against the pose, and begin alternatives."""
-        rule = self._rule
-        ago = self._innovations.steps_ago() or 0
-        # Some steps after it began, its begin and its effect are clearer.
-        if ago > _LOOK_EVERY and not self.is_lost and self._now - ago > self._no_slip_until:
-            self._begin_slip(self._now - ago)
-            self._no_slip_until = self._now - _LOOK_EVERY
+        """Look for evidence against the pose, or for the place that the robot was carried to."""
         if self._carry is None:
             since, against = self._evidence_of_carry()
-            if against <= rule.suspicious:
+            if against <= self._rule.suspicious:
                 since = self._recognised()
             if since < self._now:
                 self._begin_carry(since)
-        elif self._placed is None and self._now >= self._carry.search_from:
+        elif self._carry.placed is None and self._now >= self._carry.search_from:
             self._search(self._carry)
 
     def _evidence_of_carry(self) -> tuple[int, float]:
@@ -384,7 +285,7 @@ class Branches:
         lengths = [len(step.evidence) for step in steps]
         if not sum(lengths):
             return self._now, 0.0
-        table = np.concatenate([step.table for step in steps])
+        table = np.concatenate([step.evidence for step in steps])
         ids, place = np.unique(table[:, 0], return_inverse=True)
         against = np.zeros((len(steps), len(ids)))
         np.add.at(against, (np.repeat(np.arange(len(steps)), lengths), place), -table[:, 1])
@@ -403,7 +304,7 @@ class Branches:
     def _recognised(self) -> int:
         """Return the step before which the robot was elsewhere if new landmarks lie on older ones.
 
-        Where the map itself lets them be the same landmarks, a loop is closed: they are merged.
+        Where the whole run lets them be the same landmarks, a loop is closed: they are merged.
         """
         main, rule, first = self.main, self._rule, max(min(self._snapshots), self._judged)
         rows, ids = main.reported_rows(), main.state.landmark_ids
@@ -426,30 +327,23 @@ class Branches:
         steps = [n for n in range(first, self._now) if self._steps[n].next_id <= oldest_new_id]
         return max(steps[-1] - rule.steps, first)
 
-    def _begin_slip(self, since: int) -> None:
-        """Go back to about a step, try a slip at each of some steps around it; keep the best."""
-        width, oldest = _LOOK_EVERY, min(self._snapshots)
-        back_end, tried = self._at(max(since - width, oldest)), []
-        for start in range(max(since - width, oldest), min(since + _STARTS_AFTER, self._now)):
-            slip = Alternative(back_end.copy(), start, self._rule, slipping=start)
-            for number in range(start, self._now):
-                slip.take(self._steps[number])
-            tried.append(slip)
-            self._lead(back_end, start, start + 1)
-        self._slip = max(tried, key=lambda one: one.gain)
-
     def _begin_carry(self, since: int) -> None:
         before = self._at(since)
         if len(before.reported_rows()) >= self._rule.least_landmarks:
-            new = Alternative(
-                before.with_empty_map(), since, self._rule, set_down=True, is_new=True
+            self._carry = Carry(
+                since=since,
+                next_id=self._steps[since].next_id,
+                map=before,
+                new=before.with_empty_map(),
+                next_step=since,
+                search_from=self._now,
             )
-            self._carry = Carry(map=before, new=new, search_from=self._now)
 
     def _search(self, carry: Carry) -> None:
         """Search for the new map's place on the old one; set a copy of the old one down there."""
-        rule, new = self._rule, carry.new.back_end
-        here = constellation_of(new.state, new.reported_rows(), rule.model_sigma_m)
+        rule, new = self._rule, carry.new
+        newest = sorted(new.reported_rows(), key=lambda row: -new.state.landmark_ids[row])[:_NEWEST]
+        here = constellation_of(new.state, newest, rule.model_sigma_m)
         there = constellation_of(carry.map.state, carry.map.reported_rows(), rule.model_sigma_m)
         placement = find_placement(here, there, rule)
         if placement is None:
@@ -462,5 +356,6 @@ class Branches:
             points.append((there.ids[row], here.points_m[own], covariance))
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)
-        self._placed = Alternative(back_end, carry.new.since, rule, set_down=True)
-        self._tried_until = carry.search_from = self._now + _PLACE_PATIENCE * rule.steps
+        back_end.state.next_id = self.main.state.next_id + _IDS_APART
+        until = carry.search_from = self._now + _PLACE_PATIENCE * rule.steps
+        carry.placed = Placed(back_end, carry, until)

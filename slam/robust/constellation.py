@@ -34,7 +34,7 @@ Pairs = tuple[tuple[int, int], ...]
 # How far around its outermost landmarks, and around each of them, a map reaches
 _SURROUNDINGS_M = 1.5
 # Least evidence [nats] of a placement, and by how much it must beat every other place
-_EVIDENCE = 8.0
+_EVIDENCE = 4.0
 # Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
 # that keeps the matrix regular
 _STEPS, _LEAST_CHANGE, _VARIANCE_FLOOR_M2 = 5, 1e-9, 1e-10

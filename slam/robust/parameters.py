@@ -39,6 +39,8 @@ class RangeNoise:
     # zero takes the unknowns out of the state
     mount_sigma_m: float = 0.0
     radius_sigma_m: float = 0.0
+    # `RangeErrors.variance_share` until the ranges of the run show it
+    variance_share: float = 1.0
     detection_probability: float = 0.92  # that a target in view is detected in a frame
     clutter_per_m: float = 0.15 / 1.3  # false ranges per radar, frame and metre of range
     field_of_view_rad: float = math.radians(65.0)  # full opening angle
@@ -162,7 +164,7 @@ class RelinearisationRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BranchRule:
-    """When the robot may have slipped or been carried, and when that is believed."""
+    """When the robot may have been carried, and when that is believed."""
 
     # A landmark is missed if no range lies within so many standard deviations, that of the model
     # included: what the scattering centre of a body may wander, added in squares
@@ -175,15 +177,13 @@ class BranchRule:
     # for it (other ranges may lie near its prediction for long)
     most_against: float = 12.0
     most_for: float = 9.0
-    # Evidence [nats] against the pose from which on alternatives are looked for, and by which an
-    # alternative must be likelier to be adopted: a slip is more frequent than a carry
+    # Evidence [nats] against the pose from which on another place is looked for, from which on the
+    # robot is lost, and by which a place must be likelier to be adopted
     suspicious: float = 12.0
-    slip_price: float = 15.0
-    carry_price: float = 25.0
-    # What a slip adds to the standard deviations of a step
-    slip_m: float = 0.015
-    slip_rad: float = 0.035
-    steps: int = 15  # over which a slip is looked for, and an alternative proves itself
+    carry_price: float = 20.0
+    steps: int = 15  # over which a place proves itself
+    lost_steps: int = 100  # whose evidence decides whether the robot is lost
+    carry_steps: int = 1000  # after which the question is dropped
     # Fewest landmarks that place a map on another, and how far lengths and places may
     # differ in a guess
     least_landmarks: int = 3

@@ -109,7 +109,7 @@ class RobustSlam:
             StepResult(
                 t_ns=t_ns,
                 odometry_pose=pose,
-                belief=belief_of(branches.map, branches.lost_covariance),
+                belief=belief_of(branches.map, branches.lost_pose),
                 detections=detections,
                 report=report,
                 range_sigmas_m=sigmas_m,
@@ -167,6 +167,7 @@ def back_end_parameters(
             offset_sigma_m=robust.offset_sigma_m,
             mount_sigma_m=robust.mount_sigma_m,
             radius_sigma_m=robust.radius_sigma_m,
+            variance_share=robust.range_variance_share,
             detection_probability=robust.detection_probability,
             clutter_per_m=robust.false_ranges_per_frame / reach_m,
             field_of_view_rad=robust.field_of_view_rad,
@@ -176,10 +177,10 @@ def back_end_parameters(
     )
 
 
-def belief_of(back_end: RobustBackEnd, lost_covariance: Array | None = None) -> Belief:
+def belief_of(back_end: RobustBackEnd, lost_pose: tuple[Array, Array] | None = None) -> Belief:
     """Return pose and reported landmarks with additive errors, as a belief of its own.
 
-    While the robot is lost its pose on the map has the covariance ``lost_covariance`` (3, 3).
+    While the robot is lost, ``lost_pose`` replaces its pose (3,) and covariance (3, 3).
 
     With e_add = e + t e_th, t = J x for every point x (``State.additive_transform``), the
     covariance is P + t p_th^T + p_th t^T + P_thth t t^T: O(m^2), not a product of matrices.
@@ -194,11 +195,12 @@ def belief_of(back_end: RobustBackEnd, lost_covariance: Array | None = None) -> 
     )
     along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
     covariance = P + (along + along.T)
-    if lost_covariance is not None:
+    pose = state.pose
+    if lost_pose is not None:
         covariance[:3], covariance[:, :3] = 0.0, 0.0
-        covariance[:3, :3] = lost_covariance
+        pose, covariance[:3, :3] = lost_pose
     return Belief(
-        mean=np.concatenate([state.pose, landmarks.ravel()]),
+        mean=np.concatenate([pose, landmarks.ravel()]),
         covariance=covariance,
         landmark_ids=tuple(state.landmark_ids[row] for row in rows),
         next_id=state.next_id,

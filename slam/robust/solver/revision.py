@@ -26,7 +26,7 @@ _SIGMA_PER_MEDIAN, _MOST_SIGMAS, _FEWEST_RANGES = 1.4826, 3.0, 200
 # Over so many keyframes the errors of the ranges of one landmark are correlated; the weight of the
 # noise of all landmarks in that of one, in such groups; and limits of `RangeErrors.variance_share`
 _KEYS_PER_PASSAGE, _PRIOR_PASSAGES, _LEAST_SHARE, _MOST_SHARE = 5, 5, 0.5, 50.0
-_PRIOR_GROUPS = 30  # weight, in groups, of the prior that errors are as large as their sigmas
+_PRIOR_GROUPS = 30  # weight, in groups, of the share that is configured
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 # A group of at least so many ranges is examined from that mean cost on; the evidence [nats] for a
 # place of its own; and steps of the search for it, from each of some displacements
@@ -56,7 +56,7 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
         return False
     _replace(state, solution)
     log.solved(problem, solution.estimate)
-    learn_noise(problem, solution.estimate, state, parameters.walls.roughness_m)
+    learn_noise(problem, solution.estimate, state, parameters)
     return True
 
 
@@ -133,13 +133,15 @@ def _place_apart(
     return best_m, least
 
 
-def learn_noise(problem: Problem, estimate: Estimate, state: State, roughness_m: float) -> None:
+def learn_noise(
+    problem: Problem, estimate: Estimate, state: State, parameters: BackEndParameters
+) -> None:
     """Let the residuals of a solution choose the noise of ranges, of each landmark and of all.
 
     The variance of single ranges is that of their median residual. A landmark's own is believed in
     proportion to its passages, for ranges of one passage err alike. That shows in the sums of
     residuals over some keyframes: had all ranges errors of their own, the variance of a sum would
-    be the number of its terms. A wall's added sigma is never less than its ``roughness_m``.
+    be the number of its terms. A wall's added sigma is never less than `WallRule.roughness_m`.
     """
     n = len(problem.ranges_m)
     if n < _FEWEST_RANGES:
@@ -161,14 +163,15 @@ def learn_noise(problem: Problem, estimate: Estimate, state: State, roughness_m:
         believed = (n_passages * raw + _PRIOR_PASSAGES * of_all) / (n_passages + _PRIOR_PASSAGES)
         own[row] = math.sqrt(max(believed - 1.0, 0.0)) * float(np.median(given_m[mine]))
         if id_ in state.wall_ids:
-            own[row] = max(own[row], roughness_m)
+            own[row] = max(own[row], parameters.walls.roughness_m)
         state.added_sigmas_m[id_] = own[row]
     sigmas_m = np.hypot(given_m, own[at])
     white = np.clip(ratio * given_m / sigmas_m, -_MOST_SIGMAS, _MOST_SIGMAS)
     groups = np.unique(block * len(ids) + at, return_inverse=True)[1]
     sums = np.bincount(groups, white)
     n_groups = len(sums)
-    share = (n_groups * float(np.sum(sums**2)) / n + _PRIOR_GROUPS) / (n_groups + _PRIOR_GROUPS)
+    share = n_groups * float(np.sum(sums**2)) / n + _PRIOR_GROUPS * parameters.ranges.variance_share
+    share /= n_groups + _PRIOR_GROUPS
     share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
     added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
     state.range_errors = RangeErrors(added_m, share)
