@@ -18,7 +18,6 @@ from slam.robust.association import (
     RangeScan,
     View,
     antennas_of,
-    density_per_m2,
     find_known,
     labelled,
     predicted_ranges,
@@ -41,9 +40,15 @@ from slam.robust.initialisation import (
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.map import Existence, apply_merge, find_merge, judge
+from slam.robust.map import Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters, PointRule
-from slam.robust.solver.revision import find_split, is_due, relinearise, solve_whole_run
+from slam.robust.solver.revision import (
+    find_split,
+    is_due,
+    is_one,
+    relinearise,
+    solve_whole_run,
+)
 from slam.robust.solver.run_log import RunLog
 from slam.robust.state import (
     HEAD_SIZE,
@@ -115,6 +120,8 @@ class RobustBackEnd:
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
+        # By ids of landmarks in pairs: at which update the run did not allow them to be one
+        self._refused: dict[tuple[tuple[int, int], ...], int] = {}
 
     @property
     def pose(self) -> Array:
@@ -477,30 +484,32 @@ class RobustBackEnd:
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
 
     def _merge(self) -> None:
-        """Merge landmarks where that is certain."""
+        """Merge landmarks where that is certain, and the whole run allows it."""
         rule = self.parameters.map
         if self._landmark_of_label or self._n_updates % rule.merge_every:
             return
-        merge = find_merge(self.state, self._existence, rule)
+        refused = {
+            pairs
+            for pairs, at in self._refused.items()
+            if self._n_updates - at < rule.refused_updates
+        }
+        merge = find_merge(self.state, self._existence, rule, refused)
         if merge is not None:
-            self._merge_rows(merge.pairs)
+            self.merge_if_possible(merge.pairs)
 
     def merge_if_possible(self, pairs: Sequence[tuple[int, int]]) -> bool:
-        """Merge landmarks, rows of the older first, if the map lets all be one; return whether.
+        """Merge landmarks, rows of the older first, if the whole run allows it; return whether.
 
         Then all poses are solved for again.
         """
-        state, rule = self.state, self.parameters.map
-        density = density_per_m2(state.landmarks_m, rule.merge_reach_m)
-        if not judge(state, tuple(pairs), rule.merge_sigma_m, density).is_possible:
+        state, pairs = self.state, tuple(pairs)
+        ids = named_pairs(state, pairs)
+        if not is_one(self._log, state, pairs, self.parameters):
+            self._refused[ids] = self._n_updates
             return False
-        self._merge_rows(tuple(pairs))
-        self.relinearise()
-        return True
-
-    def _merge_rows(self, pairs: tuple[tuple[int, int], ...]) -> None:
-        ids = [tuple(self.state.landmark_ids[row] for row in pair) for pair in pairs]
-        apply_merge(self.state, pairs, self.parameters.map.merge_sigma_m)
+        apply_merge(state, pairs, self.parameters.map.merge_sigma_m)
         for kept, gone in ids:
             self._existence.merge(kept, gone)
             self._log.rename(gone, kept)
+        self.relinearise()
+        return True

@@ -7,7 +7,7 @@ when one merge, or two disjoint ones together, stand out from all competitors.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -126,21 +126,35 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
         state.remove(row)
 
 
-def find_merge(state: State, existence: Existence, rule: MapRule) -> Identity | None:
-    """Return the merge to be made now, of one pair or two, or None."""
+def named_pairs(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+    """Return the ids of landmarks that are given by row."""
+    return tuple((state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in pairs)
+
+
+def find_merge(
+    state: State,
+    existence: Existence,
+    rule: MapRule,
+    refused: Collection[tuple[tuple[int, int], ...]] = (),
+) -> Identity | None:
+    """Return the merge to be tried now, of one pair or two, or None.
+
+    ``refused`` are those not to be tried, by ids.
+    """
     density = density_per_m2(state.landmarks_m, rule.merge_reach_m)
     single = _candidates(state, existence, rule, density)
     best = certain(single)
     if best is not None:
-        return best
+        return None if named_pairs(state, best.pairs) in refused else best
     likely = [one for one in single if one.is_possible]
-    return certain(
+    best = certain(
         [
             judge(state, one.pairs + other.pairs, rule.merge_sigma_m, density)
             for one, other in combinations(likely, 2)
             if not one.contradicts(other)
         ]
     )
+    return None if best is None or named_pairs(state, best.pairs) in refused else best
 
 
 def _candidates(

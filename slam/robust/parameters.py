@@ -99,6 +99,7 @@ class MapRule:
     merge_every: int = 5  # frames between looks
     merge_reach_m: float = 1.5  # largest distance of two that may be one
     merge_sigma_m: float = 1e-5  # noise of the statement that two landmarks are one
+    refused_updates: int = 200  # after which a merge that the run did not allow is tried again
     apart_frames: int = 3  # two landmarks seen whole in this many common frames are two
     # Steps, ceiling and floor of a landmark's existence score
     hit: float = 1.0

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from scipy.special import chdtri
 
-from slam.robust.parameters import BackEndParameters
+from slam.robust.map import apply_merge
+from slam.robust.parameters import TAIL_PROBABILITY, BackEndParameters
 from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
 from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
 from slam.robust.state import (
@@ -50,14 +53,43 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     """Solve for all poses and replace the belief by the result; return whether it worked."""
     log.since_solved = 0
     problem = log.problem(state, parameters)
-    smoother = Smoother(problem, parameters.relinearisation)
-    solution = smoother.solve(min(log.starts(state, problem), key=smoother.start_cost))
+    solution = _solved(log, state, problem, parameters)
     if solution is None or not is_determined(solution.information):
         return False
     _replace(state, solution)
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state, parameters)
     return True
+
+
+def _solved(
+    log: RunLog, state: State, problem: Problem, parameters: BackEndParameters
+) -> Solution | None:
+    smoother = Smoother(problem, parameters.relinearisation)
+    return smoother.solve(min(log.starts(state, problem), key=smoother.start_cost))
+
+
+def is_one(
+    log: RunLog,
+    state: State,
+    pairs: tuple[tuple[int, int], ...],
+    parameters: BackEndParameters,
+) -> bool:
+    """Return whether the whole run allows that landmarks, by row, are one, in pairs.
+
+    The run is solved for with them as two and as one. The cost may rise by what chance explains:
+    the quantile of chi-square with two degrees of freedom for each pair.
+    """
+    ids = state.landmark_ids
+    same = {ids[gone]: ids[kept] for kept, gone in pairs}
+    merged = copy.deepcopy(state)
+    apply_merge(merged, pairs, parameters.map.merge_sigma_m)
+    apart = _solved(log, state, log.problem(state, parameters), parameters)
+    together = _solved(log, merged, log.problem(merged, parameters, same), parameters)
+    if apart is None or together is None:
+        return False
+    limit = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
+    return together.cost - apart.cost <= limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -14,6 +14,7 @@ q_i the place after the step: a step's turn moves what comes after it.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -304,12 +305,18 @@ class RunLog:
         wanted[-1] = True
         return np.flatnonzero(wanted)
 
-    def problem(self, state: State, parameters: BackEndParameters) -> Problem:
-        """Return all measurements of the landmarks the state has now."""
+    def problem(
+        self, state: State, parameters: BackEndParameters, same: Mapping[int, int] | None = None
+    ) -> Problem:
+        """Return all measurements of the landmarks the state has now.
+
+        ``same`` are the ids of landmarks that are taken for others, and those of the others.
+        """
         rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
+        names = self._names | dict(same or {})
         ranges, points = self._ranges.rows, self._points.rows
-        of_range = self._rows_of(ranges["landmark"], rows)
-        of_point = self._rows_of(points["landmark"], rows)
+        of_range = _rows_of(ranges["landmark"], names, rows)
+        of_point = _rows_of(points["landmark"], names, rows)
         range_rows = np.flatnonzero(of_range >= 0)
         ranges, of_range = ranges[range_rows], of_range[range_rows]
         points, of_point = points[of_point >= 0], of_point[of_point >= 0]
@@ -375,16 +382,19 @@ class RunLog:
         self._causal.rows[:] = all_poses(problem, estimate)[0]
         self._stored_pose = estimate.poses[-1].copy()
 
-    def _rows_of(self, ids: NDArray[np.int32], rows: dict[int, int]) -> Indices:
-        """Return the present row of each id, shape (m,), -1 for landmarks that are gone."""
-        present = np.flatnonzero(np.bincount(ids))
-        final = np.full(int(present[-1]) + 1 if len(present) else 0, -1, dtype=np.intp)
-        for id_ in present.tolist():
-            name: int | None = id_
-            while name is not None and name in self._names:
-                name = self._names[name]
-            final[id_] = -1 if name is None else rows.get(name, -1)
-        return final[ids]
+
+def _rows_of(
+    ids: NDArray[np.int32], names: Mapping[int, int | None], rows: Mapping[int, int]
+) -> Indices:
+    """Return the present row of each id, shape (m,), -1 for landmarks that are gone."""
+    present = np.flatnonzero(np.bincount(ids))
+    final = np.full(int(present[-1]) + 1 if len(present) else 0, -1, dtype=np.intp)
+    for id_ in present.tolist():
+        name: int | None = id_
+        while name is not None and name in names:
+            name = names[name]
+        final[id_] = -1 if name is None else rows.get(name, -1)
+    return final[ids]
 
 
 def fixed_values(state: State) -> Array:
