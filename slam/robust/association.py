@@ -419,12 +419,13 @@ def identity(
 def certain(identities: Sequence[Identity]) -> Identity | None:
     """Return the likeliest of those that are possible and that nothing speaks against.
 
-    What contradicts it must be less likely by `MARGIN_NATS`, possible or not.
+    All being new, and what contradicts it, possible or not, must be less likely by `MARGIN_NATS`.
     """
     ranked = sorted(identities, key=lambda one: -one.evidence)
     for one in ranked:
         rivals = [other for other in ranked if other is not one and one.contradicts(other)]
-        if one.is_possible and all(one.evidence - r.evidence > MARGIN_NATS for r in rivals):
+        least = max([0.0, *(rival.evidence for rival in rivals)])
+        if one.is_possible and one.evidence - least > MARGIN_NATS:
             return one
     return None
 
