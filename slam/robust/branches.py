@@ -246,7 +246,7 @@ class Branches:
         if self.is_lost:
             self.is_lost = total < 0.0
         else:
-            n_against = np.count_nonzero(bounded < 0.0)
+            n_against = int(np.count_nonzero(bounded < 0.0))
             self.is_lost = total < -rule.carry_price and n_against >= rule.least_landmarks
         is_answered = total > rule.carry_price and carry.placed is None
         if is_answered or self._now - carry.since > rule.carry_steps:

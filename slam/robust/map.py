@@ -19,6 +19,7 @@ from slam.robust.association import Identity, certain, density_per_m2, identity
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
 from slam.robust.state import Array, Indices, State
 
+_MOST_LIKELY = 12  # merges of two landmarks of which any two may be made together
 _FLOOR = 1e-12  # what keeps matrices regular, as a share
 
 
@@ -146,11 +147,11 @@ def find_merge(
     best = certain(single)
     if best is not None:
         return None if named_pairs(state, best.pairs) in refused else best
-    likely = [one for one in single if one.is_possible]
+    likely = sorted((one for one in single if one.is_possible), key=lambda one: -one.evidence)
     best = certain(
         [
             judge(state, one.pairs + other.pairs, rule.merge_sigma_m, density)
-            for one, other in combinations(likely, 2)
+            for one, other in combinations(likely[:_MOST_LIKELY], 2)
             if not one.contradicts(other)
         ]
     )
