@@ -20,7 +20,8 @@ Decision
     ranges than the main back end does and its evidence is larger by the price of a carry, and
     dropped when it has not after some steps. Nothing is forgotten before that, and the main back
     end goes on. The robot is reported as lost while the landmarks known before the carry, three or
-    more of them, are against its pose by that price. The question ends when they are for it.
+    more of them, are against its pose by that price, and there are others to be seen. The question
+    ends when they are for it.
 
 While nothing is suspicious that costs a copy of the back end now and then.
 """
@@ -247,7 +248,9 @@ class Branches:
             self.is_lost = total < 0.0
         else:
             n_against = int(np.count_nonzero(bounded < 0.0))
-            self.is_lost = total < -rule.carry_price and n_against >= rule.least_landmarks
+            is_against = total < -rule.carry_price and n_against >= rule.least_landmarks
+            # Radars that hear nothing are no reason to be elsewhere.
+            self.is_lost = is_against and bool(carry.new.reported_rows())
         is_answered = total > rule.carry_price and carry.placed is None
         if is_answered or self._now - carry.since > rule.carry_steps:
             self._carry, self._judged, self.is_lost = None, self._now, False

@@ -309,7 +309,8 @@ def test_a_point_is_matched_by_the_rule_written_out(seed: int, n: int) -> None:
     apart = state.landmarks_m[:, None] - state.landmarks_m[None, :]
     others = int((np.hypot(apart[..., 0], apart[..., 1]) <= rule.merge_reach_m).sum()) - n
     per_m2 = max(others / n, 1.0) / (math.pi * rule.merge_reach_m**2)
-    wanted = squared <= chi2.isf(TAIL_PROBABILITY, 2) and density > per_m2 and clear
+    is_known = density > math.exp(MARGIN_NATS) * per_m2
+    wanted = squared <= chi2.isf(TAIL_PROBABILITY, 2) and is_known and clear
     assert match(state, point, rule) == (best if wanted else None)
 
 
@@ -326,9 +327,9 @@ def sure_point(sigma_m: float, *landmarks_m: tuple[float, float]) -> tuple[State
     return state, point
 
 
-@pytest.mark.parametrize(("sigma_m", "row"), [(1.06, 0), (1.07, None)])
+@pytest.mark.parametrize(("sigma_m", "row"), [(0.236, 0), (0.237, None)])
 def test_a_point_that_is_likelier_new_is_no_match(sigma_m: float, row: int | None) -> None:
-    """1 / (2 pi sigma^2) exceeds one landmark on a disc of 1.5 m for sigma < 1.061 m."""
+    """1 / (2 pi sigma^2) exceeds one landmark on a disc of 1.5 m by 3 nats below 0.2367 m."""
     state, point = sure_point(sigma_m, (1.0, 0.0))
     assert match(state, point, MapRule()) == row
 

@@ -1,6 +1,7 @@
 """A robot that slips or is carried away: both are noticed, and put right from what was measured."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from hil_tests.unit.slam.robust.range_world import (
 from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.branches import Branches, Tally
+from slam.robust.branches import Branches, gain, totals_of
 from slam.robust.parameters import BackEndParameters, BranchRule
 from slam.robust.state import Array
 
@@ -69,8 +70,12 @@ def test_a_carried_robot_finds_itself_on_the_map() -> None:
             carried.append(k)
         if report.lost:
             lost.append(k)
-            assert branches.lost_covariance is not None
-            assert math.sqrt(branches.lost_covariance[0, 0]) > 1.0
+            assert branches.lost_pose is not None
+            pose, covariance = branches.lost_pose
+            assert math.sqrt(covariance[0, 0]) > 1.0
+            # Odometry leads on from where the robot was about when it was carried.
+            moved = between(run.poses[cut], run.poses[k])
+            assert error_m(pose, compose(run.poses[cut - 1], moved)) < 0.25
     assert len(carried) == 1
     assert 0 <= carried[0] - cut <= 80
     assert lost == list(range(carried[0], carried[0] + len(lost)))
@@ -94,7 +99,9 @@ def test_a_slip_is_taken_back() -> None:
     slip = np.array([0.04, 0.0, math.radians(4.0)])
     run = slipped_run(2, slip)
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
-    plain = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    rules = parameters_for(LAB, SIGMA_M)
+    never = replace(rules.relinearisation, steps_per_slip=math.inf)
+    plain = RobustBackEnd(paper_rig(), replace(rules, relinearisation=never))
     for report in follow(branches, run.increments, run.scans):
         assert not report.carried
         assert not report.lost
@@ -161,43 +168,51 @@ def test_a_robot_set_down_is_as_certain_as_the_points_it_sees() -> None:
     assert sigmas[2] < 0.02
 
 
-def tally(*evidence: tuple[int, float]) -> Tally:
-    result = Tally(RULE)
-    result.add(evidence)
-    return result
+def totals(*evidence: tuple[int, float]) -> Array:
+    table = np.array(evidence, dtype=float).reshape(-1, 2)
+    return totals_of([table], known_before=1000, correlated_steps=RULE.correlated_steps)
+
+
+MISSED = [(id_, -3.0) for id_ in (1, 2, 3)] * 20
+PRICE = RULE.carry_price
+
+
+def test_totals_are_sums_of_the_landmarks_known_then() -> None:
+    first, second = np.array([[4.0, 1.0], [2.0, -3.0]]), np.array([[4.0, 2.0], [9.0, 5.0]])
+    found = totals_of([first, np.empty((0, 2)), second], known_before=9, correlated_steps=2.0)
+    assert found.tolist() == [[2.0, -1.5], [4.0, 1.5]]
+    assert totals_of([], known_before=9, correlated_steps=2.0).shape == (0, 2)
 
 
 def test_ranges_that_lie_near_by_chance_for_long_do_not_make_a_place() -> None:
     """Two landmarks that seem to be there do not outweigh three that are missing."""
-    chance = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20, *[(id_, 3.0) for id_ in (4, 5)] * 50)
-    assert chance.total() > RULE.carry_price
-    assert chance.total(RULE.most_for) < 0.0
+    chance = totals(*MISSED, *[(id_, 3.0) for id_ in (4, 5)] * 50)
+    assert chance[:, 1].sum() > 2.0
+    assert gain(chance, totals(*[(id_, -3.0) for id_ in (4, 5)] * 50), RULE) < 0.0
 
 
 def test_two_landmarks_do_not_make_a_place() -> None:
     """Alone they do not exceed the price; a third one must confirm them."""
-    main, most = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20), RULE.carry_price / 2.0
-    two = tally(*[(id_, 3.0) for id_ in (1, 2)] * 50, *[(3, -3.0)] * 20)
-    three = tally(*[(id_, 3.0) for id_ in (1, 2, 3)] * 50)
-    assert two.gain(main, 100.0) > RULE.carry_price
-    assert two.gain(main, most) <= RULE.carry_price
-    assert three.gain(main, most) > RULE.carry_price
+    main = totals(*MISSED)
+    two = totals(*[(id_, 3.0) for id_ in (1, 2)] * 50, *[(3, -3.0)] * 20)
+    three = totals(*[(id_, 3.0) for id_ in (1, 2, 3)] * 50)
+    assert gain(two, main, RULE) <= PRICE
+    assert gain(three, main, RULE) > PRICE
 
 
-def test_the_evidence_of_one_landmark_against_a_place_is_bounded() -> None:
-    gone, most = tally(*[(1, -3.0)] * 100), RULE.most_against
-    assert gone.total() == pytest.approx(-most)
-    several = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 100)
-    assert several.total() == pytest.approx(-3.0 * most)
+def test_the_evidence_of_one_landmark_is_bounded() -> None:
+    """However long one landmark is missed at the main back end's pose, it is one landmark."""
+    gone, there = totals(*[(1, -3.0)] * 1000), totals(*[(1, 3.0)] * 1000)
+    assert gain(there, gone, RULE) <= PRICE / 2.0
+    assert gain(there, gone, RULE) <= RULE.most_for
 
 
 def test_a_place_that_explains_less_is_not_likelier() -> None:
     """However much the other one misses: a pose of which little is certain misses little."""
-    main = tally(*[(id_, -3.0) for id_ in (1, 2, 3)] * 20, *[(4, 3.0)] * 5)
-    silent, better = tally(), tally(*[(id_, 3.0) for id_ in (1, 2, 3, 5)] * 20)
-    assert silent.total() > main.total()
-    assert silent.gain(main, 100.0) < 0.0
-    assert better.gain(main, 100.0) > RULE.carry_price
+    main = totals(*MISSED, *[(4, 3.0)] * 5)
+    silent, better = totals(), totals(*[(id_, 3.0) for id_ in (1, 2, 3, 5)] * 20)
+    assert gain(silent, main, RULE) < 0.0
+    assert gain(better, main, RULE) > PRICE
 
 
 def test_evidence_is_the_likelihood_of_the_ranges() -> None:
@@ -254,3 +269,30 @@ def test_a_robot_carried_to_where_nothing_is_missed_recognises_the_place() -> No
     assert len(carried) == 1
     assert carried[0] > cut
     assert error_m(branches.main.pose, poses[-1]) < 0.03
+
+
+def test_a_robot_that_sees_fewer_than_three_landmarks_is_not_lost() -> None:
+    """Two landmarks that were taken away say nothing of the robot."""
+    rng, poses = np.random.default_rng(9), straight(70)
+    increments = reported(poses, LAB, rng, 0.0)
+    before = list(scans_of(poses[:76], PLACES, rng, SIGMA_M))
+    after = list(scans_of(poses[75:], PLACES[[0, 1, 2, 4, 5]], rng, SIGMA_M))
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    reports = list(follow(branches, increments, [*before, *after]))
+    assert not any(report.lost or report.carried for report in reports)
+    assert error_m(branches.main.pose, poses[-1]) < 0.03
+
+
+def test_ids_after_a_carry_are_of_no_other_landmark() -> None:
+    """What the robot maps at the wrong place before it finds itself keeps its ids to itself."""
+    run, cut = carried_run(0)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    wrong: set[int] = set()
+    known = 0
+    for k, report in enumerate(follow(branches, run.increments, run.scans), start=1):
+        if k == cut:
+            known = branches.main.state.next_id
+        if k > cut and (report.lost or not wrong):
+            wrong |= {id_ for id_ in branches.main.state.landmark_ids if id_ >= known}
+    end = {id_ for id_ in branches.main.state.landmark_ids if id_ >= known}
+    assert not end & wrong

@@ -150,8 +150,9 @@ def test_a_merge_must_stand_out_from_its_rivals() -> None:
     [
         (0.069, 0.02, False),
         (0.070, 0.02, True),  # 12^0.5 sigma: 3 nats less likely, as each is unsure by sigma
-        (9.0, 0.751, False),
-        (9.0, 0.749, True),  # below 0.75 m, 1 / (4 pi sigma^2) exceeds one on a disc of 1.5 m
+        # Below 0.1673 m, 1 / (4 pi sigma^2) exceeds one on a disc of 1.5 m by 3 nats.
+        (9.0, 0.168, False),
+        (9.0, 0.167, True),
     ],
 )
 def test_a_merge_is_made_from_the_likelihood_margin_and_the_density_on(

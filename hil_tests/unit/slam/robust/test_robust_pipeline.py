@@ -103,9 +103,10 @@ def test_ranges_correct_wheels_that_report_too_much() -> None:
     def odometry(t_ns: int) -> Array:
         return straight(t_ns) * 1.02
 
-    # Or offsets, mounts and radii may explain it.
+    # Or offsets, mounts, radii and errors common to the ranges of a passage may explain it.
     names = ("offset_sigma_m", "mount_sigma_m", "radius_sigma_m")
-    calibrated = override(ROBUST, {f"robust.{name}": "0" for name in names})
+    known = {f"robust.{name}": "0" for name in names} | {"robust.range_variance_share": "1"}
+    calibrated = override(ROBUST, known)
     beliefs = drive(robust(calibrated), 130, odometry)
     assert len(beliefs) == 129
     end = straight(129 * TICK_NS)

@@ -175,8 +175,9 @@ def test_walls_match_only_where_they_were_seen() -> None:
 @pytest.mark.parametrize(
     ("others_m", "sigmas", "row"),
     [
-        ((), (1.49, 1.0), 0),
-        ((), (1.51, 1.0), None),  # 1 / (2 pi 1.5) is one wall in all directions and up to 1.5 m
+        # 1 / (2 pi 1.5) is one wall in all directions and up to 1.5 m; 1.5 / e^3 = 0.07468
+        ((), (0.0746, 1.0), 0),
+        ((), (0.0748, 1.0), None),
         ((1.244,), (0.01, 0.1), None),
         ((1.246,), (0.01, 0.1), 0),  # (0.245 m / 0.1 m)^2 is the likelihood margin, 6
     ],
