@@ -77,15 +77,20 @@ def is_one(
 ) -> bool:
     """Return whether the whole run allows that landmarks, by row, are one, in pairs.
 
-    The run is solved for with them as two and as one. The cost may rise by what chance explains:
-    the quantile of chi-square with two degrees of freedom for each pair.
+    The run is solved for with them as two and as one, their ranges having the noise of the noisier
+    one. The cost may rise by what chance explains: the quantile of chi-square with two degrees of
+    freedom for each pair.
     """
     ids = state.landmark_ids
     same = {ids[gone]: ids[kept] for kept, gone in pairs}
-    merged = copy.deepcopy(state)
-    apply_merge(merged, pairs, parameters.map.merge_sigma_m)
-    apart = _solved(log, state, log.problem(state, parameters), parameters)
-    together = _solved(log, merged, log.problem(merged, parameters, same), parameters)
+    two, one = copy.deepcopy(state), copy.deepcopy(state)
+    for gone, kept in same.items():
+        added_m = max(state.added_sigmas_m.get(id_, 0.0) for id_ in (kept, gone))
+        two.added_sigmas_m |= {kept: added_m, gone: added_m}
+        one.added_sigmas_m[kept] = added_m
+    apply_merge(one, pairs, parameters.map.merge_sigma_m)
+    apart = _solved(log, two, log.problem(two, parameters), parameters)
+    together = _solved(log, one, log.problem(one, parameters, same), parameters)
     if apart is None or together is None:
         return False
     limit = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))

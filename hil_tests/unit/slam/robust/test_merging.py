@@ -1,0 +1,135 @@
+"""Landmarks are merged where the whole run allows it, and the noise of ranges that is assumed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.slam.robust.range_world import (
+    LAB,
+    follow,
+    parameters_for,
+    reported,
+    scans_of,
+)
+from hil_tests.unit.slam.robust.test_initialisation import mapped
+from slam.config import WheelNoise, load_preset, override
+from slam.geometry import paper_rig
+from slam.robust.association import Identity
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.map import find_merge, judge, named_pairs
+from slam.robust.parameters import BackEndParameters, MapRule
+from slam.robust.pipeline import RobustSlam
+from slam.robust.state import Array, State
+
+Pairs = tuple[tuple[int, int], ...]
+
+SIGMA_M = 4e-3
+PLACES = np.array([[0.1, 0.9], [0.55, 0.7], [0.95, 1.1], [0.3, -0.8], [0.8, -1.0]])
+
+
+def after_a_drive(seed: int, places: Array) -> RobustBackEnd:
+    """Return a back end that has driven past some landmarks and half the way back."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(0.0, 1.3, 0.02)
+    there = np.column_stack([x, np.zeros((len(x), 2))])
+    poses = np.vstack([there, there[::-1][:40]])
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    increments = reported(poses, LAB, rng, 0.0)
+    list(follow(back_end, increments, scans_of(poses, places, rng, SIGMA_M)))
+    return back_end
+
+
+def with_doubled_landmark(back_end: RobustBackEnd) -> int:
+    """Give the later ranges of the first landmark to a new one at its place; return its row."""
+    state, log = back_end.state, back_end._log
+    landmark_id = state.landmark_ids[0]
+    problem = log.problem(state, back_end.parameters)
+    rows = problem.range_rows[problem.range_landmarks == 0]
+    size = state.layout.landmark_size
+    new_id = state.augment(
+        state.landmarks_m[0] + [0.002, -0.001], np.zeros((state.P.size, size)), np.eye(size)
+    )
+    assert new_id != landmark_id
+    back_end._existence.hit(new_id, log.split_off(rows[len(rows) // 2 :], new_id))
+    assert back_end.relinearise()
+    return state.landmark_ids.index(new_id)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_landmark_mapped_twice_becomes_one(seed: int) -> None:
+    back_end = after_a_drive(seed, PLACES)
+    single = back_end.state.landmarks_m[0].copy()
+    twice = with_doubled_landmark(back_end)
+    n, kept = len(back_end.state.landmark_ids), back_end.state.landmark_ids[0]
+    assert back_end.merge_if_possible([(0, twice)])
+    assert len(back_end.state.landmark_ids) == n - 1
+    row = back_end.state.landmark_ids.index(kept)
+    assert back_end.state.landmarks_m[row] == pytest.approx(single, abs=2e-3)
+
+
+@pytest.mark.parametrize("apart_m", [0.06, 0.15, 0.3])
+def test_two_landmarks_stay_two_where_the_run_says_so(apart_m: float) -> None:
+    """Both are known to about two millimetres."""
+    places = np.vstack([PLACES[1:], PLACES[1] + [apart_m, 0.0]])
+    back_end = after_a_drive(3, places)
+    state = back_end.state
+    found = [int(np.argmin(np.hypot(*(state.landmarks_m - place).T))) for place in places[[0, -1]]]
+    if found[0] == found[1]:  # echoes so near each other are tracked as one
+        assert apart_m < 0.1
+        return
+    pair = (min(found), max(found))
+    before, covariance = state.landmarks_m.copy(), state.P.full()
+    assert not back_end.merge_if_possible([pair])
+    assert np.array_equal(state.landmarks_m, before)
+    assert np.array_equal(state.P.full(), covariance)
+    assert named_pairs(state, (pair,)) in back_end._refused
+
+
+def test_a_merge_that_was_refused_is_not_tried_again_at_once() -> None:
+    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
+    merge = find_merge(state, existence, MapRule())
+    assert merge is not None
+    refused = {named_pairs(state, merge.pairs)}
+    assert find_merge(state, existence, MapRule(), refused) is None
+    assert find_merge(state, existence, MapRule(), {((7, 8),)}) is not None
+
+
+def test_only_the_likeliest_merges_are_tried_in_twos(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of forty landmarks that could all be each other, pairs of pairs would be 300 000."""
+    rng, judged = np.random.default_rng(0), []
+    state, existence = mapped(rng.uniform(0.0, 0.05, (40, 2)), 0.1)
+    original = judge
+
+    def counted(state: State, pairs: Pairs, sigma_m: float, density: float) -> Identity:
+        judged.append(pairs)
+        return original(state, pairs, sigma_m, density)
+
+    monkeypatch.setattr("slam.robust.map.judge", counted)
+    assert find_merge(state, existence, MapRule()) is None
+    twos = [pairs for pairs in judged if len(pairs) == 2]
+    assert len(judged) - len(twos) == 40 * 39 // 2
+    assert 0 < len(twos) <= 12 * 11 // 2
+
+
+def test_the_share_of_the_preset_is_where_the_back_end_begins() -> None:
+    config = override(load_preset("robust"), {"robust.range_variance_share": "2.5"})
+    slam = RobustSlam(config, paper_rig(), WheelNoise())
+    assert slam.back_end.state.range_errors.variance_share == 2.5
+    plain = RobustBackEnd(paper_rig(), BackEndParameters())
+    assert plain.state.range_errors.variance_share == 1.0
+
+
+def test_ranges_that_err_alike_move_the_pose_less() -> None:
+    """With four times the variance of averages, the filter is less sure by up to twice."""
+    sigmas = []
+    for share in (1.0, 4.0):
+        rng = np.random.default_rng(5)
+        x = np.arange(0.0, 0.5, 0.02)
+        poses = np.column_stack([x, np.zeros((len(x), 2))])
+        config = override(load_preset("robust"), {"robust.range_variance_share": str(share)})
+        back_end = RobustSlam(config, paper_rig(), WheelNoise()).back_end
+        increments = reported(poses, LAB, rng, 0.0)
+        list(follow(back_end, increments, scans_of(poses, PLACES, rng, SIGMA_M)))
+        sigmas.append(math.sqrt(back_end.pose_covariance[0, 0]))
+    assert 1.0 < sigmas[1] / sigmas[0] <= 2.0
