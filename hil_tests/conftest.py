@@ -1,5 +1,6 @@
 """Shared pytest configuration: Hypothesis profiles, slow tests, what an installed package runs."""
 
+import importlib
 import importlib.util
 import os
 import signal
@@ -40,7 +41,15 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if IN_SOURCE_TREE and getattr(config.option, "numprocesses", None):
+        _compile_once()  # workers load what is compiled; each would compile all
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
+
+
+def _compile_once() -> None:
+    for module in ("slam.front_end.kernels", "slam.robust.kernels"):
+        importlib.import_module(module)
+    sys.modules["slam.compiled"].compile_kernels()
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
