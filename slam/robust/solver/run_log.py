@@ -226,7 +226,7 @@ class RunLog:
         No range is referred to a keyframe through a loose step: its noise is not the wheels'.
         """
         if is_loose:
-            self._is_key.rows[-1] = True
+            self._mark_key()
         self._is_key.append(is_loose)
         self._steps.append(increment)
         self._covariances.append(motion.covariance)
@@ -242,7 +242,7 @@ class RunLog:
 
     def set_causal(self, pose: Array) -> None:
         """Store the filter's newest pose, its measurements included."""
-        self._causal.rows[-1] = pose
+        self._causal.rows_to_write(self.n_poses - 1)[0] = pose
 
     def parted(self, pose: Array) -> tuple[float, float]:
         """Return how far [m], and by what angle [rad], a pose is from the stored trajectory."""
@@ -275,8 +275,12 @@ class RunLog:
 
     def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
         root = np.linalg.inv(np.linalg.cholesky(covariance))
-        self._is_key.rows[-1] = True
+        self._mark_key()
         self._points.append((self.n_poses - 1, landmark_id, point.tolist(), root.tolist()))
+
+    def _mark_key(self) -> None:
+        """Let the newest pose be a keyframe."""
+        self._is_key.rows_to_write(self.n_poses - 1)[0] = True
 
     def rename(self, gone: int, kept: int) -> None:
         self._names[gone] = kept
@@ -292,7 +296,7 @@ class RunLog:
 
     def split_off(self, rows: Indices, landmark_id: int) -> int:
         """Take ranges from their landmark and give them to a new one; return of how many poses."""
-        ranges = self._ranges.rows
+        ranges = self._ranges.rows_to_write()
         ranges["landmark"][rows] = landmark_id
         return len(np.unique(ranges["pose"][rows]))
 
@@ -379,7 +383,7 @@ class RunLog:
 
     def solved(self, problem: Problem, estimate: Estimate) -> None:
         """Store the trajectory of a solution."""
-        self._causal.rows[:] = all_poses(problem, estimate)[0]
+        self._causal.rows_to_write()[:] = all_poses(problem, estimate)[0]
         self._stored_pose = estimate.poses[-1].copy()
 
 
