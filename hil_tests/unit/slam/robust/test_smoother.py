@@ -511,7 +511,7 @@ def test_a_landmark_whose_ranges_weigh_nothing_is_unknown_and_the_rest_is_solved
     back_end = driven(200, 2e-3)
     state, log = back_end.state, back_end._log
     assert relinearise(log, state, back_end.parameters)
-    ranges = log._ranges.rows
+    ranges = log._ranges.rows_to_write()
     ranges["sigma_m"][ranges["landmark"] == state.landmark_ids[-1]] = 1e6
     assert _is_sane(state)
     assert relinearise(log, state, back_end.parameters)
@@ -523,7 +523,7 @@ def test_landmarks_merged_by_mistake_are_taken_apart_by_the_next_solution() -> N
     state, log = back_end.state, back_end._log
     assert back_end.relinearise()
     ids, places, pose = state.landmark_ids.copy(), state.landmarks_m.copy(), back_end.pose
-    ranges = log._ranges.rows
+    ranges = log._ranges.rows_to_write()
     by_count = sorted(ids, key=lambda id_: int(np.sum(ranges["landmark"] == id_)))
     gone, kept = by_count[-2:]
     log.rename(gone, kept)
