@@ -379,8 +379,8 @@ class RobustConfig(_Model):
     # position is that of the rig, targets are points.
     mount_sigma_m: NonNegative = 0.0
     radius_sigma_m: NonNegative = 0.0
-    # By how much the variance of a range counts for more where many are averaged, until the ranges
-    # of the run show it: those of one passage err alike.
+    # Factor on the variance of a range where many are averaged, until the ranges of the run show
+    # it: those of one passage err alike.
     range_variance_share: Positive = 1.0
     # Ranges of nothing that stands there, per radar and frame.
     false_ranges_per_frame: Positive = 0.05

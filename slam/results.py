@@ -158,8 +158,8 @@ class UpdateReport:
     # Of each range of a landmark, and of each landmark that gave none: its id, and the logarithm of
     # the likelihood ratio [nats] of the estimated pose to any other
     evidence: tuple[tuple[int, float], ...] = ()
-    # Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
-    # and covariance say nothing but that
+    # Whether a kidnapping was detected now; whether the place on the map is unknown: the pose is
+    # that before it and odometry since then, and its covariance covers the map
     carried: bool = False
     lost: bool = False
 

@@ -25,7 +25,7 @@ least sum is found by branch and bound, as joint compatibility is (Neira and Tar
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -416,16 +416,20 @@ def identity(
     return Identity(pairs=pairs, mahalanobis_sq=distance, evidence=evidence)
 
 
-def certain(identities: Sequence[Identity]) -> Identity | None:
+def certain(
+    identities: Sequence[Identity], refused: Collection[tuple[tuple[int, int], ...]] = ()
+) -> Identity | None:
     """Return the likeliest of those that are possible and that nothing speaks against.
 
-    All being new, and what contradicts it, possible or not, must be less likely by `MARGIN_NATS`.
+    That all things are new, and each identity that contradicts it, possible or not, must be less
+    likely by `MARGIN_NATS`. Those with the pairs ``refused`` are not returned.
     """
     ranked = sorted(identities, key=lambda one: -one.evidence)
     for one in ranked:
         rivals = [other for other in ranked if other is not one and one.contradicts(other)]
         least = max([0.0, *(rival.evidence for rival in rivals)])
-        if one.is_possible and one.evidence - least > MARGIN_NATS:
+        is_certain = one.is_possible and one.evidence - least > MARGIN_NATS
+        if is_certain and one.pairs not in refused:
             return one
     return None
 

@@ -46,6 +46,7 @@ from slam.robust.solver.revision import (
     find_split,
     is_due,
     is_one,
+    noisier,
     relinearise,
     solve_whole_run,
 )
@@ -120,7 +121,7 @@ class RobustBackEnd:
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
-        # By ids of landmarks in pairs: at which update the run did not allow them to be one
+        # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[tuple[tuple[int, int], ...], int] = {}
 
     @property
@@ -485,15 +486,12 @@ class RobustBackEnd:
 
     def _merge(self) -> None:
         """Merge landmarks where that is certain, and the whole run allows it."""
-        rule = self.parameters.map
-        if self._landmark_of_label or self._n_updates % rule.merge_every:
+        rule, now = self.parameters.map, self._n_updates
+        if self._landmark_of_label or now % rule.merge_every:
             return
-        refused = {
-            pairs
-            for pairs, at in self._refused.items()
-            if self._n_updates - at < rule.refused_updates
-        }
-        merge = find_merge(self.state, self._existence, rule, refused)
+        kept = self._refused.items()
+        self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
+        merge = find_merge(self.state, self._existence, rule, self._refused)
         if merge is not None:
             self.merge_if_possible(merge.pairs)
 
@@ -502,14 +500,17 @@ class RobustBackEnd:
 
         Then all poses are solved for again.
         """
-        state, pairs = self.state, tuple(pairs)
+        state, pairs, existence = self.state, tuple(pairs), self._existence
         ids = named_pairs(state, pairs)
+        if any(existence.are_apart(*pair) for pair in ids):
+            return False
         if not is_one(self._log, state, pairs, self.parameters):
             self._refused[ids] = self._n_updates
             return False
+        state.added_sigmas_m |= noisier(state, {gone: kept for kept, gone in ids})
         apply_merge(state, pairs, self.parameters.map.merge_sigma_m)
         for kept, gone in ids:
-            self._existence.merge(kept, gone)
+            existence.merge(kept, gone)
             self._log.rename(gone, kept)
         self.relinearise()
         return True

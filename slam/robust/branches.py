@@ -1,4 +1,4 @@
-"""Kidnapping: the question whether the robot was carried, and whereto.
+"""Kidnapping: the question whether the robot was carried, and to which place.
 
 The back end itself believes its odometry. ``Branches`` keep its last motions and scans, and the
 evidence of each range for its pose (``UpdateReport.evidence``).
@@ -20,8 +20,8 @@ Decision
     ranges than the main back end does and its evidence is larger by the price of a carry, and
     dropped when it has not after some steps. Nothing is forgotten before that, and the main back
     end goes on. The robot is reported as lost while the landmarks known before the carry, three or
-    more of them, are against its pose by that price, and there are others to be seen. The question
-    ends when they are for it.
+    more of them, are against its pose by that price, and others are seen. That ends when they are
+    for its pose, or a place is adopted, or after `BranchRule.carry_steps` with no place on trial.
 
 While nothing is suspicious that costs a copy of the back end now and then.
 """
@@ -56,7 +56,7 @@ _NEWEST, _OLD_AND_NEW = 8, 2
 # By how much the covariance of the points is enlarged by which the robot is set down
 _WEAKENED = 4.0
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
-_IDS_APART = 100
+_IDS_APART = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,9 +107,9 @@ def gain(own: Array, main: Array, rule: BranchRule) -> float:
 class Placed:
     """The map before a carry with the robot set down on it; it takes the steps since."""
 
-    def __init__(self, back_end: RobustBackEnd, carry: Carry, until: int) -> None:
+    def __init__(self, back_end: RobustBackEnd, carry: Carry) -> None:
         self.back_end = back_end
-        self.until = until  # step at which it is dropped
+        self.until: int | None = None  # step at which it is dropped, once it has caught up
         self.next_step = carry.since
         self.evidence: list[Array] = []
 
@@ -132,6 +132,7 @@ class Carry:
     new: RobustBackEnd  # with an empty map at first
     next_step: int  # that the new map has not taken yet
     search_from: int  # the step from which on its place is searched for
+    moved: Array  # shape (3,): odometry since
     placed: Placed | None = None
 
 
@@ -162,13 +163,13 @@ class Branches:
     def lost_pose(self) -> tuple[Array, Array] | None:
         """Return pose (3,) and covariance (3, 3) to report while the robot is lost, None else.
 
-        The pose is that before the carry, moved by odometry since.
+        The pose is that before the carry, and odometry since.
         """
         if not self.is_lost or self._carry is None:
             return None
         sigma_m = self._rule.lost_position_m
         covariance = np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
-        return compose(self._carry.map.pose, self._carry.new.pose), covariance
+        return compose(self._carry.map.pose, self._carry.moved), covariance
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
@@ -176,6 +177,8 @@ class Branches:
             self._keep_snapshot()
         self._motion = increment, covariance
         self.main.predict(increment, covariance)
+        if self._carry is not None:
+            self._carry.moved = compose(self._carry.moved, increment)
 
     def update(self, scans: Sequence[RangeScan]) -> UpdateReport:
         """Take in the scans of one time; a radar without a frame is absent, not empty."""
@@ -233,26 +236,31 @@ class Branches:
             for number in range(placed.next_step, min(placed.next_step + _CATCH_UP, self._now)):
                 placed.take(self._steps[number], is_first=number == carry.since)
             if placed.next_step == self._now:
-                own = totals_of(placed.evidence, carry.next_id, rule.correlated_steps)
-                main = self._totals(carry, carry.since)
-                if gain(own, main, rule) > rule.carry_price:
+                if placed.until is None:
+                    placed.until = self._now + _PLACE_PATIENCE * rule.steps
+                first = max(carry.since, self._now - rule.lost_steps)
+                tables = placed.evidence[first - carry.since :]
+                own = totals_of(tables, carry.next_id, rule.correlated_steps)
+                if gain(own, self._totals(carry, first), rule) > rule.carry_price:
                     self._adopt(placed.back_end)
                     return True
-            if self._now > placed.until:
-                carry.placed = None
+                if self._now > placed.until:
+                    carry.placed, carry.search_from = None, self._now
         # What one landmark says is bounded: it may be hidden or gone, or others may look like it.
         of_landmarks = self._totals(carry, max(carry.since, self._now - rule.lost_steps))[:, 1]
         bounded = np.clip(of_landmarks, -rule.most_against, rule.most_for)
         total = float(bounded.sum())
         if self.is_lost:
-            self.is_lost = total < 0.0
+            # Nothing seen of the old map is no evidence for the pose.
+            n_for = int(np.count_nonzero(bounded > 0.0))
+            self.is_lost = total <= 0.0 or n_for < rule.least_landmarks
         else:
             n_against = int(np.count_nonzero(bounded < 0.0))
             is_against = total < -rule.carry_price and n_against >= rule.least_landmarks
             # Radars that hear nothing are no reason to be elsewhere.
             self.is_lost = is_against and bool(carry.new.reported_rows())
-        is_answered = total > rule.carry_price and carry.placed is None
-        if is_answered or self._now - carry.since > rule.carry_steps:
+        is_answered = total > rule.carry_price or self._now - carry.since > rule.carry_steps
+        if is_answered and carry.placed is None:
             self._carry, self._judged, self.is_lost = None, self._now, False
         return False
 
@@ -332,7 +340,12 @@ class Branches:
 
     def _begin_carry(self, since: int) -> None:
         before = self._at(since)
-        if len(before.reported_rows()) >= self._rule.least_landmarks:
+        if len(before.reported_rows()) < self._rule.least_landmarks:
+            self._judged = self._now  # no place can be found on such a map
+        else:
+            moved = np.zeros(3)
+            for number in range(since + 1, self._now):
+                moved = compose(moved, self._steps[number].increment)
             self._carry = Carry(
                 since=since,
                 next_id=self._steps[since].next_id,
@@ -340,6 +353,7 @@ class Branches:
                 new=before.with_empty_map(),
                 next_step=since,
                 search_from=self._now,
+                moved=moved,
             )
 
     def _search(self, carry: Carry) -> None:
@@ -360,5 +374,4 @@ class Branches:
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)
         back_end.state.next_id = self.main.state.next_id + _IDS_APART
-        until = carry.search_from = self._now + _PLACE_PATIENCE * rule.steps
-        carry.placed = Placed(back_end, carry, until)
+        carry.placed = Placed(back_end, carry)

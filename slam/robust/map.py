@@ -1,13 +1,14 @@
 """Map management: existence and merging.
 
 The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
-merging after a loop bends the trajectory back, and everything correlated with it. It is made late,
-when one merge, or two disjoint ones together, stand out from all competitors.
+merging after a loop bends the trajectory back, and everything correlated with it. It is proposed
+late, when one merge, or two disjoint ones together, stand out from all competitors; whether it is
+made, the solution over the whole run decides (`slam.robust.solver.revision.is_one`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -19,8 +20,10 @@ from slam.robust.association import Identity, certain, density_per_m2, identity
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
 from slam.robust.state import Array, Indices, State
 
-_MOST_LIKELY = 12  # merges of two landmarks of which any two may be made together
+_MOST_LIKELY = 12  # how many single merges are combined in twos
 _FLOOR = 1e-12  # what keeps matrices regular, as a share
+
+Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(slots=True)
@@ -127,35 +130,38 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
         state.remove(row)
 
 
-def named_pairs(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
-    """Return the ids of landmarks that are given by row."""
-    return tuple((state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in pairs)
+def named_pairs(state: State, pairs: Pairs) -> Pairs:
+    """Return the ids of landmarks that are given by row, in order."""
+    ids = state.landmark_ids
+    return tuple(sorted((ids[kept], ids[gone]) for kept, gone in pairs))
 
 
 def find_merge(
-    state: State,
-    existence: Existence,
-    rule: MapRule,
-    refused: Collection[tuple[tuple[int, int], ...]] = (),
+    state: State, existence: Existence, rule: MapRule, refused: Collection[Pairs] = ()
 ) -> Identity | None:
     """Return the merge to be tried now, of one pair or two, or None.
 
-    ``refused`` are those not to be tried, by ids.
+    ``refused`` are those not to be tried, as ``named_pairs`` returns them.
     """
     density = density_per_m2(state.landmarks_m, rule.merge_reach_m)
     single = _candidates(state, existence, rule, density)
-    best = certain(single)
+    best = _certain(state, single, refused)
     if best is not None:
-        return None if named_pairs(state, best.pairs) in refused else best
+        return best
     likely = sorted((one for one in single if one.is_possible), key=lambda one: -one.evidence)
-    best = certain(
-        [
-            judge(state, one.pairs + other.pairs, rule.merge_sigma_m, density)
-            for one, other in combinations(likely[:_MOST_LIKELY], 2)
-            if not one.contradicts(other)
-        ]
-    )
-    return None if best is None or named_pairs(state, best.pairs) in refused else best
+    twos = [
+        judge(state, one.pairs + other.pairs, rule.merge_sigma_m, density)
+        for one, other in combinations(likely[:_MOST_LIKELY], 2)
+        if not one.contradicts(other)
+    ]
+    return _certain(state, twos, refused)
+
+
+def _certain(
+    state: State, merges: Sequence[Identity], refused: Collection[Pairs]
+) -> Identity | None:
+    pairs = [one.pairs for one in merges]
+    return certain(merges, [rows for rows in pairs if named_pairs(state, rows) in refused])
 
 
 def _candidates(

@@ -183,8 +183,8 @@ class BranchRule:
     suspicious: float = 12.0
     carry_price: float = 20.0
     steps: int = 15  # over which a place proves itself
-    lost_steps: int = 100  # whose evidence decides whether the robot is lost
-    carry_steps: int = 1000  # after which the question is dropped
+    lost_steps: int = 100  # the last so many decide whether the robot is lost, or at a place
+    carry_steps: int = 1000  # after which the question is dropped, unless a place is on trial
     # Fewest landmarks that place a map on another, and how far lengths and places may
     # differ in a guess
     least_landmarks: int = 3

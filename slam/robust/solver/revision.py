@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -35,6 +36,7 @@ _UNKNOWN = 100.0  # standard deviation of what is not determined
 # place of its own; and steps of the search for it, from each of some displacements
 _SUSPECT_MEAN, _FEWEST_OF_GROUP, _SPLIT_NATS, _ALONE_STEPS = 4.0, 15, 20.0, 8
 _TRIED_M = ((0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2))
+_LEAST_FIT = 0.5  # share of the ranges of a landmark that fit if it is another one
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
 
 
@@ -78,23 +80,39 @@ def is_one(
     """Return whether the whole run allows that landmarks, by row, are one, in pairs.
 
     The run is solved for with them as two and as one, their ranges having the noise of the noisier
-    one. The cost may rise by what chance explains: the quantile of chi-square with two degrees of
-    freedom for each pair.
+    one. The cost may rise by what chance explains, the quantile of chi-square with two degrees of
+    freedom for each pair, and most ranges of each landmark must fit where it is then.
     """
     ids = state.landmark_ids
     same = {ids[gone]: ids[kept] for kept, gone in pairs}
-    two, one = copy.deepcopy(state), copy.deepcopy(state)
-    for gone, kept in same.items():
-        added_m = max(state.added_sigmas_m.get(id_, 0.0) for id_ in (kept, gone))
-        two.added_sigmas_m |= {kept: added_m, gone: added_m}
-        one.added_sigmas_m[kept] = added_m
+    two, one = copy.copy(state), copy.deepcopy(state)
+    two.added_sigmas_m = state.added_sigmas_m | noisier(state, same)
+    one.added_sigmas_m |= noisier(state, same)
     apply_merge(one, pairs, parameters.map.merge_sigma_m)
-    apart = _solved(log, two, log.problem(two, parameters), parameters)
-    together = _solved(log, one, log.problem(one, parameters, same), parameters)
-    if apart is None or together is None:
+    problem = log.problem(two, parameters)
+    apart = _solved(log, two, problem, parameters)
+    merged = log.problem(one, parameters, same)
+    together = _solved(log, one, merged, parameters)
+    if apart is None or together is None or not is_determined(together.information):
         return False
     limit = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
-    return together.cost - apart.cost <= limit
+    if together.cost - apart.cost > limit:
+        return False
+    # The cost of a range is bounded: few of them could lie anywhere.
+    residual = measurement_residuals(merged, together.estimate).residual[: len(merged.ranges_m)]
+    fits = np.abs(residual) <= parameters.relinearisation.outlier_sigmas
+    rows = [row for pair in pairs for row in pair]
+    return all(np.mean(fits[problem.range_landmarks == row]) > _LEAST_FIT for row in rows)
+
+
+def noisier(state: State, same: Mapping[int, int]) -> dict[int, float]:
+    """Return what is added to the sigmas of landmarks that may be one: that of the noisier one."""
+    added = state.added_sigmas_m
+    return {
+        id_: max(added.get(gone, 0.0), added.get(kept, 0.0))
+        for gone, kept in same.items()
+        for id_ in (gone, kept)
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -314,7 +314,7 @@ class RunLog:
     ) -> Problem:
         """Return all measurements of the landmarks the state has now.
 
-        ``same`` are the ids of landmarks that are taken for others, and those of the others.
+        ``same`` maps the id of a landmark to that of the one that it is taken for.
         """
         rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
         names = self._names | dict(same or {})
