@@ -306,8 +306,7 @@ class Branches:
         known = ids < np.array([step.next_id for step in steps])[:, None]
         totals = np.where(known, sums, 0.0).sum(axis=1)
         several = totals > np.where(known, sums, -np.inf).max(axis=1)
-        best = int(np.argmax(np.where(several, totals, -np.inf)[::-1]))
-        best = len(steps) - 1 - best  # the latest of equals
+        best = int(np.argmax(np.where(several, totals, -np.inf)))  # the earliest of equals
         if not several[best] or totals[best] <= 0.0:
             return self._now, 0.0
         return first + best, float(totals[best])
