@@ -21,7 +21,8 @@ Decision
     dropped when it has not after some steps. Nothing is forgotten before that, and the main back
     end goes on. The robot is reported as lost while the landmarks known before the carry, three or
     more of them, are against its pose by that price, and others are seen. That ends when they are
-    for its pose, or a place is adopted, or after `BranchRule.carry_steps` with no place on trial.
+    no longer against it, or a place is adopted, or after `BranchRule.carry_steps` with no place on
+    trial.
 
 While nothing is suspicious that costs a copy of the back end now and then.
 """
@@ -247,13 +248,14 @@ class Branches:
                 if self._now > placed.until:
                     carry.placed, carry.search_from = None, self._now
         # What one landmark says is bounded: it may be hidden or gone, or others may look like it.
-        of_landmarks = self._totals(carry, max(carry.since, self._now - rule.lost_steps))[:, 1]
+        first = max(carry.since, self._now - rule.lost_steps)
+        of_landmarks = self._totals(carry, first)[:, 1]
         bounded = np.clip(of_landmarks, -rule.most_against, rule.most_for)
         total = float(bounded.sum())
         if self.is_lost:
-            # Nothing seen of the old map is no evidence for the pose.
-            n_for = int(np.count_nonzero(bounded > 0.0))
-            self.is_lost = total <= 0.0 or n_for < rule.least_landmarks
+            # If nothing is heard, that is no evidence for the pose.
+            heard = any(len(self._steps[number].evidence) for number in range(first, self._now))
+            self.is_lost = total < 0.0 or not heard
         else:
             n_against = int(np.count_nonzero(bounded < 0.0))
             is_against = total < -rule.carry_price and n_against >= rule.least_landmarks
