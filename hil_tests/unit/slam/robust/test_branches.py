@@ -18,7 +18,7 @@ from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.branches import Branches, gain, totals_of
+from slam.robust.branches import Branches, Step, gain, totals_of
 from slam.robust.parameters import BackEndParameters, BranchRule
 from slam.robust.state import Array
 
@@ -320,3 +320,21 @@ def test_a_carried_robot_that_hears_nothing_stays_lost_until_it_finds_itself() -
     reports = list(follow(branches, run.increments[k:], run.scans[k:]))
     assert not reports[-1].lost
     assert error_m(branches.main.pose, run.poses[-1]) < 0.05
+
+
+def test_a_carry_is_dated_to_the_earliest_step_that_explains_as_much() -> None:
+    """Ten steps that confirm the pose, ten that see nothing, ten that miss three landmarks."""
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    seen, missed = ([(id_, nats) for id_ in (0, 1, 2)] for nats in (3.0, -3.0))
+    for k, evidence in enumerate([seen] * 10 + [[]] * 10 + [missed] * 10):
+        branches._steps[k] = Step(
+            increment=np.zeros(3),
+            covariance=None,
+            scans=(),
+            next_id=3,
+            evidence=np.array(evidence, dtype=float).reshape(-1, 2),
+        )
+    branches._snapshots, branches._now = {0: branches.main}, 30
+    since, against = branches._evidence_of_carry()
+    assert since == 10
+    assert against == pytest.approx(3 * min(10 * 3.0 / RULE.correlated_steps, RULE.most_against))
