@@ -304,11 +304,14 @@ class Branches:
         np.add.at(against, (np.repeat(np.arange(len(steps)), lengths), place), -table[:, 1])
         # From each step on, each landmark within its bounds, if it was known before the step
         sums = np.cumsum(against[::-1], axis=0)[::-1] / rule.correlated_steps
-        sums = np.clip(sums, -rule.most_for, rule.most_against)
         known = ids < np.array([step.next_id for step in steps])[:, None]
+        unbounded = np.where(known, sums, 0.0).sum(axis=1)
+        sums = np.clip(sums, -rule.most_for, rule.most_against)
         totals = np.where(known, sums, 0.0).sum(axis=1)
         several = totals > np.where(known, sums, -np.inf).max(axis=1)
-        best = int(np.argmax(np.where(several, totals, -np.inf)))  # the earliest of equals
+        totals = np.where(several, totals, -np.inf)
+        # The earliest of equals, those with most evidence beyond the bounds
+        best = int(np.argmax(np.where(totals == totals.max(), unbounded, -np.inf)))
         if not several[best] or totals[best] <= 0.0:
             return self._now, 0.0
         return first + best, float(totals[best])
