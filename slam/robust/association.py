@@ -381,11 +381,15 @@ def labelled(
     return table[:, :2], table[:, 2]
 
 
+Pairs = tuple[tuple[int, int], ...]
+"""Things that may be one and the same, by row, id or another key."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identity:
     """The statement that things seen or mapped are one and the same, in pairs."""
 
-    pairs: tuple[tuple[int, int], ...]  # of keys of things
+    pairs: Pairs  # of keys of things
     mahalanobis_sq: float  # of all residuals
     evidence: float  # nats against all pairs being two things each: ln N(residuals; 0, S) - ln beta
 
@@ -403,9 +407,7 @@ class Identity:
         )
 
 
-def identity(
-    pairs: tuple[tuple[int, int], ...], residual: Array, S: Array, density: float
-) -> Identity:
+def identity(pairs: Pairs, residual: Array, S: Array, density: float) -> Identity:
     """Judge pairs of things by their residuals (2 k,), with covariance S (2 k, 2 k).
 
     ``density`` is that of all things of the kind: how likely a chance neighbour is.
@@ -416,9 +418,7 @@ def identity(
     return Identity(pairs=pairs, mahalanobis_sq=distance, evidence=evidence)
 
 
-def certain(
-    identities: Sequence[Identity], refused: Collection[tuple[tuple[int, int], ...]] = ()
-) -> Identity | None:
+def certain(identities: Sequence[Identity], refused: Collection[Pairs] = ()) -> Identity | None:
     """Return the likeliest of those that are possible and that nothing speaks against.
 
     That all things are new, and each identity that contradicts it, possible or not, must be less

@@ -15,6 +15,7 @@ from slam.results import PredictedRange, SmoothedRun, UpdateReport
 from slam.robust import kernels
 from slam.robust.association import (
     Antennas,
+    Pairs,
     RangeScan,
     View,
     antennas_of,
@@ -122,7 +123,7 @@ class RobustBackEnd:
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
         # By ids of landmarks in pairs: the update at which their merge was refused
-        self._refused: dict[tuple[tuple[int, int], ...], int] = {}
+        self._refused: dict[Pairs, int] = {}
 
     @property
     def pose(self) -> Array:

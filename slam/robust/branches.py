@@ -72,6 +72,7 @@ class Step:
 
 
 def evidence_table(report: UpdateReport) -> Array:
+    """Return ids and evidence [nats] of a report, shape (k, 2)."""
     return np.array(report.evidence).reshape(-1, 2)
 
 
@@ -108,15 +109,15 @@ def gain(own: Array, main: Array, rule: BranchRule) -> float:
 class Placed:
     """The map before a carry with the robot set down on it; it takes the steps since."""
 
-    def __init__(self, back_end: RobustBackEnd, carry: Carry) -> None:
+    def __init__(self, back_end: RobustBackEnd, since: int) -> None:
         self.back_end = back_end
         self.until: int | None = None  # step at which it is dropped, once it has caught up
-        self.next_step = carry.since
-        self.evidence: list[Array] = []
+        self.next_step = since
+        self.evidence: list[Array] = []  # of each step taken, as `evidence_table` has it
 
-    def take(self, step: Step, *, is_first: bool) -> None:
+    def take(self, step: Step) -> None:
         """Take a step; of the first one the motion is the carry."""
-        if not is_first:
+        if self.evidence:
             self.back_end.predict(step.increment, step.covariance)
         report = self.back_end.update(step.scans, solve=False)
         self.evidence.append(evidence_table(report))
@@ -125,7 +126,7 @@ class Placed:
 
 @dataclass(slots=True, kw_only=True)
 class Carry:
-    """The question whether, and whereto, the robot was carried before a step."""
+    """The question whether the robot was carried before a step, and to which place."""
 
     since: int
     next_id: int  # landmarks known before it have smaller ids
@@ -133,7 +134,7 @@ class Carry:
     new: RobustBackEnd  # with an empty map at first
     next_step: int  # that the new map has not taken yet
     search_from: int  # the step from which on its place is searched for
-    moved: Array  # shape (3,): odometry since
+    moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
     placed: Placed | None = None
 
 
@@ -164,7 +165,7 @@ class Branches:
     def lost_pose(self) -> tuple[Array, Array] | None:
         """Return pose (3,) and covariance (3, 3) to report while the robot is lost, None else.
 
-        The pose is that before the carry, and odometry since.
+        The pose is that before the carry, and odometry since: [m, m, rad], map frame.
         """
         if not self.is_lost or self._carry is None:
             return None
@@ -235,7 +236,7 @@ class Branches:
             carry.next_step = number + 1
         if placed is not None:
             for number in range(placed.next_step, min(placed.next_step + _CATCH_UP, self._now)):
-                placed.take(self._steps[number], is_first=number == carry.since)
+                placed.take(self._steps[number])
             if placed.next_step == self._now:
                 if placed.until is None:
                     placed.until = self._now + _PLACE_PATIENCE * rule.steps
@@ -378,4 +379,4 @@ class Branches:
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)
         back_end.state.next_id = self.main.state.next_id + _IDS_APART
-        carry.placed = Placed(back_end, carry)
+        carry.placed = Placed(back_end, carry.since)

@@ -25,11 +25,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam.geometry import align_se2, compose, transform
-from slam.robust.association import density_per_m2
+from slam.robust.association import Pairs, density_per_m2
 from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
 from slam.robust.state import HEADING, Array, State, quarter_turn, rotation
-
-Pairs = tuple[tuple[int, int], ...]
 
 # How far around its outermost landmarks, and around each of them, a map reaches
 _SURROUNDINGS_M = 1.5

@@ -16,14 +16,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from slam.robust.association import Identity, certain, density_per_m2, identity
+from slam.robust.association import Identity, Pairs, certain, density_per_m2, identity
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
 from slam.robust.state import Array, Indices, State
 
 _MOST_LIKELY = 12  # how many single merges are combined in twos
 _FLOOR = 1e-12  # what keeps matrices regular, as a share
-
-Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(slots=True)
@@ -91,9 +89,7 @@ class Existence:
         self.forget(gone)
 
 
-def merge_rows(
-    state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
-) -> tuple[Indices, Array, Array, Array]:
+def merge_rows(state: State, pairs: Pairs, sigma_m: float) -> tuple[Indices, Array, Array, Array]:
     """Return columns, H (2 k, 4 k), residual (2 k,) and R (2 k, 2 k) of k merges of rows."""
     at = state.landmark_columns(np.array(pairs, dtype=np.intp).ravel())
     H = np.asarray(
@@ -103,15 +99,13 @@ def merge_rows(
     return at, H, -np.concatenate(apart), sigma_m**2 * np.eye(2 * len(pairs))
 
 
-def judge(
-    state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float, density: float
-) -> Identity:
+def judge(state: State, pairs: Pairs, sigma_m: float, density: float) -> Identity:
     """Judge whether landmarks, by row, are one, in pairs."""
     at, H, residual, R = merge_rows(state, pairs, sigma_m)
     return identity(pairs, residual, H @ state.P.block(at) @ H.T + R, density)
 
 
-def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> None:
+def apply_merge(state: State, pairs: Pairs, sigma_m: float) -> None:
     """State that pairs of landmarks are one, of one radius, and marginalise the second of each."""
     k, layout = state.layout.landmark_size, state.layout
     at = layout.columns(np.array(pairs, dtype=np.intp).ravel())

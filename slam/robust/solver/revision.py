@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.special import chdtri
 
+from slam.robust.association import Pairs
 from slam.robust.map import apply_merge
 from slam.robust.parameters import TAIL_PROBABILITY, BackEndParameters
 from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
@@ -71,12 +72,7 @@ def _solved(
     return smoother.solve(min(log.starts(state, problem), key=smoother.start_cost))
 
 
-def is_one(
-    log: RunLog,
-    state: State,
-    pairs: tuple[tuple[int, int], ...],
-    parameters: BackEndParameters,
-) -> bool:
+def is_one(log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameters) -> bool:
     """Return whether the whole run allows that landmarks, by row, are one, in pairs.
 
     The run is solved for with them as two and as one, their ranges having the noise of the noisier
@@ -106,7 +102,10 @@ def is_one(
 
 
 def noisier(state: State, same: Mapping[int, int]) -> dict[int, float]:
-    """Return what is added to the sigmas of landmarks that may be one: that of the noisier one."""
+    """Return by id what is added to the sigmas of landmarks that may be one [m]: the larger of two.
+
+    ``same`` maps the id of a landmark to that of the one that it may be.
+    """
     added = state.added_sigmas_m
     return {
         id_: max(added.get(gone, 0.0), added.get(kept, 0.0))

@@ -1,4 +1,4 @@
-"""Tracklets, initialisation from one radar, merges, weights of ranges."""
+"""Tracklets, initialisation from one radar, weights of ranges."""
 
 import math
 
@@ -21,19 +21,16 @@ from slam.robust import kernels
 from slam.robust.association import RangeScan, antennas_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
-    BodyPoint,
     Search,
     Tracker,
     Tracklet,
     UnassignedRanges,
     find_tracklets,
-    initialise_landmark,
     point_guesses,
 )
-from slam.robust.map import Existence, find_merge
-from slam.robust.parameters import BackEndParameters, MapRule, RangeNoise, TrackletRule
+from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule
 from slam.robust.pipeline import belief_of
-from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion
+from slam.robust.state import Array, calibrated_motion
 
 SIGMA_M = 5e-3
 NOISE, RULE = RangeNoise(sigma_m=SIGMA_M), TrackletRule()
@@ -122,70 +119,6 @@ def test_a_radar_initialises_landmarks_where_its_partner_is_dead(dead: int) -> N
     (miss,) = belief.landmarks - target[0]
     assert np.hypot(*miss) < 0.06
     assert miss @ np.linalg.solve(belief.landmark_covariance(0), miss) < 13.8
-
-
-def mapped(places: Array, sigma_m: float = 0.02) -> tuple[State, Existence]:
-    state, existence = State((0.0, 0.0, 0.0), (0.0,) * 4), Existence(MapRule())
-    for place in places:
-        point = BodyPoint(
-            point_m=place, covariance=sigma_m**2 * np.eye(2), by_offsets=np.zeros((2, 4))
-        )
-        existence.hit(initialise_landmark(state, point), 9)
-    return state, existence
-
-
-def test_a_merge_must_stand_out_from_its_rivals() -> None:
-    rule = MapRule()
-    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
-    merge = find_merge(state, existence, rule)
-    assert merge is not None
-    assert merge.pairs == ((0, 1),)
-    # A third one as near as the second: which two are one is not certain.
-    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [-0.03, 1.0]]))
-    assert find_merge(state, existence, rule) is None
-
-
-@pytest.mark.parametrize(
-    ("third_m", "sigma_m", "merges"),
-    [
-        (0.069, 0.02, False),
-        (0.070, 0.02, True),  # 12^0.5 sigma: 3 nats less likely, as each is unsure by sigma
-        # Below 0.1673 m, 1 / (4 pi sigma^2) exceeds one on a disc of 1.5 m by 3 nats.
-        (9.0, 0.168, False),
-        (9.0, 0.167, True),
-    ],
-)
-def test_a_merge_is_made_from_the_likelihood_margin_and_the_density_on(
-    third_m: float, sigma_m: float, merges: bool
-) -> None:
-    state, existence = mapped(np.array([[0.0, 1.0], [0.0, 1.0], [third_m, 1.0]]), sigma_m)
-    merge = find_merge(state, existence, MapRule())
-    assert (merge is not None and merge.pairs == ((0, 1),)) == merges
-
-
-def test_what_was_seen_whole_together_is_never_merged() -> None:
-    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0]]))
-    for _ in range(MapRule().apart_frames):
-        existence.seen_whole([0, 1])
-    assert find_merge(state, existence, MapRule()) is None
-
-
-def test_two_merges_together_are_certain_where_each_by_itself_is_not() -> None:
-    """All landmarks shifted alike: each fits two, both together fit one way only."""
-    places = np.array([[0.0, 1.0], [0.6, 1.0], [0.3, 1.0], [0.9, 1.02]])
-    state, existence = mapped(places, 0.01)
-    # The later two were seen after a loop: an error of 0.3 m common to both, along the wall.
-    P = state.P.full()
-    first = state.landmark_columns(np.array([2]))[0]
-    along = np.zeros(state.P.size)
-    along[[first, first + 2]] = 0.3
-    state.P = SymmetricMatrix(P + np.outer(along, along))
-    for pair in ((0, 1), (2, 3)):
-        for _ in range(3):
-            existence.seen_whole(pair)
-    merge = find_merge(state, existence, MapRule())
-    assert merge is not None
-    assert set(merge.pairs) == {(0, 2), (1, 3)}
 
 
 def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> None:
