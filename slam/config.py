@@ -33,6 +33,16 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
+class Origin(StrEnum):
+    """Where a constant comes from."""
+
+    DATA_SHEET = "data sheet"  # specification of the robot or of a radar
+    MEASURED = "measured"  # on the emulator or on a recording; its sentence says on which
+    QUANTILE = "quantile"  # follows from a probability
+    BUDGET = "budget"  # limits time or memory, or how long something may take
+    CHOSEN = "chosen"  # by looking at results of scenes
+
+
 class FrontEnd(StrEnum):
     """How echoes are found in a frame."""
 
@@ -356,36 +366,39 @@ class AssociationConfig(_Model):
 class RobustConfig(_Model):
     """The radars as the robust back end models them; limits of range are those of ``detection``."""
 
-    # Full opening angle within which the front end finds what is there, wider than -3 dB.
-    field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
-    # How sure a prediction must be for a single range to continue a track, and the standard
-    # deviation of every range of a front end that predicts none.
-    range_sigma_m: Positive = 5e-3
-    # What the front end's own deviation leaves out (the shape of targets), added in squares.
-    range_floor_m: NonNegative = 0.0
-    # Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it. The
-    # ranges of a tracklet, decided on together, keep it.
-    association_doubt_m: NonNegative = 0.0
-    # Innovations of more standard deviations weigh less.
-    huber_sigmas: Annotated[float, Field(gt=0)] = math.inf
-    # Limits on the misfit and deviation that the front end reports, if it does: an echo that one
-    # pulse does not explain is of several targets, and lies between them.
-    max_misfit: Positive = 1.5
-    max_predicted_sigma_m: Positive = 8e-3
-    # Standard deviation of each radar's unknown constant range offset.
-    offset_sigma_m: NonNegative = 0.0
-    detection_probability: Annotated[float, Field(gt=0, lt=1)] = 0.95
-    # Standard deviations of an antenna's position along each axis, and of a target's radius; 0: the
-    # position is that of the rig, targets are points.
-    mount_sigma_m: NonNegative = 0.0
-    radius_sigma_m: NonNegative = 0.0
-    # Factor on the variance of a range where many are averaged, until the ranges of the run show
-    # it: those of one passage err alike.
-    range_variance_share: Positive = 1.0
-    # Ranges of nothing that stands there, per radar and frame.
-    false_ranges_per_frame: Positive = 0.05
-    # How far the wheels' calibration wanders per root of a metre, in its standard deviations.
-    wheel_walk_per_sqrt_m: NonNegative = 0.0
+    field_of_view_deg: Annotated[float, Field(gt=0, lt=180), Origin.DATA_SHEET] = 65.0
+    """Full opening angle within which the front end finds what is there: 65 degrees are the two-way
+    width at -3 dB."""
+    range_sigma_m: Annotated[Positive, Origin.CHOSEN] = 5e-3
+    """How sure a prediction must be for a single range to continue a track, and the standard
+    deviation of every range of a front end that predicts none."""
+    range_floor_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
+    """What the front end's own deviation leaves out (the shape of targets), added in squares."""
+    association_doubt_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
+    """Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it. The
+    ranges of a tracklet, decided on together, keep it."""
+    huber_sigmas: Annotated[float, Field(gt=0), Origin.QUANTILE] = math.inf
+    """Innovations of more standard deviations weigh less: of normal errors, one in 22."""
+    max_misfit: Annotated[Positive, Origin.MEASURED] = 1.5
+    """Largest misfit of an echo, if the front end reports it: one that a single pulse does not
+    explain is of several targets, and lies between them. Measured on emulated frames of `lab`."""
+    max_predicted_sigma_m: Annotated[Positive, Origin.CHOSEN] = 8e-3
+    """Largest standard deviation of a range, if the front end reports it."""
+    offset_sigma_m: Annotated[NonNegative, Origin.DATA_SHEET] = 0.0
+    """Standard deviation of each radar's unknown constant range offset."""
+    detection_probability: Annotated[float, Field(gt=0, lt=1), Origin.CHOSEN] = 0.95
+    """Probability that a target in view gives a range that is used."""
+    mount_sigma_m: Annotated[NonNegative, Origin.DATA_SHEET] = 0.0
+    """Standard deviation of an antenna's position along each axis; 0: it is that of the rig."""
+    radius_sigma_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
+    """Standard deviation of a target's radius; 0: targets are points."""
+    range_variance_share: Annotated[Positive, Origin.CHOSEN] = 1.0
+    """Factor on the variance of a range where many are averaged, until the ranges of the run show
+    it: those of one passage err alike."""
+    false_ranges_per_frame: Annotated[Positive, Origin.CHOSEN] = 0.05
+    """Ranges of nothing that stands there, per radar and frame."""
+    wheel_walk_per_sqrt_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
+    """How far the wheels' calibration wanders per root of a metre, in its standard deviations."""
 
     @property
     def field_of_view_rad(self) -> float:

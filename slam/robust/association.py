@@ -41,12 +41,8 @@ from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end reports.
 LONGEST_M = 1e6
-# Two pulses closer than this in range are hard to tell apart: the width of one at half height.
-BLUR_M = 0.12
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
-# How far a landmark may lie outside the limits of range to be looked for, in standard deviations
-_VIEW_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -278,19 +274,17 @@ def find_known(
     scans: Sequence[RangeScan],
     side_of: Indices,
     parameters: BackEndParameters,
-    *,
-    sure_m: float,
 ) -> Known | None:
     """Return the likeliest one-to-one assignment of ranges to landmarks; None with none in view.
 
     ``side_of`` (r,) is the side of each radar. Those whose ranges the prior predicts less surely
-    than ``sure_m`` take no part.
+    than the radars' ``sigma_m`` take no part.
     """
-    noise, rule, limits = parameters.ranges, parameters.continuation, parameters.map
+    noise, rule, tracklets = parameters.ranges, parameters.continuation, parameters.tracklets
     ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
     has_frame = np.zeros(len(side_of), dtype=np.bool_)
     has_frame[[scan.radar for scan in scans]] = True
-    margin_m = _VIEW_SIGMAS * noise.sigma_m
+    margin_m = rule.view_sigmas * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
     rows = np.flatnonzero(inside.any(axis=0))
     if not len(rows):
@@ -327,14 +321,14 @@ def find_known(
                 noise.max_range_m,
                 rule.view_margin_rad,
                 margin_m,
-                limits.view_inset_rad,
-                limits.view_inset_m,
-                sure_m**2,
+                tracklets.edge_rad,
+                parameters.map.view_inset_m,
+                noise.sigma_m**2,
                 *chdtri([1, 2], TAIL_PROBABILITY),
                 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau),
                 math.hypot(noise.sigma_m, parameters.branches.model_sigma_m),
-                parameters.branches.miss_sigmas,
-                BLUR_M,
+                tracklets.gate_sigmas,
+                rule.blur_m,
             ]
         ),
     )

@@ -41,7 +41,7 @@ from slam.robust.initialisation import (
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.map import Existence, apply_merge, find_merge, named_pairs
+from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.solver.revision import (
     find_split,
@@ -112,12 +112,16 @@ class RobustBackEnd:
             self._side_of[list(side)] = number
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
-        window = max(rule.window, rule.single_window)
+        window = max(rule.window, rule.long_window)
         self._unassigned = UnassignedRanges(
-            window, len(rig.mounts), parameters.ranges.sigma_m, scale, scale * rule.lever_m
+            window,
+            len(rig.mounts),
+            parameters.ranges.sigma_m,
+            scale,
+            scale * parameters.wheels.walk_lever_m,
         )
-        self._existence = Existence(parameters.map)
-        self._log = RunLog(parameters.wheels)
+        self._existence = Existence(parameters.map, rule.min_frames)
+        self._log = RunLog(parameters.wheels, parameters.relinearisation.at_least_every)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
@@ -244,7 +248,9 @@ class RobustBackEnd:
             ),
         )
 
-    def update_points(self, points: Sequence[RangeBearing]) -> tuple[int | None, ...]:
+    def update_points(
+        self, points: Sequence[RangeBearing], rule: PointRule
+    ) -> tuple[int | None, ...]:
         """Take in ranges and bearings of points seen from the newest pose.
 
         If all points have labels, each is of the landmark with its label, or new; else they are
@@ -253,7 +259,7 @@ class RobustBackEnd:
         state = self.state
         rows = named_rows(state, points, self._landmark_of_label)
         if rows is None:
-            rows = assign(state, points, PointRule())
+            rows = assign(state, points, rule)
         found = [
             None if row is None else self._see_point(point, row)
             for point, row in zip(points, rows, strict=True)
@@ -308,8 +314,7 @@ class RobustBackEnd:
         if not state.feature_ids:
             return None, seen
         seen = self._walls.look(seen, antennas)
-        sure_m = self.parameters.continuation.tight_sigmas * self.parameters.ranges.sigma_m
-        known = find_known(state, seen, widened, self._side_of, self.parameters, sure_m=sure_m)
+        known = find_known(state, seen, widened, self._side_of, self.parameters)
         if known is None:
             return None, seen
         features = state.feature_ids
@@ -409,7 +414,7 @@ class RobustBackEnd:
         rule = self.parameters.tracklets
         for side in self._sides:
             # A radar without frames for long takes no part.
-            radars = [radar for radar in side if self._silent[radar] <= rule.partner_silence]
+            radars = [radar for radar in side if self._silent[radar] <= rule.single_min_frames]
             if not radars or not all(self._unassigned.newest(radar) for radar in radars):
                 continue
             is_single = len(radars) == 1
@@ -424,7 +429,7 @@ class RobustBackEnd:
             if is_single:
                 search = Search(
                     radars=radars,
-                    window=rule.single_window,
+                    window=rule.long_window,
                     min_frames=rule.single_min_frames,
                     most_sigma_m=rule.single_max_sigma_m,
                 )
@@ -442,7 +447,7 @@ class RobustBackEnd:
             known = self._landmark_of_label.get(tracklet.label)
             row = None if known is None else state.landmark_ids.index(known)
         else:
-            row = match(state, point, self.parameters.map)
+            row = match(state, point)
         if row is None:
             landmark_id = initialise_landmark(state, point)
             if tracklet.label is not None:
@@ -488,7 +493,7 @@ class RobustBackEnd:
     def _merge(self) -> None:
         """Merge landmarks where that is certain, and the whole run allows it."""
         rule, now = self.parameters.map, self._n_updates
-        if self._landmark_of_label or now % rule.merge_every:
+        if self._landmark_of_label or now % rule.look_every:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
@@ -509,7 +514,7 @@ class RobustBackEnd:
             self._refused[ids] = self._n_updates
             return False
         state.added_sigmas_m |= noisier(state, {gone: kept for kept, gone in ids})
-        apply_merge(state, pairs, self.parameters.map.merge_sigma_m)
+        apply_merge(state, pairs, MERGE_SIGMA_M)
         for kept, gone in ids:
             existence.merge(kept, gone)
             self._log.rename(gone, kept)

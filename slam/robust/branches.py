@@ -43,19 +43,6 @@ from slam.robust.constellation import constellation_of, find_placement
 from slam.robust.parameters import BackEndParameters, BranchRule
 from slam.robust.state import Array
 
-# Steps between two snapshots, and how many are kept: a carry that is noticed later than that is
-# dated to the oldest.
-_SNAPSHOT_EVERY, _SNAPSHOTS = 50, 9
-# Steps between two looks for suspicion, and how many an alternative that lags behind takes a step
-_LOOK_EVERY, _CATCH_UP = 5, 10
-# After how many times `BranchRule.steps` a place is dropped
-_PLACE_PATIENCE = 4
-# This many landmarks may give the evidence of a whole price, but not more than it
-_LANDMARKS_OF_PRICE = 2.0
-# How many of the newest landmarks are looked for among all others; at most one in two is new
-_NEWEST, _OLD_AND_NEW = 8, 2
-# By how much the covariance of the points is enlarged by which the robot is set down
-_WEAKENED = 4.0
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
 _IDS_APART = 1000
 
@@ -90,15 +77,16 @@ def totals_of(tables: Iterable[Array], known_before: int, correlated_steps: floa
 def gain(own: Array, main: Array, rule: BranchRule) -> float:
     """Return by how much a place is likelier than the main back end's pose, in nats.
 
-    ``own`` and ``main`` are totals of the same landmarks. Three of them must be for it if that is
-    to exceed the price, and it must be as much likelier than that the robot is elsewhere. Nothing
-    is likelier by explaining less: where little is certain, little can be missed.
+    ``own`` and ``main`` are totals of the same landmarks. ``least_landmarks`` of them must be for
+    it if that is to exceed the price, and it must be as much likelier than that the robot is
+    elsewhere. Nothing is likelier by explaining less: where little is certain, little can be
+    missed.
     """
     ids = np.union1d(own[:, 0], main[:, 0])
     mine, theirs = np.zeros(len(ids)), np.zeros(len(ids))
     mine[np.searchsorted(ids, own[:, 0])] = own[:, 1]
     theirs[np.searchsorted(ids, main[:, 0])] = main[:, 1]
-    most = rule.carry_price / _LANDMARKS_OF_PRICE
+    most = rule.price_nats / (rule.least_landmarks - 1)
     return min(
         float(np.clip(mine - theirs, -most, most).sum()),
         float(np.clip(mine, -rule.most_against, rule.most_for).sum()),
@@ -147,6 +135,8 @@ class Branches:
     def __init__(self, rig: Rig, parameters: BackEndParameters) -> None:
         self.main = RobustBackEnd(rig, parameters)
         self._rule = parameters.branches
+        self._look_every, self._window = parameters.map.look_every, parameters.tracklets.window
+        self._snapshot_every = parameters.relinearisation.at_least_every
         self._steps: dict[int, Step] = {}  # by number, those that are needed still
         self._now = 0  # number of the next step
         self._motion: tuple[Array, Array | None] | None = None
@@ -175,7 +165,7 @@ class Branches:
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
-        if self._now % _SNAPSHOT_EVERY == 0:
+        if self._now % self._snapshot_every == 0:
             self._keep_snapshot()
         self._motion = increment, covariance
         self.main.predict(increment, covariance)
@@ -201,14 +191,14 @@ class Branches:
             return report
         was_lost = self.is_lost
         moved = self._carry is not None and self._decide(self._carry)
-        if self._now % _LOOK_EVERY == 0:
+        if self._now % self._look_every == 0:
             self._look()
         carried = (moved or self.is_lost) and not was_lost
         return replace(report, carried=carried, lost=self.is_lost)
 
     def _keep_snapshot(self) -> None:
         self._snapshots[self._now] = self.main.copy()
-        for old in sorted(self._snapshots)[:-_SNAPSHOTS]:
+        for old in sorted(self._snapshots)[: -self._rule.snapshots]:
             del self._snapshots[old]
         needed = min(self._snapshots)
         if self._carry is not None:
@@ -228,22 +218,22 @@ class Branches:
     def _decide(self, carry: Carry) -> bool:
         """Answer the question of a carry, if that can be; return whether a place is adopted."""
         rule, placed = self._rule, carry.placed
-        for number in range(carry.next_step, min(carry.next_step + _CATCH_UP, self._now)):
+        for number in range(carry.next_step, min(carry.next_step + rule.catch_up, self._now)):
             step = self._steps[number]
             if number > carry.since:
                 carry.new.predict(step.increment, step.covariance)
             carry.new.update(step.scans, solve=False)
             carry.next_step = number + 1
         if placed is not None:
-            for number in range(placed.next_step, min(placed.next_step + _CATCH_UP, self._now)):
+            for number in range(placed.next_step, min(placed.next_step + rule.catch_up, self._now)):
                 placed.take(self._steps[number])
             if placed.next_step == self._now:
                 if placed.until is None:
-                    placed.until = self._now + _PLACE_PATIENCE * rule.steps
+                    placed.until = self._now + rule.patience * self._window
                 first = max(carry.since, self._now - rule.lost_steps)
                 tables = placed.evidence[first - carry.since :]
                 own = totals_of(tables, carry.next_id, rule.correlated_steps)
-                if gain(own, self._totals(carry, first), rule) > rule.carry_price:
+                if gain(own, self._totals(carry, first), rule) > rule.price_nats:
                     self._adopt(placed.back_end)
                     return True
                 if self._now > placed.until:
@@ -259,10 +249,10 @@ class Branches:
             self.is_lost = total < 0.0 or not heard
         else:
             n_against = int(np.count_nonzero(bounded < 0.0))
-            is_against = total < -rule.carry_price and n_against >= rule.least_landmarks
+            is_against = total < -rule.price_nats and n_against >= rule.least_landmarks
             # Radars that hear nothing are no reason to be elsewhere.
             self.is_lost = is_against and bool(carry.new.reported_rows())
-        is_answered = total > rule.carry_price or self._now - carry.since > rule.carry_steps
+        is_answered = total > rule.price_nats or self._now - carry.since > rule.carry_steps
         if is_answered and carry.placed is None:
             self._carry, self._judged, self.is_lost = None, self._now, False
         return False
@@ -282,7 +272,7 @@ class Branches:
         """Look for evidence against the pose, or for the place that the robot was carried to."""
         if self._carry is None:
             since, against = self._evidence_of_carry()
-            if against <= self._rule.suspicious:
+            if against <= self._rule.most_against:
                 since = self._recognised()
             if since < self._now:
                 self._begin_carry(since)
@@ -325,7 +315,7 @@ class Branches:
         main, rule, first = self.main, self._rule, max(min(self._snapshots), self._judged)
         rows, ids = main.reported_rows(), main.state.landmark_ids
         oldest_id = self._steps[first].next_id if first < self._now else main.state.next_id
-        newest = sorted(rows, key=lambda row: -ids[row])[: min(_NEWEST, len(rows) // _OLD_AND_NEW)]
+        newest = sorted(rows, key=lambda row: -ids[row])[: min(rule.newest, len(rows) // 2)]
         new = [row for row in newest if ids[row] >= oldest_id]
         new_ids = {ids[row] for row in new}
         if new_ids <= self._recognised_ids:
@@ -335,13 +325,13 @@ class Branches:
         here = constellation_of(main.state, new, rule.model_sigma_m)
         there = constellation_of(main.state, older, rule.model_sigma_m)
         placement = find_placement(here, there, rule)
-        if placement is None or placement.evidence < rule.suspicious:
+        if placement is None or placement.evidence < rule.most_against:
             return self._now
         if main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs]):
             return self._now
         oldest_new_id = min(here.ids[own] for _, own in placement.pairs)
         steps = [n for n in range(first, self._now) if self._steps[n].next_id <= oldest_new_id]
-        return max(steps[-1] - rule.steps, first)
+        return max(steps[-1] - self._window, first)
 
     def _begin_carry(self, since: int) -> None:
         before = self._at(since)
@@ -364,8 +354,8 @@ class Branches:
     def _search(self, carry: Carry) -> None:
         """Search for the new map's place on the old one; set a copy of the old one down there."""
         rule, new = self._rule, carry.new
-        newest = sorted(new.reported_rows(), key=lambda row: -new.state.landmark_ids[row])[:_NEWEST]
-        here = constellation_of(new.state, newest, rule.model_sigma_m)
+        newest = sorted(new.reported_rows(), key=lambda row: -new.state.landmark_ids[row])
+        here = constellation_of(new.state, newest[: rule.newest], rule.model_sigma_m)
         there = constellation_of(carry.map.state, carry.map.reported_rows(), rule.model_sigma_m)
         placement = find_placement(here, there, rule)
         if placement is None:
@@ -374,7 +364,7 @@ class Branches:
         for row, own in placement.pairs:
             block = slice(2 * own, 2 * own + 2)
             # The same ranges are taken once more, so this use of them must hardly count.
-            covariance = _WEAKENED * here.covariance_m2[block, block]
+            covariance = rule.weakened * here.covariance_m2[block, block]
             points.append((there.ids[row], here.points_m[own], covariance))
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)

@@ -26,18 +26,12 @@ from scipy.special import chdtri
 
 from slam.geometry import align_se2, compose, transform
 from slam.robust.association import Pairs, density_per_m2
-from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
+from slam.robust.parameters import NEIGHBOURHOOD_M, TAIL_PROBABILITY, BranchRule
 from slam.robust.state import HEADING, Array, State, quarter_turn, rotation
 
-# How far around its outermost landmarks, and around each of them, a map reaches
-_SURROUNDINGS_M = 1.5
-# Least evidence [nats] of a placement, and by how much it must beat every other place
-_EVIDENCE = 4.0
 # Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
 # that keeps the matrix regular
 _STEPS, _LEAST_CHANGE, _VARIANCE_FLOOR_M2 = 5, 1e-9, 1e-10
-# Least distance of two landmarks that a guess is made from, and most guesses judged at a time
-_LEAST_BASE_M, _MOST_TRIED = 0.3, 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,12 +76,12 @@ def find_placement(here: Constellation, there: Constellation, rule: BranchRule) 
         if placement is not None and len(placement.pairs) >= least:
             found[placement.pairs] = placement
     ranked = sorted(found.values(), key=lambda one: -one.evidence)
-    if not ranked or ranked[0].evidence < _EVIDENCE:
+    if not ranked or ranked[0].evidence < rule.placement_nats:
         return None
     best = ranked[0]
     middle = here.points_m.mean(axis=0)
     for rival in ranked[1:]:
-        if best.evidence - rival.evidence >= _EVIDENCE:
+        if best.evidence - rival.evidence >= rule.placement_nats:
             break
         if _differ(best.motion, rival.motion, middle, rule):
             return None
@@ -98,7 +92,7 @@ def _differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:
     """Return whether two motions (3,) bring a point to different places, or turn it otherwise."""
     away = transform(one, point) - transform(other, point)
     turn = math.remainder(float(one[2] - other[2]), math.tau)
-    return math.hypot(away[0], away[1]) > rule.reach_m or abs(turn) > rule.reach_m / _LEAST_BASE_M
+    return math.hypot(away[0], away[1]) > rule.reach_m or abs(turn) > rule.reach_m / rule.base_m
 
 
 def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[Pairs]:
@@ -106,13 +100,13 @@ def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[Pairs]:
     gaps = targets[None, :] - targets[:, None]
     lengths = np.hypot(gaps[..., 0], gaps[..., 1])
     angles = np.arctan2(gaps[..., 1], gaps[..., 0])
-    long_enough = lengths >= _LEAST_BASE_M
+    long_enough = lengths >= rule.base_m
     found: list[Pairs] = []
     for a in range(len(points)):
         for b in range(a + 1, len(points)):
             gap = points[b] - points[a]
             length = math.hypot(gap[0], gap[1])
-            if length < _LEAST_BASE_M:
+            if length < rule.base_m:
                 continue
             alike = long_enough & (np.abs(lengths - length) <= rule.reach_m)
             for i, j in np.argwhere(alike).tolist():
@@ -125,7 +119,7 @@ def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[Pairs]:
                 if len(pairs) >= min(rule.least_landmarks, len(points)):
                     found.append(pairs)
     found.sort(key=lambda pairs: -len(pairs))
-    return found[:_MOST_TRIED]
+    return found[: rule.most_tried]
 
 
 def _nearest(away: Array, reach_m: float) -> Pairs:
@@ -140,8 +134,8 @@ def _nearest(away: Array, reach_m: float) -> Pairs:
 
 def _judged(here: Constellation, there: Constellation, pairs: Pairs) -> Placement | None:
     """Return the placement by the pairs, the worst left out until all fit; None below two."""
-    beta = density_per_m2(there.points_m, _SURROUNDINGS_M)
-    spans = np.ptp(there.points_m, axis=0) + 2 * _SURROUNDINGS_M
+    beta = density_per_m2(there.points_m, NEIGHBOURHOOD_M)
+    spans = np.ptp(there.points_m, axis=0) + 2 * NEIGHBOURHOOD_M
     area_m2 = float(spans[0] * spans[1])
     while len(pairs) >= 2:
         motion, residual, S, N = _aligned(here, there, pairs)

@@ -55,8 +55,8 @@ from slam.robust.association import (
     identity,
 )
 from slam.robust.parameters import (
+    NEIGHBOURHOOD_M,
     BackEndParameters,
-    MapRule,
     PointRule,
     RangeNoise,
     TrackletRule,
@@ -64,14 +64,7 @@ from slam.robust.parameters import (
 )
 from slam.robust.state import HEAD_SIZE, POSITION, Array, Indices, Motion, State, rotation
 
-_SEED_MARGIN_RAD = 0.05
-MEMBER_MARGIN_RAD = 0.1
-_SINGLE_BEARINGS_RAD = (0.0, -0.25, 0.25, -0.5, 0.5)
-_SINGLE_SPREAD_RAD = 0.2
-_SINGLE_RANGE_SIGMA_M = 0.05
 _FORBIDDEN = 1e9
-# What one degree of freedom is worth against chi-square, where tracklets compete
-_DOF_WORTH = 4.0
 _LEAST_WAY_M = 1e-6
 # Unknowns of the radars surer than this share of a range's standard deviation are taken for known.
 _KNOWN_SHARE = 0.1
@@ -318,11 +311,11 @@ def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp
     return np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) <= reach_m)
 
 
-def match(state: State, point: BodyPoint, rule: MapRule) -> int | None:
+def match(state: State, point: BodyPoint) -> int | None:
     """Return the row of the landmark that a point certainly is, or None."""
-    beta = density_per_m2(state.landmarks_m, rule.merge_reach_m)
+    beta = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
     found = []
-    for row in near_rows(state, point, rule.merge_reach_m).tolist():
+    for row in near_rows(state, point, NEIGHBOURHOOD_M).tolist():
         rows = point_rows(state, row, point)
         found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
     best = certain(found)
@@ -376,11 +369,6 @@ class Tracklet:
     dof: int
     label: int | None
 
-    @property
-    def score(self) -> float:
-        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
-        return _DOF_WORTH * self.dof - self.chi_square
-
     def body_point(self) -> BodyPoint:
         away = self.target - self.seen.antennas_m.mean(axis=0)
         return BodyPoint(
@@ -396,10 +384,10 @@ def point_guesses(
 ) -> list[Guess]:
     """Return the fixes of all pairs of new ranges, or for a radar alone points on their arcs."""
     if len(radars) == 1:
-        return _guesses_on_arcs(unassigned, radars[0])
+        return _guesses_on_arcs(unassigned, radars[0], noise, rule)
     guesses = []
     spread = rule.prior_sigma_m**2 * np.eye(2)
-    limit = noise.field_of_view_rad / 2 + _SEED_MARGIN_RAD
+    limit = noise.field_of_view_rad / 2 + rule.seed_margin_rad
     for one, two in combinations(radars, 2):
         first, second = unassigned.antenna(one), unassigned.antenna(two)
         for (a, label), (b, other) in product(unassigned.newest(one), unassigned.newest(two)):
@@ -419,13 +407,19 @@ def _guess(x: float, y: float, spread: Array, label: int = _NO_LABEL) -> Guess:
     return Guess(target=np.array([x, y]), covariance=spread, label=known)
 
 
-def _guesses_on_arcs(unassigned: UnassignedRanges, radar: int) -> list[Guess]:
+def _guesses_on_arcs(
+    unassigned: UnassignedRanges, radar: int, noise: RangeNoise, rule: TrackletRule
+) -> list[Guess]:
+    """Return guesses in directions of equal distance within the field of view of a radar."""
     guesses = []
+    n_steps = math.floor(noise.field_of_view_rad / 2 / rule.single_step_rad)
+    steps = sorted(range(-n_steps, n_steps + 1), key=abs)
     x, y, yaw = unassigned.antenna(radar)
     for range_m, label in unassigned.newest(radar):
-        for off in _SINGLE_BEARINGS_RAD:
+        for off in (step * rule.single_step_rad for step in steps):
             u = np.array([math.cos(yaw + off), math.sin(yaw + off)])
-            across, along = (_SINGLE_SPREAD_RAD * range_m) ** 2, _SINGLE_RANGE_SIGMA_M**2
+            across = (rule.single_spread_rad * range_m) ** 2
+            along = rule.single_range_sigma_m**2
             spread = across * np.eye(2) + (along - across) * np.outer(u, u)
             guesses.append(
                 _guess(x + range_m * float(u[0]), y + range_m * float(u[1]), spread, label)
@@ -468,7 +462,7 @@ class Tracker:
         half_view = self._noise.field_of_view_rad / 2
         self._limits = (
             half_view,
-            half_view + MEMBER_MARGIN_RAD,
+            half_view + self._rule.edge_rad,
             self._noise.min_range_m,
             self._noise.max_range_m,
             self._rule.gate_sigmas**2,
@@ -482,6 +476,10 @@ class Tracker:
     @property
     def min_hits_per_radar(self) -> int:
         return self._rule.min_hits_per_radar
+
+    def score(self, tracklet: Tracklet) -> float:
+        """Return what a tracklet's ranges are worth less chi-square; by it they compete."""
+        return self._rule.dof_worth * tracklet.dof - tracklet.chi_square
 
     def follow(self, guess: Guess, unassigned: UnassignedRanges, search: Search) -> Tracklet | None:
         """Return the ranges that follow a guess, or None if they do not suffice."""
@@ -701,7 +699,7 @@ def find_tracklets(
                 followed.append((tracklet, guess))
         if not followed:
             break
-        best, chosen = max(followed, key=lambda pair: pair[0].score)
+        best, chosen = max(followed, key=lambda pair: tracker.score(pair[0]))
         unassigned.use_up(best.members)
         found.append(best)
         # What is left may have lost its ranges: follow it again.

@@ -17,10 +17,11 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from slam.robust.association import Identity, Pairs, certain, density_per_m2, identity
-from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
+from slam.robust.parameters import MARGIN_NATS, NEIGHBOURHOOD_M, TAIL_PROBABILITY, MapRule
 from slam.robust.state import Array, Indices, State
 
-_MOST_LIKELY = 12  # how many single merges are combined in twos
+# Noise [m] of the statement that two landmarks are one: it is exact.
+MERGE_SIGMA_M = 1e-5
 _FLOOR = 1e-12  # what keeps matrices regular, as a share
 
 
@@ -33,15 +34,15 @@ class _Record:
 class Existence:
     """Scores of all landmarks by id, and which pairs were seen whole in common frames."""
 
-    def __init__(self, rule: MapRule) -> None:
-        self._rule = rule
+    def __init__(self, rule: MapRule, report_hits: int) -> None:
+        self._rule, self._report_hits = rule, report_hits
         self._records: dict[int, _Record] = {}
         self._together: dict[tuple[int, int], int] = {}
 
     def hit(self, landmark_id: int, frames: int = 1) -> None:
         """Count frames that hit a landmark; a new id begins here."""
         record = self._records.setdefault(landmark_id, _Record())
-        record.score = min(record.score + frames * self._rule.hit, self._rule.most)
+        record.score = min(record.score + frames, self._rule.most)
         record.hits += frames
 
     def miss(self, landmark_id: int) -> None:
@@ -52,7 +53,7 @@ class Existence:
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
 
     def is_reported(self, landmark_id: int) -> bool:
-        return self._records[landmark_id].hits >= self._rule.report_hits
+        return self._records[landmark_id].hits >= self._report_hits
 
     def forget(self, landmark_id: int) -> None:
         self._records.pop(landmark_id, None)
@@ -137,15 +138,15 @@ def find_merge(
 
     ``refused`` are those not to be tried, as ``named_pairs`` returns them.
     """
-    density = density_per_m2(state.landmarks_m, rule.merge_reach_m)
-    single = _candidates(state, existence, rule, density)
+    density = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
+    single = _candidates(state, existence, density)
     best = _certain(state, single, refused)
     if best is not None:
         return best
     likely = sorted((one for one in single if one.is_possible), key=lambda one: -one.evidence)
     twos = [
-        judge(state, one.pairs + other.pairs, rule.merge_sigma_m, density)
-        for one, other in combinations(likely[:_MOST_LIKELY], 2)
+        judge(state, one.pairs + other.pairs, MERGE_SIGMA_M, density)
+        for one, other in combinations(likely[: rule.most_likely], 2)
         if not one.contradicts(other)
     ]
     return _certain(state, twos, refused)
@@ -158,19 +159,17 @@ def _certain(
     return certain(merges, [rows for rows in pairs if named_pairs(state, rows) in refused])
 
 
-def _candidates(
-    state: State, existence: Existence, rule: MapRule, density: float
-) -> list[Identity]:
+def _candidates(state: State, existence: Existence, density: float) -> list[Identity]:
     """Return all merges of two landmarks within reach, those far from passing the test left out."""
     if len(state.landmark_ids) < 2:
         return []
-    near = cKDTree(state.landmarks_m).query_pairs(rule.merge_reach_m, output_type="ndarray")
+    near = cKDTree(state.landmarks_m).query_pairs(NEIGHBOURHOOD_M, output_type="ndarray")
     near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.intp)
-    distances = _distances_sq(state, near, rule.merge_sigma_m)
+    distances = _distances_sq(state, near, MERGE_SIGMA_M)
     # What contradicts a possible one and comes within the margin of it is kept, too.
     limit = float(chdtri(2, TAIL_PROBABILITY)) + 2.0 * MARGIN_NATS
     return [
-        judge(state, ((first, second),), rule.merge_sigma_m, density)
+        judge(state, ((first, second),), MERGE_SIGMA_M, density)
         for first, second in near[distances <= limit].tolist()
         if not existence.are_apart(state.landmark_ids[first], state.landmark_ids[second])
     ]

@@ -1,21 +1,38 @@
 """Parameters of the robust back end: noise of wheels and radars, and the rules of its decisions.
 
 The noise comes from specifications of the robot and of the front end; the rules are the same for
-every scene.
+every scene. Every number of a rule has an origin (`slam.config.Origin`) and one sentence that says
+what it is; `docs/constants.md` is made of them.
+
+What is a constant in this sense: a number that decides something, so that with half or twice of it
+another landmark, place, weight or time could result. It is a field here. Not constants, and beside
+the code that uses them, are
+
+- numbers that keep arithmetic regular: floors, damping, the tolerance of a search that converges,
+  the noise of a statement that is exact, and uncertainties so large that they state nothing;
+- numbers of mathematics, such as a half, or the median of normal noise;
+- sizes of buffers, and what marks a value as missing.
+
+Fields of ``RangeNoise`` and ``WheelNoise`` have the values of the settings and of the robot; their
+defaults are for tests.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from slam.config import WheelNoise
+from slam.config import Origin, WheelNoise
 from slam.geometry import FieldOfView
 
-# Probability that a test rejects what is true
-TAIL_PROBABILITY = 1e-3
-# Logarithm of how many times likelier than any other an explanation must be: twenty times
-MARGIN_NATS = 3.0
+TAIL_PROBABILITY: Annotated[float, Origin.QUANTILE] = 1e-3
+"""Probability with which a test rejects what is true."""
+MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
+"""Logarithm of how many times likelier than any other an explanation must be: twenty times."""
+NEIGHBOURHOOD_M: Annotated[float, Origin.CHOSEN] = 1.5
+"""Distance within which landmarks are neighbours: those that may be one, and those that count for
+the density of a map."""
 
 
 def chi_square_limit(dof: int, excess_sigmas: float) -> float:
@@ -59,147 +76,263 @@ class RangeNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContinuationRule:
-    """When single ranges may continue a track."""
+    """When single ranges may continue a track.
 
-    view_margin_rad: float = 0.25  # widens the field of view
-    # A landmark takes part while its predicted ranges are surer than so many range deviations
-    tight_sigmas: float = 1.0
+    A landmark takes part while its predicted ranges are surer than ``RangeNoise.sigma_m``.
+    """
+
+    view_margin_rad: Annotated[float, Origin.CHOSEN] = 0.25
+    """How far outside the field of view a landmark may lie and still be looked for."""
+    view_sigmas: Annotated[float, Origin.QUANTILE] = 5.0
+    """How far outside the limits of range it may lie, in standard deviations of a range."""
+    blur_m: Annotated[float, Origin.DATA_SHEET] = 0.12
+    """Two echoes closer than this in range are hard to tell apart: the width of a pulse at half of
+    its height."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackletRule:
     """When ranges that continue nothing are evidence of one point at rest."""
 
-    window: int = 15  # frames looked back
-    # Fewest distinct frames, fewest ranges of each radar, and the least share of the frames with
-    # the point in view that hit it
-    min_frames: int = 9
-    min_hits_per_radar: int = 4
-    min_share: float = 0.6
-    # Spread about the first fix, and how far a member may lie from its prediction
-    prior_sigma_m: float = 0.3
-    gate_sigmas: float = 3.0
-    # Share of the wheels' scale error by which a frame grows uncertain with the way back to it
-    drift_share: float = 0.7
-    lever_m: float = 0.3  # lever by which turning back does
-    # How far chi-square may exceed its degrees of freedom, in its standard deviations
-    excess_sigmas: float = 3.1
-    # For a radar without a partner: frames looked back, fewest that hit, and the largest standard
-    # deviation in any direction with which a point is used
-    single_window: int = 40
-    single_min_frames: int = 20
-    single_max_sigma_m: float = 0.1
-    partner_silence: int = 20  # a radar whose partner has sent nothing for so many frames is single
+    window: Annotated[int, Origin.BUDGET, "frames"] = 15
+    """How far back the ranges of a new landmark are looked for; the paper's window."""
+    min_share: Annotated[float, Origin.CHOSEN] = 0.6
+    """Least share of the frames with a point in view that must hit it, and of the window that must
+    be such frames; 9 of 15 are the paper's."""
+    min_hits_per_radar: Annotated[int, Origin.CHOSEN, "ranges"] = 4
+    """Fewest ranges of each radar."""
+    prior_sigma_m: Annotated[float, Origin.CHOSEN] = 0.3
+    """Spread about a first fix: of a point, of a wall's distance and, at a metre, of its
+    direction."""
+    gate_sigmas: Annotated[float, Origin.QUANTILE] = 3.0
+    """How far from its prediction a range may lie, in standard deviations: 99.7 % of normal errors
+    are less. Further off, it is no member of a tracklet, a landmark is missed in spite of it, and
+    it counts as this far off where noise is learned."""
+    drift_share: Annotated[float, Origin.CHOSEN] = 0.7
+    """Share of the wheels' scale error by which a frame grows uncertain with the way back to it; a
+    radian counts as `WheelNoise.walk_lever_m`."""
+    excess_sigmas: Annotated[float, Origin.QUANTILE] = 3.1
+    """How far chi-square may exceed its degrees of freedom, in its standard deviations: 99.9 % of
+    normal errors are less."""
+    dof_worth: Annotated[float, Origin.CHOSEN] = 4.0
+    """What one more range is worth against chi-square where tracklets compete for ranges."""
+    seed_margin_rad: Annotated[float, Origin.CHOSEN] = 0.05
+    """How far outside the field of view a first fix may lie."""
+    edge_rad: Annotated[float, Origin.CHOSEN] = 0.1
+    """Half the width of the edge of the field of view: a range from further outside is no member of
+    a tracklet, and a landmark must lie further inside to be missed."""
+    long_window: Annotated[int, Origin.BUDGET, "frames"] = 40
+    """How far back ranges are looked for of walls, and of points that only one radar sees."""
+    single_min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 20
+    """Fewest frames that hit a point that only one radar sees; a radar whose partner has sent
+    nothing for longer is alone."""
+    single_max_sigma_m: Annotated[float, Origin.CHOSEN] = 0.1
+    """Largest standard deviation, in any direction, with which such a point is used."""
+    single_step_rad: Annotated[float, Origin.BUDGET] = 0.25
+    """Angle between the directions in which such a point is guessed."""
+    single_spread_rad: Annotated[float, Origin.CHOSEN] = 0.2
+    """Standard deviation of a guessed direction."""
+    single_range_sigma_m: Annotated[float, Origin.CHOSEN] = 0.05
+    """Standard deviation of a guess along its direction."""
+
+    @property
+    def min_frames(self) -> int:
+        """Return the fewest frames that must hit a point: the least share of the window."""
+        return math.ceil(self.min_share * self.window)
+
+    @property
+    def prior_sigma_rad(self) -> float:
+        """Return the spread of a wall's direction: that of a point, seen from a metre."""
+        return self.prior_sigma_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapRule:
-    """When a point is a known landmark, two landmarks are one, or a landmark is none."""
+    """When a point is a known landmark, two landmarks are one, or a landmark is none.
 
-    merge_every: int = 5  # frames between looks
-    merge_reach_m: float = 1.5  # largest distance of two that may be one
-    merge_sigma_m: float = 1e-5  # noise of the statement that two landmarks are one
-    refused_updates: int = 200  # after which a merge that the run did not allow is tried again
-    apart_frames: int = 3  # two landmarks seen whole in this many common frames are two
-    # Steps, ceiling and floor of a landmark's existence score
-    hit: float = 1.0
-    miss: float = 1.5
-    most: float = 20.0
-    least: float = -8.0
-    # How far inside its limits a landmark must lie to be missed
-    view_inset_rad: float = 0.1
-    view_inset_m: float = 0.05
-    report_hits: int = 9  # frames a landmark must have been hit in to be reported
+    A landmark's existence score rises by one for every frame that hits it. It is reported when it
+    has been hit in as many frames as a new one of two radars (`TrackletRule.min_frames`).
+    """
+
+    look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
+    """Scans between two looks for landmarks that may be one, and for evidence of a carry."""
+    most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
+    """How many of the likeliest merges are combined in twos."""
+    refused_updates: Annotated[int, Origin.BUDGET, "scans"] = 200
+    """After how many scans a merge that the run did not allow is tried again."""
+    apart_frames: Annotated[int, Origin.CHOSEN, "frames"] = 3
+    """Two landmarks that both radars of a pair saw in so many common frames are two."""
+    miss: Annotated[float, Origin.CHOSEN, "hits"] = 1.5
+    """By how much a frame that should have hit a landmark, and did not, lowers its score."""
+    most: Annotated[float, Origin.BUDGET, "hits"] = 20.0
+    """Ceiling of the score; it limits how long a landmark stays that is there no more."""
+    least: Annotated[float, Origin.BUDGET, "hits"] = -8.0
+    """Score below which a landmark is deleted."""
+    view_inset_m: Annotated[float, Origin.CHOSEN] = 0.05
+    """How far inside the limits of range a landmark must lie to be missed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WallRule:
-    """When ranges are a wall's, and when a wall is a known one."""
+    """When ranges are a wall's, and when a wall is a known one.
 
-    # Frames looked back, fewest that hit, and how far the echo must have moved along the wall
-    window: int = 40
-    min_frames: int = 25
-    min_way_m: float = 0.25
-    # By how much chi-square must be less under a law for a wall, or a point, to be believed
-    wall_margin: float = 30.0
-    point_margin: float = 0.0
-    # Walls are known in cells of this length; how far from one of them what looks like the same
-    # wall may be that
-    cell_m: float = 0.1
-    reach_m: float = 1.0
-    # A wall as near as this to a mapped one, and not it, is its echo merged with another: a pulse
-    # is longer than that
-    resolution_m: float = 0.05
-    resolution_rad: float = 0.1
-    # Added in squares to the standard deviation of a known wall's single ranges: none is a mirror
-    # to a fraction of a millimetre, and within a Fresnel zone of its end the edge answers, too
-    roughness_m: float = 3e-3
+    A point must fit its ranges no worse than a wall does.
+    """
+
+    min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 25
+    """Fewest frames of `TrackletRule.long_window` that hit a wall."""
+    min_way_m: Annotated[float, Origin.CHOSEN] = 0.25
+    """How far its echo must have moved along it."""
+    wall_margin: Annotated[float, Origin.CHOSEN] = 30.0
+    """By how much chi-square must be less under the law of a wall than under that of a point."""
+    cell_m: Annotated[float, Origin.BUDGET] = 0.1
+    """Length of the cells in which it is stored where along it a wall gave echoes."""
+    reach_m: Annotated[float, Origin.CHOSEN] = 1.0
+    """How far along the line from a known wall an echo may lie and be of it."""
+    resolution_m: Annotated[float, Origin.CHOSEN] = 0.05
+    """A wall closer than this to a known one, and not it, is its echo merged with another: a pulse
+    is longer than that."""
+    resolution_rad: Annotated[float, Origin.CHOSEN] = 0.1
+    """The same of its direction."""
+    roughness_m: Annotated[float, Origin.CHOSEN] = 3e-3
+    """Added in squares to the standard deviation of a known wall's single ranges: none is a mirror
+    to a fraction of a millimetre, and within a Fresnel zone of its end the edge answers, too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelinearisationRule:
     """When the whole run is solved for again, and how."""
 
-    # Way and turn from one keyframe to the next
-    key_m: float = 0.05
-    key_rad: float = 0.1
-    # How far the filter's pose may part from the stored trajectory
-    turn_rad: float = 0.02
-    shift_m: float = 0.04
-    every: int = 20  # fewest frames between two solutions
-    # Most frames between two, and as a share of the run: all solutions together cost in proportion
-    # to it then
-    at_least_every: int = 50
-    run_share: float = 0.1
-    iterations: int = 10  # most steps of one solution
-    # Ranges further off than this are left out from that iteration on
-    outlier_sigmas: float = 4.0
-    outliers_from: int = 3
-    # Standard deviations of a slip, how many steps there are to one, and from which iteration on
-    # there are any
-    slip_m: float = 0.015
-    slip_rad: float = math.radians(2.0)
-    steps_per_slip: float = 100.0
-    slips_from: int = 2
+    key_m: Annotated[float, Origin.BUDGET] = 0.05
+    """Way from one keyframe to the next."""
+    key_rad: Annotated[float, Origin.BUDGET] = 0.1
+    """Turn from one keyframe to the next."""
+    turn_rad: Annotated[float, Origin.BUDGET] = 0.02
+    """How far the filter's heading may part from the stored trajectory before a solution."""
+    shift_m: Annotated[float, Origin.BUDGET] = 0.04
+    """How far its position may part from it."""
+    every: Annotated[int, Origin.BUDGET, "scans"] = 20
+    """Fewest scans between two solutions."""
+    at_least_every: Annotated[int, Origin.BUDGET, "scans"] = 50
+    """Most scans between two solutions, at the beginning of a run, and between two snapshots of the
+    back end; a landmark that has not been seen for longer is in another passage when it is seen
+    again."""
+    run_share: Annotated[float, Origin.BUDGET] = 0.1
+    """Later, most scans as a share of the run: so all solutions cost in proportion to it."""
+    iterations: Annotated[int, Origin.BUDGET, "steps"] = 10
+    """Most steps of one solution."""
+    outlier_sigmas: Annotated[float, Origin.QUANTILE] = 4.0
+    """Ranges further off than this are left out: of normal errors one in 16000."""
+    slip_m: Annotated[float, Origin.CHOSEN] = 0.015
+    """Standard deviation of a slip along and across the way; that of the stress `slip`."""
+    slip_rad: Annotated[float, Origin.CHOSEN] = math.radians(2.0)
+    """Standard deviation of a slip's turn; that of the stress `slip`."""
+    steps_per_slip: Annotated[float, Origin.CHOSEN, "steps"] = 100.0
+    """How many steps of the robot there are to one slip; as in the stress `slip`."""
+    slips_from: Annotated[int, Origin.CHOSEN, "steps"] = 2
+    """Step of a solution from which on there are slips; from the next one on, outliers."""
+    first_share: Annotated[float, Origin.CHOSEN] = 0.25
+    """What share of its price a slip must gain in that step."""
+    neighbours: Annotated[int, Origin.CHOSEN, "keyframes"] = 4
+    """A new slip gains most among so many motions before and after it."""
+    radius_scale_m: Annotated[float, Origin.CHOSEN] = 1e-3
+    """Scale of the prior of radii; smaller ones are alike."""
+
+    @property
+    def outliers_from(self) -> int:
+        """Return the step of a solution from which on ranges are left out: after the slips."""
+        return self.slips_from + 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseRule:
+    """What the residuals of a solution say of the noise of ranges."""
+
+    fewest_ranges: Annotated[int, Origin.CHOSEN, "ranges"] = 200
+    """With fewer ranges in the run the noise stays as it is."""
+    keys_per_passage: Annotated[int, Origin.CHOSEN, "keyframes"] = 5
+    """Over so many keyframes the errors of the ranges of one landmark are correlated."""
+    prior_passages: Annotated[int, Origin.CHOSEN, "groups"] = 5
+    """Weight of the noise of all landmarks in that of one, in groups of that length."""
+    prior_groups: Annotated[int, Origin.CHOSEN, "groups"] = 30
+    """Weight of the configured share of the variance (`RobustConfig.range_variance_share`)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitRule:
+    """When ranges of one landmark are of another one.
+
+    They are if the evidence for that exceeds `BranchRule.price_nats`, and at least half of what
+    they cost is gone where they have a place of their own.
+    """
+
+    suspect_mean: Annotated[float, Origin.CHOSEN] = 4.0
+    """Mean squared residual from which on a group of ranges is examined; 1 is expected."""
+    fewest: Annotated[int, Origin.CHOSEN, "ranges"] = 15
+    """Fewest ranges of a group that is examined."""
+    tried_m: Annotated[float, Origin.BUDGET] = 0.2
+    """How far from the landmark, along each axis, the search for another place begins."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BranchRule:
     """When the robot may have been carried, and when that is believed."""
 
-    # A landmark is missed if no range lies within so many standard deviations, that of the model
-    # included: what the scattering centre of a body may wander, added in squares
-    miss_sigmas: float = 3.0
-    model_sigma_m: float = 0.01
-    # Over so many steps the errors of the ranges of one target are correlated: their evidence is
-    # divided by that number
-    correlated_steps: float = 2.0
-    # Most evidence [nats] that one landmark gives against a place (it may have been taken away) and
-    # for it (other ranges may lie near its prediction for long)
-    most_against: float = 12.0
-    most_for: float = 9.0
-    # Evidence [nats] against the pose from which on another place is looked for, from which on the
-    # robot is lost, and by which a place must be likelier to be adopted
-    suspicious: float = 12.0
-    carry_price: float = 20.0
-    steps: int = 15  # over which a place proves itself
-    lost_steps: int = 100  # the last so many decide whether the robot is lost, or at a place
-    carry_steps: int = 1000  # after which the question is dropped, unless a place is on trial
-    # Fewest landmarks that place a map on another, and how far lengths and places may
-    # differ in a guess
-    least_landmarks: int = 3
-    reach_m: float = 0.2
-    # Standard deviation reported for the position while the robot is lost
-    lost_position_m: float = 5.0
+    model_sigma_m: Annotated[float, Origin.CHOSEN] = 0.01
+    """Added in squares to the noise of a range where it is evidence of a carry: what the scattering
+    centre of a body may wander."""
+    correlated_steps: Annotated[float, Origin.CHOSEN, "scans"] = 2.0
+    """Over so many scans the errors of the ranges of one target are correlated; their evidence is
+    divided by it."""
+    most_against: Annotated[float, Origin.CHOSEN, "nats"] = 12.0
+    """Most evidence that one landmark gives against a place, for it may have been taken away; with
+    more than that from several, another place is looked for."""
+    most_for: Annotated[float, Origin.CHOSEN, "nats"] = 9.0
+    """Most evidence that one landmark gives for a place, for others may lie near its prediction."""
+    price_nats: Annotated[float, Origin.CHOSEN] = 20.0
+    """By how much something rare must be likelier than that it did not happen: that the robot was
+    carried, or that a passage's ranges are of another landmark."""
+    least_landmarks: Annotated[int, Origin.CHOSEN, "landmarks"] = 3
+    """Fewest landmarks that place a map on another, that are against a pose, and that can pay the
+    price together."""
+    lost_steps: Annotated[int, Origin.BUDGET, "scans"] = 100
+    """How many of the last scans decide whether the robot is lost, or at a place."""
+    carry_steps: Annotated[int, Origin.BUDGET, "scans"] = 1000
+    """After how many scans the question of a carry is dropped, unless a place is on trial."""
+    patience: Annotated[int, Origin.BUDGET] = 4
+    """After how many times `TrackletRule.window` a place on trial is dropped."""
+    snapshots: Annotated[int, Origin.BUDGET, "snapshots"] = 9
+    """How many snapshots of the back end are kept (`RelinearisationRule.at_least_every`): a carry
+    that is noticed later is dated to the oldest."""
+    catch_up: Annotated[int, Origin.BUDGET, "scans"] = 10
+    """How many scans an alternative that lags behind takes at a time."""
+    newest: Annotated[int, Origin.BUDGET, "landmarks"] = 8
+    """How many of the newest landmarks are looked for among all others."""
+    base_m: Annotated[float, Origin.CHOSEN] = 0.3
+    """Least distance of two landmarks from which a place is guessed."""
+    reach_m: Annotated[float, Origin.CHOSEN] = 0.2
+    """How far lengths and places may differ in a guess."""
+    most_tried: Annotated[int, Origin.BUDGET, "guesses"] = 200
+    """Most guesses that are judged at a time."""
+    placement_nats: Annotated[float, Origin.QUANTILE] = 4.0
+    """Least evidence of a place, and by how much it must beat every other: 55 times."""
+    weakened: Annotated[float, Origin.CHOSEN] = 4.0
+    """Factor on the covariance of the points by which the robot is set down, as their ranges are
+    used once more."""
+    lost_position_m: Annotated[float, Origin.CHOSEN] = 5.0
+    """Standard deviation that is reported for the position while the robot is lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointRule:
-    """How points with range and bearing find their landmarks."""
+    """How points with range and bearing find their landmarks.
 
-    gate: float = 9.21  # bound on d^2 of a match (2 dof, 99 %)
-    new_gate: float = 25.0  # d^2 to every landmark from which on a point is new
-    reach_m: float = 20.0  # limit of the search
+    No radar measures such points; who has a sensor that does gives the rule with them.
+    """
+
+    gate: float  # squared Mahalanobis distance below which a point may be a landmark
+    new_gate: float  # squared distance to every landmark above which a point is new
+    reach_m: float  # distance up to which landmarks are compared with a point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,6 +344,8 @@ class BackEndParameters:
     continuation: ContinuationRule = field(default_factory=ContinuationRule)
     tracklets: TrackletRule = field(default_factory=TrackletRule)
     map: MapRule = field(default_factory=MapRule)
-    branches: BranchRule = field(default_factory=BranchRule)
     walls: WallRule = field(default_factory=WallRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)
+    noise: NoiseRule = field(default_factory=NoiseRule)
+    splits: SplitRule = field(default_factory=SplitRule)
+    branches: BranchRule = field(default_factory=BranchRule)

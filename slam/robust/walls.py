@@ -27,7 +27,6 @@ import numpy as np
 from slam.geometry import wrap_angle
 from slam.robust.association import Antennas, View, certain, identity
 from slam.robust.initialisation import (
-    MEMBER_MARGIN_RAD,
     SEEN,
     FeatureRows,
     Guess,
@@ -40,16 +39,14 @@ from slam.robust.initialisation import (
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
 from slam.robust.state import HEAD_SIZE, Array, State, rotation
 
-_PRIOR_RAD = 0.3
-
 
 def wall_guesses(
     unassigned: UnassignedRanges, radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
 ) -> list[Guess]:
     """Return the lines (phi, d) that touch both circles of every pair of new ranges."""
     guesses = []
-    spread = np.diag([_PRIOR_RAD**2, rule.prior_sigma_m**2])
-    limit = noise.field_of_view_rad / 2 + MEMBER_MARGIN_RAD
+    spread = np.diag([rule.prior_sigma_rad**2, rule.prior_sigma_m**2])
+    limit = noise.field_of_view_rad / 2 + rule.edge_rad
     for one, two in combinations(radars, 2):
         x, y, yaw = unassigned.antenna(one)
         dx, dy = unassigned.antenna(two)[0] - x, unassigned.antenna(two)[1] - y
@@ -244,7 +241,7 @@ class WallKeeper:
         if tracklet.label is not None:
             return True
         excess = self.tracker(is_wall=False).excess_of_wall(tracklet)
-        return excess >= self._rule.point_margin and not self._is_on_a_wall(tracklet)
+        return excess >= 0.0 and not self._is_on_a_wall(tracklet)
 
     def _is_on_a_wall(self, tracklet: Tracklet) -> bool:
         """Return whether a mapped wall nearby explains the ranges, too."""
@@ -278,10 +275,9 @@ class WallKeeper:
                 return False
             return -tracker.excess_of_wall(tracklet) >= rule.wall_margin
 
-        guesses = wall_guesses(
-            unassigned, radars, self._parameters.ranges, self._parameters.tracklets
-        )
-        search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
+        tracklets = self._parameters.tracklets
+        guesses = wall_guesses(unassigned, radars, self._parameters.ranges, tracklets)
+        search = Search(radars=radars, window=tracklets.long_window, min_frames=rule.min_frames)
         return find_tracklets(tracker, guesses, unassigned, search, is_wall)
 
     def place(self, tracklet: Tracklet) -> int | None:

@@ -49,7 +49,7 @@ def test_robust_steps(benchmark: BenchmarkFixture, n: int) -> None:
 def test_merge_search(benchmark: BenchmarkFixture, n: int) -> None:
     state, rule = mapped_state(n), MapRule()
     with threadpool_limits(1):
-        benchmark(find_merge, state, Existence(rule), rule)
+        benchmark(find_merge, state, Existence(rule, report_hits=9), rule)
 
 
 @pytest.mark.slow

@@ -194,9 +194,9 @@ def test_a_run_with_other_rules_is_replayed_with_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a session of another version is, whose rules are not those of this one."""
-    name = "slam.robust.parameters.TrackletRule.min_frames"
-    constants = slam_constants() | {name: 13, "slam.robust.map._KNOTS": 9}
-    rules = BackEndParameters(tracklets=TrackletRule(min_frames=13))
+    name = "slam.robust.parameters.TrackletRule.window"
+    constants = slam_constants() | {name: 21, "slam.robust.map.MERGE_SIGMA_M": 9.0}
+    rules = BackEndParameters(tracklets=TrackletRule(window=21))
     session = tmp_path / "session.mcap"
     record_session(session, "robust", rules=rules, constants=constants)
     assert main(["replay", str(session), "--out", str(tmp_path / "out")]) == 0
@@ -205,5 +205,5 @@ def test_a_run_with_other_rules_is_replayed_with_its_own(
     assert main(["replay", str(session), "--out", str(tmp_path / "again")]) == 0
     said = capsys.readouterr().err
     assert "only " in said
-    assert "slam.robust.map._KNOTS 9, here 8" in said
+    assert "slam.robust.map.MERGE_SIGMA_M 9.0, here 1e-05" in said
     assert "processor" not in said

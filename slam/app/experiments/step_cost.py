@@ -102,7 +102,7 @@ def stepper(state: State) -> Callable[[], None]:
         increment = np.array([0.01 if taken % 2 else -0.01, 0.0, 0.0])
         predict(state, calibrated_motion(increment, state.calibration, wheels), wheels)
         seen = view(state, mounts)
-        find_known(state, seen, scans, side_of, parameters, sure_m=noise.sigma_m)
+        find_known(state, seen, scans, side_of, parameters)
         rows = rows_of(state, seen, radars, landmarks)
         state.update(rows.at, rows.H, np.zeros(N_UPDATES), R)
 

@@ -36,7 +36,7 @@ from slam.evaluation import ate_rmse_m
 from slam.geometry import Rig, compose, wrap_angle
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import BackEndParameters, RelinearisationRule
+from slam.robust.parameters import BackEndParameters, PointRule, RelinearisationRule
 from slam.robust.state import CALIBRATION
 from xethru_protocol.system import StopFlag
 from xethru_protocol.validation import reason_of
@@ -50,6 +50,9 @@ FILE = "victoria_park.txt"
 PARK_RULE = RelinearisationRule(
     turn_rad=0.02, shift_m=0.5, every=100, outlier_sigmas=math.inf, steps_per_slip=math.inf
 )
+# A point may be a landmark within the 99 % quantile of chi-square, two degrees of freedom, and is a
+# new one at five standard deviations from all others.
+PARK_POINTS = PointRule(gate=9.21, new_gate=25.0, reach_m=20.0)
 
 # Wheels of which nothing is known: a tenth in distance and turn, a degree per two metres.
 UNKNOWN_WHEELS = WheelNoise(scale_sigma=0.1, turn_scale_sigma=0.1, curvature_sigma_rad_per_m=0.01)
@@ -184,7 +187,7 @@ def drive_back_end(drive: Drive, wheels: WheelNoise, stop: StopFlag, *, with_ids
         if step > 0:
             back_end.predict(drive.increments[step - 1], drive.covariances[step - 1])
         given_points = points if with_ids else [replace(point, label=None) for point in points]
-        ids = back_end.update_points(given_points)
+        ids = back_end.update_points(given_points, PARK_POINTS)
         given += [
             (point.label, id_)
             for point, id_ in zip(points, ids, strict=True)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam.robust.association import Pairs
-from slam.robust.map import apply_merge
+from slam.robust.map import MERGE_SIGMA_M, apply_merge
 from slam.robust.parameters import TAIL_PROBABILITY, BackEndParameters
 from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
 from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
@@ -25,19 +25,11 @@ from slam.robust.state import (
     SymmetricMatrix,
 )
 
-# The standard deviation of normal noise over its median magnitude; the largest white residual that
-# counts; and with fewer ranges than that the noise stays as it is
-_SIGMA_PER_MEDIAN, _MOST_SIGMAS, _FEWEST_RANGES = 1.4826, 3.0, 200
-# Over so many keyframes the errors of the ranges of one landmark are correlated; the weight of the
-# noise of all landmarks in that of one, in such groups; and limits of `RangeErrors.variance_share`
-_KEYS_PER_PASSAGE, _PRIOR_PASSAGES, _LEAST_SHARE, _MOST_SHARE = 5, 5, 0.5, 50.0
-_PRIOR_GROUPS = 30  # weight, in groups, of the share that is configured
+_SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
+_LEAST_SHARE, _MOST_SHARE = 0.5, 50.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
-# A group of at least so many ranges is examined from that mean cost on; the evidence [nats] for a
-# place of its own; and steps of the search for it, from each of some displacements
-_SUSPECT_MEAN, _FEWEST_OF_GROUP, _SPLIT_NATS, _ALONE_STEPS = 4.0, 15, 20.0, 8
-_TRIED_M = ((0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2))
-_LEAST_FIT = 0.5  # share of the ranges of a landmark that fit if it is another one
+_ALONE_STEPS = 8  # of the search for the place of a group of ranges, from each of its begins
+_BEGINS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
 
 
@@ -84,7 +76,7 @@ def is_one(log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameter
     two, one = copy.copy(state), copy.deepcopy(state)
     two.added_sigmas_m = state.added_sigmas_m | noisier(state, same)
     one.added_sigmas_m |= noisier(state, same)
-    apply_merge(one, pairs, parameters.map.merge_sigma_m)
+    apply_merge(one, pairs, MERGE_SIGMA_M)
     problem = log.problem(two, parameters)
     apart = _solved(log, two, problem, parameters)
     merged = log.problem(one, parameters, same)
@@ -98,7 +90,7 @@ def is_one(log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameter
     residual = measurement_residuals(merged, together.estimate).residual[: len(merged.ranges_m)]
     fits = np.abs(residual) <= parameters.relinearisation.outlier_sigmas
     rows = [row for pair in pairs for row in pair]
-    return all(np.mean(fits[problem.range_landmarks == row]) > _LEAST_FIT for row in rows)
+    return all(np.mean(fits[problem.range_landmarks == row]) > 0.5 for row in rows)
 
 
 def noisier(state: State, same: Mapping[int, int]) -> dict[int, float]:
@@ -126,13 +118,14 @@ def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Spli
     """Return the passage, or the landmark merged into another, that disagrees most with the rest.
 
     To be called after a solution, whose poses are taken for true: of a group of ranges of one
-    landmark, the smaller part, the cost must fall by more than chance and `_SPLIT_NATS` explain
-    where the group has a place of its own.
+    landmark, the smaller part, the cost must fall by more than chance and `BranchRule.price_nats`
+    explain where the group has a place of its own.
     """
     problem = log.problem(state, parameters)
     estimate, n = log.starts(state, problem)[0], len(problem.ranges_m)
     residual = measurement_residuals(problem, estimate).residual[:n]
     limit, layout = parameters.relinearisation.outlier_sigmas, problem.layout
+    rule, price = parameters.splits, parameters.branches.price_nats
     costs = np.minimum(residual**2, limit**2)
     found: list[tuple[float, Split]] = []
     for edges in log.edges(problem.range_rows):
@@ -142,18 +135,18 @@ def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Spli
         sizes = np.diff(np.append(starts, n))
         means = np.add.reduceat(costs[order], starts) / sizes
         wholes = np.bincount(problem.range_landmarks)[keys[starts, 0]]
-        suspects = (means > _SUSPECT_MEAN) & (sizes >= _FEWEST_OF_GROUP) & (2 * sizes <= wholes)
+        suspects = (means > rule.suspect_mean) & (sizes >= rule.fewest) & (2 * sizes <= wholes)
         for k in np.flatnonzero(suspects & (keys[starts, 0] < layout.n_landmarks)).tolist():
             at = order[starts[k] : starts[k] + sizes[k]]
-            point_m, apart = _place_apart(problem, estimate, at, limit)
+            point_m, apart = _place_apart(problem, estimate, at, limit, rule.tried_m)
             gain = (float(costs[at].sum()) - apart) / problem.variance_share
-            if gain > 2.0 * _SPLIT_NATS and apart < 0.5 * float(costs[at].sum()):
+            if gain > 2.0 * price and apart < 0.5 * float(costs[at].sum()):
                 found.append((gain, Split(rows=problem.range_rows[at], point_m=point_m)))
     return max(found, key=lambda pair: pair[0])[1] if found else None
 
 
 def _place_apart(
-    problem: Problem, estimate: Estimate, at: Indices, limit: float
+    problem: Problem, estimate: Estimate, at: Indices, limit: float, tried_m: float
 ) -> tuple[Array, float]:
     """Return where some ranges of one landmark lie, and what they cost there, poses being known."""
     few = replace(
@@ -171,7 +164,7 @@ def _place_apart(
     first = int(problem.layout.first_columns(problem.range_landmarks[at[:1]])[0]) - HEAD_SIZE
     best_m, least = estimate.fixed[first : first + 2], math.inf
     # The antennas see it from one side; where the ranges cross may lie on the other.
-    for away in _TRIED_M:
+    for away in tried_m * np.array(_BEGINS):
         fixed = estimate.fixed.copy()
         fixed[first : first + 2] += away
         for _ in range(_ALONE_STEPS):
@@ -197,8 +190,8 @@ def learn_noise(
     residuals over some keyframes: had all ranges errors of their own, the variance of a sum would
     be the number of its terms. A wall's added sigma is never less than `WallRule.roughness_m`.
     """
-    n = len(problem.ranges_m)
-    if n < _FEWEST_RANGES:
+    n, rule = len(problem.ranges_m), parameters.noise
+    if n < rule.fewest_ranges:
         return
     ids, at = state.feature_ids, problem.range_landmarks
     residual = measurement_residuals(problem, estimate).residual[:n]
@@ -206,7 +199,7 @@ def learn_noise(
     given_m = np.sqrt(np.maximum(problem.range_sigmas_m**2 - added[at] ** 2, _LEAST_VARIANCE_M2))
     ratio = residual * problem.range_sigmas_m / given_m
     of_all = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio)))) ** 2
-    block = problem.range_poses // _KEYS_PER_PASSAGE
+    block = problem.range_poses // rule.keys_per_passage
     own = np.zeros(len(ids))
     for row, id_ in enumerate(ids):
         mine = np.flatnonzero(at == row)
@@ -214,18 +207,21 @@ def learn_noise(
             continue
         n_passages = len(np.unique(block[mine]))
         raw = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio[mine])))) ** 2
-        believed = (n_passages * raw + _PRIOR_PASSAGES * of_all) / (n_passages + _PRIOR_PASSAGES)
+        believed = (n_passages * raw + rule.prior_passages * of_all) / (
+            n_passages + rule.prior_passages
+        )
         own[row] = math.sqrt(max(believed - 1.0, 0.0)) * float(np.median(given_m[mine]))
         if id_ in state.wall_ids:
             own[row] = max(own[row], parameters.walls.roughness_m)
         state.added_sigmas_m[id_] = own[row]
-    sigmas_m = np.hypot(given_m, own[at])
-    white = np.clip(ratio * given_m / sigmas_m, -_MOST_SIGMAS, _MOST_SIGMAS)
+    sigmas_m, most_sigmas = np.hypot(given_m, own[at]), parameters.tracklets.gate_sigmas
+    white = np.clip(ratio * given_m / sigmas_m, -most_sigmas, most_sigmas)
     groups = np.unique(block * len(ids) + at, return_inverse=True)[1]
     sums = np.bincount(groups, white)
     n_groups = len(sums)
-    share = n_groups * float(np.sum(sums**2)) / n + _PRIOR_GROUPS * parameters.ranges.variance_share
-    share /= n_groups + _PRIOR_GROUPS
+    share = n_groups * float(np.sum(sums**2)) / n
+    share += rule.prior_groups * parameters.ranges.variance_share
+    share /= n_groups + rule.prior_groups
     share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
     added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
     state.range_errors = RangeErrors(added_m, share)

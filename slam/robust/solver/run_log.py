@@ -32,7 +32,6 @@ _LEAST_SIGMA = 1e-7
 # Of the first pose [m, rad], where a run's own map begins
 _POSE_SIGMA = 1e-6
 _LEAST_WAY_M = 1e-9
-_GAP_POSES = 50  # a landmark not seen for longer is in another passage when it is seen again
 # Of a feature's place [m], and of a wall's direction [rad]
 _ANYWHERE_M = 30.0
 
@@ -190,11 +189,12 @@ def motion_covariances(chain: Chain, step_covariances: Array) -> Array:
 class RunLog:
     """Steps, used ranges and points of a whole run, with the trajectory last solved for.
 
-    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark.
+    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark. One that
+    has not been seen for more than ``gap_poses`` is in another passage when it is seen again.
     """
 
-    def __init__(self, wheels: WheelNoise) -> None:
-        self._wheels = wheels
+    def __init__(self, wheels: WheelNoise, gap_poses: int) -> None:
+        self._wheels, self._gap_poses = wheels, gap_poses
         self._steps = PackedRows(np.dtype(np.float64), 3)
         self._covariances = PackedRows(np.dtype(np.float64), 3, 3)
         self._walks = PackedRows(np.dtype(np.float64))
@@ -265,8 +265,8 @@ class RunLog:
         ``antenna`` is in the body frame of the pose, its mount being where the rig has it, and
         ``turn_rad`` the robot's from the pose to the sample.
         """
-        passage, last = self._passages.get(landmark_id, (0, -_GAP_POSES - 1))
-        if pose - last > _GAP_POSES:
+        passage, last = self._passages.get(landmark_id, (0, -self._gap_poses - 1))
+        if pose - last > self._gap_poses:
             passage = self._n_passages
             self._n_passages += 1
         self._passages[landmark_id] = passage, max(pose, last)

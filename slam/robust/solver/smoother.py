@@ -40,9 +40,6 @@ _LEAST_WALK_SHARE = 1e-5
 # halved
 _TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
 _SETTLED_SHARE = 0.01  # decrease of the cost, as a share, from which on outliers are left out
-# What share of its price a slip must gain to be tried, and among how many neighbours on either side
-_FIRST_SHARE, _NEIGHBOURS = 0.25, 4
-_THIN_M, _RADIUS_SCALE_M = 1e-3, 1e-3  # radii below the first are alike; tau of their prior
 # What keeps a direction finite where a landmark stands at an antenna, or at the robot, and a root
 # where nothing walks
 _LEAST_RANGE_M, _LEAST_RANGE_M2, _TINY = 1e-9, 1e-18, 1e-300
@@ -464,13 +461,14 @@ class Smoother:
         total += float(np.sum(self._walk_residual(estimate) ** 2))
         away, sigmas = self._from_prior(estimate)
         costs = (away / sigmas) ** 2
-        # Of a radius the cost is 2 ln(tau + rho), and quadratic where it is thin.
-        radii = np.maximum(away[self._radii], _THIN_M)
-        thin = np.clip(away[self._radii], 0.0, _THIN_M)
-        costs[self._radii] = thin**2 / (_THIN_M * (_RADIUS_SCALE_M + _THIN_M))
-        costs[self._radii] += 2.0 * np.log((_RADIUS_SCALE_M + radii) / (_RADIUS_SCALE_M + _THIN_M))
+        # Of a radius the cost is 2 ln(tau + rho), and quadratic where it is less than tau.
+        tau = self._rule.radius_scale_m
+        radii = np.maximum(away[self._radii], tau)
+        thin = np.clip(away[self._radii], 0.0, tau)
+        costs[self._radii] = thin**2 / (tau * (2.0 * tau))
+        costs[self._radii] += 2.0 * np.log((tau + radii) / (2.0 * tau))
         below = np.minimum(away[self._radii], 0.0)
-        return total + float(np.sum(costs) + np.sum((below / _THIN_M) ** 2))
+        return total + float(np.sum(costs) + np.sum((below / tau) ** 2))
 
     def start_cost(self, estimate: Estimate) -> float:
         """Return the cost of values to start from: any motion may be a slip."""
@@ -509,11 +507,12 @@ class Smoother:
         So at first it need not gain all its price.
         """
         residual = motion_residuals(self._problem, estimate).residual
-        as_wheels, slipped = self._motion_costs(residual, _FIRST_SHARE if is_first else 1.0)
+        share = self._rule.first_share if is_first else 1.0
+        as_wheels, slipped = self._motion_costs(residual, share)
         gain = as_wheels - slipped
-        k = len(gain)
-        padded = np.pad(gain, _NEIGHBOURS, constant_values=-math.inf)
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1)
+        k, beside = len(gain), self._rule.neighbours
+        padded = np.pad(gain, beside, constant_values=-math.inf)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * beside + 1)
         is_most = gain >= windows[:k].max(axis=1)
         return np.asarray((gain > 0.0) & (is_most | slips))
 
@@ -528,13 +527,13 @@ class Smoother:
         Radii have a prior 1 / (tau + rho), which takes most of them for thin, and of those that are
         not every size for likely: by the quadratic that touches it, as Huber's weights are.
         """
-        problem = self._problem
+        problem, tau = self._problem, self._rule.radius_scale_m
         first = np.concatenate([estimate.poses[0], estimate.calibration[0], estimate.fixed])
         away, sigmas = first - problem.prior_mean, problem.prior_sigmas.copy()
         radii = away[self._radii]
-        least = np.maximum(radii, _THIN_M)
-        rounded = np.sqrt(least * (_RADIUS_SCALE_M + least))
-        sigmas[self._radii] = np.where(radii < 0.0, _THIN_M, rounded)
+        least = np.maximum(radii, tau)
+        rounded = np.sqrt(least * (tau + least))
+        sigmas[self._radii] = np.where(radii < 0.0, tau, rounded)
         return away, sigmas
 
     def weights(self, residual: Array, limit: float) -> Array:

@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, values
 from hil_tests.property.trilateration_oracles import NO_RANGES
+from slam.app.experiments.victoria_park import PARK_POINTS
 from slam.geometry import paper_rig
 from slam.robust.association import (
     Known,
@@ -36,10 +37,9 @@ from slam.robust.initialisation import (
 )
 from slam.robust.parameters import (
     MARGIN_NATS,
+    NEIGHBOURHOOD_M,
     TAIL_PROBABILITY,
     BackEndParameters,
-    MapRule,
-    PointRule,
     RangeNoise,
 )
 from slam.robust.state import State, SymmetricMatrix, rotation
@@ -66,7 +66,7 @@ def ahead_of_the_left_radars(seed: int, n: int) -> State:
 def known_of(state: State, scans: Sequence[RangeScan], noise: RangeNoise = NOISE) -> Known:
     seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
     parameters = BackEndParameters(ranges=noise)
-    known = find_known(state, seen, scans, SIDE_OF, parameters, sure_m=noise.sigma_m)
+    known = find_known(state, seen, scans, SIDE_OF, parameters)
     assert known is not None
     return known
 
@@ -189,7 +189,7 @@ def test_the_brute_force_has_work_to_do() -> None:
 
 
 def test_the_gate_of_points_is_a_quantile_of_chi_square() -> None:
-    assert chi2.cdf(PointRule().gate, 2) == pytest.approx(0.99, abs=1e-4)
+    assert chi2.cdf(PARK_POINTS.gate, 2) == pytest.approx(0.99, abs=1e-4)
 
 
 def one_landmark(prior: Array) -> State:
@@ -243,7 +243,7 @@ def test_true_points_pass_the_gate_of_99_percent_as_often_as_it_says() -> None:
     rows = range_bearing_rows(state, 0, seen)
     expected = seen.values - rows.residual
     noisy = expected + rng.standard_normal((TRIALS // 4, 2)) @ np.linalg.cholesky(rows.S).T
-    rule = PointRule()
+    rule = PARK_POINTS
     passed = 0
     for range_m, bearing in noisy.tolist():
         point = RangeBearing(range_m=range_m, bearing_rad=bearing, covariance=C)
@@ -266,7 +266,7 @@ def test_points_are_assigned_as_the_best_of_all_assignments(
         )
         for _ in range(n_points)
     ]
-    rule = PointRule()
+    rule = PARK_POINTS
     table = np.array(
         [[range_bearing_rows(state, k, point).mahalanobis_sq for k in range(n)] for point in points]
     )
@@ -291,7 +291,7 @@ def test_points_are_assigned_as_the_best_of_all_assignments(
 def test_a_point_is_matched_by_the_rule_written_out(seed: int, n: int) -> None:
     """Gate, density of what is not yet mapped, and a lead over the next."""
     rng = np.random.default_rng(seed)
-    state, rule = ahead_of_the_left_radars(seed, n), MapRule()
+    state = ahead_of_the_left_radars(seed, n)
     point = BodyPoint(
         point_m=np.array([0.0, 1.0]) + rng.uniform(-0.15, 0.15, 2),
         covariance=1e-4 * np.eye(2),
@@ -307,11 +307,11 @@ def test_a_point_is_matched_by_the_rule_written_out(seed: int, n: int) -> None:
     _, squared, density, best = scores[0]
     clear = len(scores) == 1 or scores[1][0] - scores[0][0] > 2.0 * MARGIN_NATS
     apart = state.landmarks_m[:, None] - state.landmarks_m[None, :]
-    others = int((np.hypot(apart[..., 0], apart[..., 1]) <= rule.merge_reach_m).sum()) - n
-    per_m2 = max(others / n, 1.0) / (math.pi * rule.merge_reach_m**2)
+    others = int((np.hypot(apart[..., 0], apart[..., 1]) <= NEIGHBOURHOOD_M).sum()) - n
+    per_m2 = max(others / n, 1.0) / (math.pi * NEIGHBOURHOOD_M**2)
     is_known = density > math.exp(MARGIN_NATS) * per_m2
     wanted = squared <= chi2.isf(TAIL_PROBABILITY, 2) and is_known and clear
-    assert match(state, point, rule) == (best if wanted else None)
+    assert match(state, point) == (best if wanted else None)
 
 
 def sure_point(sigma_m: float, *landmarks_m: tuple[float, float]) -> tuple[State, BodyPoint]:
@@ -331,14 +331,14 @@ def sure_point(sigma_m: float, *landmarks_m: tuple[float, float]) -> tuple[State
 def test_a_point_that_is_likelier_new_is_no_match(sigma_m: float, row: int | None) -> None:
     """1 / (2 pi sigma^2) exceeds one landmark on a disc of 1.5 m by 3 nats below 0.2367 m."""
     state, point = sure_point(sigma_m, (1.0, 0.0))
-    assert match(state, point, MapRule()) == row
+    assert match(state, point) == row
 
 
 @pytest.mark.parametrize(("apart_m", "row"), [(0.244, None), (0.246, 1)])
 def test_a_point_between_two_landmarks_is_neither(apart_m: float, row: int | None) -> None:
     """(0.245 m / 0.1 m)^2 = 6 is the likelihood margin."""
     state, point = sure_point(0.1, (1.0, apart_m), (1.0, 0.0))
-    assert match(state, point, MapRule()) == row
+    assert match(state, point) == row
 
 
 # --- what is left alone ---------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from hil_tests.unit.slam.robust.range_world import (
     parameters_for,
     simulate,
 )
+from slam.app.experiments.victoria_park import PARK_POINTS
 from slam.evaluation import ate_rmse_m, landmark_metrics, observable_landmarks
 from slam.geometry import PAPERS_FIELD, Mount, Rig, align_se2, paper_rig, transform
 from slam.robust.association import RangeScan
@@ -146,11 +147,13 @@ def test_points_with_names_make_a_map() -> None:
         seen = np.array([2.0, 1.0]) - np.array([0.1 * (k + 1), 0.0])
         range_m, bearing = float(np.hypot(*seen)), float(np.arctan2(seen[1], seen[0]))
         point = RangeBearing(range_m=range_m, bearing_rad=bearing, covariance=C, label=7)
-        assert back_end.update_points([point]) == (0,)
+        assert back_end.update_points([point], PARK_POINTS) == (0,)
     assert back_end.state.landmarks_m[0] == pytest.approx([2.0, 1.0], abs=1e-3)
     unnamed = replace(point, label=None)
-    assert back_end.update_points([unnamed]) == (0,)
-    assert back_end.update_points([replace(unnamed, bearing_rad=bearing + 1.0)]) == (1,)
+    assert back_end.update_points([unnamed], PARK_POINTS) == (0,)
+    assert back_end.update_points([replace(unnamed, bearing_rad=bearing + 1.0)], PARK_POINTS) == (
+        1,
+    )
 
 
 def test_an_empty_scan_and_no_scan_change_nothing() -> None:
@@ -183,7 +186,7 @@ def test_a_landmark_known_to_two_centimetres_is_given_up_where_nothing_answers(
         RangeBearing(range_m=0.6, bearing_rad=bearing, covariance=np.diag([1e-6, 1e-6]))
         for bearing in (-1.5, -1.7)
     ]
-    assert back_end.update_points([point, *known]) == (0, 1, 2)
+    assert back_end.update_points([point, *known], PARK_POINTS) == (0, 1, 2)
     ranges_m = [
         tuple(math.hypot(0.6 * math.cos(b) - x_m, 0.6 * math.sin(b) + 0.2) for b in (-1.5, -1.7))
         for x_m in (0.1, -0.1)

@@ -179,7 +179,7 @@ def totals(*evidence: tuple[int, float]) -> Array:
 
 
 MISSED = [(id_, -3.0) for id_ in (1, 2, 3)] * 20
-PRICE = RULE.carry_price
+PRICE = RULE.price_nats
 
 
 def test_totals_are_sums_of_the_landmarks_known_then() -> None:

@@ -27,7 +27,7 @@ PLACES = np.array([[0.1, 0.9], [0.55, 0.7], [0.95, 1.1], [0.3, -0.8], [0.8, -1.0
 
 
 def mapped(places: Array, sigma_m: float = 0.02) -> tuple[State, Existence]:
-    state, existence = State((0.0, 0.0, 0.0), (0.0,) * 4), Existence(MapRule())
+    state, existence = State((0.0, 0.0, 0.0), (0.0,) * 4), Existence(MapRule(), report_hits=9)
     for place in places:
         point = BodyPoint(
             point_m=place, covariance=sigma_m**2 * np.eye(2), by_offsets=np.zeros((2, 4))

@@ -15,6 +15,7 @@ from scipy.special import chdtri
 
 from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.unit.slam.robust.range_world import LAB, follow, parameters_for, simulate, step_of
+from slam.app.experiments.victoria_park import PARK_POINTS
 from slam.config import WheelNoise
 from slam.geometry import between, compose, paper_rig
 from slam.robust.association import RangeScan
@@ -39,9 +40,7 @@ Complex = NDArray[np.complex128]
 
 N_RADARS, N_MARKS, N_STEPS = 4, 3, 12
 ANTENNAS = np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]])
-RULE = RelinearisationRule(
-    iterations=40, outliers_from=2, outlier_sigmas=50.0, steps_per_slip=math.inf
-)
+RULE = RelinearisationRule(iterations=40, outlier_sigmas=50.0, steps_per_slip=math.inf)
 
 
 def point_seen(pose: Array, mark: Array) -> Array:
@@ -387,7 +386,7 @@ def test_the_smoothed_run_leaves_the_filter_unchanged_and_is_within_a_centimetre
 
 def test_keyframes_remain_as_the_run_goes_on_and_a_loose_step_is_between_two() -> None:
     rng = np.random.default_rng(2)
-    log, state = RunLog(WheelNoise()), State((0.01,) * 3, (0.0,) * N_RADARS)
+    log, state = RunLog(WheelNoise(), RULE.at_least_every), State((0.01,) * 3, (0.0,) * N_RADARS)
     parameters = BackEndParameters()
     before: set[int] = set()
     for k in range(1, 120):
@@ -409,7 +408,7 @@ def test_a_range_is_the_same_from_its_keyframe_as_from_its_own_pose() -> None:
     state.mounts_m = 0.01 * np.random.default_rng(1).standard_normal((N_RADARS, 2))
     state.augment(np.array([0.3, 1.0]), np.zeros((state.P.size, 3)), np.eye(3))
     state.radii_m[0] = 0.04
-    log, wheels = RunLog(WheelNoise()), WheelNoise()
+    log, wheels = RunLog(WheelNoise(), RULE.at_least_every), WheelNoise()
     poses = [np.zeros(3)]
     for k in range(1, 41):
         step = np.array([0.01, 0.001, 0.02])
@@ -441,7 +440,7 @@ def test_each_calibration_error_walks_in_proportion_to_its_own_deviation() -> No
     wheels = WheelNoise(
         scale_sigma=s, turn_scale_sigma=w, curvature_sigma_rad_per_m=kappa, walk_per_sqrt_m=1.0
     )
-    log, state = RunLog(wheels), State(sigmas, (0.0,) * N_RADARS)
+    log, state = RunLog(wheels, RULE.at_least_every), State(sigmas, (0.0,) * N_RADARS)
     step = np.array([0.25, 0.0, 0.0])
     motion = calibrated_motion(step, np.zeros(3), wheels)
     log.add_motion(step, motion)
@@ -457,14 +456,14 @@ def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
     back_end = RobustBackEnd(paper_rig(), parameters)
     seen = RangeBearing(range_m=1.0, bearing_rad=1.5, covariance=1e-6 * np.eye(2), label=3)
     far = RangeBearing(range_m=5.0, bearing_rad=0.0, covariance=1e-6 * np.eye(2), label=4)
-    first, _ = back_end.update_points([seen, far])
+    first, _ = back_end.update_points([seen, far], PARK_POINTS)
     silent = [RangeScan(radar=radar, ranges_m=(), labels=()) for radar in range(N_RADARS)]
     for _ in range(40):
         back_end.update(silent)
     assert first not in back_end.state.landmark_ids
     heard = replace(silent[0], ranges_m=(1.0,), labels=(3,))
     assert back_end.update([heard, *silent[1:]]).continued == ()
-    assert back_end.update_points([seen]) != (first,)
+    assert back_end.update_points([seen], PARK_POINTS) != (first,)
     assert len(back_end.state.landmark_ids) == 2
 
 
@@ -488,7 +487,7 @@ def drive_along(
 @pytest.mark.parametrize("n_ranges", [14, 60])
 def test_a_range_costs_a_row_of_numbers_and_no_object(n_ranges: int) -> None:
     """A range is 46 bytes at most and a pose 129, in buffers that may be half empty."""
-    log, n_poses = RunLog(WheelNoise()), 1000
+    log, n_poses = RunLog(WheelNoise(), RULE.at_least_every), 1000
     tracemalloc.start()
     try:
         drive_along(log, n_poses, range(n_ranges), np.random.default_rng(6))

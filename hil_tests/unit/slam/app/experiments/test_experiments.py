@@ -35,7 +35,7 @@ from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
 from slam.robust.association import RangeScan, antennas_of, find_known, view
-from slam.robust.parameters import BackEndParameters, RangeNoise
+from slam.robust.parameters import BackEndParameters
 from xethru_protocol.system import StopFlag
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
@@ -138,8 +138,8 @@ def test_the_gate_of_a_step_has_something_to_weigh() -> None:
     state, rig = mapped_state(40), paper_rig()
     seen = view(state, antennas_of(rig, (), np.zeros(3)))
     scans = [RangeScan(radar=radar, ranges_m=()) for radar in range(4)]
-    sides, sure_m = np.array([0, 0, 1, 1]), RangeNoise().sigma_m
-    known = find_known(state, seen, scans, sides, BackEndParameters(), sure_m=sure_m)
+    sides = np.array([0, 0, 1, 1])
+    known = find_known(state, seen, scans, sides, BackEndParameters())
     assert known is not None
     for side in known.of_side[:, :, 0]:
         assert {0, 1} & set(known.rows[side].tolist())

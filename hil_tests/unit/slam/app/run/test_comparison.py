@@ -106,19 +106,19 @@ def test_numbers_that_differ_are_the_reason() -> None:
 
 def test_recorded_rules_are_taken_over_and_other_numbers_compared() -> None:
     recorded = slam_constants() | {
-        "slam.robust.parameters.MapRule.report_hits": 3,
-        "slam.robust.parameters.ContinuationRule.tight_sigmas": 1.5,
+        "slam.robust.parameters.MapRule.apart_frames": 7,
+        "slam.robust.parameters.ContinuationRule.view_sigmas": 1.5,
         "slam.robust.parameters.MapRule.gone": 7.0,
-        "slam.robust.branches._NEWEST": 9,
+        "slam.robust.branches._IDS_APART": 9,
     }
     del recorded["slam.front_end.matched_filter._REACH"]
     rules = recorded_rules(recorded)
-    assert rules.map == replace(MapRule(), report_hits=3)
-    assert rules.continuation.tight_sigmas == 1.5
+    assert rules.map == replace(MapRule(), apart_frames=7)
+    assert rules.continuation.view_sigmas == 1.5
     assert rules.tracklets == BackEndParameters().tracklets
     assert different_constants(recorded) == [
         "slam.front_end.matched_filter._REACH none, here 3.0",
-        "slam.robust.branches._NEWEST 9, here 8",
+        "slam.robust.branches._IDS_APART 9, here 1000",
         "slam.robust.parameters.MapRule.gone 7.0, here none",
     ]
 
@@ -129,7 +129,7 @@ def test_an_old_session_has_no_numbers_that_differ() -> None:
 
 
 def test_numbers_of_another_kind_are_not_taken_over() -> None:
-    wrong = {"slam.robust.parameters.MapRule.report_hits": "many"}
+    wrong = {"slam.robust.parameters.MapRule.apart_frames": "many"}
     assert recorded_rules(wrong) == BackEndParameters()
 
 
@@ -138,10 +138,10 @@ def test_a_replay_has_the_recorded_rules(tmp_path: Path) -> None:
         session_info(),
         config_json=settings_text(load_preset("robust")),
         wheels=asdict(WheelNoise()),
-        constants={"slam.robust.parameters.TrackletRule.min_frames": 13},
+        constants={"slam.robust.parameters.TrackletRule.window": 21},
     )
     session = write_session(tmp_path / "session.mcap", 3, odometry(9), info)
     slam = recorded_source(open_session(session), StopFlag()).slam
     assert isinstance(slam, RobustSlam)
-    assert slam.back_end.parameters.tracklets == TrackletRule(min_frames=13)
+    assert slam.back_end.parameters.tracklets == TrackletRule(window=21)
     assert slam.back_end.parameters.map == MapRule()

@@ -52,10 +52,11 @@ def test_every_number_that_a_module_of_slam_names_is_collected(file: Path) -> No
 
 def test_the_numbers_are_those_of_the_source() -> None:
     found = slam_constants()
-    assert found["slam.robust.parameters.MapRule.hit"] == 1.0
-    assert found["slam.robust.initialisation._SINGLE_BEARINGS_RAD"] == [0.0, -0.25, 0.25, -0.5, 0.5]
+    assert found["slam.robust.parameters.MapRule.miss"] == 1.5
+    assert found["slam.robust.parameters.TAIL_PROBABILITY"] == 1e-3
+    assert found["slam.robust.state.POSITION"] == [1, 3]
     assert found["slam.config.WheelNoise.along_m_per_sqrt_m"] == 2e-3
-    assert found["slam.robust.branches._NEWEST"] == 8
+    assert found["slam.robust.branches._IDS_APART"] == 1000
     assert found["slam.front_end.kernels._ECHO_LEVEL"] == 12.25
     assert found["slam.front_end.pulse._SPEED_OF_LIGHT_MPS"] == 299_792_458.0
     assert len(found) >= 190
