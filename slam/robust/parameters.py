@@ -5,11 +5,12 @@ every scene. Every number of a rule has an origin (`slam.config.Origin`) and one
 what it is; `docs/constants.md` is made of them.
 
 What is a constant in this sense: a number that decides something, so that with half or twice of it
-another landmark, place, weight or time could result. It is a field here. Not constants, and beside
-the code that uses them, are
+another landmark, place, weight or time could result. It is a field here or a setting. Not
+constants, and beside the code that uses them, are
 
-- numbers that keep arithmetic regular: floors, damping, the tolerance of a search that converges,
-  the noise of a statement that is exact, and uncertainties so large that they state nothing;
+- numbers that keep arithmetic regular: floors and ceilings that no run reaches, damping, tolerances
+  and steps of a search that converges, the noise of a statement that is exact, and uncertainties
+  so small that they count as none or so large that they state nothing;
 - numbers of mathematics, such as a half, or the median of normal noise;
 - sizes of buffers, and what marks a value as missing.
 
