@@ -25,7 +25,7 @@ least sum is found by branch and bound, as joint compatibility is (Neira and Tar
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,8 +51,6 @@ class RangeScan:
 
     radar: int  # index of the mount in the rig
     ranges_m: tuple[float, ...]  # ranges in true metres
-    # Which target each range is of, where that is known; it replaces association
-    labels: tuple[int, ...] | None = None
     # Standard deviation of each range, where the front end predicts it
     sigmas_m: tuple[float, ...] | None = None
     # Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame of
@@ -61,9 +59,6 @@ class RangeScan:
     # Ranges of echoes that several targets may share: no evidence of where anything is, nor that
     # nothing is there
     blurred_m: tuple[float, ...] = ()
-
-    def label(self, index: int) -> int | None:
-        return None if self.labels is None else self.labels[index]
 
     def sigma(self, index: int, otherwise_m: float) -> float:
         """Return the standard deviation [m] of one range; ``otherwise_m`` if there is none."""
@@ -358,21 +353,6 @@ def _padded(
         variances[scan.radar, :k] = np.square(sigmas_m)
         blurred_m[scan.radar, : len(scan.blurred_m)] = scan.blurred_m
     return ranges_m, variances, blurred_m
-
-
-def labelled(
-    scans: Sequence[RangeScan], state: State, landmark_of_label: Mapping[int, int]
-) -> tuple[Indices, Indices]:
-    """Return (radar, index) of the ranges of known labels, (k, 2), and their landmarks' rows."""
-    rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
-    found = [
-        (scan.radar, index, rows[landmark_of_label[label]])
-        for scan in scans
-        for index in range(len(scan.ranges_m))
-        if (label := scan.label(index)) in landmark_of_label and label is not None
-    ]
-    table = np.array(found, dtype=np.intp).reshape(-1, 3)
-    return table[:, :2], table[:, 2]
 
 
 Pairs = tuple[tuple[int, int], ...]

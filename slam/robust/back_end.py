@@ -20,9 +20,7 @@ from slam.robust.association import (
     View,
     antennas_of,
     find_known,
-    labelled,
     predicted_ranges,
-    rows_of,
     view,
 )
 from slam.robust.initialisation import (
@@ -224,7 +222,7 @@ class RobustBackEnd:
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         widened = [scan.with_added_sigma(added_m) for scan in scans]
-        matches, seen = self._associate(scans, widened, antennas)
+        matches, seen = self._associate(widened, antennas)
         continued, nis, likelihoods = self._correct(matches, seen, scans, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
@@ -303,18 +301,15 @@ class RobustBackEnd:
         return True
 
     def _associate(
-        self,
-        scans: Sequence[RangeScan],
-        widened: Sequence[RangeScan],
-        antennas: Antennas,
+        self, scans: Sequence[RangeScan], antennas: Antennas
     ) -> tuple[Matches | None, View]:
-        """Find the ranges of known landmarks among the ``widened`` scans; count hits and misses."""
+        """Find the ranges of known landmarks; count hits and misses."""
         state, existence = self.state, self._existence
         seen = view(state, antennas)
         if not state.feature_ids:
             return None, seen
         seen = self._walls.look(seen, antennas)
-        known = find_known(state, seen, widened, self._side_of, self.parameters)
+        known = find_known(state, seen, scans, self._side_of, self.parameters)
         if known is None:
             return None, seen
         features = state.feature_ids
@@ -339,10 +334,6 @@ class RobustBackEnd:
                 if known.rows[place] < len(state.landmark_ids)
             ],
         )
-        if any(scan.labels is not None for scan in scans):
-            ranges, landmarks = labelled(scans, state, self._landmark_of_label)
-            rows = rows_of(state, seen, ranges[:, 0], landmarks)
-            matches = replace(matches, ranges=ranges, landmarks=landmarks, at=rows.at, H=rows.H)
         return matches, seen
 
     def _correct(
@@ -443,15 +434,9 @@ class RobustBackEnd:
         point = tracklet.body_point()
         share = max(state.range_errors.variance_share, 1.0)
         point = replace(point, covariance=share * point.covariance)
-        if tracklet.label is not None:
-            known = self._landmark_of_label.get(tracklet.label)
-            row = None if known is None else state.landmark_ids.index(known)
-        else:
-            row = match(state, point)
+        row = match(state, point)
         if row is None:
             landmark_id = initialise_landmark(state, point)
-            if tracklet.label is not None:
-                self._landmark_of_label[tracklet.label] = landmark_id
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
@@ -493,7 +478,7 @@ class RobustBackEnd:
     def _merge(self) -> None:
         """Merge landmarks where that is certain, and the whole run allows it."""
         rule, now = self.parameters.map, self._n_updates
-        if self._landmark_of_label or now % rule.look_every:
+        if now % rule.look_every:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}

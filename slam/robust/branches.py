@@ -187,8 +187,6 @@ class Branches:
             evidence=evidence_table(report),
         )
         self._now += 1
-        if any(scan.labels is not None for scan in scans):
-            return report
         was_lost = self.is_lost
         moved = self._carry is not None and self._decide(self._carry)
         if self._now % self._look_every == 0:

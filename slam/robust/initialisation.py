@@ -68,8 +68,6 @@ _FORBIDDEN = 1e9
 _LEAST_WAY_M = 1e-6
 # Unknowns of the radars surer than this share of a range's standard deviation are taken for known.
 _KNOWN_SHARE = 0.1
-# Label of a range whose target is not known
-_NO_LABEL = -1
 # Stands for what is seen now where it is compared with rows of the map
 SEEN = -1
 # Room for ranges of one radar in one frame, at first
@@ -137,14 +135,11 @@ class UnassignedRanges:
         """Make room for so many ranges of a radar in a frame."""
         shape = (*self._has_frame.shape, most)
         ranges_m, sigmas_m = np.full(shape, np.nan), np.zeros(shape)
-        labels = np.full(shape, _NO_LABEL, dtype=np.intp)
         if self._count:
             k = self._ranges_m.shape[2]
             ranges_m[..., :k], sigmas_m[..., :k] = self._ranges_m, self._sigmas_m
-            labels[..., :k] = self._labels
         self._ranges_m: Array = ranges_m
         self._sigmas_m: Array = sigmas_m
-        self._labels: Indices = labels
 
     def move(self, motion: Motion) -> None:
         step = np.array([motion.step_m[0], motion.step_m[1], motion.turn_rad])
@@ -174,7 +169,7 @@ class UnassignedRanges:
         self._mounts_m[f], self._has_frame[f] = antennas.position_m, antennas.has_frame
         self._nominal_m[f], self._turns_rad[f] = antennas.nominal_m, antennas.turns_rad
         self._poses[f], self._ways[f], self._pose_indices[f] = self._pose, self._way, pose_index
-        self._ranges_m[f], self._labels[f] = np.nan, _NO_LABEL
+        self._ranges_m[f] = np.nan
         for scan in scans:
             for index, range_m in enumerate(scan.ranges_m):
                 if (scan.radar, index) in used or not 0.0 < range_m < LONGEST_M:
@@ -182,14 +177,11 @@ class UnassignedRanges:
                 at = f, scan.radar, index
                 self._ranges_m[at] = range_m
                 self._sigmas_m[at] = scan.sigma(index, self._sigma_m)
-                if (label := scan.label(index)) is not None:
-                    self._labels[at] = label
 
-    def newest(self, radar: int) -> list[tuple[float, int]]:
-        """Return the ranges of a radar in the newest frame and their labels."""
-        ranges_m, labels = self._ranges_m[self._newest, radar], self._labels[self._newest, radar]
-        pairs = zip(ranges_m.tolist(), labels.tolist(), strict=True)
-        return [(range_m, label) for range_m, label in pairs if not math.isnan(range_m)]
+    def newest(self, radar: int) -> list[float]:
+        """Return the ranges of a radar in the newest frame."""
+        ranges_m = self._ranges_m[self._newest, radar].tolist()
+        return [range_m for range_m in ranges_m if not math.isnan(range_m)]
 
     def antenna(self, radar: int) -> tuple[float, float, float]:
         """Return place and yaw of an antenna at the newest frame, in its body frame."""
@@ -217,14 +209,12 @@ class UnassignedRanges:
         return kernels.follow(
             is_wall,
             np.array([*guess.target, xx, xy, yy]),
-            _NO_LABEL if guess.label is None else guess.label,
             self._places,
             self._poses,
             self._ways,
             self._has_frame,
             self._ranges_m,
             self._sigmas_m,
-            self._labels,
             self._newest,
             min(search.window, self._count),
             np.array(search.radars, dtype=np.intp),
@@ -352,7 +342,6 @@ class Guess:
 
     target: Array
     covariance: Array
-    label: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -367,7 +356,6 @@ class Tracklet:
     # Of the residuals
     chi_square: float
     dof: int
-    label: int | None
 
     def body_point(self) -> BodyPoint:
         away = self.target - self.seen.antennas_m.mean(axis=0)
@@ -390,21 +378,14 @@ def point_guesses(
     limit = noise.field_of_view_rad / 2 + rule.seed_margin_rad
     for one, two in combinations(radars, 2):
         first, second = unassigned.antenna(one), unassigned.antenna(two)
-        for (a, label), (b, other) in product(unassigned.newest(one), unassigned.newest(two)):
-            if label != other:
-                continue
+        for a, b in product(unassigned.newest(one), unassigned.newest(two)):
             for x, y in crossings(first, second, a, b) or ():
                 if all(
                     abs(math.remainder(math.atan2(y - at[1], x - at[0]) - at[2], math.tau)) <= limit
                     for at in (first, second)
                 ):
-                    guesses.append(_guess(x, y, spread, label))
+                    guesses.append(Guess(target=np.array([x, y]), covariance=spread))
     return guesses
-
-
-def _guess(x: float, y: float, spread: Array, label: int = _NO_LABEL) -> Guess:
-    known = None if label == _NO_LABEL else label
-    return Guess(target=np.array([x, y]), covariance=spread, label=known)
 
 
 def _guesses_on_arcs(
@@ -415,15 +396,14 @@ def _guesses_on_arcs(
     n_steps = math.floor(noise.field_of_view_rad / 2 / rule.single_step_rad)
     steps = sorted(range(-n_steps, n_steps + 1), key=abs)
     x, y, yaw = unassigned.antenna(radar)
-    for range_m, label in unassigned.newest(radar):
+    for range_m in unassigned.newest(radar):
         for off in (step * rule.single_step_rad for step in steps):
             u = np.array([math.cos(yaw + off), math.sin(yaw + off)])
             across = (rule.single_spread_rad * range_m) ** 2
             along = rule.single_range_sigma_m**2
             spread = across * np.eye(2) + (along - across) * np.outer(u, u)
-            guesses.append(
-                _guess(x + range_m * float(u[0]), y + range_m * float(u[1]), spread, label)
-            )
+            target = np.array([x + range_m * float(u[0]), y + range_m * float(u[1])])
+            guesses.append(Guess(target=target, covariance=spread))
     return guesses
 
 
@@ -506,7 +486,6 @@ class Tracker:
             seen=unassigned.sightings(members, self._offsets_m),
             chi_square=chi_square,
             dof=len(members) - 2,
-            label=guess.label,
         )
         if self._free_covariance is not None:
             tracklet = self._with_free_radars(tracklet, guess.covariance)

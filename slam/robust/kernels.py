@@ -19,20 +19,18 @@ Indices = NDArray[np.intp]
 
 @kernel(
     "Tuple((f8[::1], f8[:,::1], i8[:,::1], i8[::1]))"
-    "(b1, f8[::1], i8, f8[:,:,::1], f8[:,::1], f8[:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,::1],"
-    " i8[:,:,::1], i8, i8, i8[::1], f8[::1], f8[:,::1], f8[::1])"
+    "(b1, f8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,::1],"
+    " i8, i8, i8[::1], f8[::1], f8[:,::1], f8[::1])"
 )
 def follow(
     is_wall: bool,
     guess: Array,
-    label: int,
     places: Array,
     poses: Array,
     ways: Array,
     has_frame: NDArray[np.bool_],
     ranges: Array,
     sigmas: Array,
-    labels: Indices,
     newest: int,
     count: int,
     radars: Indices,
@@ -107,7 +105,7 @@ def follow(
                 nearest, nu = -1, math.inf
                 for k in range(ranges.shape[2]):
                     miss = ranges[f, radar, k] - expected
-                    if abs(miss) < abs(nu) and labels[f, radar, k] == label:
+                    if abs(miss) < abs(nu):
                         nearest, nu = k, miss
                 if nearest < 0:
                     continue

@@ -51,9 +51,9 @@ def wall_guesses(
         x, y, yaw = unassigned.antenna(one)
         dx, dy = unassigned.antenna(two)[0] - x, unassigned.antenna(two)[1] - y
         base, along = math.hypot(dx, dy), math.atan2(dy, dx)
-        for (a, label), (b, other) in product(unassigned.newest(one), unassigned.newest(two)):
+        for a, b in product(unassigned.newest(one), unassigned.newest(two)):
             cosine = (a - b) / base if base else math.inf
-            if abs(cosine) > 1.0 or label >= 0 or other >= 0:
+            if abs(cosine) > 1.0:
                 continue
             angles = (along + math.acos(cosine), along - math.acos(cosine))
             phi = min(angles, key=lambda angle: abs(math.remainder(angle - yaw, math.tau)))
@@ -238,8 +238,6 @@ class WallKeeper:
         What goes on where a mapped wall does is not known to be a point yet: over a few frames both
         laws fit.
         """
-        if tracklet.label is not None:
-            return True
         excess = self.tracker(is_wall=False).excess_of_wall(tracklet)
         return excess >= 0.0 and not self._is_on_a_wall(tracklet)
 

@@ -57,7 +57,7 @@ def test_merge_search(benchmark: BenchmarkFixture, n: int) -> None:
 def test_relinearisation_of_3000_poses(benchmark: BenchmarkFixture) -> None:
     """As many poses as are ever kept, the lab's map in them."""
     back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
-    run = simulate(LAB, 0, SIGMA_M, labelled=True)
+    run = simulate(LAB, 0, SIGMA_M, clutter=False)
     with threadpool_limits(1):
         for increment, scans in zip(run.increments[:2990], run.scans[:2990], strict=True):
             back_end.predict(increment)

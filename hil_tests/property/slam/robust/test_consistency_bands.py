@@ -87,7 +87,7 @@ def test_ekf_is_as_sure_as_it_may_be(told: float, consistent: bool) -> None:
 
 
 def test_robust_filter_is_as_sure_as_it_may_be() -> None:
-    """Drive past two landmarks with labels told: ranges, wheels with their errors of the run."""
+    """Drive past two landmarks without clutter: ranges, wheels with their errors of the run."""
     rig = paper_rig()
     poses = true_path(LAB)[:24]  # a landmark is born from nine frames
     nees, nis, dof = [], [], []
@@ -95,7 +95,7 @@ def test_robust_filter_is_as_sure_as_it_may_be() -> None:
         rng = np.random.default_rng(seed)
         landmarks = np.array([[0.15, 1.0], [0.1, -0.9]]) + rng.uniform(-0.1, 0.1, (2, 2))
         increments = reported(poses, LAB, rng, 0.0)
-        scans = scans_of(poses, landmarks, rng, 7.4e-3, labelled=True)
+        scans = scans_of(poses, landmarks, rng, 7.4e-3, clutter=False)
         back_end = RobustBackEnd(rig, parameters_for(LAB, 7.4e-3))
         reports, errors = [], []
         reports_of = follow(back_end, increments, scans)

@@ -85,12 +85,9 @@ def simulate(
     offset_m: float = 0.0,
     *,
     laps: int = LAPS,
-    labelled: bool = False,
+    clutter: bool = True,
 ) -> Run:
-    """Return one run; ``labelled`` ranges have their landmarks as labels, clutter left out.
-
-    ``offset_m`` is the standard deviation of each radar's constant offset.
-    """
+    """Return one run; ``offset_m`` is the standard deviation of each radar's constant offset."""
     rng = np.random.default_rng(seed)
     poses = true_path(room, laps)
     landmarks = place_landmarks(room, rng)
@@ -98,7 +95,7 @@ def simulate(
         poses=poses,
         landmarks=landmarks,
         increments=reported(poses, room, rng, 0.0),
-        scans=list(scans_of(poses, landmarks, rng, sigma_m, offset_m, labelled=labelled)),
+        scans=list(scans_of(poses, landmarks, rng, sigma_m, offset_m, clutter=clutter)),
     )
 
 
@@ -141,9 +138,25 @@ def scans_of(
     offset_m: float = 0.0,
     *,
     radars: Collection[int] = range(4),
-    labelled: bool = False,
+    clutter: bool = True,
 ) -> Iterator[list[RangeScan]]:
     """Yield what some radars detect at each pose but the first."""
+    ranges, seen = echoes_of(poses, landmarks, rng, sigma_m, offset_m)
+    n_clutter = rng.poisson(0.15, seen.shape[:2])
+    for k in range(1, len(poses)):
+        scans = []
+        for radar in radars:
+            own = ranges[radar, k, seen[radar, k]].tolist()
+            if clutter:
+                own += rng.uniform(0.2, 1.5, n_clutter[radar, k]).tolist()
+            scans.append(RangeScan(radar=radar, ranges_m=tuple(own)))
+        yield scans
+
+
+def echoes_of(
+    poses: Array, landmarks: Array, rng: np.random.Generator, sigma_m: float, offset_m: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the range of each landmark and whether it is detected, shapes (radars, poses, n)."""
     mounts, n = paper_rig().mounts, len(poses)
     offsets = offset_m * rng.standard_normal(len(mounts))
     ranges = np.empty((len(mounts), n, len(landmarks)))
@@ -153,17 +166,7 @@ def scans_of(
         seen[radar] = (off <= math.radians(32.5)) & (ranges[radar] >= 0.2) & (ranges[radar] <= 1.5)
     seen &= rng.random(seen.shape) < 0.92
     ranges += sigma_m * rng.standard_normal(ranges.shape) + offsets[:, None, None]
-    n_clutter = rng.poisson(0.15, (len(mounts), n))
-    for k in range(1, n):
-        scans = []
-        for radar in radars:
-            ids = np.flatnonzero(seen[radar, k])
-            own = ranges[radar, k, ids].tolist()
-            if not labelled:
-                own += rng.uniform(0.2, 1.5, n_clutter[radar, k]).tolist()
-            labels = tuple(ids.tolist()) if labelled else None
-            scans.append(RangeScan(radar=radar, ranges_m=tuple(own), labels=labels))
-        yield scans
+    return ranges, seen
 
 
 def polar(poses: Array, mount: Mount, landmarks: Array) -> tuple[Array, Array]:

@@ -127,7 +127,7 @@ def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> N
     landmarks = np.array([[0.2, 1.0], [0.7, 0.8], [1.1, 0.9], [0.3, -0.9], [0.9, -1.1]])
     parameters = parameters_for(LAB, SIGMA_M, walk_per_sqrt_m=1.0)
     back_end = RobustBackEnd(paper_rig(), parameters)
-    scans = scans_of(poses, landmarks, rng, SIGMA_M, labelled=True)
+    scans = scans_of(poses, landmarks, rng, SIGMA_M, clutter=False)
     list(follow(back_end, reported(poses, LAB, rng, 1.0), scans))
     at = np.arange(6)
     mean, sigmas = back_end.state.calibration, np.sqrt(np.diag(back_end.state.P.block(at)))

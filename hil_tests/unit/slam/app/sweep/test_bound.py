@@ -15,9 +15,10 @@ from scipy.linalg import eigh
 from hil_tests.unit.slam.app.sessions import record_of_steps
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
-    Run,
+    echoes_of,
     parameters_for,
-    simulate,
+    place_landmarks,
+    reported,
     true_path,
 )
 from slam.app.errors import AppError
@@ -52,29 +53,31 @@ SIGMA_M = 7.4e-3
 N_STEPS = 160
 
 
-@cache
-def simulated(offset_m: float) -> Run:
-    return simulate(LAB, 3, SIGMA_M, offset_m, labelled=True)
-
-
 def known_range(radar: int, landmark: int, range_m: float) -> KnownRange:
     return KnownRange(
         radar=radar, landmark=landmark, range_m=range_m, sigma_m=SIGMA_M, motion=np.zeros(3)
     )
 
 
-def labelled(run: Run, n_steps: int) -> KnownRun:
-    return KnownRun(
-        increments=run.increments[:n_steps],
-        ranges=tuple(
-            tuple(
-                known_range(scan.radar, label, range_m)
-                for scan in scans
-                for range_m, label in zip(scan.ranges_m, scan.labels or (), strict=True)
-            )
-            for scans in run.scans[:n_steps]
-        ),
+@cache
+def simulated(offset_m: float) -> tuple[KnownRun, Array]:
+    """Return a run with all ranges of its landmarks, and these, (n, 2)."""
+    rng, poses = np.random.default_rng(3), true_path(LAB)
+    landmarks = place_landmarks(LAB, rng)
+    increments = reported(poses, LAB, rng, 0.0)
+    ranges, seen = echoes_of(poses, landmarks, rng, SIGMA_M, offset_m)
+    known = tuple(
+        tuple(
+            known_range(radar, landmark, float(ranges[radar, k, landmark]))
+            for radar, landmark in np.argwhere(seen[:, k]).tolist()
+        )
+        for k in range(1, len(poses))
     )
+    return KnownRun(increments=increments, ranges=known), landmarks
+
+
+def begin_of(run: KnownRun, n_steps: int) -> KnownRun:
+    return KnownRun(increments=run.increments[:n_steps], ranges=run.ranges[:n_steps])
 
 
 def exact_run(n_steps: int) -> tuple[KnownRun, Array, Array]:
@@ -166,7 +169,7 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
 @pytest.mark.parametrize("offset_sigma_m", [0.0, 0.02])
 def test_the_smoother_is_ours_and_the_filtered_pose_ends_there(offset_sigma_m: float) -> None:
     pytest.importorskip("gtsam")
-    run = labelled(simulated(offset_sigma_m), N_STEPS)
+    run = begin_of(simulated(offset_sigma_m)[0], N_STEPS)
     bound = solve_known(
         run, paper_rig(), parameters_for(LAB, SIGMA_M).wheels, offset_sigma_m=offset_sigma_m
     )
@@ -184,8 +187,8 @@ def test_the_smoother_is_ours_and_the_filtered_pose_ends_there(offset_sigma_m: f
 
 def test_the_filtered_path_knows_nothing_of_what_comes_later() -> None:
     pytest.importorskip("gtsam")
-    run = labelled(simulated(0.0), 90)
-    short = KnownRun(increments=run.increments[:70], ranges=run.ranges[:70])
+    run = begin_of(simulated(0.0)[0], 90)
+    short = begin_of(run, 70)
     wheels = parameters_for(LAB, SIGMA_M).wheels
     whole, part = (solve_known(data, paper_rig(), wheels) for data in (run, short))
     np.testing.assert_array_equal(whole.filtered[:70], part.filtered)
@@ -195,18 +198,19 @@ def test_the_filtered_path_knows_nothing_of_what_comes_later() -> None:
 
 def test_a_radar_without_partner_finds_landmarks_too() -> None:
     pytest.importorskip("gtsam")
-    both = labelled(simulated(0.0), 130)
+    whole, landmarks = simulated(0.0)
+    both = begin_of(whole, 130)
     alive = tuple(tuple(k for k in ranges if k.radar in (0, 2)) for ranges in both.ranges)
     run = KnownRun(increments=both.increments, ranges=alive)
     bound = solve_known(run, paper_rig(), parameters_for(LAB, SIGMA_M).wheels)
     assert bound.landmark_ids
-    away = bound.landmarks_m - simulated(0.0).landmarks[list(bound.landmark_ids)]
+    away = bound.landmarks_m - landmarks[list(bound.landmark_ids)]
     assert np.hypot(*away.T).max() < 0.1
 
 
 def test_wandering_calibration_errors_get_sets_of_their_own() -> None:
     pytest.importorskip("gtsam")
-    run = labelled(simulated(0.0), 60)
+    run = begin_of(simulated(0.0)[0], 60)
     sigma = WheelNoise().scale_sigma
     wander = solve_known(run, paper_rig(), WheelNoise(walk_per_sqrt_m=0.5))
     still = solve_known(run, paper_rig(), WheelNoise())
