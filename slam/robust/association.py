@@ -269,8 +269,8 @@ def find_known(
     scans: Sequence[RangeScan],
     side_of: Indices,
     parameters: BackEndParameters,
-) -> Known | None:
-    """Return the likeliest one-to-one assignment of ranges to landmarks; None with none in view.
+) -> Known:
+    """Return the likeliest one-to-one assignment of ranges to landmarks.
 
     ``side_of`` (r,) is the side of each radar. Those whose ranges the prior predicts less surely
     than the radars' ``sigma_m`` take no part.
@@ -282,8 +282,6 @@ def find_known(
     margin_m = rule.view_sigmas * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
     rows = np.flatnonzero(inside.any(axis=0))
-    if not len(rows):
-        return None
     layout, state_columns = state.layout, np.arange(state.offsets.start, state.n_fixed)
     at = np.concatenate([np.array([1, 2]), state_columns, layout.columns(rows)])
     block = state.P.block(at)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import Rig
-from slam.results import PredictedRange, SmoothedRun, UpdateReport
+from slam.results import SmoothedRun, UpdateReport
 from slam.robust import kernels
 from slam.robust.association import (
     Antennas,
+    Known,
     Pairs,
     RangeScan,
     View,
@@ -53,7 +54,6 @@ from slam.robust.solver.run_log import RunLog
 from slam.robust.state import (
     HEAD_SIZE,
     Array,
-    Indices,
     Motion,
     RangeErrors,
     State,
@@ -68,22 +68,6 @@ _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 _FREE_M, _FREE_RAD = 1.0, 1.0
 # Variance of a new landmark's place until the run is solved for with it
 _ANYWHERE_M2 = 1.0
-
-
-@dataclass(slots=True)
-class Matches:
-    """Ranges of known landmarks among the scans of one time."""
-
-    # shape (k, 2): radar and index of each range; (k,): the row of its landmark
-    ranges: Indices
-    landmarks: Indices
-    # Columns of the error, and the derivatives of the ranges by them (k, columns)
-    at: Indices
-    H: Array
-    # The ranges of every landmark that took part, measured or not
-    predicted: list[PredictedRange] = field(default_factory=list)
-    # Landmarks surely in view, one entry per radar, that have no range near their prediction
-    missed: list[int] = field(default_factory=list)
 
 
 class RobustBackEnd:
@@ -222,8 +206,11 @@ class RobustBackEnd:
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         widened = [scan.with_added_sigma(added_m) for scan in scans]
-        matches, seen = self._associate(widened, antennas)
-        continued, nis, likelihoods = self._correct(matches, seen, scans, antennas)
+        seen = self._walls.look(view(self.state, antennas), antennas)
+        known = find_known(self.state, seen, widened, self._side_of, self.parameters)
+        predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
+        missed = self._count(known)
+        continued, nis, likelihoods = self._correct(known, seen, scans, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
@@ -239,11 +226,8 @@ class RobustBackEnd:
             continued=continued,
             nis=nis,
             dof=len(continued),
-            predicted=tuple(matches.predicted) if matches else (),
-            evidence=(
-                *likelihoods,
-                *((id_, miss) for id_ in (matches.missed if matches else ())),
-            ),
+            predicted=tuple(predicted),
+            evidence=(*likelihoods, *((id_, miss) for id_ in missed)),
         )
 
     def update_points(
@@ -300,45 +284,27 @@ class RobustBackEnd:
             relinearise(self._log, self.state, self.parameters)
         return True
 
-    def _associate(
-        self, scans: Sequence[RangeScan], antennas: Antennas
-    ) -> tuple[Matches | None, View]:
-        """Find the ranges of known landmarks; count hits and misses."""
-        state, existence = self.state, self._existence
-        seen = view(state, antennas)
-        if not state.feature_ids:
-            return None, seen
-        seen = self._walls.look(seen, antennas)
-        known = find_known(state, seen, scans, self._side_of, self.parameters)
-        if known is None:
-            return None, seen
-        features = state.feature_ids
+    def _count(self, known: Known) -> list[int]:
+        """Count hits and misses; return the landmarks that none of their radars has heard.
+
+        Each is returned once for every radar that surely has it in view.
+        """
+        features, existence = self.state.feature_ids, self._existence
         ids = [features[row] for row in known.rows.tolist()]
-        hits = set(known.assigned[:, 2].tolist())
-        for place in hits:
+        for place in set(known.assigned[:, 2].tolist()):
             existence.hit(ids[place])
         for place in np.flatnonzero(known.of_side[:, :, 1].any(axis=0)).tolist():
             existence.miss(ids[place])
         for side in known.of_side[:, :, 2]:
             existence.seen_whole(ids[place] for place in np.flatnonzero(side).tolist())
-        matches = Matches(
-            ranges=known.assigned[:, :2],
-            landmarks=known.rows[known.assigned[:, 2]],
-            at=known.at,
-            H=known.H,
-            predicted=predicted_ranges(state, seen, known, self._side_of, antennas),
-            # A wall may end before it comes into view.
-            missed=[
-                ids[place]
-                for place in np.nonzero(known.unheard)[0].tolist()
-                if known.rows[place] < len(state.landmark_ids)
-            ],
-        )
-        return matches, seen
+        # A wall may end before it comes into view.
+        n = len(self.state.landmark_ids)
+        unheard = np.nonzero(known.unheard)[0].tolist()
+        return [ids[place] for place in unheard if known.rows[place] < n]
 
     def _correct(
         self,
-        matches: Matches | None,
+        known: Known,
         seen: View,
         scans: Sequence[RangeScan],
         antennas: Antennas,
@@ -349,23 +315,24 @@ class RobustBackEnd:
         range the landmark and ln(Pd p / lambda), where p is its density given those before it, and
         lambda that of ranges in its scan, whatever they are of.
         """
-        if matches is None or not len(matches.ranges):
+        if not len(known.assigned):
             return (), 0.0, []
-        state, ids, H = self.state, self.state.feature_ids, matches.H
-        pairs, landmarks = matches.ranges.tolist(), matches.landmarks
+        state, ids = self.state, self.state.feature_ids
+        radars, landmarks = known.assigned[:, 0], known.rows[known.assigned[:, 2]]
+        pairs = known.assigned[:, :2].tolist()
         continued = tuple(
             (radar, index, ids[row])
             for (radar, index), row in zip(pairs, landmarks.tolist(), strict=True)
         )
         of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
         z = np.array([of_radar[radar].ranges_m[index] for radar, index in pairs])
-        innovations_m = z - seen.ranges_m[matches.ranges[:, 0], landmarks]
+        innovations_m = z - seen.ranges_m[radars, landmarks]
         sigmas = np.array([of_radar[radar].sigma(index, noise.sigma_m) for radar, index in pairs])
         variances = np.square(sigmas) + np.square(state.feature_added_sigmas_m[landmarks])
         gain, weighted, white, scales = kernels.weigh(
-            state.P.columns(matches.at),
-            matches.at,
-            H,
+            state.P.columns(known.at),
+            known.at,
+            known.H,
             innovations_m,
             variances,
             noise.huber_sigmas,

@@ -66,9 +66,7 @@ def ahead_of_the_left_radars(seed: int, n: int) -> State:
 def known_of(state: State, scans: Sequence[RangeScan], noise: RangeNoise = NOISE) -> Known:
     seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
     parameters = BackEndParameters(ranges=noise)
-    known = find_known(state, seen, scans, SIDE_OF, parameters)
-    assert known is not None
-    return known
+    return find_known(state, seen, scans, SIDE_OF, parameters)
 
 
 def choice_of(known: Known) -> dict[tuple[int, int], int]:

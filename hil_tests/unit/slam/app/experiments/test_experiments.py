@@ -140,7 +140,6 @@ def test_the_gate_of_a_step_has_something_to_weigh() -> None:
     scans = [RangeScan(radar=radar, ranges_m=()) for radar in range(4)]
     sides = np.array([0, 0, 1, 1])
     known = find_known(state, seen, scans, sides, BackEndParameters())
-    assert known is not None
     for side in known.of_side[:, :, 0]:
         assert {0, 1} & set(known.rows[side].tolist())
 
