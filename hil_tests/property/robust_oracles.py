@@ -1,12 +1,17 @@
-"""What the robust filter must agree with: its error model written again in complex numbers."""
+"""What the robust filter must agree with: its error model written again in complex numbers.
+
+And the derivatives of any range, of which the filter has those that it uses in a compiled loop.
+"""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.robust.state import State, SymmetricMatrix
+from slam.robust.association import View
+from slam.robust.state import Indices, State, SymmetricMatrix
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -84,6 +89,53 @@ def body_point(x: Complex, landmark: int) -> Complex:
     first = 6 + N_RADARS + 2 * landmark
     result: Complex = turn(x[0]).T @ (x[first : first + 2] - x[1:3])
     return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """Range measurements that could be made: row i is of radar ``radars[i]``, one landmark each."""
+
+    # shape (k,): index of the radar, row of the landmark; walls are the rows from n on
+    radars: Indices
+    landmarks: Indices
+    at: Indices  # columns of the error that H has entries for, shape (c,)
+    H: Array  # shape (k, c)
+    predicted_m: Array  # shape (k,)
+
+
+def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Rows:
+    """Return the ranges of some landmarks from some radars, and their derivatives."""
+    known, place = np.unique(landmarks, return_inverse=True)
+    layout = state.layout
+    n_offsets = layout.n_radars
+    at = np.concatenate(
+        [np.array([1, 2]), np.arange(layout.offsets.start, state.n_fixed), layout.columns(known)]
+    )
+    k = np.arange(len(radars))
+    u = seen.directions[radars, landmarks]
+    H = np.zeros((len(radars), len(at)))
+    H[:, :2] = -u
+    H[k, 2 + radars] = 1.0
+    if layout.has_mounts:
+        by_mount = -np.einsum("ki,kij->kj", u, seen.turned[radars])
+        H[k, 2 + n_offsets + 2 * radars] = by_mount[:, 0]
+        H[k, 3 + n_offsets + 2 * radars] = by_mount[:, 1]
+    first = 2 + state.n_fixed - layout.offsets.start + 2 * place
+    if layout.has_radii:
+        points = int(np.searchsorted(known, layout.n_landmarks))
+        first = first + np.minimum(place, points)
+        of_point = np.flatnonzero(landmarks < layout.n_landmarks)
+        H[of_point, first[of_point] + 2] = -1.0
+    by_feature = seen.by_feature[radars, landmarks]
+    H[k, first] = by_feature[:, 0]
+    H[k, first + 1] = by_feature[:, 1]
+    return Rows(
+        radars=radars,
+        landmarks=landmarks,
+        at=at,
+        H=H,
+        predicted_m=seen.ranges_m[radars, landmarks],
+    )
 
 
 def random_covariance(size: int, rng: np.random.Generator, scale: float = 0.05) -> Array:

@@ -167,52 +167,6 @@ def view(state: State, antennas: Antennas) -> View:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rows:
-    """Range measurements that could be made: row i is of radar ``radars[i]``, one landmark each."""
-
-    # shape (k,): index of the radar, row of the landmark; walls are the rows from n on
-    radars: Indices
-    landmarks: Indices
-    at: Indices  # columns of the error that H has entries for, shape (c,)
-    H: Array  # shape (k, c)
-    predicted_m: Array  # shape (k,)
-
-
-def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Rows:
-    known, place = np.unique(landmarks, return_inverse=True)
-    layout = state.layout
-    n_offsets = layout.n_radars
-    at = np.concatenate(
-        [np.array([1, 2]), np.arange(layout.offsets.start, state.n_fixed), layout.columns(known)]
-    )
-    k = np.arange(len(radars))
-    u = seen.directions[radars, landmarks]
-    H = np.zeros((len(radars), len(at)))
-    H[:, :2] = -u
-    H[k, 2 + radars] = 1.0
-    if layout.has_mounts:
-        by_mount = -np.einsum("ki,kij->kj", u, seen.turned[radars])
-        H[k, 2 + n_offsets + 2 * radars] = by_mount[:, 0]
-        H[k, 3 + n_offsets + 2 * radars] = by_mount[:, 1]
-    first = 2 + state.n_fixed - layout.offsets.start + 2 * place
-    if layout.has_radii:
-        points = int(np.searchsorted(known, layout.n_landmarks))
-        first = first + np.minimum(place, points)
-        of_point = np.flatnonzero(landmarks < layout.n_landmarks)
-        H[of_point, first[of_point] + 2] = -1.0
-    by_feature = seen.by_feature[radars, landmarks]
-    H[k, first] = by_feature[:, 0]
-    H[k, first + 1] = by_feature[:, 1]
-    return Rows(
-        radars=radars,
-        landmarks=landmarks,
-        at=at,
-        H=H,
-        predicted_m=seen.ranges_m[radars, landmarks],
-    )
-
-
 def crossings(
     first_m: Sequence[float], second_m: Sequence[float], a: float, b: float
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:

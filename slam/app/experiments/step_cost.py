@@ -25,7 +25,7 @@ from slam.app.experiments import Result, table
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, note
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.association import RangeScan, antennas_of, find_known, rows_of, view
+from slam.robust.association import RangeScan, antennas_of, find_known, view
 from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
@@ -87,13 +87,10 @@ def stepper(state: State) -> Callable[[], None]:
     rig, wheels, noise = paper_rig(), WheelNoise(), RangeNoise()
     parameters, sides = BackEndParameters(ranges=noise), rig.sides()
     side_of = np.repeat(np.arange(len(sides)), [len(side) for side in sides])
-    scans = [RangeScan(radar=radar, ranges_m=()) for radar in range(len(rig.mounts))]
-    radars = np.array([radar for side in sides for radar in side], dtype=np.intp)
     R = np.full(N_UPDATES, noise.sigma_m**2)
     mounts = antennas_of(rig, (), np.zeros(3))
     seen = view(state, mounts)
-    nearest = [int(np.argmin(seen.ranges_m[radar, :2])) for radar in radars]
-    landmarks = np.array(nearest, dtype=np.intp)
+    nearest = [int(np.argmin(ranges_m)) for ranges_m in seen.ranges_m[:, :2]]
     taken = 0
 
     def step() -> None:
@@ -102,9 +99,12 @@ def stepper(state: State) -> Callable[[], None]:
         increment = np.array([0.01 if taken % 2 else -0.01, 0.0, 0.0])
         predict(state, calibrated_motion(increment, state.calibration, wheels), wheels)
         seen = view(state, mounts)
-        find_known(state, seen, scans, side_of, parameters)
-        rows = rows_of(state, seen, radars, landmarks)
-        state.update(rows.at, rows.H, np.zeros(N_UPDATES), R)
+        scans = [
+            RangeScan(radar=radar, ranges_m=(float(seen.ranges_m[radar, landmark]),))
+            for radar, landmark in enumerate(nearest)
+        ]
+        known = find_known(state, seen, scans, side_of, parameters)
+        state.update(known.at, known.H, np.zeros(N_UPDATES), R)
 
     return step
 

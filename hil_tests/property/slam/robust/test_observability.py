@@ -15,12 +15,18 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 
 from hil_tests.property.ekf_oracles import random_belief
-from hil_tests.property.robust_oracles import N_RADARS, random_covariance, random_state, seeds
+from hil_tests.property.robust_oracles import (
+    N_RADARS,
+    random_covariance,
+    random_state,
+    rows_of,
+    seeds,
+)
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.paper import ekf as ekf_slam
 from slam.results import Belief, landmark_slice
-from slam.robust.association import antennas_of, rows_of, view
+from slam.robust.association import antennas_of, view
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn
 
 Array = NDArray[np.float64]

@@ -12,15 +12,17 @@ from hil_tests.property.ekf_oracles import relative_error, turn_between
 from hil_tests.property.robust_oracles import (
     N_RADARS,
     Array,
+    Rows,
     landmark_covariance,
     random_state,
+    rows_of,
     seeds,
     turn,
     values,
 )
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.association import Rows, antennas_of, rows_of, view
+from slam.robust.association import antennas_of, view
 from slam.robust.initialisation import BodyPoint, initialise_landmark
 from slam.robust.map import apply_merge
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn

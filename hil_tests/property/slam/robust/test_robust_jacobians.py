@@ -21,13 +21,14 @@ from hil_tests.property.robust_oracles import (
     plus,
     random_state,
     range_to,
+    rows_of,
     seeds,
     turn,
     values,
 )
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.association import RangeScan, antennas_of, rows_of, view
+from slam.robust.association import RangeScan, antennas_of, view
 from slam.robust.initialisation import (
     BodyPoint,
     RangeBearing,

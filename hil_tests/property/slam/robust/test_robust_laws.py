@@ -12,10 +12,11 @@ from hil_tests.property.robust_oracles import (
     N_RADARS,
     Array,
     random_state,
+    rows_of,
     seeds,
 )
 from slam.config import WheelNoise
-from slam.robust.association import Antennas, rows_of, view
+from slam.robust.association import Antennas, view
 from slam.robust.initialisation import BodyPoint, initialise_landmark
 from slam.robust.map import apply_merge, merge_rows
 from slam.robust.state import Indices, State, calibrated_motion, predict

@@ -2,21 +2,23 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from hil_tests.property.robust_oracles import rows_of
 from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
-from slam.robust.association import RangeScan, antennas_of, rows_of, view
+from slam.robust.association import RangeScan, antennas_of, find_known, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import BodyPoint, initialise_landmark, point_rows
 from slam.robust.map import apply_merge
 from slam.robust.parameters import BackEndParameters, RangeNoise
-from slam.robust.state import HEAD_SIZE, State
+from slam.robust.state import HEAD_SIZE, State, SymmetricMatrix, rotation
 
 Array = NDArray[np.float64]
 
@@ -142,6 +144,32 @@ def test_rows_of_ranges_are_derivatives_by_mounts_and_radii() -> None:
         assert H[:, column] == pytest.approx((sides[0] - sides[1]) / 2e-6, abs=1e-6)
     assert H[:3, 20] == pytest.approx(np.array([-1.0, 0.0, 0.0]))
     assert H[:3, 23] == pytest.approx(np.array([0.0, -1.0, -1.0]))
+
+
+def test_the_rows_of_known_ranges_are_these() -> None:
+    """A landmark on either side and a wall on the left, each heard by both radars there."""
+    state, rig = state_with_map(), paper_rig()
+    state.landmarks_m = state.position_m + [[0.0, 0.8], [0.0, -0.9]] @ rotation(0.3).T
+    phi = 0.3 + math.pi / 2
+    normal = np.array([math.cos(phi), math.sin(phi)])
+    state.walls = np.array([[phi, float(normal @ state.position_m) + 1.2]])
+    state.P = SymmetricMatrix(1e-4 * state.P.full())
+    features = {0: (0, 2), 1: (0, 2), 2: (1,), 3: (1,)}
+    moved = [
+        RangeScan(radar=radar, ranges_m=(), moved=(0.01, 0.0, 0.1 * radar)) for radar in features
+    ]
+    antennas = antennas_of(rig, moved, state.calibration, state.mounts_m)
+    seen = view(state, antennas)
+    scans = [
+        replace(scan, ranges_m=tuple(seen.ranges_m[scan.radar, list(features[scan.radar])]))
+        for scan in moved
+    ]
+    known = find_known(state, seen, scans, np.array([0, 0, 1, 1]), BackEndParameters())
+    assert len(known.assigned) == 6
+    rows = rows_of(state, seen, known.assigned[:, 0], known.rows[known.assigned[:, 2]])
+    H, expected = np.zeros((2, 6, state.P.size))
+    H[:, known.at], expected[:, rows.at] = known.H, rows.H
+    assert np.array_equal(H, expected)
 
 
 def test_a_new_landmark_stands_behind_its_surface_by_a_radius_unknown() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hil_tests.property.robust_oracles import rows_of
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
     follow,
@@ -17,7 +18,7 @@ from hil_tests.unit.slam.robust.range_world import (
 from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
-from slam.robust.association import Antennas, RangeScan, antennas_of, rows_of, view
+from slam.robust.association import Antennas, RangeScan, antennas_of, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
     Search,
