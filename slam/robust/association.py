@@ -187,22 +187,6 @@ def crossings(
     return (x - across * dy, y + across * dx), (x + across * dy, y - across * dx)
 
 
-def fix_of_pair(
-    first_m: Array, second_m: Array, range_first_m: float, range_second_m: float, ahead: Array
-) -> Array | None:
-    """Return where two circles about the antennas meet on the side ``ahead``, or None.
-
-    Body frame, shapes (2,); paper eq. 1 with the arcs' angles as arccos.
-    """
-    if not (0.0 < range_first_m < LONGEST_M and 0.0 < range_second_m < LONGEST_M):
-        return None
-    fixes = crossings(first_m.tolist(), second_m.tolist(), range_first_m, range_second_m)
-    if fixes is None:
-        return None
-    is_left = quarter_turn(second_m - first_m) @ ahead >= 0.0
-    return np.array(fixes[0] if is_left else fixes[1])
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Known:
     """The c features that some radar may have in view, and which ranges are theirs."""

@@ -46,8 +46,8 @@ from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import ate_rmse_m, nees_pose
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
-from slam.robust.association import fix_of_pair
-from slam.robust.state import calibrated_motion, rotation
+from slam.robust.association import LONGEST_M, crossings
+from slam.robust.state import calibrated_motion, quarter_turn, rotation
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
@@ -307,6 +307,22 @@ def first_position(rig: Rig, seen: Sequence[SeenFrom], poses: Sequence[Array]) -
     if len(seen) < ALONE_RANGES or len(seen) % ALONE_RANGES:
         return None
     return _from_many(seen, poses)
+
+
+def fix_of_pair(
+    first_m: Array, second_m: Array, range_first_m: float, range_second_m: float, ahead: Array
+) -> Array | None:
+    """Return where two circles about the antennas meet on the side ``ahead``, or None.
+
+    Body frame, shapes (2,); paper eq. 1 with the arcs' angles as arccos.
+    """
+    if not (0.0 < range_first_m < LONGEST_M and 0.0 < range_second_m < LONGEST_M):
+        return None
+    fixes = crossings(first_m.tolist(), second_m.tolist(), range_first_m, range_second_m)
+    if fixes is None:
+        return None
+    is_left = quarter_turn(second_m - first_m) @ ahead >= 0.0
+    return np.array(fixes[0] if is_left else fixes[1])
 
 
 def _from_many(seen: Sequence[SeenFrom], poses: Sequence[Array]) -> Array | None:

@@ -17,13 +17,13 @@ from scipy.stats import chi2
 from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, values
 from hil_tests.property.trilateration_oracles import NO_RANGES
 from slam.app.experiments.victoria_park import PARK_POINTS
+from slam.app.sweep.bound import fix_of_pair
 from slam.geometry import paper_rig
 from slam.robust.association import (
     Known,
     RangeScan,
     antennas_of,
     find_known,
-    fix_of_pair,
     view,
 )
 from slam.robust.back_end import RobustBackEnd
