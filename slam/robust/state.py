@@ -520,9 +520,14 @@ class State:
         order = np.array([2, 0, 1])
         P[:3, :3] = covariance[np.ix_(order, order)]
         self.position_m, self.heading_rad = np.array(pose[:2]), float(pose[2])
+        self.set_additive_covariance(P)
+
+    def set_additive_covariance(self, covariance: Array) -> None:
+        """Set the covariance from that of additive errors at the present mean, (m, m)."""
+        # e_p = e_add,p - J p e_th, landmarks likewise
         T = self.additive_transform()
         T[1:, HEADING] *= -1.0
-        P = T @ P @ T.T
+        P = T @ covariance @ T.T
         self.P = SymmetricMatrix((P + P.T) / 2)
 
     def take_calibration(self, other: State) -> None:

@@ -17,12 +17,10 @@ from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
 from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
 from slam.robust.state import (
     HEAD_SIZE,
-    HEADING,
     Array,
     Indices,
     RangeErrors,
     State,
-    SymmetricMatrix,
 )
 
 _SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
@@ -283,9 +281,4 @@ def _replace(state: State, solution: Solution) -> None:
     # The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...)
     additive = np.linalg.inv(solution.information)
     order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
-    additive = additive[np.ix_(order, order)]
-    # e_p = e_add,p - J p e_th, landmarks likewise
-    T = state.additive_transform()
-    T[1:, HEADING] *= -1.0
-    P = T @ additive @ T.T
-    state.P = SymmetricMatrix(np.asarray((P + P.T) / 2))
+    state.set_additive_covariance(additive[np.ix_(order, order)])
