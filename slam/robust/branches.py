@@ -30,7 +30,7 @@ While nothing is suspicious that costs a copy of the back end now and then.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,8 +94,8 @@ def gain(own: Array, main: Array, rule: BranchRule) -> float:
     )
 
 
-class Placed:
-    """The map before a carry with the robot set down on it; it takes the steps since."""
+class Alternative:
+    """A back end that takes the steps since a carry."""
 
     def __init__(self, back_end: RobustBackEnd, since: int) -> None:
         self.back_end = back_end
@@ -103,13 +103,15 @@ class Placed:
         self.next_step = since
         self.evidence: list[Array] = []  # of each step taken, as `evidence_table` has it
 
-    def take(self, step: Step) -> None:
-        """Take a step; of the first one the motion is the carry."""
-        if self.evidence:
-            self.back_end.predict(step.increment, step.covariance)
-        report = self.back_end.update(step.scans, solve=False)
-        self.evidence.append(evidence_table(report))
-        self.next_step += 1
+    def take(self, steps: Mapping[int, Step], end: int) -> None:
+        """Take the steps before ``end``; of the very first one the motion is the carry."""
+        for number in range(self.next_step, end):
+            step = steps[number]
+            if self.evidence:
+                self.back_end.predict(step.increment, step.covariance)
+            report = self.back_end.update(step.scans, solve=False)
+            self.evidence.append(evidence_table(report))
+            self.next_step = number + 1
 
 
 @dataclass(slots=True, kw_only=True)
@@ -119,11 +121,10 @@ class Carry:
     since: int
     next_id: int  # landmarks known before it have smaller ids
     map: RobustBackEnd  # the main back end after the step before
-    new: RobustBackEnd  # with an empty map at first
-    next_step: int  # that the new map has not taken yet
+    new: Alternative  # with an empty map at first
     search_from: int  # the step from which on its place is searched for
     moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
-    placed: Placed | None = None
+    placed: Alternative | None = None  # with the map before it, and the robot set down on that
 
 
 class Branches:
@@ -216,26 +217,21 @@ class Branches:
     def _decide(self, carry: Carry) -> bool:
         """Answer the question of a carry, if that can be; return whether a place is adopted."""
         rule, placed = self._rule, carry.placed
-        for number in range(carry.next_step, min(carry.next_step + rule.catch_up, self._now)):
-            step = self._steps[number]
-            if number > carry.since:
-                carry.new.predict(step.increment, step.covariance)
-            carry.new.update(step.scans, solve=False)
-            carry.next_step = number + 1
-        if placed is not None:
-            for number in range(placed.next_step, min(placed.next_step + rule.catch_up, self._now)):
-                placed.take(self._steps[number])
-            if placed.next_step == self._now:
-                if placed.until is None:
-                    placed.until = self._now + rule.patience * self._window
-                first = max(carry.since, self._now - rule.lost_steps)
-                tables = placed.evidence[first - carry.since :]
-                own = totals_of(tables, carry.next_id, rule.correlated_steps)
-                if gain(own, self._totals(carry, first), rule) > rule.price_nats:
-                    self._adopt(placed.back_end)
-                    return True
-                if self._now > placed.until:
-                    carry.placed, carry.search_from = None, self._now
+        for alternative in (carry.new, placed):
+            if alternative is not None:
+                end = min(alternative.next_step + rule.catch_up, self._now)
+                alternative.take(self._steps, end)
+        if placed is not None and placed.next_step == self._now:
+            if placed.until is None:
+                placed.until = self._now + rule.patience * self._window
+            first = max(carry.since, self._now - rule.lost_steps)
+            tables = placed.evidence[first - carry.since :]
+            own = totals_of(tables, carry.next_id, rule.correlated_steps)
+            if gain(own, self._totals(carry, first), rule) > rule.price_nats:
+                self._adopt(placed.back_end)
+                return True
+            if self._now > placed.until:
+                carry.placed, carry.search_from = None, self._now
         # What one landmark says is bounded: it may be hidden or gone, or others may look like it.
         first = max(carry.since, self._now - rule.lost_steps)
         of_landmarks = self._totals(carry, first)[:, 1]
@@ -249,7 +245,7 @@ class Branches:
             n_against = int(np.count_nonzero(bounded < 0.0))
             is_against = total < -rule.price_nats and n_against >= rule.least_landmarks
             # Radars that hear nothing are no reason to be elsewhere.
-            self.is_lost = is_against and bool(carry.new.reported_rows())
+            self.is_lost = is_against and bool(carry.new.back_end.reported_rows())
         is_answered = total > rule.price_nats or self._now - carry.since > rule.carry_steps
         if is_answered and carry.placed is None:
             self._carry, self._judged, self.is_lost = None, self._now, False
@@ -343,15 +339,14 @@ class Branches:
                 since=since,
                 next_id=self._steps[since].next_id,
                 map=before,
-                new=before.with_empty_map(),
-                next_step=since,
+                new=Alternative(before.with_empty_map(), since),
                 search_from=self._now,
                 moved=moved,
             )
 
     def _search(self, carry: Carry) -> None:
         """Search for the new map's place on the old one; set a copy of the old one down there."""
-        rule, new = self._rule, carry.new
+        rule, new = self._rule, carry.new.back_end
         newest = sorted(new.reported_rows(), key=lambda row: -new.state.landmark_ids[row])
         here = constellation_of(new.state, newest[: rule.newest], rule.model_sigma_m)
         there = constellation_of(carry.map.state, carry.map.reported_rows(), rule.model_sigma_m)
@@ -367,4 +362,4 @@ class Branches:
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)
         back_end.state.next_id = self.main.state.next_id + _IDS_APART
-        carry.placed = Placed(back_end, carry.since)
+        carry.placed = Alternative(back_end, carry.since)
