@@ -32,7 +32,6 @@ from slam.robust.initialisation import (
     Tracklet,
     UnassignedRanges,
     assign,
-    find_tracklets,
     initialise_landmark,
     match,
     named_rows,
@@ -393,7 +392,7 @@ class RobustBackEnd:
                 )
             tracker = self._walls.tracker(is_wall=False)
             is_point = None if is_single else self._walls.is_point
-            for tracklet in find_tracklets(tracker, guesses, self._unassigned, search, is_point):
+            for tracklet in tracker.find(guesses, self._unassigned, search, is_point):
                 self._place(tracklet)
 
     def _place(self, tracklet: Tracklet) -> None:

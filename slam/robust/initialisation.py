@@ -416,10 +416,6 @@ class Search:
     min_frames: int  # distinct ones
     most_sigma_m: float = math.inf  # largest standard deviation in any direction
 
-    @property
-    def least_radars(self) -> int:
-        return min(len(self.radars), 2)
-
 
 class Tracker:
     """Follows guesses of points, or of walls, back in time.
@@ -453,13 +449,40 @@ class Tracker:
         if float(radar_covariance.diagonal().max(initial=0.0)) <= least:
             self._free_covariance = None
 
-    @property
-    def min_hits_per_radar(self) -> int:
-        return self._rule.min_hits_per_radar
+    def find(
+        self,
+        guesses: Sequence[Guess],
+        unassigned: UnassignedRanges,
+        search: Search,
+        accepts: Callable[[Tracklet], bool] | None = None,
+    ) -> list[Tracklet]:
+        """Return the tracklets of some guesses, best first; their ranges are used up.
 
-    def score(self, tracklet: Tracklet) -> float:
-        """Return what a tracklet's ranges are worth less chi-square; by it they compete."""
-        return self._rule.dof_worth * tracklet.dof - tracklet.chi_square
+        ``accepts`` is the last test of each. They compete by what their ranges are worth less
+        chi-square.
+        """
+        rule = self._rule
+        held = [unassigned.n_frames_with_ranges(radar, search.window) for radar in search.radars]
+        if min(held) < rule.min_hits_per_radar:
+            return []
+        found: list[Tracklet] = []
+        waiting = list(guesses)
+        while waiting:
+            followed = []
+            for guess in waiting:
+                tracklet = self.follow(guess, unassigned, search)
+                if tracklet is not None and (accepts is None or accepts(tracklet)):
+                    followed.append((tracklet, guess))
+            if not followed:
+                break
+            best, chosen = max(
+                followed, key=lambda pair: rule.dof_worth * pair[0].dof - pair[0].chi_square
+            )
+            unassigned.use_up(best.members)
+            found.append(best)
+            # What is left may have lost its ranges: follow it again.
+            waiting = [guess for _, guess in followed if guess is not chosen]
+        return found
 
     def follow(self, guess: Guess, unassigned: UnassignedRanges, search: Search) -> Tracklet | None:
         """Return the ranges that follow a guess, or None if they do not suffice."""
@@ -472,9 +495,10 @@ class Tracker:
             is_wall=self._is_wall,
         )
         x, y, xx, xy, yy, chi_square, in_view, hit = found.tolist()
-        least = self._rule.min_hits_per_radar
         counts = [n for n in hits.tolist() if n]
-        if hit < search.min_frames or len(counts) < search.least_radars or min(counts) < least:
+        if hit < search.min_frames or len(counts) < min(len(search.radars), 2):
+            return None
+        if min(counts) < self._rule.min_hits_per_radar:
             return None
         if hit < self._rule.min_share * in_view:
             return None
@@ -651,39 +675,6 @@ def _radar_part(
         extra = np.hstack([is_of, by_x, by_y])
     known = covariance[np.ix_(columns, columns)] + _FLOOR * np.eye(len(columns))
     return columns, extra, np.asarray(np.linalg.inv(known))
-
-
-def find_tracklets(
-    tracker: Tracker,
-    guesses: Sequence[Guess],
-    unassigned: UnassignedRanges,
-    search: Search,
-    accepts: Callable[[Tracklet], bool] | None = None,
-) -> list[Tracklet]:
-    """Return the tracklets of some guesses, best first; their ranges are used up.
-
-    ``accepts`` is the last test of each.
-    """
-    least = tracker.min_hits_per_radar
-    held = [unassigned.n_frames_with_ranges(radar, search.window) for radar in search.radars]
-    if min(held) < least:
-        return []
-    found: list[Tracklet] = []
-    waiting = list(guesses)
-    while waiting:
-        followed = []
-        for guess in waiting:
-            tracklet = tracker.follow(guess, unassigned, search)
-            if tracklet is not None and (accepts is None or accepts(tracklet)):
-                followed.append((tracklet, guess))
-        if not followed:
-            break
-        best, chosen = max(followed, key=lambda pair: tracker.score(pair[0]))
-        unassigned.use_up(best.members)
-        found.append(best)
-        # What is left may have lost its ranges: follow it again.
-        waiting = [guess for _, guess in followed if guess is not chosen]
-    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

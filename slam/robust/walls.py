@@ -34,7 +34,6 @@ from slam.robust.initialisation import (
     Tracker,
     Tracklet,
     UnassignedRanges,
-    find_tracklets,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
 from slam.robust.state import HEAD_SIZE, Array, State, rotation
@@ -276,7 +275,7 @@ class WallKeeper:
         tracklets = self._parameters.tracklets
         guesses = wall_guesses(unassigned, radars, self._parameters.ranges, tracklets)
         search = Search(radars=radars, window=tracklets.long_window, min_frames=rule.min_frames)
-        return find_tracklets(tracker, guesses, unassigned, search, is_wall)
+        return tracker.find(guesses, unassigned, search, is_wall)
 
     def place(self, tracklet: Tracklet) -> int | None:
         """Bring a wall into the map; return its id, or None if it is too near to another one."""

@@ -25,7 +25,6 @@ from slam.robust.initialisation import (
     Tracker,
     Tracklet,
     UnassignedRanges,
-    find_tracklets,
     point_guesses,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule
@@ -67,7 +66,7 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Unassig
 def tracklets(unassigned: UnassignedRanges, offset_sigma_m: float = 0.0) -> list[Tracklet]:
     tracker = Tracker(PARAMETERS, np.zeros(4), offset_sigma_m**2 * np.eye(4))
     guesses = point_guesses(unassigned, LEFT, NOISE, RULE)
-    return find_tracklets(tracker, guesses, unassigned, SEARCH)
+    return tracker.find(guesses, unassigned, SEARCH)
 
 
 def test_a_tracklet_is_a_point_at_rest_and_uses_its_ranges_up() -> None:

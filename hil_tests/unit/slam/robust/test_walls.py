@@ -27,7 +27,6 @@ from slam.robust.initialisation import (
     Tracklet,
     UnassignedRanges,
     compare,
-    find_tracklets,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.state import Array, Indices, State, SymmetricMatrix, calibrated_motion, predict
@@ -321,7 +320,7 @@ def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[list[Tracklet], Ar
     (first, *_) = wall_guesses(unassigned, (0, 1), parameters.ranges, parameters.tracklets)
     guess = replace(first, target=np.array([math.pi / 2, WALL_Y_M + OFFSET_M]))
     search = Search(radars=(0, 1), window=len(shape), min_frames=25)
-    return find_tracklets(tracker, [guess], unassigned, search), covariance
+    return tracker.find([guess], unassigned, search), covariance
 
 
 def test_an_unknown_offset_is_one_number_and_no_noise_of_each_range() -> None:
