@@ -303,12 +303,16 @@ def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp
 
 def match(state: State, point: BodyPoint) -> int | None:
     """Return the row of the landmark that a point certainly is, or None."""
-    beta = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
-    found = []
-    for row in near_rows(state, point, NEIGHBOURHOOD_M).tolist():
-        rows = point_rows(state, row, point)
-        found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
-    best = certain(found)
+    near = near_rows(state, point, NEIGHBOURHOOD_M).tolist()
+    density = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
+    return certain_row({row: point_rows(state, row, point) for row in near}, density)
+
+
+def certain_row(found: Mapping[int, FeatureRows], density: float) -> int | None:
+    """Return the row of the feature that what is seen certainly is, or None."""
+    best = certain(
+        [identity(((SEEN, row),), rows.residual, rows.S, density) for row, rows in found.items()]
+    )
     return None if best is None else best.pairs[0][1]
 
 

@@ -25,15 +25,15 @@ from itertools import combinations, product
 import numpy as np
 
 from slam.geometry import wrap_angle
-from slam.robust.association import Antennas, View, certain, identity
+from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
-    SEEN,
     FeatureRows,
     Guess,
     Search,
     Tracker,
     Tracklet,
     UnassignedRanges,
+    certain_row,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
 from slam.robust.state import HEAD_SIZE, Array, State, rotation
@@ -160,13 +160,12 @@ def match_wall(
     """
     feet, reach_m = seen.in_map(state), parameters.walls.reach_m
     beta = max(len(state.wall_ids), 1) / (math.tau * parameters.ranges.max_range_m)
-    found = []
-    for row, wall_id in enumerate(state.wall_ids):
-        if cells.is_near(wall_id, along_wall(state, row, feet), reach_m):
-            rows = wall_rows(state, row, seen)
-            found.append(identity(((SEEN, row),), rows.residual, rows.S, beta))
-    best = certain(found)
-    return None if best is None else best.pairs[0][1]
+    found = {
+        row: wall_rows(state, row, seen)
+        for row, wall_id in enumerate(state.wall_ids)
+        if cells.is_near(wall_id, along_wall(state, row, feet), reach_m)
+    }
+    return certain_row(found, beta)
 
 
 def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> bool:
