@@ -220,11 +220,11 @@ def find_known(
     margin_m = rule.view_sigmas * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
     rows = np.flatnonzero(inside.any(axis=0))
-    layout, state_columns = state.layout, np.arange(state.offsets.start, state.n_fixed)
-    at = np.concatenate([np.array([1, 2]), state_columns, layout.columns(rows)])
+    layout, of_radars = state.layout, state.radar_columns
+    at = np.concatenate([np.array([1, 2]), of_radars, layout.columns(rows)])
     block = state.P.block(at)
     widths = np.where(rows < layout.n_landmarks, layout.landmark_size, 2)
-    first = 2 + len(state_columns) + np.cumsum(widths) - widths
+    first = 2 + len(of_radars) + np.cumsum(widths) - widths
     by_mount = np.zeros((0, 0, 0))
     if layout.has_mounts:
         by_mount = np.ascontiguousarray(-np.einsum("rni,rij->rnj", seen.directions, seen.turned))

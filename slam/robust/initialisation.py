@@ -278,8 +278,7 @@ class FeatureRows:
 
 def point_rows(state: State, row: int, point: BodyPoint) -> FeatureRows:
     R, layout = rotation(state.heading_rad), state.layout
-    fixed = np.arange(layout.offsets.start, state.n_fixed)
-    at = np.concatenate([np.array([1, 2]), fixed, layout.columns(np.array([row]))])
+    at = np.concatenate([np.array([1, 2]), state.radar_columns, layout.columns(np.array([row]))])
     seen_m, by_radius = point.point_m, np.zeros((2, 0))
     if layout.has_radii:
         outward = np.zeros(2) if point.outward is None else point.outward

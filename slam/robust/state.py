@@ -392,13 +392,14 @@ class State:
         )
 
     @property
-    def offsets(self) -> slice:
-        return self.layout.offsets
-
-    @property
     def n_fixed(self) -> int:
         """Return how many rows of the error come before those of the features."""
         return int(self.layout.landmarks.start)
+
+    @property
+    def radar_columns(self) -> Indices:
+        """Return where the unknowns of the radars lie in the error."""
+        return np.arange(HEAD_SIZE, self.n_fixed)
 
     @property
     def feature_ids(self) -> list[int]:

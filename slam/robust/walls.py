@@ -137,9 +137,8 @@ def wall_rows(state: State, wall_row: int, seen: BodyWall) -> FeatureRows:
     phi, d = (float(value) for value in state.walls[wall_row])
     n = np.array([math.cos(phi), math.sin(phi)])
     along = float(state.position_m @ np.array([-n[1], n[0]]))
-    offsets = np.arange(state.offsets.start, state.n_fixed)
     columns = state.landmark_columns(np.array([len(state.landmark_ids) + wall_row]))
-    at = np.concatenate([np.array([1, 2]), offsets, columns])
+    at = np.concatenate([np.array([1, 2]), state.radar_columns, columns])
     by_position = np.array([[0.0, 0.0], -n])
     by_wall = np.array([[1.0, 0.0], [-along, 1.0]])
     H = np.hstack([by_position, -seen.by_offsets, by_wall])
@@ -257,7 +256,7 @@ class WallKeeper:
 
     def tracker(self, *, is_wall: bool) -> Tracker:
         state = self._state
-        block = state.P.block(np.arange(HEAD_SIZE, state.n_fixed))
+        block = state.P.block(state.radar_columns)
         return Tracker(self._parameters, state.offsets_m, block, is_wall=is_wall)
 
     def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[Tracklet]:

@@ -201,7 +201,7 @@ def test_moving_the_world_moves_the_estimate_and_keeps_the_innovations(
 
     def moved(state: State) -> State:
         A = np.eye(state.P.size)
-        for first in (1, *range(state.offsets.stop, state.P.size, 2)):
+        for first in (1, *range(state.layout.offsets.stop, state.P.size, 2)):
             A[first : first + 2, first : first + 2] = R
             A[first : first + 2, 0] = -quarter_turn(t)
         there = deepcopy(state)
@@ -233,7 +233,7 @@ def test_other_names_permute_the_state_and_nothing_else(seed: int, order: list[i
         other = deepcopy(state)
         other.landmarks_m = state.landmarks_m[order]
         at = np.concatenate(
-            [np.arange(state.offsets.stop), state.landmark_columns(np.array(order))]
+            [np.arange(state.layout.offsets.stop), state.landmark_columns(np.array(order))]
         )
         other.P = SymmetricMatrix(state.P.full()[np.ix_(at, at)])
         return other

@@ -117,7 +117,7 @@ def test_point_rows_are_derivatives(seed: int, heading: float) -> None:
     wanted = complex_step(lambda e: body_point(plus(mean, e), 1), np.zeros(len(mean)))
     full = np.zeros((2, len(mean)))
     full[:, rows.at] = rows.H
-    full[:, state.offsets] += point.by_offsets
+    full[:, state.layout.offsets] += point.by_offsets
     assert np.abs(full - wanted).max() <= 1e-10
     assert rows.residual == pytest.approx(point.point_m - body_point(mean, 1).real, abs=1e-12)
 

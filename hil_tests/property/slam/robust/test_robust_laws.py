@@ -86,7 +86,7 @@ def test_a_merge_is_the_statement_that_the_difference_is_zero(seed: int) -> None
     moved.correct(K @ residual)
     merged = deepcopy(state)
     apply_merge(merged, ((0, 2),), 1e-3)
-    gone = [state.offsets.stop + 4, state.offsets.stop + 5]
+    gone = [state.layout.offsets.stop + 4, state.layout.offsets.stop + 5]
     keep = np.delete(np.arange(len(P)), gone)
     assert np.abs(merged.P.full() - wanted[np.ix_(keep, keep)]).max() <= 1e-9
     assert merged.landmarks_m == pytest.approx(np.delete(moved.landmarks_m, 2, 0), abs=1e-9)
@@ -97,7 +97,7 @@ def test_a_merge_is_the_statement_that_the_difference_is_zero(seed: int) -> None
 @given(seeds, st.integers(0, 3))
 def test_deleting_is_marginalising_bit_for_bit(seed: int, row: int) -> None:
     state = random_state(seed, 4, 0.0)
-    first = state.offsets.stop + 2 * row
+    first = state.layout.offsets.stop + 2 * row
     keep = np.delete(np.arange(state.P.size), [first, first + 1])
     wanted = state.P.full()[np.ix_(keep, keep)]
     state.remove(row)

@@ -128,7 +128,7 @@ def test_a_step_predicts_and_learns_from_a_landmark_on_each_side() -> None:
     step()
     assert state.position_m[0] == pytest.approx(0.01, abs=1e-4)
     after = state.P.full()
-    seen = slice(state.offsets.stop, state.offsets.stop + 4)
+    seen = slice(state.layout.offsets.stop, state.layout.offsets.stop + 4)
     assert (np.diag(after)[seen] < np.diag(before)[seen]).any()
     step()
     assert np.abs(state.position_m).max() < 1e-3, "to and fro"
