@@ -194,7 +194,7 @@ class Known:
     rows: Indices  # shape (c,)
     prior: Array  # shape (c, r, r): H P H^T between the radars, the features' own variances added
     assigned: Indices  # shape (k, 3): radar, index of its range, place in ``rows``
-    # shape (s, c, 3), per side: whether it took part, was missed, was hit by all of its radars
+    # shape (s, c, 2), per side: whether it took part, and whether it was missed
     of_side: NDArray[np.bool_]
     unheard: NDArray[np.bool_]  # shape (c, r): surely in view, and no echo near its prediction
     at: Indices  # columns of the error that H has entries for

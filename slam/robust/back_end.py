@@ -294,8 +294,6 @@ class RobustBackEnd:
             existence.hit(ids[place])
         for place in np.flatnonzero(known.of_side[:, :, 1].any(axis=0)).tolist():
             existence.miss(ids[place])
-        for side in known.of_side[:, :, 2]:
-            existence.seen_whole(ids[place] for place in np.flatnonzero(side).tolist())
         # A wall may end before it comes into view.
         n = len(self.state.landmark_ids)
         unheard = np.nonzero(known.unheard)[0].tolist()
@@ -448,7 +446,7 @@ class RobustBackEnd:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
-        merge = find_merge(self.state, self._existence, rule, self._refused)
+        merge = find_merge(self.state, rule, self._refused)
         if merge is not None:
             self.merge_if_possible(merge.pairs)
 
@@ -457,17 +455,15 @@ class RobustBackEnd:
 
         Then all poses are solved for again.
         """
-        state, pairs, existence = self.state, tuple(pairs), self._existence
+        state, pairs = self.state, tuple(pairs)
         ids = named_pairs(state, pairs)
-        if any(existence.are_apart(*pair) for pair in ids):
-            return False
         if not is_one(self._log, state, pairs, self.parameters):
             self._refused[ids] = self._n_updates
             return False
         state.added_sigmas_m |= noisier(state, {gone: kept for kept, gone in ids})
         apply_merge(state, pairs, MERGE_SIGMA_M)
         for kept, gone in ids:
-            existence.merge(kept, gone)
+            self._existence.merge(kept, gone)
             self._log.rename(gone, kept)
         self.relinearise()
         return True

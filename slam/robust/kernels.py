@@ -184,9 +184,9 @@ def assign(
     many standard deviations it may lie off; the length within which echoes blur.
 
     Returns H P H^T between the radars of each landmark, with the variances added, (c, r, r); the
-    assignment, rows of radar, index and place in ``rows``; of each side and landmark (s, c, 3)
-    whether it took part, was missed, and was hit by all radars; of each landmark and radar (c, r)
-    whether it is surely in view and not heard; and the rows H of the assignment.
+    assignment, rows of radar, index and place in ``rows``; of each side and landmark (s, c, 2)
+    whether it took part, and whether it was missed; of each landmark and radar (c, r) whether it is
+    surely in view and not heard; and the rows H of the assignment.
     """
     half_view, shortest, longest, wide_rad, wide_m = (
         limits[0],
@@ -202,7 +202,7 @@ def assign(
     entries = np.zeros((n_radars, n_rows, 8))
     columns = np.zeros((n_radars, n_rows, 8), dtype=np.int64)
     prior = np.zeros((n_rows, n_radars, n_radars))
-    status = np.zeros((n_sides, n_rows, 3), dtype=np.bool_)
+    status = np.zeros((n_sides, n_rows, 2), dtype=np.bool_)
     unheard = np.zeros((n_rows, n_radars), dtype=np.bool_)
     chosen = np.empty((n_radars * n_ranges, 3), dtype=np.int64)
     n_chosen = 0
@@ -400,7 +400,7 @@ def assign(
             else:
                 choice[depth] += 1
         for at_part in range(n_part):
-            c, used = part[at_part], 0
+            c = part[at_part]
             for place in range(m):
                 k = taken[best_choice[at_part], place]
                 if k >= 0:
@@ -408,10 +408,7 @@ def assign(
                     chosen[n_chosen, 1] = k
                     chosen[n_chosen, 2] = c
                     n_chosen += 1
-                    used += 1
-            if used:
-                status[side, c, 1] = False
-                status[side, c, 2] = used >= max(m, 2)
+                    status[side, c, 1] = False
     H = np.zeros((n_chosen, n_columns))
     for k in range(n_chosen):
         for a in range(8):

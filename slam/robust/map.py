@@ -8,7 +8,7 @@ made, the solution over the whole run decides (`slam.robust.solver.revision.is_o
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -32,12 +32,11 @@ class _Record:
 
 
 class Existence:
-    """Scores of all landmarks by id, and which pairs were seen whole in common frames."""
+    """Scores of all landmarks, by id."""
 
     def __init__(self, rule: MapRule, report_hits: int) -> None:
         self._rule, self._report_hits = rule, report_hits
         self._records: dict[int, _Record] = {}
-        self._together: dict[tuple[int, int], int] = {}
 
     def hit(self, landmark_id: int, frames: int = 1) -> None:
         """Count frames that hit a landmark; a new id begins here."""
@@ -57,36 +56,11 @@ class Existence:
 
     def forget(self, landmark_id: int) -> None:
         self._records.pop(landmark_id, None)
-        for pair in [pair for pair in self._together if landmark_id in pair]:
-            del self._together[pair]
-
-    def seen_whole(self, landmark_ids: Iterable[int]) -> None:
-        """Count a frame in which both radars of a pair saw each of these landmarks."""
-        ids = sorted(landmark_ids)
-        for place, first in enumerate(ids):
-            for second in ids[place + 1 :]:
-                key = (first, second)
-                self._together[key] = self._together.get(key, 0) + 1
-
-    def are_apart(self, first: int, second: int) -> bool:
-        """Return whether two landmarks were seen whole together, and so are two.
-
-        Only whole sightings count: of two copies of one target, each can be given one of its two
-        ranges, and they would veto their own merge.
-        """
-        key = (min(first, second), max(first, second))
-        return self._together.get(key, 0) >= self._rule.apart_frames
 
     def merge(self, kept: int, gone: int) -> None:
         into, other = self._records[kept], self._records[gone]
         into.score = min(max(into.score, 0.0) + max(other.score, 0.0), self._rule.most)
         into.hits += other.hits
-        for (first, second), count in list(self._together.items()):
-            if gone in (first, second):
-                third = second if first == gone else first
-                if third != kept:
-                    key = (min(kept, third), max(kept, third))
-                    self._together[key] = self._together.get(key, 0) + count
         self.forget(gone)
 
 
@@ -131,15 +105,13 @@ def named_pairs(state: State, pairs: Pairs) -> Pairs:
     return tuple(sorted((ids[kept], ids[gone]) for kept, gone in pairs))
 
 
-def find_merge(
-    state: State, existence: Existence, rule: MapRule, refused: Collection[Pairs] = ()
-) -> Identity | None:
+def find_merge(state: State, rule: MapRule, refused: Collection[Pairs] = ()) -> Identity | None:
     """Return the merge to be tried now, of one pair or two, or None.
 
     ``refused`` are those not to be tried, as ``named_pairs`` returns them.
     """
     density = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
-    single = _candidates(state, existence, density)
+    single = _candidates(state, density)
     best = _certain(state, single, refused)
     if best is not None:
         return best
@@ -159,7 +131,7 @@ def _certain(
     return certain(merges, [rows for rows in pairs if named_pairs(state, rows) in refused])
 
 
-def _candidates(state: State, existence: Existence, density: float) -> list[Identity]:
+def _candidates(state: State, density: float) -> list[Identity]:
     """Return all merges of two landmarks within reach, those far from passing the test left out."""
     if len(state.landmark_ids) < 2:
         return []
@@ -171,7 +143,6 @@ def _candidates(state: State, existence: Existence, density: float) -> list[Iden
     return [
         judge(state, ((first, second),), MERGE_SIGMA_M, density)
         for first, second in near[distances <= limit].tolist()
-        if not existence.are_apart(state.landmark_ids[first], state.landmark_ids[second])
     ]
 
 

@@ -15,7 +15,7 @@ from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
 from slam.app.experiments.step_cost import mapped_state, stepper
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.map import Existence, find_merge
+from slam.robust.map import find_merge
 from slam.robust.parameters import MapRule
 
 SIGMA_M = 7.4e-3
@@ -49,7 +49,7 @@ def test_robust_steps(benchmark: BenchmarkFixture, n: int) -> None:
 def test_merge_search(benchmark: BenchmarkFixture, n: int) -> None:
     state, rule = mapped_state(n), MapRule()
     with threadpool_limits(1):
-        benchmark(find_merge, state, Existence(rule, report_hits=9), rule)
+        benchmark(find_merge, state, rule)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from slam.geometry import paper_rig
 from slam.robust.association import Identity, Pairs
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import BodyPoint, initialise_landmark
-from slam.robust.map import Existence, find_merge, judge, named_pairs
+from slam.robust.map import find_merge, judge, named_pairs
 from slam.robust.parameters import BackEndParameters, MapRule
 from slam.robust.pipeline import RobustSlam
 from slam.robust.state import Array, State, SymmetricMatrix
@@ -26,25 +26,25 @@ SIGMA_M = 4e-3
 PLACES = np.array([[0.1, 0.9], [0.55, 0.7], [0.95, 1.1], [0.3, -0.8], [0.8, -1.0]])
 
 
-def mapped(places: Array, sigma_m: float = 0.02) -> tuple[State, Existence]:
-    state, existence = State((0.0, 0.0, 0.0), (0.0,) * 4), Existence(MapRule(), report_hits=9)
+def mapped(places: Array, sigma_m: float = 0.02) -> State:
+    state = State((0.0, 0.0, 0.0), (0.0,) * 4)
     for place in places:
         point = BodyPoint(
             point_m=place, covariance=sigma_m**2 * np.eye(2), by_offsets=np.zeros((2, 4))
         )
-        existence.hit(initialise_landmark(state, point), 9)
-    return state, existence
+        initialise_landmark(state, point)
+    return state
 
 
 def test_a_merge_must_stand_out_from_its_rivals() -> None:
     rule = MapRule()
-    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
-    merge = find_merge(state, existence, rule)
+    state = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
+    merge = find_merge(state, rule)
     assert merge is not None
     assert merge.pairs == ((0, 1),)
     # A third one as near as the second: which two are one is not certain.
-    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [-0.03, 1.0]]))
-    assert find_merge(state, existence, rule) is None
+    state = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [-0.03, 1.0]]))
+    assert find_merge(state, rule) is None
 
 
 @pytest.mark.parametrize(
@@ -60,32 +60,22 @@ def test_a_merge_must_stand_out_from_its_rivals() -> None:
 def test_a_merge_is_made_from_the_likelihood_margin_and_the_density_on(
     third_m: float, sigma_m: float, merges: bool
 ) -> None:
-    state, existence = mapped(np.array([[0.0, 1.0], [0.0, 1.0], [third_m, 1.0]]), sigma_m)
-    merge = find_merge(state, existence, MapRule())
+    state = mapped(np.array([[0.0, 1.0], [0.0, 1.0], [third_m, 1.0]]), sigma_m)
+    merge = find_merge(state, MapRule())
     assert (merge is not None and merge.pairs == ((0, 1),)) == merges
-
-
-def test_what_was_seen_whole_together_is_never_merged() -> None:
-    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0]]))
-    for _ in range(MapRule().apart_frames):
-        existence.seen_whole([0, 1])
-    assert find_merge(state, existence, MapRule()) is None
 
 
 def test_two_merges_together_are_certain_where_each_by_itself_is_not() -> None:
     """All landmarks shifted alike: each fits two, both together fit one way only."""
     places = np.array([[0.0, 1.0], [0.6, 1.0], [0.3, 1.0], [0.9, 1.02]])
-    state, existence = mapped(places, 0.01)
+    state = mapped(places, 0.01)
     # The later two were seen after a loop: an error of 0.3 m common to both, along the wall.
     P = state.P.full()
     first = state.landmark_columns(np.array([2]))[0]
     along = np.zeros(state.P.size)
     along[[first, first + 2]] = 0.3
     state.P = SymmetricMatrix(P + np.outer(along, along))
-    for pair in ((0, 1), (2, 3)):
-        for _ in range(3):
-            existence.seen_whole(pair)
-    merge = find_merge(state, existence, MapRule())
+    merge = find_merge(state, MapRule())
     assert merge is not None
     assert set(merge.pairs) == {(0, 2), (1, 3)}
 
@@ -139,7 +129,6 @@ def test_two_landmarks_stay_two_where_the_run_says_so(apart_m: float) -> None:
     found = [int(np.argmin(np.hypot(*(state.landmarks_m - place).T))) for place in places[[0, -1]]]
     assert found[0] != found[1]
     pair = (min(found), max(found))
-    back_end._existence._together.clear()  # that both were seen at once would decide it
     before, covariance = state.landmarks_m.copy(), state.P.full()
     assert not back_end.merge_if_possible([pair])
     assert np.array_equal(state.landmarks_m, before)
@@ -148,21 +137,21 @@ def test_two_landmarks_stay_two_where_the_run_says_so(apart_m: float) -> None:
 
 
 def test_a_merge_that_was_refused_is_not_tried_again_at_once() -> None:
-    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
-    merge = find_merge(state, existence, MapRule())
+    state = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
+    merge = find_merge(state, MapRule())
     assert merge is not None
     refused = {named_pairs(state, merge.pairs)}
-    assert find_merge(state, existence, MapRule(), refused) is None
-    assert find_merge(state, existence, MapRule(), {((7, 8),)}) is not None
+    assert find_merge(state, MapRule(), refused) is None
+    assert find_merge(state, MapRule(), {((7, 8),)}) is not None
 
 
 def test_a_refused_merge_hides_no_other_one() -> None:
     places = np.array([[0.0, 1.0], [0.01, 1.0], [2.0, 1.0], [2.03, 1.0]])
-    state, existence = mapped(places)
-    first = find_merge(state, existence, MapRule())
+    state = mapped(places)
+    first = find_merge(state, MapRule())
     assert first is not None
     assert first.pairs == ((0, 1),)
-    second = find_merge(state, existence, MapRule(), {named_pairs(state, first.pairs)})
+    second = find_merge(state, MapRule(), {named_pairs(state, first.pairs)})
     assert second is not None
     assert second.pairs == ((2, 3),)
 
@@ -170,7 +159,7 @@ def test_a_refused_merge_hides_no_other_one() -> None:
 def test_only_the_likeliest_merges_are_tried_in_twos(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of forty landmarks that could all be each other, pairs of pairs would be 300 000."""
     rng, judged = np.random.default_rng(0), []
-    state, existence = mapped(rng.uniform(0.0, 0.05, (40, 2)), 0.1)
+    state = mapped(rng.uniform(0.0, 0.05, (40, 2)), 0.1)
     original = judge
 
     def counted(state: State, pairs: Pairs, sigma_m: float, density: float) -> Identity:
@@ -178,7 +167,7 @@ def test_only_the_likeliest_merges_are_tried_in_twos(monkeypatch: pytest.MonkeyP
         return original(state, pairs, sigma_m, density)
 
     monkeypatch.setattr("slam.robust.map.judge", counted)
-    assert find_merge(state, existence, MapRule()) is None
+    assert find_merge(state, MapRule()) is None
     twos = [pairs for pairs in judged if len(pairs) == 2]
     assert len(judged) - len(twos) == 40 * 39 // 2
     assert 0 < len(twos) <= 12 * 11 // 2

@@ -106,14 +106,14 @@ def test_numbers_that_differ_are_the_reason() -> None:
 
 def test_recorded_rules_are_taken_over_and_other_numbers_compared() -> None:
     recorded = slam_constants() | {
-        "slam.robust.parameters.MapRule.apart_frames": 7,
+        "slam.robust.parameters.MapRule.refused_updates": 7,
         "slam.robust.parameters.ContinuationRule.view_sigmas": 1.5,
         "slam.robust.parameters.MapRule.gone": 7.0,
         "slam.robust.branches._IDS_APART": 9,
     }
     del recorded["slam.front_end.matched_filter._REACH"]
     rules = recorded_rules(recorded)
-    assert rules.map == replace(MapRule(), apart_frames=7)
+    assert rules.map == replace(MapRule(), refused_updates=7)
     assert rules.continuation.view_sigmas == 1.5
     assert rules.tracklets == BackEndParameters().tracklets
     assert different_constants(recorded) == [
@@ -129,7 +129,7 @@ def test_an_old_session_has_no_numbers_that_differ() -> None:
 
 
 def test_numbers_of_another_kind_are_not_taken_over() -> None:
-    wrong = {"slam.robust.parameters.MapRule.apart_frames": "many"}
+    wrong = {"slam.robust.parameters.MapRule.refused_updates": "many"}
     assert recorded_rules(wrong) == BackEndParameters()
 
 
