@@ -52,7 +52,6 @@ class Step:
     """One motion with the scans at its end, and their evidence for the main back end's pose."""
 
     increment: Array
-    covariance: Array | None
     scans: Sequence[RangeScan]
     next_id: int  # landmarks known before it have smaller ids
     evidence: Array  # shape (k, 2): ids and nats
@@ -108,7 +107,7 @@ class Alternative:
         for number in range(self.next_step, end):
             step = steps[number]
             if self.evidence:
-                self.back_end.predict(step.increment, step.covariance)
+                self.back_end.predict(step.increment)
             report = self.back_end.update(step.scans, solve=False)
             self.evidence.append(evidence_table(report))
             self.next_step = number + 1
@@ -140,7 +139,7 @@ class Branches:
         self._snapshot_every = parameters.relinearisation.at_least_every
         self._steps: dict[int, Step] = {}  # by number, those that are needed still
         self._now = 0  # number of the next step
-        self._motion: tuple[Array, Array | None] | None = None
+        self._increment: Array | None = None
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
         self._carry: Carry | None = None
         self._judged = 0  # the evidence of the steps before it has been judged
@@ -164,25 +163,23 @@ class Branches:
         covariance = np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
         return compose(self._carry.map.pose, self._carry.moved), covariance
 
-    def predict(self, increment: Array, covariance: Array | None = None) -> None:
+    def predict(self, increment: Array) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
         if self._now % self._snapshot_every == 0:
             self._keep_snapshot()
-        self._motion = increment, covariance
-        self.main.predict(increment, covariance)
+        self._increment = increment
+        self.main.predict(increment)
         if self._carry is not None:
             self._carry.moved = compose(self._carry.moved, increment)
 
     def update(self, scans: Sequence[RangeScan]) -> UpdateReport:
         """Take in the scans of one time; a radar without a frame is absent, not empty."""
-        if self._motion is None:
+        if self._increment is None:
             raise ValueError("scans without a motion before them")
         next_id = self.main.state.next_id
         report = self.main.update(scans)
-        increment, covariance = self._motion
         self._steps[self._now] = Step(
-            increment=increment,
-            covariance=covariance,
+            increment=self._increment,
             scans=scans,
             next_id=next_id,
             evidence=evidence_table(report),
@@ -210,7 +207,7 @@ class Branches:
         begin = max(kept for kept in self._snapshots if kept <= number)
         back_end = self._snapshots[begin].copy()
         for step in (self._steps[between] for between in range(begin, number)):
-            back_end.predict(step.increment, step.covariance)
+            back_end.predict(step.increment)
             back_end.update(step.scans, solve=False)
         return back_end
 

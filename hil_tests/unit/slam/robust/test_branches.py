@@ -325,7 +325,6 @@ def test_a_carry_is_dated_to_the_earliest_step_that_explains_as_much() -> None:
     for k, evidence in enumerate([seen] * 10 + [[]] * 10 + [missed] * 10):
         branches._steps[k] = Step(
             increment=np.zeros(3),
-            covariance=None,
             scans=(),
             next_id=3,
             evidence=np.array(evidence, dtype=float).reshape(-1, 2),
