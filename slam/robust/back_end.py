@@ -284,10 +284,7 @@ class RobustBackEnd:
         return True
 
     def _count(self, known: Known) -> list[int]:
-        """Count hits and misses; return the landmarks that none of their radars has heard.
-
-        Each is returned once for every radar that surely has it in view.
-        """
+        """Count hits and misses; return landmarks surely in view and not heard, once per radar."""
         features, existence = self.state.feature_ids, self._existence
         ids = [features[row] for row in known.rows.tolist()]
         for place in set(known.assigned[:, 2].tolist()):
