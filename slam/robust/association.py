@@ -124,10 +124,8 @@ class View:
     by_feature: Array  # shape (r, n + w, 2), d(range) / d(error of the landmark or wall)
     turned: Array  # shape (r, 2, 2): rotations from the body frame of the sample to the map
 
-    def inside(
-        self, noise: RangeNoise, widen_rad: float = 0.0, widen_m: float = 0.0
-    ) -> NDArray[np.bool_]:
-        """Return whether each radar has each landmark in view, shape (r, n)."""
+    def inside(self, noise: RangeNoise, widen_rad: float, widen_m: float) -> NDArray[np.bool_]:
+        """Return whether each radar may have each feature in view, shape (r, n + w)."""
         return (
             (np.abs(self.off_boresight_rad) <= noise.field_of_view_rad / 2 + widen_rad)
             & (self.ranges_m >= noise.min_range_m - widen_m)

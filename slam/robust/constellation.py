@@ -52,7 +52,7 @@ class Placement:
     evidence: float  # in nats, against that all landmarks of the one are new
 
 
-def constellation_of(state: State, rows: Sequence[int], sigma_m: float = 0.0) -> Constellation:
+def constellation_of(state: State, rows: Sequence[int], sigma_m: float) -> Constellation:
     """Return the landmarks in some rows; ``sigma_m`` is added to their errors, in squares."""
     at_rows = np.array(rows, dtype=np.intp)
     points = state.landmarks_m[at_rows]
