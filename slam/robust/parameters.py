@@ -161,8 +161,6 @@ class MapRule:
     """How many of the likeliest merges are combined in twos."""
     refused_updates: Annotated[int, Origin.BUDGET, "scans"] = 200
     """After how many scans a merge that the run did not allow is tried again."""
-    apart_frames: Annotated[int, Origin.CHOSEN, "frames"] = 3
-    """Two landmarks that both radars of a pair saw in so many common frames are two."""
     miss: Annotated[float, Origin.CHOSEN, "hits"] = 1.5
     """By how much a frame that should have hit a landmark, and did not, lowers its score."""
     most: Annotated[float, Origin.BUDGET, "hits"] = 20.0

@@ -39,7 +39,7 @@ Every number that decides something in `slam/robust`: where it comes from and wh
 the same in every scene. `slam/robust/parameters.py` says which numbers are no constants in this
 sense. A session stores all numbers, these and the others.
 
-This page is made of the source: `python -m hil_tests.golden.update_constants` writes it.
+This page is made of the source: `python -m hil_tests.architecture.pages.constants` writes it.
 """
 
 

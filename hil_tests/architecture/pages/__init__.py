@@ -1,0 +1,1 @@
+"""Pages of the documentation: those that are made of the source, and tests of all of them."""

@@ -1,0 +1,170 @@
+"""Write the tables of `docs/results.md` and README from `fixtures/baselines`: `python -m` this."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from hil_tests.paths import FIXTURES, REPOSITORY
+from slam.app.sweep.statistics import carries_text, in_band_text
+
+PAGE = REPOSITORY / "docs" / "results.md"
+README = REPOSITORY / "README.md"
+BASELINES = FIXTURES / "baselines"
+
+Group = Mapping[str, Any]
+
+HEAD = """# Results
+
+Every number on this page is **simulated**: echoes, noise and errors of the wheels come from the
+scenes in `fixtures/scenes`, not from a real room. The paper reports 12 mm and 62 mm in real rooms
+with another metric; nothing here claims to match that.
+
+This page is made of the sweeps in `fixtures/baselines`, and a test compares it with them.
+`python -m hil_tests.architecture.pages.results` writes it.
+
+What the columns mean:
+
+- **wheels**: error of the wheel odometry alone. All errors are medians over the runs, with the 90th
+  percentile in brackets, of the absolute trajectory error (ATE) in mm: associated by time, aligned
+  in SE(2), root mean square over the run.
+- **causal**: each pose as SLAM had it when the robot was there. A controller gets this one.
+- **smoothed**: all poses solved for together at the end of the run, which preset `paper` does not
+  do.
+- **of wheels**: median of the runs' ratios to the error of their own wheels.
+- **NEES**: normalised error squared of the causal pose, mean over ten times and all runs. It is 3
+  if the covariance is true; more means that SLAM is surer than it may be. Beside it: at how many of
+  the ten times the mean over runs is in its 95 % band, and that band. For few runs it is wide.
+- **precision, recall**: medians of the landmarks' scores. Recall counts targets that a radar could
+  see from nine poses or more.
+- **worse**: runs in which the causal path was worse than the wheels. **lost**: runs without a carry
+  in which SLAM reported for a time that it had lost the robot. **carries found**: of the runs in
+  which the robot was carried, those in which SLAM knew its place within 20 s of seeing three
+  landmarks.
+"""
+
+SWEEPS = {
+    "sweep": (
+        "The paper's rooms",
+        "Both presets, all laps. `robust` has one set of numbers for every scene "
+        "([constants](constants.md)); `paper` is Algorithm 1 and Table I as printed, where they "
+        "can run.",
+    ),
+    "scenes": ("Scenes", "Preset `robust`, nothing set per scene, all laps."),
+    "rooms": (
+        "Random rooms",
+        "Preset `robust`, two laps, ten rooms of each family, drawn by `emulator/scene/rooms.py`. "
+        "Nothing is set per room.",
+    ),
+    "stress": (
+        "Hardships",
+        "Preset `robust`, two laps, the same seeds in every row. SLAM gets nothing of a hardship "
+        "but the time stamps of the frames. `uwb-slam sweep --help` says what each of them is.",
+    ),
+}
+"""Title and introduction of the section of each file, in the order of the page."""
+
+
+README_ROWS = (
+    ("the paper's laboratory, `lab`", "sweep", {"scene": "lab", "preset": "robust"}),
+    ("the same, preset `paper`", "sweep", {"scene": "lab", "preset": "paper"}),
+    ("the paper's classroom, `classroom`", "sweep", {"scene": "classroom", "preset": "robust"}),
+    ("the same, preset `paper`", "sweep", {"scene": "classroom", "preset": "paper"}),
+    ("ten random rooms with pillars", "rooms", {"scene": "pillars"}),
+    ("ten random offices", "rooms", {"scene": "office"}),
+    ("ten random rooms with rods 25 cm apart", "rooms", {"scene": "dense"}),
+    ("`lab` with a distorted pulse", "stress", {"scene": "lab", "stress": "pulse"}),
+    ("`lab` with every model error at once", "stress", {"scene": "lab", "stress": "mismatch"}),
+)
+"""Text, file and group of each row of README's table."""
+
+_BEGIN, _END = "<!-- results -->\n", "<!-- /results -->"
+
+
+def readme_with_table(readme: str) -> str:
+    """Return README with its table made anew, between the two comments."""
+    before, rest = readme.split(_BEGIN)
+    return f"{before}{_BEGIN}{_readme_table()}{_END}{rest.split(_END)[1]}"
+
+
+def _readme_table() -> str:
+    lines = [
+        "| simulated; median, 90th percentile in brackets | runs | wheels | causal | smoothed |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for text, name, key in README_ROWS:
+        groups = json.loads((BASELINES / f"{name}.json").read_text())["groups"]
+        (group,) = (group for group in groups if key.items() <= group.items())
+        cells = [
+            text,
+            str(group["runs"]),
+            _spread_mm(group["odometry_ate_rmse_m"]),
+            _spread_mm(group["ate_rmse_m"]),
+            _of_smoothed(group, "ate_rmse_m", _spread_mm),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def page() -> str:
+    return "\n".join([HEAD, *_sections()])
+
+
+def _sections() -> Iterator[str]:
+    for name, (title, text) in SWEEPS.items():
+        path = BASELINES / f"{name}.json"
+        sweep = json.loads(path.read_text())
+        yield f"## {title}\n\n{text}\n"
+        yield f"```console\n$ {sweep['command']}\n```\n"
+        if name == "stress":
+            for scene in dict.fromkeys(group["scene"] for group in sweep["groups"]):
+                yield f"### `{scene}`\n"
+                yield table([group for group in sweep["groups"] if group["scene"] == scene])
+        else:
+            yield table(sweep["groups"])
+
+
+def table(groups: Sequence[Group]) -> str:
+    """Return a table with a row per group, named by what tells the groups apart."""
+    keys = [key for key in ("scene", "preset", "stress") if len({g[key] for g in groups}) > 1]
+    columns: dict[str, Callable[[Group], str]] = {
+        **{key: lambda group, key=key: f"`{group[key]}`" for key in keys},
+        "runs": lambda group: str(group["runs"]),
+        "wheels": lambda group: _spread_mm(group["odometry_ate_rmse_m"]),
+        "causal": lambda group: _spread_mm(group["ate_rmse_m"]),
+        "of wheels": lambda group: _share(group["ratio"]),
+        "smoothed": lambda group: _of_smoothed(group, "ate_rmse_m", _spread_mm),
+        "of wheels ": lambda group: _of_smoothed(group, "ratio", _share),
+        "NEES": lambda group: f"{group['anees_mean']:.1f} ({in_band_text(group)})",
+        "precision, recall": _scores,
+        "worse": lambda group: str(group["runs_above_odometry"]),
+        "lost": lambda group: str(group["runs_lost"]),
+    }
+    if any(group.get("carries") for group in groups):
+        columns["carries found"] = carries_text
+    lines = [f"| {' | '.join(column.strip() for column in columns)} |"]
+    lines.append("|" + "---|" * len(keys) + "---:|" * (len(columns) - len(keys)))
+    lines += [f"| {' | '.join(cell(group) for cell in columns.values())} |" for group in groups]
+    return "\n".join(lines) + "\n"
+
+
+def _spread_mm(spread: Mapping[str, float]) -> str:
+    return f"{1e3 * spread['median']:.1f} ({1e3 * spread['p90']:.1f})"
+
+
+def _share(spread: Mapping[str, float]) -> str:
+    return f"{spread['median']:.2f}"
+
+
+def _of_smoothed(group: Group, key: str, text: Callable[[Mapping[str, float]], str]) -> str:
+    return "-" if group["smoothed"] is None else text(group["smoothed"][key])
+
+
+def _scores(group: Group) -> str:
+    """Return the medians of a group's landmarks; a scene without targets has no recall."""
+    scores = (group["landmark_medians"][key] for key in ("precision", "recall"))
+    return ", ".join("-" if score is None else f"{score:.2f}" for score in scores)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
+    README.write_text(readme_with_table(README.read_text()))
