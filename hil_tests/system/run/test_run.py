@@ -271,7 +271,7 @@ def test_what_cannot_begin_says_why_in_one_line(
 
 
 @pytest.mark.thorough
-def test_the_run_that_the_readme_prints_works_in_a_clean_folder(
+def test_the_run_of_the_documents_works_in_a_clean_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both commands as printed, but for an end after a second; no other emulator is seen."""
@@ -279,7 +279,7 @@ def test_the_run_that_the_readme_prints_works_in_a_clean_folder(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     (clean := tmp_path / "clean").mkdir()
     monkeypatch.chdir(clean)
-    printed = (REPOSITORY / "README.md").read_text()
+    printed = (REPOSITORY / "docs" / "robot.md").read_text()
     serve, run = re.search(
         r"^\$ xethru-emulator (serve .*)\n\$ uwb-slam (run .*?) *(?:#.*)?$", printed, re.MULTILINE
     ).groups()  # type: ignore[union-attr]  # None fails the test
