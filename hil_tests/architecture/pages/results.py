@@ -22,9 +22,9 @@ with another metric; nothing here claims to match that.
 This page is made of the sweeps in `fixtures/baselines`, and a test compares it with them.
 `python -m hil_tests.architecture.pages.results` writes it.
 
-Some of these runs were looked at while SLAM was developed: `lab` and `classroom` with seeds 0 to 17, 31
-and 38, from which the weight of ranges was chosen; `corridor`, `store` and `two_rooms` with seeds 0 and
-1, for the rules of walls and thick targets; and rooms 0 to 9 of the random families.
+Some of these runs were looked at while SLAM was developed: `lab` and `classroom` with seeds 0 to
+17, 31 and 38, from which the weight of ranges was chosen; `corridor`, `store` and `two_rooms` with
+seeds 0 and 1, for the rules of walls and thick targets; and rooms 0 to 9 of the random families.
 
 What the columns mean:
 
@@ -36,7 +36,7 @@ What the columns mean:
   do.
 - **of wheels**: median of the runs' ratios to the error of their own wheels.
 - **NEES**: normalised error squared of the causal pose, mean over ten times and all runs. It is 3
-  if the covariance is true; more means that SLAM is surer than it may be. Beside it: at how many of
+  if the covariance is true; more means that the covariance is too small. Beside it: at how many of
   the ten times the mean over runs is in its 95 % band, and that band. For few runs it is wide.
 - **precision, recall**: medians of the landmarks' scores. Recall counts targets that a radar could
   see from nine poses or more.
@@ -52,21 +52,32 @@ SWEEPS = {
         "Both presets, all laps. `robust` has one set of numbers for every scene "
         "([constants](constants.md)); `paper` is Algorithm 1 and Table I as printed, where they "
         "can run.",
+        "consistency.png",
+        "Mean NEES and NIS over the runs at ten times, with their 95 % bands",
     ),
-    "scenes": ("Scenes", "Preset `robust`, nothing set per scene, all laps."),
+    "scenes": (
+        "Scenes",
+        "Preset `robust`, nothing set per scene, all laps.",
+        "scenes.png",
+        "Errors and consistency in every scene",
+    ),
     "rooms": (
         "Random rooms",
         "Preset `robust`, two laps, ten rooms of each family, drawn by `emulator/scene/rooms.py`. "
-        "Nothing is set per room.",
+        "Nothing is set per room. The picture shows two rooms and a hardship before and after "
+        "preset `robust` allowed for model error.",
+        "before_after.png",
+        "Paths in pillars:1, office:3 and under wander_10, before and after",
     ),
     "stress": (
         "Hardships",
         "Preset `robust`, two laps, the same seeds in every row. SLAM gets nothing of a hardship "
         "but the time stamps of the frames. `uwb-slam sweep --help` says what each of them is.",
+        "stress.png",
+        "What each hardship costs, and whether the covariance allows for it",
     ),
 }
-"""Title and introduction of the section of each file, in the order of the page."""
-
+"""Of each file, in the order of the page: title, introduction, picture and what it shows."""
 
 README_ROWS = (
     ("the paper's laboratory, `lab`", "sweep", {"scene": "lab", "preset": "robust"}),
@@ -114,7 +125,7 @@ def page() -> str:
 
 
 def _sections() -> Iterator[str]:
-    for name, (title, text) in SWEEPS.items():
+    for name, (title, text, picture, shows) in SWEEPS.items():
         path = BASELINES / f"{name}.json"
         sweep = json.loads(path.read_text())
         yield f"## {title}\n\n{text}\n"
@@ -128,13 +139,13 @@ def _sections() -> Iterator[str]:
                 yield table([group for group in sweep["groups"] if group["scene"] == scene])
         else:
             yield table(sweep["groups"])
+        yield f"![{shows}](../fixtures/pictures/{picture})\n"
 
 
 def table(groups: Sequence[Group]) -> str:
     """Return a table with a row per group, named by what tells the groups apart."""
     keys = [key for key in ("scene", "preset", "stress") if len({g[key] for g in groups}) > 1]
     columns: dict[str, Callable[[Group], str]] = {
-        **{key: lambda group, key=key: f"`{group[key]}`" for key in keys},
         "runs": lambda group: str(group["runs"]),
         "wheels": lambda group: _spread_mm(group["odometry_ate_rmse_m"]),
         "causal": lambda group: _spread_mm(group["ate_rmse_m"]),
@@ -148,9 +159,11 @@ def table(groups: Sequence[Group]) -> str:
     }
     if any(group.get("carries") for group in groups):
         columns["carries found"] = carries_text
-    lines = [f"| {' | '.join(column.strip() for column in columns)} |"]
-    lines.append("|" + "---|" * len(keys) + "---:|" * (len(columns) - len(keys)))
-    lines += [f"| {' | '.join(cell(group) for cell in columns.values())} |" for group in groups]
+    lines = [f"| {' | '.join([*keys, *(column.strip() for column in columns)])} |"]
+    lines.append("|" + "---|" * len(keys) + "---:|" * len(columns))
+    for group in groups:
+        cells = [*(f"`{group[key]}`" for key in keys), *(of(group) for of in columns.values())]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
