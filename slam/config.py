@@ -379,16 +379,16 @@ class RobustConfig(_Model):
     ranges of a tracklet, decided on together, keep it."""
     huber_sigmas: Annotated[float, Field(gt=0), Origin.QUANTILE] = math.inf
     """Innovations of more standard deviations weigh less: of normal errors, one in 22."""
-    max_misfit: Annotated[Positive, Origin.MEASURED] = 1.5
+    max_misfit: Annotated[Positive, Origin.CHOSEN] = 1.5
     """Largest misfit of an echo, if the front end reports it: one that a single pulse does not
-    explain is of several targets, and lies between them. Measured on emulated frames of `lab`."""
+    explain is of several targets, and lies between them."""
     max_predicted_sigma_m: Annotated[Positive, Origin.CHOSEN] = 8e-3
     """Largest standard deviation of a range, if the front end reports it."""
-    offset_sigma_m: Annotated[NonNegative, Origin.DATA_SHEET] = 0.0
+    offset_sigma_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
     """Standard deviation of each radar's unknown constant range offset."""
     detection_probability: Annotated[float, Field(gt=0, lt=1), Origin.CHOSEN] = 0.95
     """Probability that a target in view gives a range that is used."""
-    mount_sigma_m: Annotated[NonNegative, Origin.DATA_SHEET] = 0.0
+    mount_sigma_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
     """Standard deviation of an antenna's position along each axis; 0: it is that of the rig."""
     radius_sigma_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
     """Standard deviation of a target's radius; 0: targets are points."""

@@ -102,7 +102,7 @@ class RobustBackEnd:
             scale * parameters.wheels.walk_lever_m,
         )
         self._existence = Existence(parameters.map, rule.min_frames)
-        self._log = RunLog(parameters.wheels, parameters.relinearisation.at_least_every)
+        self._log = RunLog(parameters.wheels, parameters.splits.gap_poses)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}

@@ -136,7 +136,6 @@ class Branches:
         self.main = RobustBackEnd(rig, parameters)
         self._rule = parameters.branches
         self._look_every, self._window = parameters.map.look_every, parameters.tracklets.window
-        self._snapshot_every = parameters.relinearisation.at_least_every
         self._steps: dict[int, Step] = {}  # by number, those that are needed still
         self._now = 0  # number of the next step
         self._increment: Array | None = None
@@ -165,7 +164,7 @@ class Branches:
 
     def predict(self, increment: Array) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
-        if self._now % self._snapshot_every == 0:
+        if self._now % self._rule.snapshot_every == 0:
             self._keep_snapshot()
         self._increment = increment
         self.main.predict(increment)

@@ -308,7 +308,11 @@ def match(state: State, point: BodyPoint) -> int | None:
 
 
 def certain_row(found: Mapping[int, FeatureRows], density: float) -> int | None:
-    """Return the row of the feature that what is seen certainly is, or None."""
+    """Return the row of the feature that what is seen certainly is, or None.
+
+    ``found`` has the candidates by row, and ``density`` is that of all features of the kind, per
+    unit of the residuals' plane (1/m^2 of points, 1/(m rad) of walls).
+    """
     best = certain(
         [identity(((SEEN, row),), rows.residual, rows.S, density) for row, rows in found.items()]
     )

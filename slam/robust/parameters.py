@@ -84,7 +84,7 @@ class ContinuationRule:
 
     view_margin_rad: Annotated[float, Origin.CHOSEN] = 0.25
     """How far outside the field of view a landmark may lie and still be looked for."""
-    view_sigmas: Annotated[float, Origin.QUANTILE] = 5.0
+    view_sigmas: Annotated[float, Origin.CHOSEN] = 5.0
     """How far outside the limits of range it may lie, in standard deviations of a range."""
     blur_m: Annotated[float, Origin.DATA_SHEET] = 0.12
     """Two echoes closer than this in range are hard to tell apart: the width of a pulse at half of
@@ -213,9 +213,7 @@ class RelinearisationRule:
     every: Annotated[int, Origin.BUDGET, "scans"] = 20
     """Fewest scans between two solutions."""
     at_least_every: Annotated[int, Origin.BUDGET, "scans"] = 50
-    """Most scans between two solutions, at the beginning of a run, and between two snapshots of the
-    back end; a landmark that has not been seen for longer is in another passage when it is seen
-    again."""
+    """Most scans between two solutions, at the beginning of a run."""
     run_share: Annotated[float, Origin.BUDGET] = 0.1
     """Later, most scans as a share of the run: so all solutions cost in proportion to it."""
     iterations: Annotated[int, Origin.BUDGET, "steps"] = 10
@@ -265,6 +263,8 @@ class SplitRule:
     they cost is gone where they have a place of their own.
     """
 
+    gap_poses: Annotated[int, Origin.CHOSEN, "scans"] = 50
+    """A landmark that has not been seen for longer is in another passage when it is seen again."""
     suspect_mean: Annotated[float, Origin.CHOSEN] = 4.0
     """Mean squared residual from which on a group of ranges is examined; 1 is expected."""
     fewest: Annotated[int, Origin.CHOSEN, "ranges"] = 15
@@ -300,9 +300,10 @@ class BranchRule:
     """After how many scans the question of a carry is dropped, unless a place is on trial."""
     patience: Annotated[int, Origin.BUDGET] = 4
     """After how many times `TrackletRule.window` a place on trial is dropped."""
+    snapshot_every: Annotated[int, Origin.BUDGET, "scans"] = 50
+    """Scans between two snapshots of the back end."""
     snapshots: Annotated[int, Origin.BUDGET, "snapshots"] = 9
-    """How many snapshots of the back end are kept (`RelinearisationRule.at_least_every`): a carry
-    that is noticed later is dated to the oldest."""
+    """How many snapshots are kept: a carry that is noticed later is dated to the oldest."""
     catch_up: Annotated[int, Origin.BUDGET, "scans"] = 10
     """How many scans an alternative that lags behind takes at a time."""
     newest: Annotated[int, Origin.BUDGET, "landmarks"] = 8

@@ -9,6 +9,7 @@ from itertools import pairwise
 from types import ModuleType
 from typing import get_args, get_type_hints
 
+from hil_tests.architecture.pages.markdown import table
 from hil_tests.paths import REPOSITORY
 from slam.config import Origin, RobustConfig, load_preset
 from slam.robust import parameters
@@ -135,22 +136,23 @@ def counts() -> Counter[Origin]:
 
 def page() -> str:
     found = counts()
-    lines = [HEAD, "| origin | constants | meaning |", "|---|---:|---|"]
-    lines += [f"| {origin} | {found[origin]} | {text} |" for origin, text in MEANINGS.items()]
-    lines.append(f"| all | {found.total()} | |")
+    kinds = [(str(origin), str(found[origin]), text) for origin, text in MEANINGS.items()]
+    kinds.append(("all", str(found.total()), ""))
+    parts = [HEAD, table(("origin", "constants", "meaning"), kinds, ["constants"])]
     for group in groups():
-        lines += ["", f"## {group.title}", "", group.purpose, ""]
-        lines += ["| name | value | unit | origin | what it is |", "|---|---:|---|---|---|"]
-        for constant in group.constants:
-            cells = [
+        rows = [
+            (
                 f"`{constant.name}`",
                 f"{constant.value:.6g}",
                 constant.unit,
                 ", ".join(constant.origins),
                 constant.sentence,
-            ]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+            )
+            for constant in group.constants
+        ]
+        columns = ("name", "value", "unit", "origin", "what it is")
+        parts += [f"## {group.title}\n", f"{group.purpose}\n", table(columns, rows, ["value"])]
+    return "\n".join(parts)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,9 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from hil_tests.architecture.pages.markdown import table
 from hil_tests.paths import FIXTURES, REPOSITORY
+from slam.app.run.output import share_text
 from slam.app.sweep.statistics import carries_text, in_band_text
 
 PAGE = REPOSITORY / "docs" / "results.md"
@@ -102,77 +104,50 @@ def readme_with_table(readme: str) -> str:
 
 
 def _readme_table() -> str:
-    lines = [
-        "| simulated; median, 90th percentile in brackets | runs | wheels | causal | smoothed |",
-        "|---|---:|---:|---:|---:|",
-    ]
+    first = "simulated; median, 90th percentile in brackets"
+    rows = []
     for text, name, key in README_ROWS:
-        groups = json.loads((BASELINES / f"{name}.json").read_text())["groups"]
-        (group,) = (group for group in groups if key.items() <= group.items())
-        cells = [
-            text,
-            str(group["runs"]),
-            _spread_mm(group["odometry_ate_rmse_m"]),
-            _spread_mm(group["ate_rmse_m"]),
-            _of_smoothed(group, "ate_rmse_m", _spread_mm),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        (group,) = (group for group in _sweep(name)["groups"] if key.items() <= group.items())
+        cells = {title: of(group) for title, of in COLUMNS}
+        rows.append([text, *(cells[title] for title in README_COLUMNS)])
+    return table([first, *README_COLUMNS], rows, README_COLUMNS)
 
 
 def page() -> str:
     return "\n".join([HEAD, *_sections()])
 
 
+def _sweep(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((BASELINES / f"{name}.json").read_text())
+    return found
+
+
 def _sections() -> Iterator[str]:
     for name, (title, text, picture, shows) in SWEEPS.items():
-        path = BASELINES / f"{name}.json"
-        sweep = json.loads(path.read_text())
+        sweep = _sweep(name)
+        commands = "".join(f"$ {command}\n" for command in sweep["command"].splitlines())
         yield f"## {title}\n\n{text}\n"
-        command = sweep["command"]
-        if "--json" not in command:
-            command += f" --json out/{name}.json"
-        yield f"```console\n$ {command}\n```\n"
-        if name == "stress":
-            for scene in dict.fromkeys(group["scene"] for group in sweep["groups"]):
-                yield f"### `{scene}`\n"
-                yield table([group for group in sweep["groups"] if group["scene"] == scene])
-        else:
-            yield table(sweep["groups"])
+        yield f"```console\n{commands}```\n"
+        yield groups_table(sweep["groups"])
         yield f"![{shows}](../fixtures/pictures/{picture})\n"
 
 
-def table(groups: Sequence[Group]) -> str:
+def groups_table(groups: Sequence[Group]) -> str:
     """Return a table with a row per group, named by what tells the groups apart."""
     keys = [key for key in ("scene", "preset", "stress") if len({g[key] for g in groups}) > 1]
-    columns: dict[str, Callable[[Group], str]] = {
-        "runs": lambda group: str(group["runs"]),
-        "wheels": lambda group: _spread_mm(group["odometry_ate_rmse_m"]),
-        "causal": lambda group: _spread_mm(group["ate_rmse_m"]),
-        "of wheels": lambda group: _share(group["ratio"]),
-        "smoothed": lambda group: _of_smoothed(group, "ate_rmse_m", _spread_mm),
-        "of wheels ": lambda group: _of_smoothed(group, "ratio", _share),
-        "NEES": lambda group: f"{group['anees_mean']:.1f} ({in_band_text(group)})",
-        "precision, recall": _scores,
-        "worse": lambda group: str(group["runs_above_odometry"]),
-        "lost": lambda group: str(group["runs_lost"]),
-    }
-    if any(group.get("carries") for group in groups):
-        columns["carries found"] = carries_text
-    lines = [f"| {' | '.join([*keys, *(column.strip() for column in columns)])} |"]
-    lines.append("|" + "---|" * len(keys) + "---:|" * len(columns))
-    for group in groups:
-        cells = [*(f"`{group[key]}`" for key in keys), *(of(group) for of in columns.values())]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    columns = [*COLUMNS]
+    if any(group["carries"] for group in groups):
+        columns.append(("carries found", carries_text))
+    rows = [
+        [*(f"`{group[key]}`" for key in keys), *(of(group) for _, of in columns)]
+        for group in groups
+    ]
+    titles = [title for title, _ in columns]
+    return table([*keys, *titles], rows, titles)
 
 
 def _spread_mm(spread: Mapping[str, float]) -> str:
     return f"{1e3 * spread['median']:.1f} ({1e3 * spread['p90']:.1f})"
-
-
-def _share(spread: Mapping[str, float]) -> str:
-    return f"{spread['median']:.2f}"
 
 
 def _of_smoothed(group: Group, key: str, text: Callable[[Mapping[str, float]], str]) -> str:
@@ -182,8 +157,25 @@ def _of_smoothed(group: Group, key: str, text: Callable[[Mapping[str, float]], s
 def _scores(group: Group) -> str:
     """Return the medians of a group's landmarks; a scene without targets has no recall."""
     scores = (group["landmark_medians"][key] for key in ("precision", "recall"))
-    return ", ".join("-" if score is None else f"{score:.2f}" for score in scores)
+    return ", ".join(map(share_text, scores))
 
+
+COLUMNS: tuple[tuple[str, Callable[[Group], str]], ...] = (
+    ("runs", lambda group: str(group["runs"])),
+    ("wheels", lambda group: _spread_mm(group["odometry_ate_rmse_m"])),
+    ("causal", lambda group: _spread_mm(group["ate_rmse_m"])),
+    ("of wheels", lambda group: share_text(group["ratio"]["median"])),
+    ("smoothed", lambda group: _of_smoothed(group, "ate_rmse_m", _spread_mm)),
+    (
+        "smoothed, of wheels",
+        lambda group: _of_smoothed(group, "ratio", lambda ratio: share_text(ratio["median"])),
+    ),
+    ("NEES", lambda group: f"{group['anees_mean']:.1f} ({in_band_text(group)})"),
+    ("precision, recall", _scores),
+    ("worse", lambda group: str(group["runs_above_odometry"])),
+    ("lost", lambda group: str(group["runs_lost"])),
+)
+README_COLUMNS = ("runs", "wheels", "causal", "smoothed")
 
 if __name__ == "__main__":
     PAGE.write_text(page())

@@ -57,13 +57,12 @@ def test_a_frame_is_plotted_in_five_lines(document: Path, monkeypatch: pytest.Mo
 
 
 def test_the_test_of_the_readme_passes_on_an_emulated_module(tmp_path: Path) -> None:
-    programs = re.findall(r"```python\n(def test_.*?)```", README.read_text(), re.DOTALL)
-    (tmp_path / "test_mine.py").write_text(programs[0])
+    (program,) = re.findall(r"```python\n(def test_.*?)```", README.read_text(), re.DOTALL)
+    (tmp_path / "test_mine.py").write_text(program)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py"]
     ended = subprocess.run(
         [*command, "--radar", "emu:lab"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
-    assert len(programs) == 1
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "1 passed" in ended.stdout
 
@@ -72,20 +71,23 @@ def test_the_state_diagram_is_that_of_the_emulated_module() -> None:
     assert f"```mermaid\n{state_diagram().rstrip()}\n```" in (DOCS / "emulator.md").read_text()
 
 
+def links_of(document: Path) -> list[Path]:
+    """Return the files that a document links to or shows."""
+    found = re.findall(r"\]\((?!https?:|#)([^)#]+)", document.read_text())
+    return [(document.parent / link).resolve() for link in found]
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_path_and_link_in_a_document_exists(document: Path) -> None:
-    text = document.read_text()
     folders = "xethru_protocol|emulator|slam|hil_tests|fixtures|docs"
-    paths = [REPOSITORY / path for path in re.findall(rf"`((?:{folders})/[\w./]+)`", text)]
-    links = re.findall(r"\]\((?!https?:|#)([^)#]+)(?:#[\w-]+)?\)", text)
-    paths += [document.parent / link for link in links]
+    named = re.findall(rf"`((?:{folders})/[\w./]+)`", document.read_text())
+    paths = [*(REPOSITORY / path for path in named), *links_of(document)]
     assert [str(path) for path in paths if not path.exists()] == []
 
 
 def test_every_page_is_linked_from_another_document() -> None:
-    links = {
-        (document.parent / link).resolve()
-        for document in DOCUMENTS
-        for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", document.read_text())
+    pages = {page.resolve() for page in DOCS.glob("*.md")}
+    linked = {
+        link for document in DOCUMENTS for link in links_of(document) if link != document.resolve()
     }
-    assert {page for page in DOCS.glob("*.md") if page.resolve() not in links} == set()
+    assert pages - linked == set()

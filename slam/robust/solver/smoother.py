@@ -465,7 +465,7 @@ class Smoother:
         tau = self._rule.radius_scale_m
         radii = np.maximum(away[self._radii], tau)
         thin = np.clip(away[self._radii], 0.0, tau)
-        costs[self._radii] = thin**2 / (tau * (2.0 * tau))
+        costs[self._radii] = thin**2 / (2.0 * tau * tau)
         costs[self._radii] += 2.0 * np.log((tau + radii) / (2.0 * tau))
         below = np.minimum(away[self._radii], 0.0)
         return total + float(np.sum(costs) + np.sum((below / tau) ** 2))

@@ -89,7 +89,7 @@ def test_ekf_is_as_sure_as_it_may_be(told: float, consistent: bool) -> None:
 def test_robust_filter_is_as_sure_as_it_may_be() -> None:
     """Drive past two landmarks without clutter: ranges, wheels with their errors of the run."""
     rig = paper_rig()
-    poses = true_path(LAB)[:24]  # a landmark is born from nine frames
+    poses = true_path(LAB)[:24]  # a landmark is initialised from nine frames
     nees, nis, dof = [], [], []
     for seed in range(N_RUNS):
         rng = np.random.default_rng(seed)

@@ -21,7 +21,7 @@ from slam.geometry import between, compose, paper_rig
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import BackEndParameters, RelinearisationRule
+from slam.robust.parameters import BackEndParameters, RelinearisationRule, SplitRule
 from slam.robust.solver.revision import is_determined, relinearise
 from slam.robust.solver.run_log import (
     Estimate,
@@ -386,7 +386,7 @@ def test_the_smoothed_run_leaves_the_filter_unchanged_and_is_within_a_centimetre
 
 def test_keyframes_remain_as_the_run_goes_on_and_a_loose_step_is_between_two() -> None:
     rng = np.random.default_rng(2)
-    log, state = RunLog(WheelNoise(), RULE.at_least_every), State((0.01,) * 3, (0.0,) * N_RADARS)
+    log, state = RunLog(WheelNoise(), SplitRule().gap_poses), State((0.01,) * 3, (0.0,) * N_RADARS)
     parameters = BackEndParameters()
     before: set[int] = set()
     for k in range(1, 120):
@@ -408,7 +408,7 @@ def test_a_range_is_the_same_from_its_keyframe_as_from_its_own_pose() -> None:
     state.mounts_m = 0.01 * np.random.default_rng(1).standard_normal((N_RADARS, 2))
     state.augment(np.array([0.3, 1.0]), np.zeros((state.P.size, 3)), np.eye(3))
     state.radii_m[0] = 0.04
-    log, wheels = RunLog(WheelNoise(), RULE.at_least_every), WheelNoise()
+    log, wheels = RunLog(WheelNoise(), SplitRule().gap_poses), WheelNoise()
     poses = [np.zeros(3)]
     for k in range(1, 41):
         step = np.array([0.01, 0.001, 0.02])
@@ -440,7 +440,7 @@ def test_each_calibration_error_walks_in_proportion_to_its_own_deviation() -> No
     wheels = WheelNoise(
         scale_sigma=s, turn_scale_sigma=w, curvature_sigma_rad_per_m=kappa, walk_per_sqrt_m=1.0
     )
-    log, state = RunLog(wheels, RULE.at_least_every), State(sigmas, (0.0,) * N_RADARS)
+    log, state = RunLog(wheels, SplitRule().gap_poses), State(sigmas, (0.0,) * N_RADARS)
     step = np.array([0.25, 0.0, 0.0])
     motion = calibrated_motion(step, np.zeros(3), wheels)
     log.add_motion(step, motion)
@@ -485,7 +485,7 @@ def drive_along(
 @pytest.mark.parametrize("n_ranges", [14, 60])
 def test_a_range_costs_a_row_of_numbers_and_no_object(n_ranges: int) -> None:
     """A range is 46 bytes at most and a pose 129, in buffers that may be half empty."""
-    log, n_poses = RunLog(WheelNoise(), RULE.at_least_every), 1000
+    log, n_poses = RunLog(WheelNoise(), SplitRule().gap_poses), 1000
     tracemalloc.start()
     try:
         drive_along(log, n_poses, range(n_ranges), np.random.default_rng(6))
