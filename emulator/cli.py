@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.chip import Pace
 from xethru_protocol.cli.version import add_version
+from xethru_protocol.extras import what_is_missing
 from xethru_protocol.system import (
     STDERR,
     STDOUT,
@@ -320,6 +321,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if failure is None or isinstance(failure, BrokenPipeError):  # its reader has seen enough
             return exit_code
         return _failed(f"stdout: cannot write: {failure.strerror}")
+    except ModuleNotFoundError as error:
+        missing = what_is_missing(error, extra="emulator")
+        if missing is None:
+            raise
+        return _failed(missing, exit_code=2)
     except KeyboardInterrupt:
         return _INTERRUPTED
     finally:

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
-from slam.app.errors import EXIT_FAILED, AppError
+from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
+from xethru_protocol.extras import what_is_missing
 from xethru_protocol.system import (
     STDERR,
     STDOUT,
@@ -85,6 +86,11 @@ def _run(arguments: argparse.Namespace) -> int:
         return _end(str(error), error.exit_code)
     except StopRequestedError as stopped:
         return _end(str(stopped), stopped.exit_code)
+    except ModuleNotFoundError as error:
+        missing = what_is_missing(error, extra="slam")
+        if missing is None:
+            raise
+        return _end(missing, EXIT_USAGE)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _end(f"{where}{error.strerror or error}", EXIT_FAILED)

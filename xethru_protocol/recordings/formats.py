@@ -10,11 +10,13 @@ last field.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from xethru_protocol.extras import what_is_missing
 from xethru_protocol.recordings import npz, wire_capture
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.records import (
@@ -91,6 +93,18 @@ def recording_format(path: Path | str) -> RecordingFormat:
     )
 
 
+@contextmanager
+def _optional_packages() -> Iterator[None]:
+    """Import what knows MCAP; RecordingError without the packages that it needs."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = what_is_missing(error)
+        if missing is None:
+            raise
+        raise RecordingError(f"MCAP needs packages that are optional; {missing}") from None
+
+
 def read_recording(
     path: Path | str, on_fault: FaultHandler | None = None, *, radar: str | None = None
 ) -> TimedMessages:
@@ -120,7 +134,8 @@ def read_recording(
         case "npz":
             yield from npz.read_npz(path)
         case "mcap":
-            from xethru_protocol.recordings.mcap import read_mcap
+            with _optional_packages():
+                from xethru_protocol.recordings.mcap import read_mcap
 
             yield from read_mcap(path, on_fault, radar)
         case "vendor":
@@ -132,7 +147,8 @@ def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
     path = Path(path)
     if recording_format(path) != "mcap":
         return (RadarFacts(),)
-    from xethru_protocol.recordings.mcap import mcap_radars
+    with _optional_packages():
+        from xethru_protocol.recordings.mcap import mcap_radars
 
     return mcap_radars(path)
 
@@ -146,7 +162,8 @@ def recording_facts(path: Path | str) -> RecordingFacts:
         case "npz":
             return npz.npz_facts(path)
         case "mcap":
-            from xethru_protocol.recordings.mcap import mcap_facts
+            with _optional_packages():
+                from xethru_protocol.recordings.mcap import mcap_facts
 
             return mcap_facts(path)
         case "vendor":
@@ -258,7 +275,8 @@ def _writer(target: Path) -> _Writer:
     writer: _Writer
     match target.suffix:
         case ".mcap":
-            from xethru_protocol.recordings.mcap import write_mcap
+            with _optional_packages():
+                from xethru_protocol.recordings.mcap import write_mcap
 
             writer = write_mcap
         case npz.SUFFIX:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -26,7 +26,7 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.rig.sources import RigSource
-from slam.app.run.output import Progress
+from slam.app.run.output import Progress, note
 from slam.app.run.results import RESULTS, finish, hold_folder, remove_earlier
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
@@ -35,6 +35,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.compiled import compile_kernels
 from slam.config import BackEnd
+from xethru_protocol.extras import what_is_missing
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
@@ -65,7 +66,7 @@ def run_demo(
         kept = f"; what was recorded is in {out}"
         with ExitStack() as stack:
             emulator = stack.enter_context(EmulatorProcess(scene, seed))
-            from slam.app.view.panels import RerunView  # a second, while the emulator starts
+            make_view = _rerun_view()  # a second, while the emulator starts
 
             if config.back_end is BackEnd.ROBUST:
                 compile_kernels(before_each=stop.check)  # seconds the first time
@@ -113,12 +114,11 @@ def run_demo(
             path = out / "session.mcap"
             log = SessionLog(path, info, odometry, truth_at=trajectory.poses, drawn=not lean)
             stack.callback(log.close)
-            view = RerunView(out / "session.rrd", info)
             sinks: list[SessionObserver] = [
                 Progress(info, source.lost_frames, end_ns=trajectory.duration_ns),
                 log,  # closed before the views: the record must not wait for them
                 *([live.observer(info)] if live is not None else []),
-                view,
+                *([make_view(out / "session.rrd", info)] if make_view is not None else []),
             ]
             for row in early_bytes:
                 log.on_wire(*row)
@@ -136,6 +136,19 @@ def run_demo(
             raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
         if live is not None:
             live.keep_serving()
+
+
+def _rerun_view() -> Callable[[Path, SessionInfo], SessionObserver] | None:
+    """Return what makes the view of a session; None, with a note, if Rerun is not installed."""
+    try:
+        from slam.app.view.panels import RerunView
+    except ModuleNotFoundError as error:
+        missing = what_is_missing(error)
+        if missing is None:
+            raise
+        note(f"session.rrd is not written: {missing}")
+        return None
+    return RerunView
 
 
 class _Scans:

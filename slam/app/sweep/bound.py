@@ -48,6 +48,7 @@ from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
 from slam.robust.association import LONGEST_M, crossings
 from slam.robust.state import calibrated_motion, quarter_turn, rotation
+from xethru_protocol.extras import install_command
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
@@ -74,7 +75,7 @@ def load_gtsam(purpose: str) -> Any:  # noqa: ANN401 - types must not depend on 
         return import_module("gtsam")
     except ImportError:
         raise AppError(
-            f"{purpose} needs GTSAM, which is not installed: pip install 'xethru-hil[gtsam]'"
+            f"{purpose} needs GTSAM, which is not installed: {install_command('gtsam')}"
         ) from None
 
 

@@ -23,6 +23,7 @@ from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from slam.app.errors import AppError, UsageError
 from slam.app.rig.emulated import signal_at_parents_death
+from xethru_protocol.extras import install_command
 
 _LEFT_TO_THE_PARENT = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
@@ -147,7 +148,7 @@ def _connect(address: str) -> Any:  # noqa: ANN401 - Dask is optional
     try:
         import distributed  # heavy, and an extra
     except ImportError:
-        raise UsageError("--dask: Dask is missing; pip install 'xethru-hil[dask]'") from None
+        raise UsageError(f"--dask: Dask is not installed: {install_command('dask')}") from None
     # what goes wrong becomes one line of ours
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:

@@ -28,6 +28,7 @@ from slam.app.rig.emulated import signal_at_parents_death
 from slam.app.run.output import note
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.results import SmoothedRun
+from xethru_protocol.extras import install_command
 from xethru_protocol.system import StopFlag
 
 _HERE = "127.0.0.1"
@@ -164,7 +165,7 @@ def executable() -> Path:
             path = Path(found.origin).parent / name
             if path.is_file():
                 return path
-    raise AppError("the Rerun viewer is not installed; `pip install rerun-sdk` brings it")
+    raise AppError(f"the Rerun viewer is not installed: {install_command('view')}")
 
 
 def _environment(kind: ViewerKind) -> dict[str, str]:

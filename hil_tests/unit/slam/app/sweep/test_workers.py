@@ -165,7 +165,7 @@ def test_without_dask_the_remedy_is_named(
     out = tmp_path / "o.json"
     assert main(["sweep", "--dask", "tcp://127.0.0.1:8786", "--json", str(out)]) == 2
     text = capsys.readouterr()
-    assert text.err == "uwb-slam: --dask: Dask is missing; pip install 'xethru-hil[dask]'\n"
+    assert text.err == "uwb-slam: --dask: Dask is not installed: pip install 'xethru-hil[dask]'\n"
     assert list(tmp_path.iterdir()) == []
 
 
