@@ -24,7 +24,7 @@ from hil_tests.system.recorded_session import (
     write_shorter_scene,
 )
 from slam.app.cli import main
-from slam.app.commands.view import is_finished, session_file
+from slam.app.commands.recorded_session import is_finished, session_file
 from slam.app.errors import AppError
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute

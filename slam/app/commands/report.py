@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from slam.app.commands.view import play, refuse_overwriting, session_file
+from slam.app.commands.recorded_session import play, refuse_overwriting, session_file
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot

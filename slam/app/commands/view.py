@@ -10,28 +10,27 @@ from __future__ import annotations
 import io
 import tempfile
 import time
-from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
 from PIL import Image
 
+from slam.app.commands.recorded_session import (
+    VIEW_NAME,
+    is_finished,
+    play,
+    refuse_overwriting,
+    session_file,
+)
 from slam.app.errors import AppError, UsageError, naming
-from slam.app.records import SessionObserver, Snapshot
-from slam.app.run.output import Progress, note, print_text
-from slam.app.run.recorded import play_states
-from slam.app.run.replay import recorded_source
-from slam.app.run.runner import LostFrames, RunRecord, execute
+from slam.app.run.output import print_text
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
 from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
-from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.system import StopFlag, one_line, written_whole
 
 _MAGIC = b"RRF"
-_END = b"FOOT"
-"""Ends a finished file, with four bytes behind it."""
 _OLDEST = (0, 23)
 """Of files that later versions open."""
 
@@ -60,13 +59,6 @@ def _require_readable(path: Path) -> None:
             f"{path}: was never closed, its program was killed; make it again from its session: "
             f"uwb-slam view session.mcap --out {path.name}; or: rerun rrd merge {path.name} -o NEW"
         )
-
-
-def is_finished(path: Path) -> bool:
-    """Return whether a recording was closed; that of a killed program lacks its last rows."""
-    with path.open("rb") as stream:
-        stream.seek(max(path.stat().st_size - len(_END) - 4, 0))
-        return stream.read().startswith(_END)
 
 
 _SETTLE_LIMIT_S = 30.0
@@ -134,9 +126,6 @@ def _wait(stop: StopFlag, give_up: float) -> None:
     time.sleep(_PERIOD_S)
 
 
-_SESSION_NAME, _VIEW_NAME = "session.mcap", "session.rrd"
-
-
 def run_view(
     stop: StopFlag,
     *,
@@ -169,43 +158,13 @@ def run_view(
         print_text(one_line(str(out)))
     elif screenshot is not None:
         with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
-            made = Path(folder) / _VIEW_NAME
+            made = Path(folder) / VIEW_NAME
             _write_view(recorded, made, stop)
             _take_screenshot(made, screenshot, at_s, stop)
     else:
         with LiveView(where, stop, is_replay=True) as live:
             play(recorded, [live.observer(recorded.info)], stop)
             live.keep_serving()
-
-
-def session_file(given: Path, *, allow_view: bool = False) -> Path:
-    """Return a file as it is, or the session of a run's folder.
-
-    `allow_view` prefers the .rrd of a folder, which is drawn already, if it was closed.
-    """
-    if not given.is_dir():
-        if not given.exists():
-            raise AppError(f"{given}: no such file")
-        return given
-    session, view = given / _SESSION_NAME, given / _VIEW_NAME
-    if allow_view and view.is_file() and (is_finished(view) or not session.is_file()):
-        return view
-    if session.is_file():
-        return session
-    names = f"{_VIEW_NAME} nor {_SESSION_NAME}" if allow_view else _SESSION_NAME
-    raise AppError(f"{given}: holds no {names}; name a session.mcap")
-
-
-def refuse_overwriting(recorded: Path, out: Path | None) -> None:
-    """Raise UsageError if a result would replace its own session or another recording."""
-    if out is None or not out.is_file():
-        return
-    if out.samefile(recorded):
-        raise UsageError(f"{out}: is the session itself; write to another file")
-    with out.open("rb") as stream:
-        is_recording = stream.read(len(MAGIC)) == MAGIC
-    if is_recording:
-        raise UsageError(f"{out}: is a recording, which cannot be repeated; write to another file")
 
 
 def _write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
@@ -215,33 +174,3 @@ def _write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
     with naming(path), written_whole(path) as fresh:
         fresh.open("wb").close()  # Rerun's own message would not name the remedy
         play(session, [RerunView(fresh, session.info, called=str(path))], stop)
-
-
-def play(session: RecordedSession, sinks: Sequence[SessionObserver], stop: StopFlag) -> RunRecord:
-    """Give what was recorded to sinks, with a progress line.
-
-    A session without a state, such as an imported one, goes through SLAM first.
-
-    Raises
-    ------
-    AppError
-        The file is damaged other than by being cut, or has no state and cannot be replayed.
-    """
-    lost = LostFrames()
-    progress = Progress(session.info, lambda: lost.n_lost, end_ns=session.end_ns)
-    if _has_state(session, stop):
-        record = play_states(session, [lost, progress, *sinks], stop)
-    else:
-        note(f"{session.path} holds no state of SLAM, so SLAM runs over its frames")
-        record = execute(recorded_source(session, stop), [lost, progress, *sinks])
-    if session.cut_at_byte is not None:
-        note(f"{session.path} was cut at byte {session.cut_at_byte}; this is what is left of it")
-    return record
-
-
-def _has_state(session: RecordedSession, stop: StopFlag) -> bool:
-    for record in session.records():
-        stop.check()
-        if isinstance(record, Snapshot):
-            return True
-    return False

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
 from typing import IO, Self
@@ -312,4 +312,9 @@ def end_tick(duration_ns: int) -> int:
 
 
 def versions() -> dict[str, str]:
-    return {"python": python_version()} | {name: version(name) for name in _VERSIONED}
+    """Return the versions of Python and of what computes or records, where it is installed."""
+    found = {"python": python_version()}
+    for name in _VERSIONED:
+        with contextlib.suppress(PackageNotFoundError):  # rerun-sdk is of an extra
+            found[name] = version(name)
+    return found
