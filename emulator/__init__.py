@@ -32,7 +32,7 @@ __all__ = ["control", "emulated_port"]
 def emulated_port(scene: str | Path | None = None, *options: str) -> Iterator[str]:
     """Run ``xethru-emulator serve`` until the block ends; yield the port of its first module.
 
-    `xethru_protocol.find_ports` lists the ports of the other modules of the scene.
+    The ports of the scene's other modules are beside it, under the names that the scene gives them.
 
     Parameters
     ----------
