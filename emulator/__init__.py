@@ -69,9 +69,9 @@ def emulated_port(scene: str | Path | None = None, *options: str) -> Iterator[st
 def control(port: str | Path, request: str) -> dict[str, Any]:
     """Ask a running emulator for what ``xethru-emulator ctl`` does; return its answer.
 
-    ``control(port, "unplug 2")`` unplugs the module for two seconds, and
-    ``control(port, "fault add stall seconds=1.5")`` adds a fault, whose number is the answer's
-    ``"id"``. Every module of the emulator gets it.
+    ``control(port, "unplug 2")`` unplugs for two seconds, ``control(port, "fault add stall
+    seconds=1.5")`` adds a fault, and ``control(port, "state")["radars"]`` is what every module of
+    the emulator does. A request is for all of them.
 
     Raises
     ------

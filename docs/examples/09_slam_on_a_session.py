@@ -12,16 +12,16 @@ the emulated drive, and then
 ```text
 ...
 wrote drive/session.mcap
-401 poses in 80 s
-error of the path: wheels 11 mm, SLAM 1 mm
-landmark at -0.23, -0.96, standard deviation 4 mm
-landmark at +0.71, +1.61, standard deviation 5 mm
-landmark at +1.24, -0.59, standard deviation 4 mm
-landmark at +1.72, +0.64, standard deviation 5 mm
-landmark at -0.90, +0.29, standard deviation 4 mm
+274 poses in 55 s
+error of the path: wheels 10 mm, SLAM 2 mm
+landmark at -0.23, -0.96, standard deviation 6 mm
+landmark at +0.72, +1.62, standard deviation 6 mm
+landmark at +1.24, -0.60, standard deviation 6 mm
+landmark at +1.73, +0.63, standard deviation 6 mm
+landmark at -0.91, +0.29, standard deviation 6 mm
 ```
 
-The sixth rod was too seldom within 1.5 m, where the front end stops.
+The front end stops at 1.5 m, and one of the six rods was too seldom so near.
 """
 
 import sys

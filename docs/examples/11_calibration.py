@@ -12,10 +12,10 @@ It prints the tables of drive and calibration, and then
 ```text
 ...
 wrote rig.toml
-left_rear: range offset +2.0 cm
-left_front: range offset -1.9 cm
-right_rear: range offset +1.3 cm
-right_front: range offset -0.6 cm
+left_rear: range offset +1.9 cm
+left_front: range offset -2.1 cm
+right_rear: range offset +1.2 cm
+right_front: range offset -0.8 cm
 ```
 """
 

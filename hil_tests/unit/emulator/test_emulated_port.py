@@ -31,10 +31,10 @@ def test_an_emulator_that_does_not_start_has_said_why(capfd: pytest.CaptureFixtu
 
 def test_a_running_emulator_is_controlled_by_its_port(tmp_path: Path) -> None:
     with emulated_port() as port:
-        assert control(port, "fault add stall seconds=2")["id"] == 1
+        assert control(port, "fault add stall seconds=2")["ids"] == {"radar_1": 1}
         (fault,) = control(port, "state")["radars"]["radar_1"]["faults"]
         assert (fault["kind"], fault["parameters"]) == ("stall", {"seconds": 2.0})
-        with pytest.raises(ValueError, match="no kind of fault is called 'rain'"):
+        with pytest.raises(ValueError, match='no kind of fault is called "rain"'):
             control(port, "fault add rain")
         with pytest.raises(ValueError, match="nothing known"):
             control(port, "explode")
