@@ -29,8 +29,7 @@ def record(port: str) -> str:
         with Recorder(radar, "recordings") as recorder:
             radar.start(17)
             for _ in radar.frames(20):
-                pass  # look at the frame here
-            radar.stop()
+                pass  # use the frame here
     return str(recorder.directory)
 
 
@@ -38,13 +37,14 @@ def main(port: str) -> None:
     directory = record(port)
     print(f"wrote {directory}")
 
-    counters, frames, times_ns = [], [], []
+    times_ns, counters, frames = [], [], []
     for message, time_ns in read_recording(directory):
         if isinstance(message, DataFloat):  # a raw frame, as the module sent it
+            times_ns.append(time_ns)
             counters.append(message.info)
             frames.append(message.values)
-            times_ns.append(time_ns)
-    print(f"{len(frames)} frames in {(times_ns[-1] - times_ns[0]) / 1e9:.1f} s")
+    times = np.array(times_ns, "datetime64[ns]")  # UTC, of arrival
+    print(f"{len(frames)} frames in {(times[-1] - times[0]) / np.timedelta64(1, 's'):.1f} s")
     print(f"counters {counters[0]} to {counters[-1]}, an array of shape {np.array(frames).shape}")
 
 

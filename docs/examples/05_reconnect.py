@@ -1,8 +1,8 @@
 """Survive an unplugged cable.
 
 With `reconnect_s` the driver looks for a module that vanished, by its serial number and on every
-port, sets it up again as it was, and goes on. Frames after it belong to a new `stream`, because the
-module's counter begins anew; `frames_lost` counts what is missing, by the time and the frame rate.
+port, sets it up again as it was, and goes on. What comes then is a new `stream`, in which the
+counter begins anew; `frames_lost` counts what is missing, by the time and the frame rate.
 
 Without an argument the example unplugs an emulated module for half a second. With one of your own,
 pull its cable and plug it in again: `python 05_reconnect.py /dev/ttyACM0`. It prints
@@ -10,7 +10,7 @@ pull its cable and plug it in again: `python 05_reconnect.py /dev/ttyACM0`. It p
 ```text
 stream 0, frame 1
 stream 0, frame 10
-unplugged
+the cable is pulled
 stream 1, frame 1
 stream 1, frame 10
 1 reconnect, ... frames lost
@@ -30,11 +30,11 @@ def main(port: str, is_emulated: bool) -> None:
         for frame in radar.frames():
             if frame.counter in (1, 10):
                 print(f"stream {frame.stream}, frame {frame.counter}")
-            if frame.counter == 10 and frame.stream == 1:
-                break
-            if frame.counter == 10 and is_emulated:
+            if (frame.stream, frame.counter) == (0, 10) and is_emulated:
+                print("the cable is pulled")
                 control(port, "unplug 0.5")
-                print("unplugged")
+            if (frame.stream, frame.counter) == (1, 10):
+                break
         print(f"{radar.reconnects} reconnect, {radar.frames_lost} frames lost")
 
 

@@ -32,15 +32,15 @@ def main(port: str) -> None:
     for fault in FAULTS:
         with X4M300.open(port) as radar:
             radar.configure_raw()
-            radar.start(17)
             control(port, f"fault add {fault} every=5 count=3")
+            radar.start(17)
             for _ in radar.frames(20):
                 pass
-        seen = radar.statistics
-        print(
-            f"{fault}: {seen.frames_lost} frames lost, {seen.junk_bytes} bytes of junk, "
-            f"{seen.off_lattice_samples} samples damaged"
-        )
+            seen = radar.statistics
+            print(
+                f"{fault}: {seen.frames_lost} frames lost, {seen.junk_bytes} bytes of junk, "
+                f"{seen.off_lattice_samples} samples damaged"
+            )
     injected = control(port, "state")["radars"][Path(port).name]["injected"]
     print(f"injected: {injected}")
 
@@ -49,5 +49,6 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         main(sys.argv[1])
     else:
-        with emulated_port("visitor") as emulated:
+        # as fast as the program reads, so that nothing is lost but by the faults
+        with emulated_port("visitor", "--pace", "asap") as emulated:
             main(emulated)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="examples are in the
 
 def imported(program: ast.Module) -> set[str]:
     """Return the top-level packages that a program imports."""
-    names = set()
+    names: set[str] = set()
     for node in ast.walk(program):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
