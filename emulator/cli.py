@@ -166,7 +166,7 @@ def _control(arguments: argparse.Namespace) -> int:
         arguments.usage_error(one_line(str(error)))
     if arguments.radar is not None:
         request["radar"] = arguments.radar
-    path = _socket_of(arguments.socket)
+    path = socket_of(arguments.socket)
     try:
         answer = ask(path, request)
     except OSError as error:
@@ -242,7 +242,7 @@ def _number(text: str) -> float:
         raise ValueError(f"{text} is not a number") from None
 
 
-def _socket_of(path: Path) -> Path:
+def socket_of(path: Path) -> Path:
     """Return the control socket of the emulator that has a port; a socket is itself."""
     from xethru_protocol.transport import announcements, run_directory
 

@@ -5,6 +5,7 @@ Imports nothing heavy: a command line uses it while it imports the rest.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import fcntl
 import json
@@ -23,6 +24,7 @@ from typing import Any, Literal, Self, TextIO, TypeVar
 T = TypeVar("T")
 
 MOST_BYTES = 1 << 20
+_PR_SET_PDEATHSIG = 1  # Linux, prctl(2)
 
 
 def read_bounded(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
@@ -439,6 +441,18 @@ def each_line(text: str) -> str:
 def json_text(value: object, **options: Any) -> str:  # noqa: ANN401 - those of json.dumps
     """JSON in ASCII without control characters; DEL is the one that `json.dumps` leaves."""
     return json.dumps(value, **options).replace("\x7f", "\\u007f")
+
+
+def signal_at_parents_death(which: signal.Signals) -> Callable[[], None] | None:
+    """Return what a process calls to get a signal when its parent dies; None except on Linux.
+
+    Strictly, when the thread that started it ends. It is a single system call, as a `preexec_fn`
+    must be.
+    """
+    if sys.platform != "linux":
+        return None
+    libc = ctypes.CDLL(None)
+    return lambda: libc.prctl(_PR_SET_PDEATHSIG, which)
 
 
 def _null_at(descriptor: int) -> None:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hil_tests.patience import patient_ns, seconds
-from slam.app.rig.emulated import signal_at_parents_death
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.system import signal_at_parents_death
 
 END_LIMIT_S = seconds(10)
 

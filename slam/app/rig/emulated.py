@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import math
 import os
@@ -13,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -39,25 +37,10 @@ from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Rig, transform
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, signal_at_parents_death
 from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import real_frame_rate
-
-_PR_SET_PDEATHSIG = 1
-
-
-def signal_at_parents_death(which: signal.Signals) -> Callable[[], None] | None:
-    """Return what a process calls to get a signal when its parent dies; None except on Linux.
-
-    Strictly, when the thread that started it ends. It is a single system call, as a `preexec_fn`
-    must be.
-    """
-    if sys.platform != "linux":
-        return None
-    libc = ctypes.CDLL(None)
-    return lambda: libc.prctl(_PR_SET_PDEATHSIG, which)
-
 
 READY_LIMIT_S = 30.0
 _POLL_S = 0.2

@@ -24,12 +24,11 @@ from urllib.parse import quote, urlsplit
 
 from slam.app.errors import AppError
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
-from slam.app.rig.emulated import signal_at_parents_death
 from slam.app.run.output import note
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.results import SmoothedRun
 from xethru_protocol.extras import install_command
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, signal_at_parents_death
 
 _HERE = "127.0.0.1"
 _DEFAULT_PORT = 9876

@@ -1,0 +1,55 @@
+"""The examples run without hardware, print what they show, and write what they say they write."""
+
+import ast
+import doctest
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from hil_tests.paths import REPOSITORY
+
+FOLDER = REPOSITORY / "docs" / "examples"
+EXAMPLES = sorted(FOLDER.glob("*.py"))
+
+pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="examples are in the source tree")
+
+
+def imported(program: ast.Module) -> set[str]:
+    """Return the top-level packages that a program imports."""
+    names: set[str] = set()
+    for node in ast.walk(program):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            names.add(node.module)
+    return {name.partition(".")[0] for name in names}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_prints_what_it_shows(example: Path, tmp_path: Path) -> None:
+    program = ast.parse(example.read_text("utf-8"))
+    for name in sorted(imported(program)):
+        if find_spec(name) is None:
+            pytest.skip(f"{name} is not installed")
+    (shown,) = re.findall(r"```text\n(.*?)```", ast.get_docstring(program) or "", re.DOTALL)
+    ended = subprocess.run(
+        [sys.executable, str(example)], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    same = doctest.OutputChecker().check_output(shown, ended.stdout, doctest.ELLIPSIS)
+    assert same, f"shown:\n{shown}\nprinted:\n{ended.stdout}"
+    for path in re.findall(r"^wrote (\S+)$", ended.stdout, re.MULTILINE):
+        assert (tmp_path / path).exists()
+
+
+def test_every_example_is_in_the_table() -> None:
+    assert len(EXAMPLES) >= 12
+    table = (FOLDER / "README.md").read_text("utf-8")
+    assert re.findall(r"^\| \[\w+\.py\]\((.*?)\)", table, re.MULTILINE) == [
+        path.name for path in EXAMPLES
+    ]

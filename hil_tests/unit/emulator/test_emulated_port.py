@@ -1,0 +1,42 @@
+"""An emulated module in one line of Python, and control of it."""
+
+from pathlib import Path
+
+import pytest
+
+from emulator import control, emulated_port
+from hil_tests.device.serving import open_radar
+from xethru_protocol.wire.codes import PongCode
+
+
+def test_a_module_answers_at_the_port_until_the_block_ends() -> None:
+    with emulated_port("visitor", "--pace", "asap") as port, open_radar(port) as radar:
+        assert radar.ping() is PongCode.XTS_SPRP_READY
+        assert radar.info().serial_number == "202305070401"
+        assert Path(port).with_name("right").exists()
+    assert not Path(port).exists()
+
+
+def test_an_error_in_the_block_ends_the_emulator() -> None:
+    with pytest.raises(ZeroDivisionError), emulated_port() as port:
+        _ = 1 / 0
+    assert not Path(port).exists()
+
+
+def test_an_emulator_that_does_not_start_has_said_why(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(RuntimeError, match="did not start: exit code 2"), emulated_port("nowhere"):
+        pass
+    assert "xethru-emulator: nowhere: no such scene" in capfd.readouterr().err
+
+
+def test_a_running_emulator_is_controlled_by_its_port(tmp_path: Path) -> None:
+    with emulated_port() as port:
+        assert control(port, "fault add stall seconds=2")["ids"] == {"radar_1": 1}
+        (fault,) = control(port, "state")["radars"]["radar_1"]["faults"]
+        assert (fault["kind"], fault["parameters"]) == ("stall", {"seconds": 2.0})
+        with pytest.raises(ValueError, match='no kind of fault is called "rain"'):
+            control(port, "fault add rain")
+        with pytest.raises(ValueError, match="nothing known"):
+            control(port, "explode")
+    with pytest.raises(OSError, match="No such file"):
+        control(tmp_path / "port", "state")
