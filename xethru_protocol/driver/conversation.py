@@ -196,9 +196,11 @@ class Conversation:
         """Read answers only from now on.
 
         An interrupt may have come while bytes were taken in, so what is half-read is forgotten;
-        the rest of a packet that was cut so looks like damage and is neither reported nor counted.
+        the rest of a packet that was cut so looks like damage and is neither reported nor counted,
+        and the frames after it would show a gap.
         """
         self._winding_down = True
+        self._take_data = lambda message, arrival_ns: None
         self._connection = Connection(Role.HOST)
         self.answers.clear()
 

@@ -38,6 +38,15 @@ def test_interrupt_while_bytes_are_sorted_leaves_a_driver_that_works(raw: Script
     assert radar.statistics.faults  # the rest of frame 3
 
 
+def test_a_frame_cut_by_the_end_of_the_driver_is_not_counted_as_lost(raw: Scripted) -> None:
+    radar, line = raw
+    line.say(line._bytes(frame(1)) + line._bytes(frame(2))[:100])
+    with radar:
+        assert radar.read_frame().counter == 1
+        line.say(line._bytes(frame(2))[100:], frame(3))
+    assert radar.frames_lost == 0
+
+
 def test_interrupted_request_waits_for_nothing_any_more(driver_on: DriverOn) -> None:
     """What answers it later is a stray, also where others send such messages unasked."""
     plain = PlainModule()
