@@ -1,5 +1,7 @@
 """A module that restarts, is unplugged, or changes its baud rate."""
 
+import contextlib
+
 import pytest
 
 from hil_tests.plugin.bench import RadarUnderTest
@@ -7,8 +9,8 @@ from hil_tests.plugin.gate import Measure
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import PongCode
-from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
+from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
 
 pytestmark = pytest.mark.requires("settings")
 
@@ -72,6 +74,39 @@ def test_an_unplugged_module_is_disconnected(radar: X4M300, radar_place: RadarUn
     radar_place.place.unplug(0.5)
     with pytest.raises(Disconnected):
         list(radar.frames(timeout_s=5.0))
+
+
+@pytest.mark.requires("power")
+def test_a_power_cut_leaves_nothing_of_the_chips_settings(
+    radar_place: RadarUnderTest, frame_rate_hz: float
+) -> None:
+    """Protocol reference 8.2, 9.3: X4 settings are never saved; 8 iterations, 0 frames/s."""
+    radar = radar_place.open()
+    serial = radar.info().serial_number
+    radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0), iterations=32))
+    radar.start(frame_rate_hz)
+    list(radar.frames(3))
+    radar = radar_place.power_cycle()
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert radar.info().serial_number == serial
+    assert (radar.x4.fps, radar.x4.iterations) == (0.0, 8)
+
+
+@pytest.mark.requires("power")
+def test_counters_begin_again_after_a_power_cut(
+    radar_place: RadarUnderTest, frame_rate_hz: float
+) -> None:
+    """Protocol reference 6.1: the first frame after power-up carries 1, also without an INIT."""
+    radar = radar_place.open()
+    radar.configure_raw(SHORT)
+    radar.start(frame_rate_hz)
+    assert [frame.counter for frame in radar.frames(3)] == [1, 2, 3]
+    radar = radar_place.power_cycle()
+    with contextlib.suppress(DeviceError):  # bare XEP firmware has no modes
+        radar.set_mode(SensorMode.XTID_SM_STOP)
+        radar.set_mode(SensorMode.XTID_SM_MANUAL)
+    radar.request(m.X4DriverSet(setting=X4Setting.FPS, value=5.0))
+    assert radar.read_message(m.DataFloat).info == 1
 
 
 @pytest.mark.requires("uart")
