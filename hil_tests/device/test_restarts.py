@@ -106,7 +106,7 @@ def test_counters_begin_again_after_a_power_cut(
         radar.set_mode(SensorMode.XTID_SM_STOP)
         radar.set_mode(SensorMode.XTID_SM_MANUAL)
     radar.request(m.X4DriverSet(setting=X4Setting.FPS, value=5.0))
-    assert radar.read_message(m.DataFloat).info == 1
+    assert radar.read_frame().counter == 1
 
 
 @pytest.mark.requires("uart")
