@@ -260,7 +260,7 @@ def test_a_place_where_no_file_can_be_is_refused_before_tests_run(tmp_path: Path
 def test_a_fault_that_never_took_effect_fails_its_test(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(
         "def test_hit(radar, fault):\n"
-        "    lost = fault('bad_checksum', packet='reply')\n"
+        "    lost = fault('bad_checksum')\n"
         "    try:\n        radar.ping(0.5)\n    except Exception:\n        pass\n"
         "    assert lost.injected() == 1\n\n"
         "def test_missed(radar, fault):\n"
@@ -327,3 +327,21 @@ def test_a_test_that_runs_again_gets_a_new_radar(tmp_path: Path, address: str) -
     kept = sorted(path.name.rpartition("-")[2] for path in (tmp_path / "hil-artifacts").iterdir())
     assert len(kept) == 2
     assert kept[1] == "try2"
+
+
+def test_two_real_radars_are_tested_at_the_same_time(tmp_path: Path) -> None:
+    """Each test waits for the other radar's, so one worker alone would never end."""
+    (tmp_path / "test_mine.py").write_text(
+        "import os\nfrom pathlib import Path\nfrom hil_tests.patience import wait_until\n\n"
+        "def test_meets(radar, radar_name):\n"
+        "    here = Path(os.environ['MEET'])\n    (here / radar_name).touch()\n"
+        "    wait_until(lambda: len(list(here.iterdir())) == 2)\n"
+    )
+    (meet := tmp_path / "meet").mkdir()
+    with emulator("serve", "--bare", "--count", "2", "--tcp", "0") as served:
+        radars = [w for port in served.tcp_ports for w in ("--radar", f"tcp://127.0.0.1:{port}")]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("MEET", str(meet))
+            done = run(tmp_path, *radars, "-n", "3")
+    assert done.returncode == 0, done.stdout
+    assert "2 passed" in done.stdout
