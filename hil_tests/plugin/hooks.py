@@ -164,13 +164,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | Non
     from xdist.scheduler import LoadScopeScheduling  # which need not be installed
 
     class RealRadarScheduling(LoadScopeScheduling):  # type: ignore[misc]  # xdist is not typed
+        _groups: dict[str, str] | None = None
+
         def _split_scope(self, nodeid: str) -> str:
             if self._groups is None:
                 collected = next(iter(self.registered_collections.values()))
                 self._groups = groups_of(collected, shared)
             return self._groups[nodeid]
-
-        _groups: dict[str, str] | None = None
 
     return RealRadarScheduling(config, log)
 
