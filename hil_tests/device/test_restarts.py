@@ -74,6 +74,22 @@ def test_an_unplugged_module_is_disconnected(radar: X4M300, radar_place: RadarUn
         list(radar.frames(timeout_s=5.0))
 
 
+@pytest.mark.requires("power")
+def test_a_power_cut_leaves_nothing_of_the_chips_settings(
+    radar_place: RadarUnderTest, frame_rate_hz: float
+) -> None:
+    """Protocol reference 8.2, 9.3: X4 settings are never saved; 8 iterations, 0 frames/s."""
+    radar = radar_place.open()
+    serial = radar.info().serial_number
+    radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0), iterations=32))
+    radar.start(frame_rate_hz)
+    list(radar.frames(3))
+    radar = radar_place.power_cycle()
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert radar.info().serial_number == serial
+    assert (radar.x4.fps, radar.x4.iterations) == (0.0, 8)
+
+
 @pytest.mark.requires("uart")
 @pytest.mark.parametrize("baudrate", [921600, 230400])
 def test_baud_rates(radar: X4M300, baudrate: int) -> None:

@@ -8,7 +8,7 @@ import hashlib
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,8 +155,8 @@ class RadarUnderTest:
         What passed over its line in the running test, and the drivers that this test opened.
     """
 
-    def __init__(self, spec: RadarSpec) -> None:
-        self.place: RadarTarget = target_of(spec)
+    def __init__(self, place: RadarTarget) -> None:
+        self.place = place
         with contextlib.ExitStack() as held:
             if self.place.lock_target is not None:
                 held.callback(PortLock(self.place.lock_target).release)
@@ -201,6 +201,20 @@ class RadarUnderTest:
             self._line = self.tap.around(self.place.open_line())
         return self._line
 
+    def power_cycle(self, off_s: float = 1.0) -> X4M300:
+        """Cut the power for ``off_s``; return a new driver once the module answers again.
+
+        The drivers and lines of this test are closed before. The module is left as it starts: its
+        profile may run. The test fails, with one line, if the power cannot be switched.
+        """
+        self.end_test()
+        try:
+            self.place.cut_power(off_s)
+        except TargetError as error:
+            pytest.fail(f"{self.spec.name}: {error}", pytrace=False)
+        self._settle(stop=False)
+        return self.open()
+
     def end_test(self) -> None:
         while self.drivers:
             self.drivers.pop().close()
@@ -212,7 +226,7 @@ class RadarUnderTest:
         self.place.close()
         self._lock.close()
 
-    def _settle(self) -> None:
+    def _settle(self, *, stop: bool = True) -> None:
         deadline_ns = self.place.clock_ns() + _RESTART_LIMIT_NS
         while True:
             try:
@@ -226,7 +240,8 @@ class RadarUnderTest:
             try:
                 radar = self.place.driver(line, self.tap)
                 self._wait_until_ready(radar, line, deadline_ns)
-                _stop(radar)
+                if stop:
+                    _stop(radar)
                 if not self.identity:
                     self._identify(radar)
             except Disconnected:  # an adapter may still hold the last client
@@ -243,6 +258,7 @@ class RadarUnderTest:
 
     def _identify(self, radar: X4M300) -> None:
         info = radar.info()
+        self.place.serial_number = info.serial_number or ""
         if info.order_code is None:  # base firmware, without profiles
             self.place.capabilities -= {"profiles"}
         known = (info.order_code or "bare", info.serial_number, info.firmware_id, info.version)
@@ -274,20 +290,30 @@ class RadarUnderTest:
 
 
 class Bench:
-    """All radars of the session, by name."""
+    """All radars of the session, by name; ``reach`` returns the target of a spec."""
 
-    def __init__(self, specs: Iterable[RadarSpec]) -> None:
+    def __init__(
+        self, specs: Iterable[RadarSpec], reach: Callable[[RadarSpec], RadarTarget] = target_of
+    ) -> None:
         self.specs = {spec.name: spec for spec in specs}
+        self._reach = reach
         self._radars: dict[str, RadarUnderTest] = {}
         self._failed: dict[str, str] = {}
 
-    def radar(self, name: str) -> RadarUnderTest:
-        """Return a radar, opened on first use; `BrokenRadarError` if it could not be earlier."""
+    def radar(self, name: str, *, again: bool = False) -> RadarUnderTest:
+        """Return a radar, opened on first use; `BrokenRadarError` if it could not be earlier.
+
+        With ``again``, one that failed earlier is tried once more.
+        """
+        if again:
+            self._failed.pop(name, None)
+            if name in self._radars:
+                self._radars[name].broken = None
         if name in self._failed:
             raise BrokenRadarError(self._failed[name])
         if name not in self._radars:
             try:
-                self._radars[name] = RadarUnderTest(self.specs[name])
+                self._radars[name] = RadarUnderTest(self._reach(self.specs[name]))
             except (TargetError, PortBusyError, XeThruError) as error:
                 self._failed[name] = f"{name} could not be opened in an earlier test: {error}"
                 raise

@@ -41,13 +41,18 @@ _LONGEST_NAME = 150
 _MOST_FRAMES = 512  # the last ones of each radar
 
 
-def folder_name(nodeid: str) -> str:
+def folder_name(nodeid: str, tries: int = 1) -> str:
     """Return the folder name of a test: its id, with ``-`` for special characters.
+
+    From the second try of `--reruns` on the number of the try follows.
 
     >>> folder_name("hil_tests/device/test_raw.py::test_frames[emu-lab]")
     'hil_tests-device-test_raw.py-test_frames-emu-lab'
+    >>> folder_name("test_raw.py::test_frames[emu]", 2)
+    'test_raw.py-test_frames-emu-try2'
     """
-    return re.sub(r"[^0-9A-Za-z._]+", "-", nodeid).strip("-")[-_LONGEST_NAME:]
+    name = re.sub(r"[^0-9A-Za-z._]+", "-", nodeid).strip("-")[-_LONGEST_NAME:]
+    return name if tries == 1 else f"{name}-try{tries}"
 
 
 def write_bundle(folder: Path, findings: Findings, about: Mapping[str, Any]) -> None:

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import Kind, RadarSpec, SpecError, parse_specs
 
 ENVIRONMENT = "XETHRU_RADARS"
 INI = "xethru_radars"
 WORKER_KEY = "xethru_radars"
 RIG_ENVIRONMENT, RIG_INI = "XETHRU_RIG", "xethru_rig"
+POWER_ENVIRONMENT, POWER_INI = "XETHRU_POWER_CMD", "xethru_power_cmd"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,6 +29,7 @@ class Choices:
     specs: tuple[RadarSpec, ...]
     chosen: bool
     rig: Path | None
+    power: PowerCommand | None
     cassette: Path | None
     artifacts: Path
     json: Path | None
@@ -50,6 +53,13 @@ def add_options(parser: pytest.Parser) -> None:
         metavar="FILE",
         help="rig file: names the modules of radar_rig by serial number; alone, those are tested "
         f"(environment {RIG_ENVIRONMENT}, ini {RIG_INI})",
+    )
+    group.addoption(
+        "--hil-power-cmd",
+        metavar="CMD",
+        help="command that switches the power of real radars, such as 'uhubctl -l 1-1 -p 2 -a "
+        "{action}'; {action} is off, then on, {port} the port, {serial} the serial number; without "
+        f"{{action}} it runs once (environment {POWER_ENVIRONMENT}, ini {POWER_INI})",
     )
     for name, text in (
         ("--hil-strict", "a missing capability fails a test instead of skipping it"),
@@ -78,6 +88,9 @@ def add_options(parser: pytest.Parser) -> None:
     )
     group.addoption("--hil-json", metavar="FILE", help="write what ran where and what was measured")
     parser.addini(INI, f"radars to test, as --radar; {ENVIRONMENT} and --radar win", "linelist")
+    parser.addini(
+        POWER_INI, f"power command, as --hil-power-cmd; {POWER_ENVIRONMENT} and that one win"
+    )
     parser.addini(RIG_INI, f"rig file, as --rig; {RIG_ENVIRONMENT} and --rig win")
 
 
@@ -108,10 +121,23 @@ def choose(config: pytest.Config) -> Choices:
         specs=specs,
         chosen=bool(chosen),
         rig=Path(rig) if rig else None,
+        power=_power(config),
         cassette=Path(cassette) if cassette else None,
         artifacts=Path(config.invocation_params.dir, config.getoption("hil_artifacts")),
         json=Path(config.invocation_params.dir, report) if report else None,
     )
+
+
+def _power(config: pytest.Config) -> PowerCommand | None:
+    text = (
+        config.getoption("hil_power_cmd")
+        or os.environ.get(POWER_ENVIRONMENT)
+        or config.getini(POWER_INI)
+    )
+    try:
+        return PowerCommand(text) if text else None
+    except PowerError as error:
+        raise pytest.UsageError(f"--hil-power-cmd {error}") from None
 
 
 def _modules_of(rig: Path) -> list[str]:

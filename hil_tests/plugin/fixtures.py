@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from hil_tests.plugin.choices import CHOICES
-from hil_tests.plugin.gate import Measure, findings_of, gate, lacking
+from hil_tests.plugin.gate import InjectFault, Measure, findings_of, gate, lacking
 
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarUnderTest
+    from hil_tests.plugin.radar_specs import RadarSpec
+    from hil_tests.plugin.radar_targets import RadarTarget
     from xethru_protocol.driver.radar import X4M300
 
 RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
@@ -22,7 +24,13 @@ def hil_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     """All radars of the session."""
     from hil_tests.plugin.bench import Bench
 
-    bench = Bench(request.config.stash[CHOICES].specs)
+    config = request.config
+
+    def reach(spec: RadarSpec) -> RadarTarget:
+        place: RadarTarget = config.hook.pytest_xethru_radar_target(config=config, spec=spec)
+        return place
+
+    bench = Bench(config.stash[CHOICES].specs, reach)
     yield bench
     bench.close()
 
@@ -40,8 +48,9 @@ def radar_place(
 ) -> RadarUnderTest:
     """Return the radar in a known state: stopped, no profile, nothing on the line.
 
-    ``radar_place.open()`` returns drivers; ``radar_place.place.unplug(seconds)`` unplugs a radar
-    that has the capability ``unplug``.
+    ``radar_place.open()`` returns drivers; ``radar_place.power_cycle()`` cuts the power of a radar
+    that has the capability ``power``, ``radar_place.place.unplug(seconds)`` unplugs one that has
+    ``unplug``.
     """
     return gate(request, hil_bench, (radar_name,))[0]
 
@@ -93,6 +102,19 @@ def radar_rig(
     rig = request.config.stash[CHOICES].rig
     drivers = {place.spec.name: place.open() for place in found}
     return drivers if rig is None else matched(rig, drivers)
+
+
+@pytest.fixture
+def fault(request: pytest.FixtureRequest) -> Iterator[InjectFault]:
+    """Arm faults of emulated radars: ``fault("stall", seconds=1.5)``; others skip the test.
+
+    What it returns counts: ``.injected()``. A test that passes although one of its faults never
+    took effect fails. All faults end with the test.
+    """
+    findings = findings_of(request.node)
+    yield InjectFault(findings)
+    for one in findings.faults:
+        one.clear()
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import pytest
 
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarUnderTest
+    from hil_tests.plugin.radar_targets import InjectedFault
 
 
 Limit = tuple[float | None, float | None]
@@ -53,6 +54,43 @@ class Measurement:
         return {**asdict(self), "within": self.within}
 
 
+class InjectFault:
+    """Orders faults of the emulated radars of one test."""
+
+    def __init__(self, findings: Findings) -> None:
+        self._findings = findings
+
+    def __call__(
+        self,
+        kind: str,
+        *,
+        radar: str | None = None,
+        **keys: Any,  # noqa: ANN401 - parameters of the kind
+    ) -> InjectedFault:
+        """Arm a fault of the test's radar, or of the one called ``radar``, until the test ends.
+
+        Kinds, their parameters and when they strike: `xethru-emulator faults`. Times of a scenario
+        are not allowed: a test arms a fault when it wants it.
+        """
+        from hil_tests.plugin.radar_targets import TargetError
+
+        if wrong := {"at_s", "until_s"} & set(keys):
+            pytest.fail(
+                f"fault {kind}: {wrong.pop()} is for scenario files; arm it when you want it",
+                pytrace=False,
+            )
+        places = {one.spec.name: one.place for one in self._findings.radars}
+        name = next(iter(places), "no radar") if radar is None else radar
+        if name not in places or (radar is None and len(places) > 1):
+            there = ", ".join(places) or "none; ask for the fixture radar first"
+            pytest.fail(f"fault {kind}: radar= must be one of: {there}", pytrace=False)
+        try:
+            self._findings.faults.append(fault := places[name].inject(kind, keys))
+        except TargetError as error:
+            pytest.fail(f"fault {kind}: {error}", pytrace=False)
+        return fault
+
+
 class Measure:
     """Takes measurements of one test; one outside its limits fails the test at once.
 
@@ -89,6 +127,7 @@ class Findings:
     reason: str | None = None
     bundle: str | None = None
     failures: list[str] = field(default_factory=list)
+    faults: list[InjectedFault] = field(default_factory=list)
 
     @property
     def measurements(self) -> Sequence[Measurement]:
@@ -142,7 +181,7 @@ def gate(
             _check_kind(request, bench, name)
             problem: Exception | None = None
             try:
-                radar = bench.radar(name)
+                radar = bench.radar(name, again=getattr(item, "execution_count", 1) > 1)
                 found.append(radar)
                 findings.radars = tuple(found)
                 _check_capabilities(request, radar)
@@ -169,6 +208,17 @@ def lacking(request: pytest.FixtureRequest, names: Sequence[str], reason: str) -
     pytest.skip(reason)
 
 
+def check_faults(findings: Findings) -> None:
+    """Fail a test of which a fault never took effect: whatever it showed, it was not that."""
+    for fault in findings.faults:
+        if not fault.injected():
+            pytest.fail(
+                f"{fault.radar}: the fault '{fault}' never took effect, so this test shows nothing "
+                f"of it; 'xethru-emulator faults {fault.kind}' says what it acts on",
+                pytrace=False,
+            )
+
+
 def leave_out(request: pytest.FixtureRequest, reason: str) -> NoReturn:
     """Skip a test that was not asked for; never a failure, since nothing is missing."""
     findings_of(request.node).reason = reason
@@ -188,6 +238,8 @@ def _check_capabilities(request: pytest.FixtureRequest, radar: RadarUnderTest) -
     from hil_tests.plugin.radar_targets import CAPABILITIES
 
     wanted = [name for mark in request.node.iter_markers("requires") for name in mark.args]
+    if "fault" in request.fixturenames:
+        wanted.append("faults")
     for capability in wanted:
         if capability not in radar.place.capabilities:
             name = radar.spec.name

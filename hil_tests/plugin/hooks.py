@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from hil_tests.plugin import hookspecs
 from hil_tests.plugin.choices import CHOICES, WORKER_KEY, add_options, choose
-from hil_tests.plugin.gate import FINDINGS, Findings
+from hil_tests.plugin.gate import FINDINGS, Findings, check_faults
+from hil_tests.plugin.radar_specs import Kind, RadarSpec, no_radar
+
+if TYPE_CHECKING:
+    from hil_tests.plugin.radar_targets import RadarTarget
 
 pytest_plugins = ["hil_tests.plugin.fixtures"]
 
@@ -87,6 +92,10 @@ MARKERS = (
 )
 
 
+def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
+    pluginmanager.add_hookspecs(hookspecs)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     add_options(parser)
 
@@ -95,9 +104,21 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register markers and read what the user chose."""
     for marker in MARKERS:
         config.addinivalue_line("markers", marker)
-    config.stash[CHOICES] = choose(config)
+    choices = config.stash[CHOICES] = choose(config)
+    if len(config.hook.pytest_xethru_radar_target.get_hookimpls()) == 1:  # ours
+        for spec in choices.specs:
+            if spec.kind is Kind.OWN:
+                raise pytest.UsageError(str(no_radar(spec.text)))
     summary = config.stash[SUMMARY] = Summary()
     config.pluginmanager.register(summary, "xethru-hil-summary")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_xethru_radar_target(config: pytest.Config, spec: RadarSpec) -> RadarTarget:
+    """Reach a radar of a built-in kind."""
+    from hil_tests.plugin.radar_targets import target_of
+
+    return target_of(spec, config.stash[CHOICES].power)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -132,34 +153,71 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:  # noqa: ANN401 - xdist is not typed
-    """Keep the tests of real radars on one worker, however the others are spread.
+    """Keep the tests of each real radar on one worker, however the others are spread.
 
     The mark ``xdist_group`` would need ``--dist loadgroup``, and xdist 3.8 loses groups under
     pytest 9.2.
     """
-    shared = [spec.name for spec in config.stash[CHOICES].specs if not spec.emulated]
+    shared = {s.name: s.shared_as for s in config.stash[CHOICES].specs if not s.emulated}
     if not shared:
         return None
     from xdist.scheduler import LoadScopeScheduling  # which need not be installed
 
     class RealRadarScheduling(LoadScopeScheduling):  # type: ignore[misc]  # xdist is not typed
+        _groups: dict[str, str] | None = None
+
         def _split_scope(self, nodeid: str) -> str:
-            return group_of(nodeid, shared)
+            if self._groups is None:
+                collected = next(iter(self.registered_collections.values()))
+                self._groups = groups_of(collected, shared)
+            return self._groups[nodeid]
 
     return RealRadarScheduling(config, log)
 
 
-def group_of(nodeid: str, radars: Iterable[str]) -> str:
-    """Return the group that must stay on one worker; the test's id if it may go to any.
+def groups_of(nodeids: Sequence[str], radars: Mapping[str, str]) -> dict[str, str]:
+    """Return for each test the group that must stay on one worker: its own id if it may go to any.
 
-    >>> group_of("test_raw.py::test_frames[ttyACM0-1431]", ["ttyACM0"])
-    'tests of real radars'
-    >>> group_of("test_raw.py::test_frames[emu-1431]", ["ttyACM0"])
-    'test_raw.py::test_frames[emu-1431]'
+    ``radars`` holds names of real radars, and what each is locked by. A test of all of them
+    together, as with `radar_rig`, ties them to one worker.
+
+    >>> radars = {"ttyACM0": "/dev/ttyACM0", "ttyACM1": "/dev/ttyACM1"}
+    >>> list(groups_of(["t::a[ttyACM0-8]", "t::a[ttyACM1-8]", "t::a[emu-8]"], radars).values())
+    ['/dev/ttyACM0', '/dev/ttyACM1', 't::a[emu-8]']
+    >>> set(groups_of(["t::a[ttyACM0-1431]", "t::b[ttyACM0+ttyACM1]"], radars).values())
+    {'tests of real radars'}
     """
-    found = re.search(r"\[(.*)\]", nodeid, re.DOTALL)
-    parameters = f"-{found[1]}-".replace("+", "-") if found else ""
-    return "tests of real radars" if any(f"-{name}-" in parameters for name in radars) else nodeid
+    groups = {nodeid: nodeid for nodeid in nodeids}
+    together = "+".join(radars)
+    tied = False
+    for nodeid in nodeids:
+        found = re.search(r"\[(.*)\]", nodeid, re.DOTALL)
+        parameters = f"-{found[1]}-" if found else ""
+        if f"-{together}-" in parameters:
+            tied |= len(radars) > 1
+            groups[nodeid] = next(iter(radars.values()))
+        # the longest: one name may begin with another
+        elif names := [name for name in radars if f"-{name}-" in parameters]:
+            groups[nodeid] = radars[max(names, key=len)]
+    if tied:
+        real = set(radars.values())
+        return {n: "tests of real radars" if g in real else g for n, g in groups.items()}
+    return groups
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Begin anew where a test runs again: what was found belongs to the try before."""
+    if item.stash.get(FINDINGS, None) is not None:
+        del item.stash[FINDINGS]
+        kept = [one for one in item.user_properties if not one[0].startswith("measurement ")]
+        item.user_properties[:] = kept
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    yield
+    if FINDINGS in item.stash:
+        check_faults(item.stash[FINDINGS])
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -186,7 +244,8 @@ def pytest_runtest_makereport(
 def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> None:
     from hil_tests.plugin.bundle import folder_name, write_bundle
 
-    folder = item.config.stash[CHOICES].artifacts / folder_name(item.nodeid)
+    tries = getattr(item, "execution_count", 1)  # of pytest-rerunfailures
+    folder = item.config.stash[CHOICES].artifacts / folder_name(item.nodeid, tries)
     about = {
         "test": item.nodeid,
         "outcome": report.outcome,

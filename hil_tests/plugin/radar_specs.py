@@ -12,6 +12,7 @@
 | `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
 | `rfc2217://HOST:PORT` | a UART behind an adapter that sets the baud rate, such as ser2net |
 | `replay:RECORDING?radar=NAME` | a recording at the port of an emulated module |
+| `SCHEME:TARGET` | whatever the hook `pytest_xethru_radar_target` of a conftest.py makes of it |
 
 Each takes ``?has=NAME,NAME``: further capabilities, such as a reflector on a stage, for tests
 marked with ``@pytest.mark.requires``.
@@ -41,6 +42,7 @@ class Kind(Enum):
     NETWORK = "network"
     REPLAY = "replay"
     AUTO = "auto"
+    OWN = "own"
 
 
 _FIRMWARE = ("sensor", "xep")
@@ -53,17 +55,19 @@ _OPTIONS: dict[Kind, tuple[str, ...]] = {
     Kind.REPLAY: ("has", "radar"),
     Kind.AUTO: ("fps", "has"),
 }
+"""Of the built-in kinds; a hook reads what it likes of its own."""
 DEFAULT_FPS = 17.0
 _NETWORK_SCHEMES = ("tcp", "socket", "rfc2217")
+_BUILT_IN_SCHEMES = (*_NETWORK_SCHEMES, "emu", "auto", "serial", "replay")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarSpec:
     """One radar to test.
 
-    ``text`` is what the user wrote, ``target`` its scene, port, serial number or recording,
-    perhaps empty, ``options`` what followed the question mark. Tests, reports and
-    folders use ``name``, which is unique within a run.
+    ``text`` is what the user wrote, ``target`` its scene, port, serial number, recording,
+    address or, for a hook, all before the question mark, perhaps empty; ``options`` is what
+    followed. Tests, reports and folders use ``name``, which is unique within a run.
     """
 
     text: str
@@ -76,6 +80,14 @@ class RadarSpec:
     def emulated(self) -> bool:
         """Whether this program starts the radar itself; else other processes may want it, too."""
         return self.kind in {Kind.EMULATED, Kind.REPLAY}
+
+    @property
+    def shared_as(self) -> str:
+        """What all specs of one radar have in common: the port's own path or the address."""
+        if self.kind is Kind.PORT:
+            return os.path.realpath(self.target)
+        # an adapter is one by every scheme
+        return self.target.partition("://")[2] if self.kind is Kind.NETWORK else self.target
 
     @property
     def line(self) -> str:
@@ -110,18 +122,19 @@ def parse_specs(texts: Iterable[str]) -> tuple[RadarSpec, ...]:
     for text in texts:
         body, _, query = text.strip().partition("?")
         kind, target = _kind(body)
-        options = _query(text, query, _OPTIONS[kind])
+        options = _query(text, query, _OPTIONS.get(kind))
         _check(text, kind, options)
         taken = {other.name for other in specs}
         name = plain = _name(kind, target, options)
         number = 2
         while name in taken:
-            name, number = f"{plain}-{number}", number + 1
+            # no dash: pytest joins the name and other parameters with that
+            name, number = f"{plain}.{number}", number + 1
         specs.append(RadarSpec(text=text, kind=kind, target=target, options=options, name=name))
     return tuple(specs)
 
 
-def _kind(body: str) -> tuple[Kind, str]:
+def _kind(body: str) -> tuple[Kind, str]:  # noqa: PLR0911 - one return per kind
     scheme, colon, rest = body.partition(":")
     if scheme == "emu":
         return Kind.EMULATED, rest
@@ -145,27 +158,34 @@ def _kind(body: str) -> tuple[Kind, str]:
         return Kind.REPLAY, rest
     if body.startswith(("/", "./", "../", "~")):
         return Kind.PORT, str(Path(os.path.expanduser(body)))
-    raise SpecError(
+    if colon and re.fullmatch(r"[a-z][a-z0-9_]*", scheme) and scheme not in _BUILT_IN_SCHEMES:
+        return Kind.OWN, body
+    raise no_radar(body)
+
+
+def no_radar(body: str) -> SpecError:
+    return SpecError(
         f"--radar {body}: names no radar; allowed are emu[:SCENE], a port such as /dev/ttyACM0, "
-        "serial=NUMBER, auto, tcp://HOST:PORT, rfc2217://HOST:PORT, replay:RECORDING"
+        "serial=NUMBER, auto, tcp://HOST:PORT, rfc2217://HOST:PORT, replay:RECORDING, and what a "
+        "hook pytest_xethru_radar_target adds"
     )
 
 
-def _query(text: str, query: str, allowed: Sequence[str]) -> dict[str, str]:
+def _query(text: str, query: str, allowed: Sequence[str] | None) -> dict[str, str]:
     options: dict[str, str] = {}
     for part in filter(None, query.split("&")):
         key, equals, value = part.partition("=")
-        if key not in allowed or not equals or not value:
+        if not key or not equals or not value or (allowed is not None and key not in allowed):
             raise SpecError(
                 f"--radar {text}: {part!r} is no option here; allowed are "
-                + ", ".join(f"{name}=..." for name in allowed)
+                + ", ".join(f"{name}=..." for name in allowed or ("NAME",))
             )
         options[key] = value
     return options
 
 
 def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
-    line = options.get("line")
+    line = options.get("line") if kind is not Kind.OWN else None
     lines = _LINES if kind is Kind.EMULATED else ("uart",)
     if line is not None and line not in lines:
         raise SpecError(f"--radar {text}: line={line}: must be {' or '.join(lines)}")
@@ -198,7 +218,7 @@ def _name(kind: Kind, target: str, options: Mapping[str, str]) -> str:
         return target
     if kind is Kind.AUTO:
         return "auto"
-    if kind is Kind.NETWORK:
-        return re.sub(r"[^0-9A-Za-z.]+", "-", target)
+    if kind in {Kind.NETWORK, Kind.OWN}:
+        return re.sub(r"[^0-9A-Za-z.]+", "-", target).strip("-")
     last = Path(target).name or target
     return f"replay-{Path(last).stem}" if kind is Kind.REPLAY else last

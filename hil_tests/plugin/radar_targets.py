@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from hil_tests.device.serving import Served, emulator
 from hil_tests.paths import FIXTURES
+from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import Kind, RadarSpec
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import Transport, capacity_bytes_per_s, find_ports, open_line
@@ -107,6 +108,8 @@ CAPABILITIES: Mapping[str, str] = {
     "profiles": "bare XEP firmware has none",
     "files": "a file system that answers",
     "unplug": "only emulated ones can be unplugged by a program",
+    "power": "--hil-power-cmd CMD switches the power of a real one",
+    "faults": "only emulated ones have faults to order",
     "uart": "USB, tcp:// and pseudo-terminals have no baud rate",
     "virtual_time": "waiting must cost nothing",
 }
@@ -121,12 +124,32 @@ class TargetError(Exception):
     """A radar that is not available; the message is one line with the remedy."""
 
 
+@dataclass(frozen=True, slots=True)
+class InjectedFault:
+    """One fault that a test has ordered for an emulated radar.
+
+    `injected` returns how often it took effect so far; `clear` ends it.
+    """
+
+    radar: str
+    kind: str
+    keys: Mapping[str, Any]
+    injected: Callable[[], int]
+    clear: Callable[[], object]
+
+    def __str__(self) -> str:
+        return " ".join([self.kind, *(f"{key}={value}" for key, value in self.keys.items())])
+
+
 class RadarTarget(ABC):
     """How one radar under test is reached, and its capabilities.
 
-    ``bytes_per_s`` is the capacity of the line, infinite but on a UART; ``scene_text`` the scene
-    file of an emulated radar; ``lock_target`` the name to lock against other sessions (None: no
-    other process can reach the radar).
+    The base of radars of your own, too: a subclass has `open_line`, and what else it can do.
+    ``capabilities`` names what tests may require, ``description`` is shown in the summary,
+    ``serial_number`` is what the module said, empty before it was asked. ``bytes_per_s`` is the
+    capacity of the line, infinite but on a UART; ``scene_text`` the scene file of an emulated
+    radar; ``lock_target`` the name to lock against other sessions (None: no other process can
+    reach the radar).
     """
 
     scene_text: str | None = None
@@ -137,6 +160,7 @@ class RadarTarget(ABC):
         self.capabilities = capabilities | spec.has
         self.description = description
         self.bytes_per_s = math.inf
+        self.serial_number = ""
         self.clock_ns: Callable[[], int] = time.monotonic_ns
         self.sleep: Callable[[float], None] = time.sleep
 
@@ -173,6 +197,16 @@ class RadarTarget(ABC):
     def unplug(self, seconds: float) -> None:
         """Take the port away and bring it back after ``seconds``; the module restarts."""
         raise TargetError(f"{self.spec.name} cannot be unplugged by a program")
+
+    def cut_power(self, seconds: float) -> None:
+        """Take the power away for ``seconds``; return when it is back, or will come by itself."""
+        raise TargetError(
+            f"{self.spec.name} has no power to switch; --hil-power-cmd CMD tells how it is done"
+        )
+
+    def inject(self, kind: str, keys: Mapping[str, Any]) -> InjectedFault:
+        """Arm a fault; keys as of `emulator.faults.plan.fault_spec`."""
+        raise TargetError(f"{self.spec.name} has no faults to order: it is not emulated")
 
     def close(self) -> None:  # noqa: B027 - an optional hook
         """Release processes and ports."""
@@ -222,13 +256,28 @@ class InProcessTarget(RadarTarget):
     def unplug(self, seconds: float) -> None:
         self._line.device.unplug(self._line.clock_ns(), round(seconds * 1e9))
 
+    cut_power = unplug  # it has its power from the port
+
+    def inject(self, kind: str, keys: Mapping[str, Any]) -> InjectedFault:
+        from emulator.faults.plan import FaultPlanError, fault_spec
+
+        device = self._line.device
+        try:
+            number = device.add(fault_spec(kind, **keys))
+        except FaultPlanError as error:
+            raise TargetError(str(error)) from None
+        armed = device.armed[-1]
+        return InjectedFault(
+            self.spec.name, kind, keys, lambda: armed.injected, lambda: device.clear(number)
+        )
+
 
 class ProcessTarget(RadarTarget):
     """A module of an emulator that runs in a process of its own, or a recording played there."""
 
     def __init__(self, spec: RadarSpec) -> None:
         played = spec.kind is Kind.REPLAY
-        able = {"settings", "profiles", "files", "unplug"}
+        able = {"settings", "profiles", "files", "unplug", "power", "faults"}
         if spec.line == "uart":
             able.add("uart")
         super().__init__(
@@ -258,14 +307,41 @@ class ProcessTarget(RadarTarget):
         return open_line(path or self._served.paths[self._index], baudrate)
 
     def unplug(self, seconds: float) -> None:
+        self._ask("unplug", seconds=seconds)
+
+    cut_power = unplug
+
+    def inject(self, kind: str, keys: Mapping[str, Any]) -> InjectedFault:
+        from emulator.faults.plan import FaultPlanError, fault_spec
+
+        try:
+            fault = fault_spec(kind, **keys)
+        except FaultPlanError as error:
+            raise TargetError(str(error)) from None
+        name = self._served.names[self._index]
+        number = self._ask("fault add", fault=fault.model_dump())["ids"][name]
+
+        def injected() -> int:
+            for armed in self._ask("fault list")["faults"][name]:
+                if armed["id"] == number:
+                    return int(armed["injected"])
+            return fault.count  # no longer armed: as often as was asked for
+
+        def clear() -> None:
+            with contextlib.suppress(TargetError):  # it is over
+                self._ask("fault clear", id=number)
+
+        return InjectedFault(self.spec.name, kind, keys, injected, clear)
+
+    def _ask(self, verb: str, **keys: Any) -> dict[str, Any]:  # noqa: ANN401 - JSON
         from emulator.cli import ask
 
         assert self._served.control is not None
-        name = self._served.names[self._index]
-        request = {"verb": "unplug", "radar": name, "seconds": seconds}
-        answer = json.loads(ask(Path(self._served.control), request))
+        request = {"verb": verb, "radar": self._served.names[self._index], **keys}
+        answer: dict[str, Any] = json.loads(ask(Path(self._served.control), request))
         if not answer["ok"]:
             raise TargetError(str(answer["error"]))
+        return answer
 
     def close(self) -> None:
         self._served.end()
@@ -275,13 +351,14 @@ class ProcessTarget(RadarTarget):
 class PortTarget(RadarTarget):
     """A module at a port, named or found by its serial number; perhaps a port of the network."""
 
-    def __init__(self, spec: RadarSpec) -> None:
+    def __init__(self, spec: RadarSpec, power: PowerCommand | None = None) -> None:
         path = _port_of(spec.target) if spec.kind is Kind.SERIAL_NUMBER else spec.target
-        super().__init__(spec, frozenset({"settings", "profiles", "files"}), f"module at {path}")
-        self._path = path
+        able = {"settings", "profiles", "files"} | ({"power"} if power else set())
+        super().__init__(spec, frozenset(able), f"module at {path}")
+        self._path, self._power = path, power
         self._is_here = spec.kind is not Kind.NETWORK
-        # this keeps sessions of this machine apart; an adapter is one by every scheme
-        self.lock_target = os.path.realpath(path) if self._is_here else path.partition("://")[2]
+        # this keeps sessions of this machine apart
+        self.lock_target = os.path.realpath(path) if self._is_here else spec.shared_as
 
     def explore(self) -> None:
         """Find out whether the port is a UART."""
@@ -299,16 +376,27 @@ class PortTarget(RadarTarget):
     def candidates(self) -> Sequence[str]:
         return known_ports() if self._is_here else ()
 
+    def cut_power(self, seconds: float) -> None:
+        if self._power is None:
+            super().cut_power(seconds)
+            return
+        try:
+            self._power.cycle(self._path, self.serial_number, seconds, self.sleep)
+        except PowerError as error:
+            raise TargetError(f"--hil-power-cmd: {error}") from None
 
-def target_of(spec: RadarSpec) -> RadarTarget:
-    """Return the target of a spec; `TargetError` or `PortUnavailable` if there is none."""
+
+def target_of(spec: RadarSpec, power: PowerCommand | None = None) -> RadarTarget:
+    """Return the target of a built-in spec; `TargetError` or `PortUnavailable` if there is none."""
     match spec.kind:
         case Kind.EMULATED if spec.line == "memory":
             return InProcessTarget(spec)
         case Kind.EMULATED | Kind.REPLAY:
             return ProcessTarget(spec)
+        case Kind.OWN:
+            raise TargetError(f"--radar {spec.text}: no hook pytest_xethru_radar_target knows it")
         case _:
-            return PortTarget(spec)
+            return PortTarget(spec, power)
 
 
 def ports_that_answer() -> tuple[tuple[str, str], ...]:

@@ -255,3 +255,93 @@ def test_a_place_where_no_file_can_be_is_refused_before_tests_run(tmp_path: Path
         assert done.returncode == pytest.ExitCode.USAGE_ERROR
         assert "is there already; name a new file" in done.stderr
         assert "Traceback" not in done.stdout + done.stderr
+
+
+def test_a_fault_that_never_took_effect_fails_its_test(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(
+        "def test_hit(radar, fault):\n"
+        "    lost = fault('bad_checksum')\n"
+        "    try:\n        radar.ping(0.5)\n    except Exception:\n        pass\n"
+        "    assert lost.injected() == 1\n\n"
+        "def test_missed(radar, fault):\n"
+        "    fault('missing_frames', frames=2)\n    radar.ping()\n"
+    )
+    done = run(tmp_path, "--radar", "emu", "--radar", "emu:?line=pty")
+    assert done.returncode == 1
+    assert "2 failed, 2 passed" in done.stdout
+    for name in ("emu", "emu-pty"):
+        assert f"{name}: the fault 'missing_frames frames=2' never took effect" in done.stdout
+
+
+def test_a_radar_of_ones_own_by_a_hook(tmp_path: Path) -> None:
+    (tmp_path / "conftest.py").write_text(
+        "from hil_tests.plugin.radar_targets import RadarTarget\n"
+        "from xethru_protocol.transport import open_line\n\n"
+        "class Rack(RadarTarget):\n"
+        "    def open_line(self, path=None, baudrate=115200):\n"
+        "        return open_line(f\"tcp://127.0.0.1:{self.spec.options['port']}\")\n\n"
+        "def pytest_xethru_radar_target(spec):\n"
+        "    if spec.target.startswith('mylab:'):\n"
+        "        return Rack(spec, frozenset({'settings'}), 'slot in the rack')\n"
+    )
+    (tmp_path / "test_mine.py").write_text("def test_answers(radar):\n    radar.ping()\n")
+    with emulator("serve", "--bare", "--tcp", "0") as served:
+        done = run(tmp_path, "--radar", f"mylab:rack3?port={served.tcp_ports[0]}")
+    assert done.returncode == 0, done.stdout
+    assert "slot in the rack" in done.stdout
+    (tmp_path / "conftest.py").unlink()
+    unknown = run(tmp_path, "--radar", "mylab:rack3")
+    assert unknown.returncode == 4
+    assert "--radar mylab:rack3: names no radar" in unknown.stderr
+
+
+def test_a_power_command_on_a_module_of_another_process(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(
+        "def test_power(radar_place):\n"
+        "    radar_place.open().x4.iterations = 32\n"
+        "    assert radar_place.power_cycle().x4.iterations == 8\n"
+    )
+    with emulator("serve", "--bare", "--tcp", "0") as served:
+        command = f"{sys.executable} -m emulator.cli ctl {served.control} unplug 0.3"
+        address = ("--radar", f"tcp://127.0.0.1:{served.tcp_ports[0]}")
+        done = run(tmp_path, *address, "--hil-power-cmd", command)
+        failed = run(tmp_path, *address, "--hil-power-cmd", "sh -c 'echo no hub; exit 3'")
+    assert done.returncode == 0, done.stdout
+    assert failed.returncode == 1
+    assert "ended with 3: no hub" in failed.stdout
+    refused = run(tmp_path, "--hil-power-cmd", "hub {colour}")
+    assert refused.returncode == 4
+    assert "{colour} is unknown" in refused.stderr
+
+
+def test_a_test_that_runs_again_gets_a_new_radar(tmp_path: Path, address: str) -> None:
+    pytest.importorskip("pytest_rerunfailures")
+    (tmp_path / "test_mine.py").write_text(
+        "tries = []\n\ndef test_second_try(radar):\n    radar.ping()\n"
+        "    tries.append(radar)\n    assert len(tries) == 2\n"
+        "    assert tries[0] is not radar\n"
+    )
+    done = run(tmp_path, "--radar", address, "--reruns", "1", "--hil-keep", "all")
+    assert done.returncode == 0, done.stdout
+    assert "1 passed, 1 rerun" in done.stdout
+    kept = sorted(path.name.rpartition("-")[2] for path in (tmp_path / "hil-artifacts").iterdir())
+    assert len(kept) == 2
+    assert kept[1] == "try2"
+
+
+def test_two_real_radars_are_tested_at_the_same_time(tmp_path: Path) -> None:
+    """Each test waits for the other radar's, so one worker alone would never end."""
+    (tmp_path / "test_mine.py").write_text(
+        "import os\nfrom pathlib import Path\nfrom hil_tests.patience import wait_until\n\n"
+        "def test_meets(radar, radar_name):\n"
+        "    here = Path(os.environ['MEET'])\n    (here / radar_name).touch()\n"
+        "    wait_until(lambda: len(list(here.iterdir())) == 2)\n"
+    )
+    (meet := tmp_path / "meet").mkdir()
+    with emulator("serve", "--bare", "--count", "2", "--tcp", "0") as served:
+        radars = [w for port in served.tcp_ports for w in ("--radar", f"tcp://127.0.0.1:{port}")]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("MEET", str(meet))
+            done = run(tmp_path, *radars, "-n", "3")
+    assert done.returncode == 0, done.stdout
+    assert "2 passed" in done.stdout

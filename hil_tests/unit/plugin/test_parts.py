@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin import radar_targets
+from hil_tests.plugin import power, radar_targets
 from hil_tests.plugin.bench import Bench, PortBusyError, PortLock
 from hil_tests.plugin.gate import Measure, findings_of, gate
+from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import TappedTransport, WireTap
 
@@ -120,3 +121,31 @@ def test_a_line_is_closed_where_the_firmware_turns_out_to_lack_something(
     assert len(closed) == 1
     findings = findings_of(request.node)
     findings.names, findings.radars, findings.reason = (), (), None  # not a test of that radar
+
+
+def test_power_is_switched_off_and_on_with_a_pause(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    script = f'echo "$0 $1 $2" >> {log}'
+    slept: list[float] = []
+    command = PowerCommand(f"sh -c '{script}' {{action}} {{port}} {{serial}}")
+    command.cycle("/dev/ttyACM0", "202611210001", 1.5, slept.append)
+    rest = "/dev/ttyACM0 202611210001"
+    assert log.read_text().splitlines() == [f"off {rest}", f"on {rest}"]
+    assert slept == [1.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("sh -c 'echo busy; exit 3'", "ended with 3: busy"),
+        ("no-such-hub {action}", "cannot be started: No such file"),
+        ("sh -c 'sleep 60'", "did not end within 0.1 s"),
+    ],
+)
+def test_a_power_command_that_fails_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, text: str, says: str
+) -> None:
+    monkeypatch.setattr(power, "LIMIT_S", 0.1 if "sleep" in text else 30.0)
+    with pytest.raises(PowerError, match=says) as failure:
+        PowerCommand(text).cycle("port", "", 0.0, lambda seconds: None)
+    assert "\n" not in str(failure.value)

@@ -27,6 +27,7 @@ def one(text: str) -> RadarSpec:
         ("tcp://192.0.2.7:3000", Kind.NETWORK, "tcp://192.0.2.7:3000", "tcp-192.0.2.7-3000"),
         ("rfc2217://pi:7000", Kind.NETWORK, "rfc2217://pi:7000", "rfc2217-pi-7000"),
         ("auto", Kind.AUTO, "", "auto"),
+        ("mylab:rack3?slot=2", Kind.OWN, "mylab:rack3", "mylab-rack3"),
     ],
 )
 def test_what_a_spec_names(text: str, kind: Kind, target: str, name: str) -> None:
@@ -50,7 +51,7 @@ def test_options() -> None:
 
 def test_radars_that_would_share_a_name_get_numbers() -> None:
     names = [spec.name for spec in parse_specs(["/a/radar", "/b/radar", "/c/radar"])]
-    assert names == ["radar", "radar-2", "radar-3"]
+    assert names == ["radar", "radar.2", "radar.3"]
 
 
 def test_what_this_program_starts_itself_is_emulated() -> None:
