@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test test-quick test-all check bench sweep stress scenes failures pictures clean
+.PHONY: demo test test-quick test-all check bench sweep stress scenes failures pictures docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -29,7 +29,12 @@ check: $(VENV)/installed-dev
 	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(MAKE) docs
 	$(MAKE) test
+
+# The documents as a site in out/site; a warning fails. The variable silences an advertisement.
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: $(VENV)/installed-bench
 	$(PYTEST) hil_tests/bench -p no:xdist --benchmark-columns=min,median,max,rounds
@@ -94,6 +99,7 @@ $(VENV)/installed-demo: EXTRA =
 $(VENV)/installed-test: EXTRA = [test]
 $(VENV)/installed-bench: EXTRA = [bench]
 $(VENV)/installed-dev: EXTRA = [dev]
+$(VENV)/installed-docs: EXTRA = [docs]
 $(VENV)/installed-sweep: EXTRA = [gtsam]
 $(VENV)/installed-%: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.$(EXTRA)'
