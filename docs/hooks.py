@@ -9,7 +9,6 @@ import ast
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -52,7 +51,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
                     pages.append(target)  # whose links count, too
 
 
-def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Let links lead to where their files are on the site."""
     uri = page.file.src_uri
     file = ROOT / uri.removeprefix("repository/") if uri.startswith("repository/") else DOCS / uri
@@ -64,7 +63,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     return _LINK.sub(there, markdown)
 
 
-def on_post_page(output: str, page: Page, **_: Any) -> None:
+def on_post_page(output: str, page: Page, **_: object) -> None:
     """Refuse a page that would load something from another host when it is shown."""
     if loaded := _LOADED.search(output):
         raise PluginError(f"{page.file.src_uri} loads from the internet: {loaded[0]}")

@@ -1,0 +1,1 @@
+"""What the documents show, done as a reader would."""

@@ -233,14 +233,15 @@ def check_words(prompt: Prompt) -> None:
             assert {part for extra in extras for part in extra.split(",")} <= _extras(), words
         elif name == "pytest":
             options = [word.partition("=")[0] for word in words if word.startswith("--")]
-            assert [option for option in options if f"{option}" not in _pytest_help()] == []
+            assert [option for option in options if option not in _pytest_help()] == []
 
 
 def _parsed(parse: Any, words: list[str]) -> None:  # noqa: ANN401 - three parsers
     try:
         parse(words)
     except SystemExit as end:
-        assert end.code in {0, None}, words
+        if end.code:
+            raise AssertionError(f"wrong usage: {words}") from end
 
 
 def _extras() -> set[str]:
