@@ -30,7 +30,7 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -59,9 +59,7 @@ pytestmark = [
     pytest.mark.skipif(not README.exists(), reason="documents are in the source tree"),
 ]
 
-_UNTIL_CTRL_C = re.compile(
-    r"xethru-emulator (serve|play|proxy)\b|xethru stream (?!.*--count)|uwb-slam run\b"
-)
+_UNTIL_CTRL_C = re.compile(r"xethru-emulator (serve|play|proxy)\b|xethru stream (?!.*--count)")
 _ONLY_PARSED = re.compile(r"(pip|make|sudo)\b|pytest --pyargs")
 _NUMBER = r"\d+(?:\.\d+)?"
 
@@ -291,8 +289,8 @@ def test_every_fence_is_read_and_names_a_language_that_has_a_rule(page: Path) ->
     assert [str(block) for block in blocks if block.language not in known] == []
 
 
-def test_most_blocks_are_run(record_property: Callable[[str, object], None]) -> None:
-    """Those that are not, and why, are in the file of ``--junitxml``."""
+def test_most_blocks_are_run() -> None:
+    """``pytest -rP`` shows which are not, and why."""
     programs = [
         block
         for page in PAGES
@@ -300,9 +298,8 @@ def test_most_blocks_are_run(record_property: Callable[[str, object], None]) -> 
         if block.language in {"python", "console"}
     ]
     left_out = [block for block in programs if block.not_run]
-    for block in left_out:
-        record_property(f"not run: {block}", block.not_run)
-    assert len(left_out) < len(programs) / 2
+    sys.stdout.writelines(f"{block}: {block.not_run}\n" for block in left_out)
+    assert 0 < len(left_out) < 2 * len(programs) / 3
 
 
 @pytest.mark.parametrize(
