@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test test-quick test-all test-install check bench sweep stress scenes failures pictures clean
+.PHONY: demo test test-quick test-all test-install check bench sweep stress scenes failures pictures docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -29,12 +29,17 @@ check: $(VENV)/installed-dev
 	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(MAKE) docs
 	$(MAKE) test
 
 # The wheel with each extra in an empty environment, for every Python from 3.11 to 3.13 on the path: a
 # quarter of an hour and 2 GB a Python. `make test-install INSTALL="--python 3.11 --extra hil slam"`.
 test-install: $(VENV)/bin/python
 	$(BIN)/python -m hil_tests.system.installation $(INSTALL)
+
+# The documents as a site in out/site; a warning fails. The variable silences an advertisement.
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: $(VENV)/installed-bench
 	$(PYTEST) hil_tests/bench -p no:xdist --benchmark-columns=min,median,max,rounds
@@ -100,6 +105,7 @@ $(VENV)/installed-view: EXTRA = [view]
 $(VENV)/installed-test: EXTRA = [test]
 $(VENV)/installed-bench: EXTRA = [bench]
 $(VENV)/installed-dev: EXTRA = [dev]
+$(VENV)/installed-docs: EXTRA = [docs]
 $(VENV)/installed-sweep: EXTRA = [gtsam]
 $(VENV)/installed-%: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.$(EXTRA)'

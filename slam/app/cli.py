@@ -442,7 +442,8 @@ _COMMANDS = (
         "estimate offsets, mounts, gains and pulses from a recorded drive",
         _add_calibrate,
         "Estimates every radar's range offset, mount position, relative gain and pulse from a "
-        "session of `uwb-slam demo` past reflectors, and says what the drive cannot tell apart.",
+        "session of `uwb-slam run` or `demo` past reflectors, and says what the drive cannot tell "
+        "apart.",
     ),
     _Command(
         "sweep",

@@ -283,36 +283,24 @@ class X4M300(RadarState):
 
     The methods, by task:
 
-    begin and end
-        `open`, `ping`, `info`, `close`
-    raw frames
-        `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
-    all other messages
-        `messages`, `read_message`, `messages_waiting`; `listener` is called with every one,
-        `raw_listener` with the bytes of both directions
-    the module and its line
-        `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`
-    any command of the protocol
-        `request`
+    - begin and end: `open`, `ping`, `info`, `close`
+    - raw frames: `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
+    - all other messages: `messages`, `read_message`, `messages_waiting`; `listener` is called with
+      every one, `raw_listener` with the bytes of both directions
+    - the module and its line: `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`
+    - any command of the protocol: `request`
 
     The parts, each with a help of its own, such as ``help(radar.x4)``:
 
-    x4
-        Settings of the radar chip, an attribute each: ``radar.x4.iterations = 8``.
-    profile
-        What the module computes itself: load, set up, run; its noise maps and parameter file.
-    pins
-        IO pins.
-    files
-        Files in the module's flash, and its crash dump.
-    firmware
-        The bootloader; writing an image of the firmware.
-    registers
-        Registers of the radar chip.
-    postprocessing
-        What newer firmware does to frames before it sends them.
-    diagnostics
-        System tests, trace output, injected frames.
+    - ``x4``: settings of the radar chip, an attribute each: ``radar.x4.iterations = 8``.
+    - ``profile``: what the module computes itself: load, set up, run; its noise maps and parameter
+      file.
+    - ``pins``: IO pins.
+    - ``files``: files in the module's flash, and its crash dump.
+    - ``firmware``: the bootloader; writing an image of the firmware.
+    - ``registers``: registers of the radar chip.
+    - ``postprocessing``: what newer firmware does to frames before it sends them.
+    - ``diagnostics``: system tests, trace output, injected frames.
 
     Ranges are metres as the module counts them, with 3.0e8 m/s. What goes wrong raises an
     `XeThruError`: `DeviceError` if the module refuses, `ResponseTimeout` if it is silent,

@@ -127,7 +127,7 @@ def _sections() -> Iterator[str]:
         sweep = _sweep(name)
         commands = "".join(f"$ {command}\n" for command in sweep["command"].splitlines())
         yield f"## {title}\n\n{text}\n"
-        yield f"```console\n{commands}```\n"
+        yield f"<!-- not run: an hour or more -->\n```console\n{commands}```\n"
         yield groups_table(sweep["groups"])
         yield f"![{shows}](../fixtures/pictures/{picture})\n"
 

@@ -1,1 +1,1 @@
-"""What `docs/` shows is what happens."""
+"""What the documents show, done as a reader would."""

@@ -392,7 +392,7 @@ def test_help_names_every_method_and_part(driver: type) -> None:
     made = X4M300(ScriptedTransport(PlainModule()))
     for name, part in vars(made).items():
         if isinstance(part, Part):
-            assert f"\n{name}\n    " in manual, name
+            assert f"\n- ``{name}``: " in manual, name
 
 
 def test_help_of_the_chip_of_a_driver_asks_the_module_nothing() -> None:
