@@ -18,7 +18,6 @@ from mkdocs.structure.pages import Page
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 EXAMPLES = sorted(DOCS.glob("examples/[0-9]*.py"))
-_TO_COME = ("protocol.md", "examples/README.md")  # another branch brings them
 _LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)[^)#\s]+")
 _LOADED = re.compile(r"<(?:script|img|link rel=\"(?:stylesheet|preconnect)\")[^>]+=\"https?:[^>]*>")
 
@@ -27,11 +26,8 @@ def on_config(config: MkDocsConfig) -> None:
     """List the examples below their index."""
     for section in config.nav or []:
         for entries in section.values():
-            for entry in list(entries) if isinstance(entries, list) else []:
-                (page,) = entry.values()
-                if isinstance(page, str) and page in _TO_COME and not (DOCS / page).exists():
-                    entries.remove(entry)
-                elif "Examples" in entry:
+            for entry in entries if isinstance(entries, list) else []:
+                if "Examples" in entry:
                     entry["Examples"] = ["examples/README.md", *map(_uri, EXAMPLES)]
 
 
