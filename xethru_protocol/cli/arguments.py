@@ -383,8 +383,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "convert",
         "turn a recording into another format",
         "recordings:convert",
-        "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture); a name without "
-        "suffix is a directory in the vendor's format.",
+        "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture), .pcap (of a wire "
+        "capture, for Wireshark); a name without suffix is a directory in the vendor's format.",
     )
     one.add_argument(
         "source",
@@ -396,6 +396,18 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     _add_radar(one)
     one.add_argument("--force", action="store_true", help="replace TARGET if it exists")
     _add_json(one)
+
+    one = _add_command(
+        commands,
+        "export",
+        "write the protocol for other tools",
+        "recordings:export",
+        "wireshark: a dissector in Lua for the .pcap files that 'xethru convert' writes.",
+    )
+    one.add_argument("tool", choices=("wireshark",), metavar="TOOL", help="wireshark")
+    one.add_argument(
+        "--out", type=not_empty, metavar="FILE", help="file to write (default: standard output)"
+    )
 
     one = _add_command(
         commands,
