@@ -402,9 +402,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "export",
         "write the protocol for other tools",
         "recordings:export",
-        "wireshark: a dissector in Lua for the .pcap files that 'xethru convert' writes.",
+        "kaitai: a .ksy file for kaitai-struct-compiler. wireshark: a dissector in Lua for the .pcap "
+        "files that 'xethru convert' writes.",
     )
-    one.add_argument("tool", choices=("wireshark",), metavar="TOOL", help="wireshark")
+    one.add_argument("tool", choices=("kaitai", "wireshark"), metavar="TOOL", help="%(choices)s")
     one.add_argument(
         "--out", type=not_empty, metavar="FILE", help="file to write (default: standard output)"
     )

@@ -22,6 +22,7 @@ from xethru_protocol.cli.output import (
     warn,
     warn_of,
 )
+from xethru_protocol.export.kaitai import structure
 from xethru_protocol.export.wireshark import dissector
 from xethru_protocol.recordings import (
     FrameLayout,
@@ -307,7 +308,7 @@ def convert(arguments: Namespace) -> int:
 
 def export(arguments: Namespace) -> int:
     """Write the message table for another tool."""
-    text = {"wireshark": dissector}[arguments.tool]()
+    text = {"kaitai": structure, "wireshark": dissector}[arguments.tool]()
     if arguments.out is None:
         print_line(text.rstrip())
         return 0
