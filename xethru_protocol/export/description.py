@@ -5,13 +5,15 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 from xethru_protocol.wire import fields
-from xethru_protocol.wire.messages import ROWS
-from xethru_protocol.wire.rows import Command, Message, Row
+from xethru_protocol.wire import messages as messages  # importing them enters all rows
+from xethru_protocol.wire.rows import ROWS, Command, Message, Row
 
 TYPES = {"B": "u1", "I": "u4", "i": "s4", "f": "f4", "a": "f4", "c": "bytes", "s": "text"}
 TYPES |= {"H": "u2be"}
 DTYPES = {fields.FLOAT32: "f4", fields.UINT32: "u4", fields.INT16: "s2"}
 SIZES = {"u1": 1, "u2be": 2, "s2": 2, "u4": 4, "s4": 4, "f4": 4, "bytes": 1, "text": 1}
+
+EnumType = type[IntEnum]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +33,7 @@ class Field:
     beyond: int = -1
     short: bool = False
     skip: int = 0
-    enum: type[IntEnum] | None = None
+    enum: EnumType | None = None
     on: str = ""
     cases: tuple[tuple[int, tuple["Field", ...]], ...] = ()
 
@@ -60,7 +62,8 @@ def layouts() -> tuple[Layout, ...]:
 
 
 def _layout(cls: type[Message], row: Row) -> Layout:
-    prefixes, kinds = (row.prefix,), row.kinds
+    kinds = row.kinds
+    prefixes: tuple[bytes, ...] = (row.prefix,)
     if kinds and isinstance(kinds[0][1], fields.Spelling):
         prefixes = tuple(row.prefix + bytes((code,)) for code in kinds[0][1].codes)
         kinds = kinds[1:]

@@ -2,7 +2,8 @@
 
 from xethru_protocol.export.description import SIZES, Field, Layout, layouts
 
-_HEAD = """-- Wireshark dissector of the XeThru module protocol, written by `xethru export wireshark`.
+_HEAD = """\
+-- Wireshark dissector of the XeThru module protocol, written by `xethru export wireshark`.
 -- wireshark -X lua_script:xethru.lua FILE.pcap
 -- Each packet (link type USER0) is a byte, 3C from the module or 3E from the host, then one packet
 -- of the wire as it was captured, or bytes that belong to none.

@@ -236,8 +236,8 @@ def convert(
     source
         Any recording that `read_recording` takes.
     target
-        A new file ``*.mcap``, ``*.npz``, ``*.xtwire`` or, of a wire capture, ``*.pcap``; a name without suffix is a new
-        directory of ModuleConnector.
+        A new file ``*.mcap``, ``*.npz``, ``*.xtwire`` or, of a wire capture, ``*.pcap``; a name
+        without suffix is a new directory of ModuleConnector.
     on_progress
         Called with the number of messages so far, every thousand and at the end.
     radar
@@ -296,7 +296,8 @@ def _writer(target: Path) -> _Writer:
         case unknown:
             raise RecordingError(
                 f"{target}: no format has the suffix {unknown}; known are .mcap, {npz.SUFFIX},"
-                f" {wire_capture.SUFFIX}, {pcap.SUFFIX}, and none for a directory of ModuleConnector"
+                f" {wire_capture.SUFFIX}, {pcap.SUFFIX}, and none for a directory of"
+                " ModuleConnector"
             )
     if target.exists():
         raise RecordingError(f"{target} exists already")

@@ -3,8 +3,8 @@
 Classic pcap with nanoseconds, little-endian, link type 147 (DLT_USER0). One record per packet of
 the wire: a byte, 3C from the module or 3E from the host, then the packet as it was captured, with
 its framing. Bytes that belong to no packet are a record of their own in front of the packet behind
-them, and have its time: that of the chunk that completed the packet, of the chunk before where it is
-unknown, 0 if none is known.
+them, and have its time: that of the chunk that completed the packet, of the chunk before where it
+is unknown, 0 if none is known.
 """
 
 import re

@@ -14,17 +14,17 @@ HEAD = """# Protocol reference
 
 What is on the wire between a host and a module, from the message table in
 `xethru_protocol/wire/messages.py`. This page is made of the source:
-`python -m hil_tests.architecture.pages.protocol` writes it. Numbers in text refer to the sections of
-the reference that the table was written from.
+`python -m hil_tests.architecture.pages.protocol` writes it. Numbers in text refer to the sections
+of the reference that the table was written from.
 
 ## Framing
 
-A payload travels in one of two framings. Hosts send Normal packets only; modules send radar frames and
-other bulk data as NoEscape packets. All numbers are little-endian without padding.
+A payload travels in one of two framings. Hosts send Normal packets only; modules send radar frames
+and other bulk data as NoEscape packets. All numbers are little-endian without padding.
 
 | framing | bytes | notes |
 |---|---|---|
-| Normal | `7D` payload checksum `7E` | the checksum is the XOR of `7D` and the payload; before a payload or checksum byte `7D`, `7E` or `7F` stands a `7F` |
+| Normal | `7D` payload checksum `7E` | checksum: XOR of `7D` and the payload; `7F` escapes 7D, 7E, 7F |
 | NoEscape | `7C 7C 7C 7C` length (u32) `00` payload | no escapes, no checksum, no end |
 
 ## Wireshark and Kaitai
@@ -39,9 +39,9 @@ xethru convert live.xtwire live.pcap
 tshark -X lua_script:xethru.lua -r live.pcap
 ```
 
-Wireshark takes the same options as tshark. A record of the pcap file is one packet of the wire behind
-a byte for its direction, `3C` from the module or `3E` from the host; its link type is 147 (USER0). On an
-emulated module the last command ended with:
+Wireshark takes the same options as tshark. A record of the pcap file is one packet of the wire
+behind a byte for its direction, `3C` from the module or `3E` from the host; its link type is 147
+(USER0). On an emulated module the last command ended with:
 
 ```
    55 0.011072893         host → module       XeThru 10 X4DRIVER_GET
@@ -50,8 +50,8 @@ emulated module the last command ended with:
    58 0.083695077       module → host         XeThru 5748 DATA FLOAT
 ```
 
-In the tables below `[n]` is a list with as many entries as the field `n`, `[*]` takes the bytes that
-are left, and a `?` marks a field that may be absent.
+In the tables below `[n]` is a list with as many entries as the field `n`, `[*]` takes the bytes
+that are left, and a `?` marks a field that may be absent.
 """
 
 
