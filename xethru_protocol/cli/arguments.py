@@ -240,6 +240,21 @@ def _add_flash(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     _add_json(one)
 
 
+def _add_export(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    one = _add_command(
+        commands,
+        "export",
+        "write the protocol for other tools",
+        "recordings:export",
+        "kaitai: a .ksy file for kaitai-struct-compiler. wireshark: a dissector in Lua for the "
+        ".pcap files that 'xethru convert' writes.",
+    )
+    one.add_argument("tool", choices=("kaitai", "wireshark"), metavar="TOOL", help="%(choices)s")
+    one.add_argument(
+        "--out", type=not_empty, metavar="FILE", help="file to write (default: standard output)"
+    )
+
+
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line; exits with 2 on wrong usage.
 
@@ -383,8 +398,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "convert",
         "turn a recording into another format",
         "recordings:convert",
-        "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture); a name without "
-        "suffix is a directory in the vendor's format.",
+        "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture), .pcap (of a wire "
+        "capture, for Wireshark); a name without suffix is a directory in the vendor's format.",
     )
     one.add_argument(
         "source",
@@ -397,6 +412,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     one.add_argument("--force", action="store_true", help="replace TARGET if it exists")
     _add_json(one)
 
+    _add_export(commands)
     one = _add_command(
         commands,
         "decode",

@@ -22,6 +22,8 @@ from xethru_protocol.cli.output import (
     warn,
     warn_of,
 )
+from xethru_protocol.export.kaitai import structure
+from xethru_protocol.export.wireshark import dissector
 from xethru_protocol.recordings import (
     FrameLayout,
     RecordingError,
@@ -302,6 +304,19 @@ def convert(arguments: Namespace) -> int:
         warn(f"xethru convert: {number} {name} left out: the format has no place for them")
     warn_of("convert", done.faults)
     return 1 if done.faults else 0
+
+
+def export(arguments: Namespace) -> int:
+    """Write the message table for another tool."""
+    text = {"kaitai": structure, "wireshark": dissector}[arguments.tool]()
+    if arguments.out is None:
+        print_line(text.rstrip())
+        return 0
+    try:
+        Path(arguments.out).write_text(text, "utf-8")
+    except OSError as error:
+        raise CommandFailed(f"{arguments.out} cannot be written: {error.strerror}") from None
+    return 0
 
 
 # --- older recordings ---------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from xethru_protocol.extras import what_is_missing
-from xethru_protocol.recordings import npz, wire_capture
+from xethru_protocol.recordings import npz, pcap, wire_capture
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.records import (
     FaultHandler,
@@ -236,16 +236,26 @@ def convert(
     source
         Any recording that `read_recording` takes.
     target
-        A new file ``*.mcap``, ``*.npz`` or ``*.xtwire``; a name without suffix is a new
-        directory of ModuleConnector.
+        A new file ``*.mcap``, ``*.npz``, ``*.xtwire`` or, of a wire capture, ``*.pcap``; a name
+        without suffix is a new directory of ModuleConnector.
     on_progress
         Called with the number of messages so far, every thousand and at the end.
     radar
         Which radar of a session of several, as in `read_recording`.
     """
     source, target = Path(source), Path(target)
-    write = _writer(target)
     faults: list[RecordingFault] = []
+    if target.suffix == pcap.SUFFIX:
+        if recording_format(source) != "wire":
+            raise RecordingError(
+                f"{source} has no raw bytes, which {target} needs; record them with"
+                " 'xethru record --wire', or take them out of a session with 'uwb-slam convert'"
+            )
+        if target.exists():
+            raise RecordingError(f"{target} exists already")
+        packets = pcap.write_pcap(source, target, faults.append)
+        return Conversion(messages=packets, skipped={}, faults=tuple(faults))
+    write = _writer(target)
     facts = recording_facts(source)
     n_messages = 0
 
@@ -286,7 +296,8 @@ def _writer(target: Path) -> _Writer:
         case unknown:
             raise RecordingError(
                 f"{target}: no format has the suffix {unknown}; known are .mcap, {npz.SUFFIX},"
-                f" {wire_capture.SUFFIX}, and none for a directory of ModuleConnector"
+                f" {wire_capture.SUFFIX}, {pcap.SUFFIX}, and none for a directory of"
+                " ModuleConnector"
             )
     if target.exists():
         raise RecordingError(f"{target} exists already")
