@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from hil_tests.plugin import hookspecs
 from hil_tests.plugin.choices import CHOICES, WORKER_KEY, add_options, choose
 from hil_tests.plugin.gate import FINDINGS, Findings, check_faults
 from hil_tests.plugin.radar_specs import Kind, RadarSpec, no_radar
@@ -22,6 +21,21 @@ if TYPE_CHECKING:
 pytest_plugins = ["hil_tests.plugin.fixtures"]
 
 _OUTCOMES = ("passed", "failed", "skipped")
+
+
+class HookSpecs:
+    """The hook with which a conftest.py or another plugin adds radars of its own."""
+
+    @staticmethod
+    @pytest.hookspec(firstresult=True)
+    def pytest_xethru_radar_target(config: pytest.Config, spec: RadarSpec) -> RadarTarget | None:
+        """Return how the radar of a ``--radar`` value is reached, or None if others know.
+
+        Called once per process and radar, before its first test. ``spec.target`` is the value
+        before the question mark, such as ``mylab:rack3``, and ``spec.options`` what follows. The
+        plugin's own kinds are asked last, so a hook may also answer for one of theirs. It raises
+        `TargetError`, with one line, if the radar is not available.
+        """
 
 
 class Summary:
@@ -93,7 +107,7 @@ MARKERS = (
 
 
 def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
-    pluginmanager.add_hookspecs(hookspecs)
+    pluginmanager.add_hookspecs(HookSpecs)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -31,19 +31,20 @@ and other bulk data as NoEscape packets. All numbers are little-endian without p
 
 `xethru export` writes the same table for two other tools:
 
-```
-xethru export kaitai --out xethru.ksy
-xethru export wireshark --out xethru.lua
-xethru record --port /dev/ttyACM0 --wire live.xtwire --count 5
-xethru convert live.xtwire live.pcap
-tshark -X lua_script:xethru.lua -r live.pcap
+```console
+$ xethru export kaitai --out xethru.ksy
+$ xethru export wireshark --out xethru.lua
+$ xethru record --port /dev/ttyACM0 --wire live.xtwire --count 5
+$ xethru convert live.xtwire live.pcap
 ```
 
 Wireshark takes the same options as tshark. A record of the pcap file is one packet of the wire
 behind a byte for its direction, `3C` from the module or `3E` from the host; its link type is 147
-(USER0). On an emulated module the last command ended with:
+(USER0). This is the end of such a recording of an emulated module:
 
-```
+<!-- not run: needs tshark -->
+```console
+$ tshark -X lua_script:xethru.lua -r live.pcap
    55 0.011072893         host → module       XeThru 10 X4DRIVER_GET
    56 0.011368522       module → host         XeThru 23 REPLY FLOAT
    57 0.024970407       module → host         XeThru 5748 DATA FLOAT
