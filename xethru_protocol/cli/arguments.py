@@ -255,6 +255,17 @@ def _add_export(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     )
 
 
+def _add_simple(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    for name, about, run in (
+        ("ping", "check whether a module answers", "module:ping"),
+        ("info", "print what a module reports about itself", "module:info"),
+        ("reset", "restart a module", "module:reset"),
+    ):
+        one = _add_command(commands, name, about, run)
+        _add_port(one)
+        _add_json(one)
+
+
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line; exits with 2 on wrong usage.
 
@@ -288,14 +299,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "all that are found)",
     )
     _add_json(one)
-    for name, about, run in (
-        ("ping", "check whether a module answers", "module:ping"),
-        ("info", "print what a module reports about itself", "module:info"),
-        ("reset", "restart a module", "module:reset"),
-    ):
-        one = _add_command(commands, name, about, run)
-        _add_port(one)
-        _add_json(one)
+    _add_simple(commands)
     _add_flash(commands)
     one = _add_command(
         commands,

@@ -24,7 +24,7 @@ and other bulk data as NoEscape packets. All numbers are little-endian without p
 
 | framing | bytes | notes |
 |---|---|---|
-| Normal | `7D` payload checksum `7E` | checksum: XOR of `7D` and the payload; `7F` escapes 7D, 7E, 7F |
+| Normal | `7D` payload checksum `7E` | XOR of `7D` and payload; `7F` stands before 7D, 7E, 7F |
 | NoEscape | `7C 7C 7C 7C` length (u32) `00` payload | no escapes, no checksum, no end |
 
 ## Wireshark and Kaitai

@@ -80,7 +80,7 @@ def same(shown: Any, expected: Any) -> bool:  # noqa: ANN401, PLR0911 - any JSON
     if expected.startswith("0x"):
         return int(shown) == int(expected, 16)
     if expected in ENUMS and shown.isdigit():
-        return int(shown) == ENUMS[expected]
+        return bool(int(shown) == ENUMS[expected])
     if expected in {shown, shown.replace(":", " ").upper()}:
         return True
     return ":" in shown and bytes.fromhex(shown.replace(":", "")).decode("latin-1") == expected
