@@ -11,10 +11,9 @@ is a short recorded run.
   Ctrl-C the lines that are shown must come, and it goes on until the page ends. What installs, make
   and the suite of an installed package are not run.
 - What a console block shows below a command is compared with its stdout, or, if that is empty, with
-  its stderr. ``...`` stands for
-  anything. White space counts as one blank. A whole number below 30, or of more than 8 digits, must
-  be the same; every other number, which the machine's speed may change, must be within a half of
-  it.
+  its stderr. ``...`` stands for anything. White space counts as one blank. A whole number below 30,
+  or of more than 8 digits, must be the same; every other number, which the machine's speed may
+  change, must be within a half of it.
 - ``toml`` is parsed, and is a rig file if it has radars.
 - Behind ``<!-- not run: reason -->`` nothing is run: Python is compiled, and of commands the words
   are parsed, so that each option, extra and target of make exists.
@@ -152,7 +151,7 @@ class Reader:
         with self._started(command, stderr=subprocess.PIPE) as process:
             printed, errors = process.communicate(timeout=seconds(20))
         if process.returncode == 0 and shown.strip():
-            check_output(command, shown, printed or errors)
+            check_output(command, self._here(shown), printed or errors)
         assert process.returncode == 0, f"{command}\n{printed}\n{errors}"
 
     def _begins(self, prompt: Prompt) -> None:
@@ -161,7 +160,7 @@ class Reader:
         n_lines = max(1, len(prompt.shown.splitlines()))
         printed = "".join(process.stdout.readline() for _ in range(n_lines))
         assert printed, f"{prompt.command}: ended with {process.wait()}"
-        check_output(prompt.command, prompt.shown or "...", printed)
+        check_output(prompt.command, self._here(prompt.shown) or "...", printed)
 
     @contextlib.contextmanager
     def _started(
