@@ -83,7 +83,8 @@ def _fields(name: str, kind: fields.Kind, labels: dict[str, str]) -> Iterator[Fi
     label = labels[name]
     match kind:
         case fields.Number():
-            yield Field(name=label, type=TYPES[kind.code[0]], skip=kind.code.count("x"))
+            skip = kind.code.count("x")
+            yield Field(name=label, type=TYPES[kind.code[0]], skip=skip, enum=kind.enum)
         case fields.Member():
             yield Field(name=label, type="u4", enum=kind.enum)
         case fields.Count():

@@ -11,9 +11,9 @@ list and not, beside it, a number that could contradict it.
 
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -62,13 +62,21 @@ def hex_bytes(value: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One scalar: a ``struct`` code, how a dump shows it, and the least that is accepted."""
+    """One scalar: a ``struct`` code, how a dump shows it, and the least that is accepted.
+
+    ``enum`` names the values that are documented; others are passed on all the same.
+    """
 
     code: str
     label: str = ""
     shown: Callable[[Any], Any] = _plain
     order: str = "<"
     least: float | None = None
+    enum: type[IntEnum] | None = None
+
+    def of(self, enum: type[IntEnum]) -> Self:
+        """Return this kind of number with names for its values."""
+        return replace(self, enum=enum)
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         self._check(value)

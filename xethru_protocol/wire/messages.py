@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol.wire import fields
+from xethru_protocol.wire import codes, fields
 from xethru_protocol.wire.codes import (
     I2C_REGISTER,
     LEGACY_DIR_CODES,
@@ -70,7 +70,7 @@ class Error(Response):
 class Pong(Response):
     """Answer to Ping: a `PongCode`. 5."""
 
-    value: Annotated[int, fields.ID32]
+    value: Annotated[int, fields.ID32.of(codes.PongCode)]
 
 
 @response(
@@ -86,7 +86,7 @@ class Pong(Response):
 class System(Response):
     """The module reports its state unasked: a `SystemCode`. 5."""
 
-    code: Annotated[int, fields.U32]
+    code: Annotated[int, fields.U32.of(codes.SystemCode)]
 
 
 _REPLY = ResponseCode.XTS_SPR_REPLY
@@ -390,9 +390,9 @@ class PresenceSingle(Response):
     """One person, once a second: `PresenceState`, `PresenceDirection`, quality 0 ... 10. 7.3."""
 
     counter: Annotated[int, fields.U32]
-    state: Annotated[int, fields.Number("I", "presence_state")]
+    state: Annotated[int, fields.Number("I", "presence_state").of(codes.PresenceState)]
     distance_m: Annotated[float, _DISTANCE]
-    direction: Annotated[int, fields.U8]
+    direction: Annotated[int, fields.U8.of(codes.PresenceDirection)]
     signal_quality: Annotated[int, fields.U32]
 
 
@@ -406,7 +406,7 @@ class PresenceMovingList(Response):
     """
 
     counter: Annotated[int, fields.U32]
-    state: Annotated[int, fields.Number("I", "presence_state")]
+    state: Annotated[int, fields.Number("I", "presence_state").of(codes.PresenceState)]
     interval_count: ClassVar[Annotated[int, _INTERVALS]]
     detection_count: ClassVar[Annotated[int, _DETECTIONS]]
     movement_slow: Annotated[_Floats, fields.Floats("interval_count")]
@@ -421,7 +421,7 @@ class RespStatus(Response):
     """Breathing: `RespirationState`, breaths per minute, movement [mm], quality. 7.4."""
 
     counter: Annotated[int, fields.U32]
-    state: Annotated[int, fields.U32]
+    state: Annotated[int, fields.U32.of(codes.RespirationState)]
     rpm: Annotated[int, fields.U32]
     distance_m: Annotated[float, _DISTANCE]
     movement_mm: Annotated[float, fields.F32]
@@ -433,7 +433,7 @@ class SleepStatus(Response):
     """Sleep: `RespirationState`, breaths per minute, quality, slow and fast movement. 7.4."""
 
     counter: Annotated[int, fields.U32]
-    state: Annotated[int, fields.U32]
+    state: Annotated[int, fields.U32.of(codes.RespirationState)]
     rpm: Annotated[float, fields.F32]
     distance_m: Annotated[float, _DISTANCE]
     signal_quality: Annotated[int, fields.U32]
@@ -446,7 +446,7 @@ class VitalSigns(Response):
     """Rates of breath and heartbeat, with distances [m] and confidences. 7.4."""
 
     counter: Annotated[int, fields.U32]
-    state: Annotated[int, fields.U32]
+    state: Annotated[int, fields.U32.of(codes.RespirationState)]
     respiration_rate: Annotated[float, fields.F32]
     respiration_distance_m: Annotated[float, fields.Number("f", "respiration_distance")]
     respiration_confidence: Annotated[float, fields.F32]
@@ -659,7 +659,7 @@ class BootloaderSuccess(Response):
 class BootloaderFramingError(Response):
     """A bootloader found a packet damaged: a `BootloaderFraming`. 4.12."""
 
-    code: Annotated[int, fields.U8]
+    code: Annotated[int, fields.U8.of(codes.BootloaderFraming)]
 
 
 _BOOTLOADER_ERRORS = (
@@ -698,7 +698,7 @@ class Ping(Command[Pong]):
 class StartBootloader(Command[Ack]):
     """Restart into the bootloader about 500 ms after the ACK; ``key`` as `BootloaderKey`. 4.1."""
 
-    key: Annotated[int, fields.ID32]
+    key: Annotated[int, fields.ID32.of(codes.BootloaderKey)]
 
 
 @command(CommandCode.XTS_SPC_MOD_RESET, name="MOD_RESET")
@@ -716,7 +716,7 @@ class ModReset(Command[Ack]):
 class SetMode(Command[Ack]):
     """Switch to a `SensorMode`; a host leaves ``param`` out for all but NORMAL and REG. 4.2."""
 
-    mode: Annotated[int, fields.U8]
+    mode: Annotated[int, fields.U8.of(codes.SensorMode)]
     param: Annotated[int | None, fields.OptionalByte(shown_if_absent=True)] = None
 
 
@@ -729,7 +729,7 @@ class GetMode(Command[ReplyByte]):
 class LoadApp(Command[Ack]):
     """Load a profile (`ProfileId`) without running it. 4.3."""
 
-    profile_id: Annotated[int, fields.ID32]
+    profile_id: Annotated[int, fields.ID32.of(codes.ProfileId)]
 
 
 @command(CommandCode.XTS_SPC_DIR_COMMAND, DirCode.XTS_SDC_GET_PROFILEID, name="DIR GET_PROFILEID")
@@ -741,7 +741,7 @@ class GetProfileId(Command[ReplyInt]):
 class SetLedControl(Command[Ack]):
     """Choose what the LED shows (`LedMode`); an intensity, 0 ... 100, is not implemented. 4.5."""
 
-    mode: Annotated[int, fields.U8]
+    mode: Annotated[int, fields.U8.of(codes.LedMode)]
     intensity: Annotated[int, fields.U8] = 0
 
 
@@ -809,7 +809,7 @@ class GetSensitivity(Command[ReplyInt]):
 class SetTxCenterFrequency(Command[Ack]):
     """Choose the profile's band, a `TxCenterFrequency`. 4.4, 9.2."""
 
-    tx_center_frequency: Annotated[int, fields.Number("I", "band")]
+    tx_center_frequency: Annotated[int, fields.Number("I", "band").of(codes.TxCenterFrequency)]
 
 
 @command(*_get(AppObject.TX_CENTER_FREQ), name="APP_GET TX_CENTER_FREQ")
@@ -821,7 +821,7 @@ class GetTxCenterFrequency(Command[ReplyInt]):
 class AppSetLedControl(Command[Ack]):
     """Choose what the LED shows; as `SetLedControl`, but kept with the profile. 4.4."""
 
-    mode: Annotated[int, fields.U8]
+    mode: Annotated[int, fields.U8.of(codes.LedMode)]
     intensity: Annotated[int, fields.U8] = 0
 
 
@@ -919,7 +919,7 @@ class OutputSetControl(Command[Ack]):
     ``control`` holds `OutputControl` bits; for pulse-Doppler and noise maps `MatrixControl` bits.
     """
 
-    feature: Annotated[int, fields.ID32]
+    feature: Annotated[int, fields.ID32.of(codes.OutputFeature)]
     control: Annotated[int, fields.U32]
 
 
@@ -927,14 +927,14 @@ class OutputSetControl(Command[Ack]):
 class OutputGetControl(Command[ReplyInt]):
     """Ask for the control bits of an `OutputFeature`. 4.7."""
 
-    feature: Annotated[int, fields.ID32]
+    feature: Annotated[int, fields.ID32.of(codes.OutputFeature)]
 
 
 @command(_DEBUG_OUTPUT, OutputCode.XTS_SPCO_SETCONTROL, name="DEBUG_OUTPUT_SETCONTROL")
 class DebugOutputSetControl(Command[Ack]):
     """Switch a message on or off on the debug line; fields as in `OutputSetControl`. 4.7, 16."""
 
-    feature: Annotated[int, fields.ID32]
+    feature: Annotated[int, fields.ID32.of(codes.OutputFeature)]
     control: Annotated[int, fields.U32]
 
 
@@ -942,7 +942,7 @@ class DebugOutputSetControl(Command[Ack]):
 class DebugOutputGetControl(Command[ReplyInt]):
     """Ask for a message's control bits on the debug line. 4.7, 16."""
 
-    feature: Annotated[int, fields.ID32]
+    feature: Annotated[int, fields.ID32.of(codes.OutputFeature)]
 
 
 @command(_IOPIN, IoPinCode.XTS_SPCIOP_SETCONTROL, name="IOPIN_SETCONTROL", errors=IoPinError)
@@ -952,23 +952,23 @@ class IoPinSetControl(Command[Ack]):
     ``pin_id``: an `IoPin`.
     """
 
-    pin_id: Annotated[int, fields.U32]
+    pin_id: Annotated[int, fields.U32.of(codes.IoPin)]
     pin_setup: Annotated[int, fields.U32]
-    pin_feature: Annotated[int, fields.U32]
+    pin_feature: Annotated[int, fields.U32.of(codes.IoPinFeature)]
 
 
 @command(_IOPIN, IoPinCode.XTS_SPCIOP_GETCONTROL, name="IOPIN_GETCONTROL", errors=IoPinError)
 class IoPinGetControl(Command[ReplyInt]):
     """Ask for a pin's setup bits and feature: two integers. 4.8."""
 
-    pin_id: Annotated[int, fields.U32]
+    pin_id: Annotated[int, fields.U32.of(codes.IoPin)]
 
 
 @command(_IOPIN, IoPinCode.XTS_SPCIOP_SETVALUE, name="IOPIN_SETVALUE", errors=IoPinError)
 class IoPinSetValue(Command[Ack]):
     """Drive an output pin high (1) or low (0). 4.8."""
 
-    pin_id: Annotated[int, fields.U32]
+    pin_id: Annotated[int, fields.U32.of(codes.IoPin)]
     pin_value: Annotated[int, fields.U32]
 
 
@@ -976,11 +976,11 @@ class IoPinSetValue(Command[Ack]):
 class IoPinGetValue(Command[ReplyInt]):
     """Ask whether a pin is high (1) or low (0). 4.8."""
 
-    pin_id: Annotated[int, fields.U32]
+    pin_id: Annotated[int, fields.U32.of(codes.IoPin)]
 
 
 _DIR = CommandCode.XTS_SPC_DIR_COMMAND
-_TYPE = fields.Number("I", "type", shown=fields.hexadecimal)
+_TYPE = fields.Number("I", "type", shown=fields.hexadecimal).of(codes.FileType)
 
 
 @command(_DIR, DirCode.XTS_SDC_SEARCH_FILE_TYPE, name="DIR SEARCH_FILE_TYPE", errors=FileError)
@@ -1069,7 +1069,7 @@ class FormatFilesystem(Command[Ack]):
 class SystemTest(Command[ReplyByte | Ack]):
     """Run a `TestCode`; 256 bytes, of which the first tells whether it passed, or an ACK. 4.10."""
 
-    code: Annotated[int, fields.Number("B", "test_code")]
+    code: Annotated[int, fields.Number("B", "test_code").of(codes.TestCode)]
 
 
 @command(
@@ -1081,14 +1081,14 @@ class SystemTest(Command[ReplyByte | Ack]):
 class SystemGetInfo(Command[ReplyString]):
     """Ask for an `InfoItem`. 4.10."""
 
-    item: Annotated[int, fields.Number("B", "info_code")]
+    item: Annotated[int, fields.Number("B", "info_code").of(codes.InfoItem)]
 
 
 @command(_DIR, DirCode.XTS_SDC_SYSTEM_GET_DEBUG_DATA, name="DIR SYSTEM_GET_DEBUG_DATA")
 class SystemGetDebugData(Command[Response]):
     """A command that is not implemented: an emulator answers ERROR 1. 4.10."""
 
-    item: Annotated[int, fields.Number("B", "info_code")]
+    item: Annotated[int, fields.Number("B", "info_code").of(codes.InfoItem)]
 
 
 @command(_DIR, DirCode.XTS_SDC_GET_CRASH_DUMP_LENGTH, name="DIR GET_CRASH_DUMP_LENGTH")

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import re
 import shutil
 import struct
 import subprocess
@@ -35,16 +36,18 @@ def converted(path: Path, pieces: list[tuple[str, bytes, int]]) -> Path:
 
 
 def dissected(capture: Path) -> list[dict[str, Any]]:
-    tshark = shutil.which("tshark")
-    if tshark is None:
+    layers = json.loads(tshark(capture, "-T", "json", "--no-duplicate-keys"))
+    return [packet["_source"]["layers"]["xethru"] for packet in layers]
+
+
+def tshark(capture: Path, *options: str) -> str:
+    program = shutil.which("tshark")
+    if program is None:
         pytest.skip("tshark is not installed: apt-get install tshark")
     script = capture.with_name("xethru.lua")
     assert xethru(["export", "wireshark", "--out", str(script)]) == 0
-    command = [tshark, "-X", f"lua_script:{script}", "-r", str(capture), "-T", "json"]
-    printed = subprocess.run(
-        [*command, "--no-duplicate-keys"], capture_output=True, text=True, check=True
-    )
-    return [packet["_source"]["layers"]["xethru"] for packet in json.loads(printed.stdout)]
+    command = [program, "-X", f"lua_script:{script}", "-r", str(capture), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def expected_fields(vector: Vector) -> dict[str, Any]:
@@ -108,6 +111,17 @@ def test_every_vector_is_shown_with_its_name_and_fields(tmp_path: Path) -> None:
             if not same(shown.get(key), value)
         ]
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(("message", "field"), [("SETMODE", "mode"), ("SYSTEM", "code")])
+def test_values_have_the_names_of_the_vectors(message: str, field: str, tmp_path: Path) -> None:
+    named = [v for v in VECTORS if v.message == message and v.decoded.get(f"{field}_name")]
+    pieces = [("tx" if v.from_host else "rx", v.wire, n) for n, v in enumerate(named)]
+    shown = tshark(converted(tmp_path, pieces), "-V")
+    found = re.findall(rf"^    {field}: (\w+) ", shown, re.MULTILINE)
+    assert len(found) == len(named) > 1
+    for name, vector in zip(found, named, strict=True):  # which leaves the prefix out
+        assert name.endswith(f"_{vector.decoded[f'{field}_name']}")
 
 
 def test_a_pcap_has_the_bytes_of_its_format(tmp_path: Path) -> None:
