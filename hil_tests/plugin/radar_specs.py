@@ -6,7 +6,7 @@
 | `emu:SCENE?seed=3&fps=17&radar=NAME` | the same in a scene: a name or a .toml file |
 | `emu:?line=pty`, `uart`, `tcp` | an emulator in a process of its own behind such a line |
 | `emu:?firmware=xep` | in this process, with the bare base firmware |
-| `/dev/ttyACM0`, `ports/left` | a module at a port; `?line=uart`: a UART that does not look like one |
+| `/dev/ttyACM0`, `ports/left` | a module at a port; `?line=uart`: a UART that looks like none |
 | `serial=202611210001` | a module by its serial number, at any port |
 | `auto` | every module that answers; at least one must |
 | `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
