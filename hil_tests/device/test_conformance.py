@@ -14,10 +14,11 @@ from hil_tests.plugin.cassette import EMULATED, Cassette, ask_all, differences
 from hil_tests.plugin.choices import CHOICES
 from hil_tests.plugin.gate import Measure, leave_out
 from hil_tests.plugin.radar_specs import parse_specs
+from hil_tests.plugin.radar_targets import target_of
 
 
 def emulator() -> RadarUnderTest:
-    radar = RadarUnderTest(parse_specs(["emu"])[0])
+    radar = RadarUnderTest(target_of(parse_specs(["emu"])[0]))
     radar.begin_test()
     return radar
 

@@ -1,5 +1,7 @@
 """A module that restarts, is unplugged, or changes its baud rate."""
 
+import contextlib
+
 import pytest
 
 from hil_tests.plugin.bench import RadarUnderTest
@@ -7,8 +9,8 @@ from hil_tests.plugin.gate import Measure
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import PongCode
-from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
+from xethru_protocol.wire.codes import PongCode, SensorMode
+from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
 
 pytestmark = pytest.mark.requires("settings")
 
@@ -88,6 +90,29 @@ def test_a_power_cut_leaves_nothing_of_the_chips_settings(
     assert radar.ping() is PongCode.XTS_SPRP_READY
     assert radar.info().serial_number == serial
     assert (radar.x4.fps, radar.x4.iterations) == (0.0, 8)
+
+
+@pytest.mark.requires("power")
+def test_the_counter_begins_at_1_after_a_power_cut(
+    radar_place: RadarUnderTest, frame_rate_hz: float
+) -> None:
+    """Protocol reference 6.1: without an INIT, which clears it, too.
+
+    The module stays stopped (8.2): a profile would count its sweeps.
+    """
+    radar = radar_place.open()
+    geometry = radar.configure_raw(SHORT)
+    radar.start(frame_rate_hz)
+    assert [frame.counter for frame in radar.frames(3)] == [1, 2, 3]
+    radar.stop()
+    radar = radar_place.power_cycle()
+    with contextlib.suppress(DeviceError):  # bare XEP firmware has no modes
+        radar.set_mode(SensorMode.XTID_SM_STOP)
+        radar.set_mode(SensorMode.XTID_SM_MANUAL)
+    radar.x4.frame_area_m = SHORT.frame_area_m
+    radar.geometry = geometry  # the driver discards frames whose bins it does not know
+    radar.x4.fps = 5.0
+    assert [frame.counter for frame in radar.frames(3)] == [1, 2, 3]
 
 
 @pytest.mark.requires("uart")

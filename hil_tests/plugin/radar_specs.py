@@ -6,7 +6,7 @@
 | `emu:SCENE?seed=3&fps=17&radar=NAME` | the same in a scene: a name or a .toml file |
 | `emu:?line=pty`, `uart`, `tcp` | an emulator in a process of its own behind such a line |
 | `emu:?firmware=xep` | in this process, with the bare base firmware |
-| `/dev/ttyACM0` | a module at a port; `?line=uart`: a UART that does not look like one |
+| `/dev/ttyACM0`, `ports/left` | a module at a port; `?line=uart`: a UART that looks like none |
 | `serial=202611210001` | a module by its serial number, at any port |
 | `auto` | every module that answers; at least one must |
 | `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
@@ -156,10 +156,11 @@ def _kind(body: str) -> tuple[Kind, str]:  # noqa: PLR0911 - one return per kind
         if not rest or not os.path.exists(rest):
             raise SpecError(f"--radar {body}: there is no recording {rest}")
         return Kind.REPLAY, rest
-    if body.startswith(("/", "./", "../", "~")):
+    if colon and re.fullmatch(r"[a-z][a-z0-9_]*", scheme):
+        if scheme not in _BUILT_IN_SCHEMES:
+            return Kind.OWN, body
+    elif "/" in body or body.startswith("~") or os.path.exists(body):
         return Kind.PORT, str(Path(os.path.expanduser(body)))
-    if colon and re.fullmatch(r"[a-z][a-z0-9_]*", scheme) and scheme not in _BUILT_IN_SCHEMES:
-        return Kind.OWN, body
     raise no_radar(body)
 
 

@@ -229,8 +229,8 @@ def check_words(prompt: Prompt) -> None:
             extras = re.findall(r"\[([\w,-]+)\]", " ".join(words))
             assert {part for extra in extras for part in extra.split(",")} <= _extras(), words
         elif name == "pytest":
-            options = [word.partition("=")[0] for word in words if word.startswith("--")]
-            assert [option for option in options if option not in _pytest_help()] == []
+            options = {word.partition("=")[0] for word in words if word.startswith("--")}
+            assert sorted(options - _pytest_options()) == []
 
 
 def _parsed(parse: Any, words: list[str]) -> None:  # noqa: ANN401 - three parsers
@@ -247,9 +247,10 @@ def _extras() -> set[str]:
 
 
 @cache
-def _pytest_help() -> str:
+def _pytest_options() -> set[str]:
     command = [sys.executable, "-m", "pytest", "--help"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return set(re.findall(r"--[\w-]+", shown))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -23,6 +23,9 @@ def one(text: str) -> RadarSpec:
         ("emu:lab?radar=left_front", Kind.EMULATED, "lab", "emu-lab-left_front"),
         ("/dev/ttyACM0", Kind.PORT, "/dev/ttyACM0", "ttyACM0"),
         ("./ports/radar_1?line=uart", Kind.PORT, "ports/radar_1", "radar_1"),
+        ("ports/left", Kind.PORT, "ports/left", "left"),
+        ("ports/usb:1", Kind.PORT, "ports/usb:1", "usb:1"),
+        ("/dev/serial/by-path/pci-0:1", Kind.PORT, "/dev/serial/by-path/pci-0:1", "pci-0:1"),
         ("serial=202611210001", Kind.SERIAL_NUMBER, "202611210001", "202611210001"),
         ("tcp://192.0.2.7:3000", Kind.NETWORK, "tcp://192.0.2.7:3000", "tcp-192.0.2.7-3000"),
         ("rfc2217://pi:7000", Kind.NETWORK, "rfc2217://pi:7000", "rfc2217-pi-7000"),
@@ -33,6 +36,16 @@ def one(text: str) -> RadarSpec:
 def test_what_a_spec_names(text: str, kind: Kind, target: str, name: str) -> None:
     spec = one(text)
     assert (spec.kind, spec.target, spec.name) == (kind, target, name)
+
+
+def test_a_name_without_a_slash_is_a_port_if_it_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SpecError, match="names no radar"):
+        one("left")
+    (tmp_path / "left").touch()
+    assert (one("left").kind, one("left").target) == (Kind.PORT, "left")
 
 
 def test_recordings_must_exist(tmp_path: Path) -> None:
