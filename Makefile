@@ -37,9 +37,10 @@ check: $(VENV)/installed-dev
 test-install: $(VENV)/bin/python
 	$(BIN)/python -m hil_tests.system.installation $(INSTALL)
 
-# The documents as a site in out/site; a warning fails. The variable silences an advertisement.
+# The documents as a site in out/site; a warning fails, but not with --quiet, which also hides it from
+# --strict. The variable silences an advertisement.
 docs: $(VENV)/installed-docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(VENV)/installed-bench
 	$(PYTEST) hil_tests/bench -p no:xdist --benchmark-columns=min,median,max,rounds

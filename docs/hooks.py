@@ -19,7 +19,9 @@ DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 EXAMPLES = sorted(DOCS.glob("examples/[0-9]*.py"))
 _LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)[^)#\s]+")
-_LOADED = re.compile(r"<(?:script|img|link rel=\"(?:stylesheet|preconnect)\")[^>]+=\"https?:[^>]*>")
+_LOADED = re.compile(
+    r"<(?:script|img|iframe|link rel=\"(?:stylesheet|preconnect)\")[^>]+=\"(?:https?:)?//[^>]*>"
+)
 
 
 def on_config(config: MkDocsConfig) -> None:

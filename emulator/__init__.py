@@ -27,6 +27,8 @@ from xethru_protocol.system import signal_at_parents_death
 
 __all__ = ["control", "emulated_port"]
 
+_END_LIMIT_S = 10.0
+
 
 @contextmanager
 def emulated_port(scene: str | Path | None = None, *options: str) -> Iterator[str]:
@@ -64,6 +66,10 @@ def emulated_port(scene: str | Path | None = None, *options: str) -> Iterator[st
             yield json.loads(ready)["devices"][0]["path"]
         finally:
             process.terminate()
+            try:
+                process.wait(_END_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 def control(port: str | Path, request: str) -> dict[str, Any]:
@@ -82,7 +88,13 @@ def control(port: str | Path, request: str) -> dict[str, Any]:
     """
     from emulator.cli import ask, request_of, socket_of
 
-    answer: dict[str, Any] = json.loads(ask(socket_of(Path(port)), request_of(request.split())))
+    path = socket_of(Path(port))
+    try:
+        answer: dict[str, Any] = json.loads(ask(path, request_of(request.split())))
+    except OSError as error:
+        raise OSError(
+            error.errno, f"no emulator answers: {error.strerror or error}", str(path)
+        ) from None
     if not answer["ok"]:
         raise ValueError(answer["error"])
     return answer

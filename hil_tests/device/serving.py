@@ -41,7 +41,8 @@ def open_radar(path: str, reconnect_s: float = 0.0) -> X4M300:
 def emulator(*arguments: str | Path) -> Iterator[Served]:
     """Run ``xethru-emulator`` until the block ends; stderr goes to the test's."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "emulator.cli", *map(str, arguments)],
+        # -P: a package "emulator" of the project that is tested must not come first
+        [sys.executable, "-P", "-m", "emulator.cli", *map(str, arguments)],
         stdout=subprocess.PIPE,
         text=True,
         # a test session that is killed leaves no emulator behind

@@ -2,7 +2,8 @@
 
 ``make test-install`` runs it for every Python from 3.11 to 3.13 that is on the path, and skips
 the others with the reason. It prints a row per environment, with its size, and the output of what
-failed. Exit 1 if anything failed. Needs an index of packages, and the standard library only.
+failed. Exit 1 if anything failed, or nothing was tested. Needs an index of packages, and the
+standard library only.
 """
 
 from __future__ import annotations
@@ -116,6 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--extra", nargs="+", choices=PROMISES, default=tuple(PROMISES))
     arguments = parser.parse_args(argv)
     failures: list[str] = []
+    tested = False
     with tempfile.TemporaryDirectory() as folder:
         wheel = _wheel(Path(folder))
         print("python  extra      MB installed  seconds  promises", flush=True)
@@ -124,10 +126,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             if python is None:
                 print(f"{version:6}  skipped: no working python{version} on the path")
                 continue
+            tested = True
             failures += _each_extra(python, version, wheel, arguments.extra, Path(folder))
     for failure in failures:
         print(f"\n{failure}", file=sys.stderr)
-    return 1 if failures else 0
+    if not tested:
+        print("nothing was tested", file=sys.stderr)
+    return 0 if tested and not failures else 1
 
 
 def _wheel(folder: Path) -> Path:

@@ -37,7 +37,7 @@ from xethru_protocol.recordings import convert as convert_recording
 from xethru_protocol.recordings.records import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
-from xethru_protocol.system import PathInUseError, built_aside, one_line, sync
+from xethru_protocol.system import PathInUseError, built_aside, one_line, sync, written_whole
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
@@ -313,7 +313,8 @@ def export(arguments: Namespace) -> int:
         print_line(text.rstrip())
         return 0
     try:
-        Path(arguments.out).write_text(text, "utf-8")
+        with written_whole(Path(arguments.out)) as fresh:
+            fresh.write_text(text, "utf-8")
     except OSError as error:
         raise CommandFailed(f"{arguments.out} cannot be written: {error.strerror}") from None
     return 0

@@ -125,6 +125,7 @@ end
 function xethru.dissector(buffer, info, root)
   info.cols.protocol = "XeThru"
   local tree = root:add(xethru, buffer())
+  if buffer:len() == 0 then return end
   local from_host = buffer(0, 1):uint() == 0x3E
   tree:add(direction, buffer(0, 1), from_host and "host" or "module")
   info.cols.src = from_host and "host" or "module"
@@ -140,7 +141,10 @@ function xethru.dissector(buffer, info, root)
   if sum then tree:add(checksum, sum) end
   local payload
   if kind == "noescape" then
-    if #bytes == 0 then return end
+    if #bytes == 0 then
+      info.cols.info = "empty"
+      return
+    end
     payload = buffer:range(10):tvb()
   else
     payload = ByteArray.new(bytes, true):tvb("Unescaped payload")

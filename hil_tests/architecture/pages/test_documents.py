@@ -1,6 +1,10 @@
 """Paths and links in the documents exist; `hil_tests/system/documentation` runs their blocks."""
 
 import re
+import shlex
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -39,3 +43,15 @@ def test_every_page_is_linked_from_another_document() -> None:
         link for document in DOCUMENTS for link in links_of(document) if link != document.resolve()
     }
     assert pages - linked == set()
+
+
+@pytest.mark.skipif(find_spec("mkdocs") is None, reason="mkdocs is of the extra docs")
+def test_a_broken_link_fails_the_build_of_the_site(tmp_path: Path) -> None:
+    (tmp_path / "mkdocs.yml").write_text("site_name: short\nplugins: []\n")
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "index.md").write_text("[a page](nowhere.md)\n")
+    (options,) = re.findall(r"\tNO_.*/mkdocs (.*)", (REPOSITORY / "Makefile").read_text())
+    command = [sys.executable, "-m", "mkdocs", *shlex.split(options)]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 1
+    assert "nowhere.md" in built.stderr

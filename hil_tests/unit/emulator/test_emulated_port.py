@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from emulator import control, emulated_port
-from hil_tests.device.serving import open_radar
+from hil_tests.device.serving import emulator, open_radar
 from xethru_protocol.wire.codes import PongCode
 
 
@@ -36,7 +36,20 @@ def test_a_running_emulator_is_controlled_by_its_port(tmp_path: Path) -> None:
         assert (fault["kind"], fault["parameters"]) == ("stall", {"seconds": 2.0})
         with pytest.raises(ValueError, match='no kind of fault is called "rain"'):
             control(port, "fault add rain")
-        with pytest.raises(ValueError, match="nothing known"):
+        with pytest.raises(ValueError, match="'explode' is no request"):
             control(port, "explode")
-    with pytest.raises(OSError, match="No such file"):
+    with pytest.raises(
+        FileNotFoundError, match=f"no emulator answers: No such file.*{tmp_path}/port"
+    ):
         control(tmp_path / "port", "state")
+
+
+def test_a_package_of_the_same_name_in_the_current_folder_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "emulator").mkdir()
+    (tmp_path / "emulator" / "__init__.py").touch()
+    monkeypatch.chdir(tmp_path)
+    with emulated_port() as port, emulator("serve", "--bare") as served:
+        assert Path(port).exists()
+        assert Path(served.paths[0]).exists()

@@ -153,6 +153,16 @@ def test_damage_is_marked_and_a_long_frame_in_pieces_is_one_packet(tmp_path: Pat
     assert "malformed" in json.dumps(damaged)
 
 
+def test_a_record_without_bytes_and_a_packet_without_payload_are_no_errors(tmp_path: Path) -> None:
+    empty = bytes.fromhex("7C7C7C7C 00000000 00")
+    capture = converted(tmp_path, [("rx", empty, 1)])
+    with capture.open("ab") as stream:
+        stream.write(bytes(16))  # the head of a record of no bytes
+    packet, nothing = dissected(capture)
+    assert packet["xethru.framing"] == "noescape"
+    assert "error" not in json.dumps([packet, nothing]).lower()
+
+
 def test_a_recording_without_raw_bytes_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
