@@ -102,7 +102,6 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/installed-demo: EXTRA = [slam]
-$(VENV)/installed-view: EXTRA = [view]
 $(VENV)/installed-test: EXTRA = [test]
 $(VENV)/installed-bench: EXTRA = [bench]
 $(VENV)/installed-dev: EXTRA = [dev]

@@ -23,11 +23,22 @@ RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
 def hil_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     """All radars of the session."""
     from hil_tests.plugin.bench import Bench
+    from hil_tests.plugin.radar_targets import RadarTarget, TargetError
+    from xethru_protocol.extras import what_is_missing
 
     config = request.config
 
     def reach(spec: RadarSpec) -> RadarTarget:
-        place: RadarTarget = config.hook.pytest_xethru_radar_target(config=config, spec=spec)
+        try:
+            place = config.hook.pytest_xethru_radar_target(config=config, spec=spec)
+        except ModuleNotFoundError as error:
+            missing = what_is_missing(error, extra="hil")
+            if missing is None:
+                raise
+            raise TargetError(f"--radar {spec.text}: {missing}") from None
+        if not isinstance(place, RadarTarget):
+            hook = "pytest_xethru_radar_target"
+            raise TargetError(f"--radar {spec.text}: {hook} returned {place!r}, no RadarTarget")
         return place
 
     bench = Bench(config.stash[CHOICES].specs, reach)

@@ -84,10 +84,13 @@ class InjectFault:
         if name not in places or (radar is None and len(places) > 1):
             there = ", ".join(places) or "none; ask for the fixture radar first"
             pytest.fail(f"fault {kind}: radar= must be one of: {there}", pytrace=False)
+        refused = ""
         try:
             self._findings.faults.append(fault := places[name].inject(kind, keys))
         except TargetError as error:
-            pytest.fail(f"fault {kind}: {error}", pytrace=False)
+            refused = str(error).removeprefix("fault: ")
+        if refused:  # not above, where pytest would show both errors
+            pytest.fail(f"fault {kind}: {refused}", pytrace=False)
         return fault
 
 
@@ -243,7 +246,7 @@ def _check_capabilities(request: pytest.FixtureRequest, radar: RadarUnderTest) -
     for capability in wanted:
         if capability not in radar.place.capabilities:
             name = radar.spec.name
-            why = CAPABILITIES.get(capability, f"--radar ...?has={capability} vouches for it")
+            why = CAPABILITIES.get(capability, f"--radar ...?has={capability} declares it")
             lacking(request, [name], f"{name}: needs {capability} ({why})")
 
 

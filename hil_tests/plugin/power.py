@@ -56,14 +56,16 @@ class PowerCommand:
     def cycle(self, port: str, serial: str, off_s: float, sleep: Callable[[float], None]) -> None:
         """Take the power away for ``off_s`` and give it back; `PowerError` if that fails."""
         if "serial" in self._placeholders and not serial:
-            raise PowerError(f"{self.text!r}: {port} has told no serial number")
+            raise PowerError(f"{self.text!r}: the module at {port} reports no serial number")
         values = {"port": port, "serial": serial}
         if "action" not in self._placeholders:
             _run(self.words(values))
             return
         _run(self.words({**values, "action": "off"}))
-        sleep(off_s)
-        _run(self.words({**values, "action": "on"}))
+        try:
+            sleep(off_s)
+        finally:  # also after an interrupt
+            _run(self.words({**values, "action": "on"}))
 
 
 def _run(words: list[str]) -> None:

@@ -201,7 +201,7 @@ class RadarTarget(ABC):
     def cut_power(self, seconds: float) -> None:
         """Take the power away for ``seconds``; return when it is back, or will come by itself."""
         raise TargetError(
-            f"{self.spec.name} has no power to switch; --hil-power-cmd CMD tells how it is done"
+            f"{self.spec.name} has no power to switch; --hil-power-cmd names the command"
         )
 
     def inject(self, kind: str, keys: Mapping[str, Any]) -> InjectedFault:
@@ -321,13 +321,18 @@ class ProcessTarget(RadarTarget):
         name = self._served.names[self._index]
         number = self._ask("fault add", fault=fault.model_dump())["ids"][name]
 
+        cleared: list[int] = []
+
         def injected() -> int:
+            if cleared:
+                return cleared[0]
             for armed in self._ask("fault list")["faults"][name]:
                 if armed["id"] == number:
                     return int(armed["injected"])
             return fault.count  # no longer armed: as often as was asked for
 
         def clear() -> None:
+            cleared.append(injected())
             with contextlib.suppress(TargetError):  # it is over
                 self._ask("fault clear", id=number)
 

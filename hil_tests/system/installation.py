@@ -79,7 +79,7 @@ _HIL = (Promise("python -m pytest -q --pyargs hil_tests.device", " passed"),)
 
 PROMISES: dict[str, tuple[Promise, ...]] = {
     "emulator": _EMULATOR,  # the first: its emulator serves the others
-    "": (
+    "base": (
         *_DRIVER,
         Promise("xethru-emulator --help", "serve"),
         Promise("xethru-emulator serve --bare", "pip install 'xethru-hil[emulator]'", 2),
@@ -108,7 +108,7 @@ PROMISES: dict[str, tuple[Promise, ...]] = {
         Promise("uwb-slam sweep --scene {scene} --seeds 1 --bound --json sweep.json", "short"),
     ),
 }
-"""What is run in the environment of each extra; the empty one is the base."""
+"""What is run in the environment of each extra; `base` is without any."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -162,16 +162,16 @@ def _each_extra(
             if extra not in extras:
                 continue
             begun = time.monotonic()
-            place = folder / f"{version}-{extra or 'base'}"
+            place = folder / f"{version}-{extra}"
             environment = emulator
             if extra != "emulator":
                 environment = _installed(python, wheel, extra, place)
             size = _megabytes(environment)
             failed = list(_broken(environment, PROMISES[extra], port, folder))
-            row = f"{version:6}  {extra or '-':9}  {size:12.0f}  {time.monotonic() - begun:7.0f}"
+            row = f"{version:6}  {extra:9}  {size:12.0f}  {time.monotonic() - begun:7.0f}"
             kept = len(PROMISES[extra]) - len(failed)
             print(f"{row}  {kept} of {len(PROMISES[extra])}", flush=True)
-            yield from (f"python {version}, extra {extra or '-'}: {text}" for text in failed)
+            yield from (f"python {version}, extra {extra}: {text}" for text in failed)
             if extra != "emulator":
                 shutil.rmtree(environment)
     shutil.rmtree(emulator)
@@ -180,7 +180,7 @@ def _each_extra(
 def _installed(python: str, wheel: Path, extra: str, environment: Path) -> Path:
     subprocess.run([python, "-m", "venv", str(environment)], check=True)
     pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "--quiet"]
-    requirement = f"{wheel}[{extra}]" if extra else str(wheel)
+    requirement = f"{wheel}[{extra}]" if extra != "base" else str(wheel)
     subprocess.run([*pip, "--disable-pip-version-check", requirement], check=True)
     return environment
 

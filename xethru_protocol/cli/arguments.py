@@ -253,6 +253,7 @@ def _add_export(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     one.add_argument(
         "--out", type=not_empty, metavar="FILE", help="file to write (default: standard output)"
     )
+    one.add_argument("--force", action="store_true", help="replace FILE if it exists")
 
 
 def _add_simple(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:

@@ -312,6 +312,8 @@ def export(arguments: Namespace) -> int:
     if arguments.out is None:
         print_line(text.rstrip())
         return 0
+    if Path(arguments.out).exists() and not arguments.force:
+        raise CommandFailed(f"{arguments.out} exists already; --force replaces it")
     try:
         with written_whole(Path(arguments.out)) as fresh:
             fresh.write_text(text, "utf-8")

@@ -251,6 +251,8 @@ def convert(
                 f"{source} has no raw bytes, which {target} needs; record them with"
                 " 'xethru record --wire', or take them out of a session with 'uwb-slam convert'"
             )
+        if radar is not None:
+            raise RecordingError(f"{source} is of one radar and names none; leave the name out")
         if target.exists():
             raise RecordingError(f"{target} exists already")
         packets = pcap.write_pcap(source, target, faults.append)

@@ -134,6 +134,29 @@ def test_power_is_switched_off_and_on_with_a_pause(tmp_path: Path) -> None:
     assert slept == [1.5]
 
 
+def test_power_comes_back_after_an_interrupted_pause(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    command = PowerCommand(f"sh -c 'echo {{action}} >> {log}'")
+
+    def interrupted(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        command.cycle("port", "", 1.0, interrupted)
+    assert log.read_text().split() == ["off", "on"]
+
+
+def test_a_fault_that_is_cleared_unused_was_not_injected() -> None:
+    (spec,) = parse_specs(["emu:?line=pty"])
+    target = radar_targets.ProcessTarget(spec)
+    try:
+        fault = target.inject("bad_checksum", {"count": 3})
+        fault.clear()
+        assert fault.injected() == 0
+    finally:
+        target.close()
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
