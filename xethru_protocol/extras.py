@@ -14,7 +14,11 @@ PACKAGES = {
 }
 """Names as imported, by the extra of pyproject.toml that lists their distributions."""
 
-_INCLUDED = {"slam": ("emulator", "mcap"), "hil": ("emulator", "mcap")}
+_INCLUDED = {
+    "slam": ("emulator", "mcap"),
+    "view": ("emulator", "mcap", "slam"),
+    "hil": ("emulator", "mcap"),
+}
 """Extras that an extra includes."""
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
-from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
+from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError, UsageError
 from slam.app.experiments import add_experiments
 from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
@@ -118,12 +118,19 @@ class _Command(NamedTuple):
     add_arguments: Callable[[argparse.ArgumentParser], None]
     description: str
     epilog: str | None = None
+    extra: str = "slam"
 
     def start(self, arguments: argparse.Namespace, stop: StopFlag) -> None:
         module, _, name = self.function.partition(":")
         options: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k != "command"}
-        with stop.leaving(program="uwb-slam"):  # imports take seconds
-            function = getattr(import_module(module), name)
+        try:
+            with stop.leaving(program="uwb-slam"):  # imports take seconds
+                function = getattr(import_module(module), name)
+        except ModuleNotFoundError as error:
+            missing = what_is_missing(error, extra=self.extra)
+            if missing is None:
+                raise
+            raise UsageError(missing) from None
         function(stop, **options)
 
 
@@ -383,6 +390,7 @@ _COMMANDS = (
         "show a session in Rerun: window, browser, file or picture",
         _add_view,
         "Shows a recorded session in Rerun, as its run saw it. Without an option a window opens.",
+        extra="view",
     ),
     _Command(
         "report",

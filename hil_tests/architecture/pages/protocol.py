@@ -40,7 +40,8 @@ $ xethru convert live.xtwire live.pcap
 
 Wireshark takes the same options as tshark. A record of the pcap file is one packet of the wire
 behind a byte for its direction, `3C` from the module or `3E` from the host; its link type is 147
-(USER0). This is the end of such a recording of an emulated module:
+(USER0). These are lines of such a recording of an emulated module (`-Y 'xethru.message ==
+"DATA FLOAT"'` would leave the frames only):
 
 <!-- not run: needs tshark -->
 ```console

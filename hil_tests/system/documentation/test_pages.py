@@ -4,7 +4,7 @@ The blocks of a page are taken in order, in one empty folder. `/dev/ttyACM0` and
 `tcp://192.168.0.7:3000` stand for an emulated module, which is also at `ports/radar_1`; `out/demo`
 is a short recorded run.
 
-- ``python`` with ``>>>`` is a doctest; with tests, it is run by pytest with ``--radar emu``; with a
+- ``python`` with ``>>>`` is a doctest; with tests, it is run by pytest on ``emu:lab``; with a
   file's name as the comment on its first line, it is saved under that name; else it is executed.
   The names of a page's blocks are shared.
 - ``console``: each ``$`` line is run by a shell and must end with 0. Of a command that runs until
@@ -128,7 +128,7 @@ class Reader:
             name = named[1] if named else "test_mine.py"
             (self._folder / name).write_text(self._here(block.text))
             if name.startswith("test_"):
-                words = (*(sys.executable, "-m", "pytest", "-q"), name, "--radar", "emu")
+                words = (*(sys.executable, "-m", "pytest", "-q"), name, "--radar", "emu:lab")
                 self._ends(shlex.join(words), "...passed in...")
         else:
             exec(self._compile(block), self.names)

@@ -35,7 +35,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.compiled import compile_kernels
 from slam.config import BackEnd
-from xethru_protocol.extras import what_is_missing
+from xethru_protocol.extras import install_command, what_is_missing
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
@@ -143,10 +143,9 @@ def _rerun_view() -> Callable[[Path, SessionInfo], SessionObserver] | None:
     try:
         from slam.app.view.panels import RerunView
     except ModuleNotFoundError as error:
-        missing = what_is_missing(error)
-        if missing is None:
+        if what_is_missing(error) is None:
             raise
-        note(f"session.rrd is not written: {missing}")
+        note(f"without Rerun no session.rrd is written; {install_command('view')} brings it")
         return None
     return RerunView
 
