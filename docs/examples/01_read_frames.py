@@ -5,16 +5,17 @@ lets them come. A frame has one sample per range bin, and `ranges_m` is the rang
 samples are what the antenna receives, as a part of full scale; the strongest is the strongest echo.
 
 Without an argument the example opens an emulated module, which looks along a corridor; for one of
-your own: `python 01_read_frames.py /dev/ttyACM0`. It prints
+your own: `python 01_read_frames.py /dev/ttyACM0`. At `--pace asap` the emulator waits for its
+reader, so that the numbers are the same every time. It prints
 
 ```text
 X4M300 202305070401, firmware 1.6.8
 1431 bins of 6.4 mm from 0.20 m on, 17.05 frames per second
-frame 1: the strongest sample is +0.0067 at 2.08 m
-frame 2: the strongest sample is +0.0068 at 2.08 m
-frame 3: the strongest sample is +0.0062 at 2.06 m
-frame 4: the strongest sample is +0.0063 at 2.06 m
-frame 5: the strongest sample is +0.0059 at 2.08 m
+frame 1: the strongest sample is +0.0063 at 2.08 m
+frame 2: the strongest sample is +0.0067 at 2.08 m
+frame 3: the strongest sample is +0.0068 at 2.08 m
+frame 4: the strongest sample is +0.0062 at 2.06 m
+frame 5: the strongest sample is +0.0063 at 2.06 m
 ```
 """
 
@@ -48,5 +49,5 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         main(sys.argv[1])
     else:
-        with emulated_port("visitor") as emulated:
+        with emulated_port("visitor", "--pace", "asap") as emulated:
             main(emulated)

@@ -52,5 +52,5 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         main(sys.argv[1])
     else:
-        with emulated_port("visitor") as emulated:
+        with emulated_port("visitor", "--pace", "asap") as emulated:
             main(emulated)

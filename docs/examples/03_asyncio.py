@@ -47,6 +47,6 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         asyncio.run(main(sys.argv[1:]))
     else:
-        with emulated_port("visitor") as left:
+        with emulated_port("visitor", "--pace", "asap") as left:
             right = str(Path(left).with_name("right"))
             asyncio.run(main([left, right]))

@@ -9,7 +9,7 @@ The example puts a metal rod 3 m in front of a radar and looks for it. It prints
 
 ```text
 wrote rod.toml
-the rod stands at 3.000 m, its echo is at 3.001 m
+the rod stands at 3.000 m, its echo is at 3.000 m
 ```
 """
 
@@ -49,7 +49,7 @@ amplitude_1m = 0.015
 def main() -> None:
     Path("rod.toml").write_text(SCENE)
     print("wrote rod.toml")
-    with emulated_port("rod.toml") as port, X4M300.open(port) as radar:
+    with emulated_port("rod.toml", "--pace", "asap") as port, X4M300.open(port) as radar:
         radar.configure_raw()
         radar.start(17)
         frames = list(radar.frames(17))
