@@ -14,7 +14,7 @@ PACKAGES = {
 }
 """Names as imported, by the extra of pyproject.toml that lists their distributions."""
 
-_INCLUDED = {
+INCLUDED = {
     "slam": ("emulator", "mcap"),
     "view": ("emulator", "mcap", "slam"),
     "hil": ("emulator", "mcap"),
@@ -39,6 +39,6 @@ def what_is_missing(error: ModuleNotFoundError, *, extra: str | None = None) -> 
     package = (error.name or "").partition(".")[0]
     for found, packages in PACKAGES.items():
         if package in packages:
-            named = extra if extra and found in _INCLUDED.get(extra, ()) else found
+            named = extra if extra and found in INCLUDED.get(extra, ()) else found
             return f"{package} is not installed: {install_command(named)}"
     return None

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
-from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError, UsageError
+from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
@@ -87,7 +87,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except StopRequestedError as stopped:
         return _end(str(stopped), stopped.exit_code)
     except ModuleNotFoundError as error:
-        missing = what_is_missing(error, extra="slam")
+        missing = what_is_missing(error, extra=arguments.extra)
         if missing is None:
             raise
         return _end(missing, EXIT_USAGE)
@@ -109,7 +109,8 @@ class _Command(NamedTuple):
     """A row of the table of commands.
 
     `function` is "module:name" of what runs it: the module is imported once the command starts,
-    and the function gets the StopFlag, and the command's arguments by their names.
+    and the function gets the StopFlag, and the command's arguments by their names. `extra` is the
+    extra of the distribution that it needs.
     """
 
     name: str
@@ -122,15 +123,10 @@ class _Command(NamedTuple):
 
     def start(self, arguments: argparse.Namespace, stop: StopFlag) -> None:
         module, _, name = self.function.partition(":")
-        options: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k != "command"}
-        try:
-            with stop.leaving(program="uwb-slam"):  # imports take seconds
-                function = getattr(import_module(module), name)
-        except ModuleNotFoundError as error:
-            missing = what_is_missing(error, extra=self.extra)
-            if missing is None:
-                raise
-            raise UsageError(missing) from None
+        of_row = {"command", "extra"}
+        options: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k not in of_row}
+        with stop.leaving(program="uwb-slam"):  # imports take seconds
+            function = getattr(import_module(module), name)
         function(stop, **options)
 
 
@@ -473,6 +469,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uwb-slam", description="UWB-radar SLAM on X4M300 radars, emulated or real."
     )
+    parser.set_defaults(extra="slam")
     add_version(parser)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for row in _COMMANDS:
@@ -480,7 +477,7 @@ def _parser() -> argparse.ArgumentParser:
             row.name, help=row.help, description=row.description, epilog=row.epilog
         )
         row.add_arguments(command)
-        command.set_defaults(command=row.start)
+        command.set_defaults(command=row.start, extra=row.extra)
 
     experiment = commands.add_parser(
         "experiment",

@@ -126,8 +126,8 @@ def read_recording(
     """
     path = Path(path)
     found = recording_format(path)
-    if radar is not None and found != "mcap":
-        raise RecordingError(f"{path} is of one radar and names none; leave the name out")
+    if found != "mcap":
+        _refuse_name(path, radar)
     match found:
         case "wire":
             yield from wire_capture.read_wire(path, on_fault)
@@ -140,6 +140,11 @@ def read_recording(
             yield from read_mcap(path, on_fault, radar)
         case "vendor":
             yield from read_vendor(path, on_fault)
+
+
+def _refuse_name(path: Path, radar: str | None) -> None:
+    if radar is not None:
+        raise RecordingError(f"{path} is of one radar and names none; leave the name out")
 
 
 def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
@@ -251,8 +256,7 @@ def convert(
                 f"{source} has no raw bytes, which {target} needs; record them with"
                 " 'xethru record --wire', or take them out of a session with 'uwb-slam convert'"
             )
-        if radar is not None:
-            raise RecordingError(f"{source} is of one radar and names none; leave the name out")
+        _refuse_name(source, radar)
         if target.exists():
             raise RecordingError(f"{target} exists already")
         packets = pcap.write_pcap(source, target, faults.append)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.paths import REPOSITORY
-from xethru_protocol.extras import PACKAGES, what_is_missing
+from xethru_protocol.extras import INCLUDED, PACKAGES, what_is_missing
 
 _PROJECT = REPOSITORY / "pyproject.toml"
 _NOT_INSTALLED = """\
@@ -39,6 +39,20 @@ def test_the_table_agrees_with_the_requirements(extra: str) -> None:
     assert ours == listed - {"xethru-hil"}
 
 
+@pytest.mark.skipif(not _PROJECT.exists(), reason="the requirements are in the source tree")
+@pytest.mark.parametrize("extra", INCLUDED)
+def test_the_table_of_included_extras_agrees_with_the_requirements(extra: str) -> None:
+    extras = tomllib.loads(_PROJECT.read_text())["project"]["optional-dependencies"]
+
+    def included(name: str) -> set[str]:
+        text = " ".join(extras[name])
+        (names,) = re.findall(r"xethru-hil\[([\w,]+)\]", text) or ("",)
+        direct = set(filter(None, names.split(",")))
+        return direct.union(*map(included, direct))
+
+    assert included(extra) == set(INCLUDED[extra])
+
+
 @pytest.mark.parametrize(
     ("module", "own", "line"),
     [
@@ -47,6 +61,7 @@ def test_the_table_agrees_with_the_requirements(extra: str) -> None:
         ("mcap.writer", "slam", "mcap is not installed: pip install 'xethru-hil[slam]'"),
         ("mcap.writer", None, "mcap is not installed: pip install 'xethru-hil[mcap]'"),
         ("rerun", "slam", "rerun is not installed: pip install 'xethru-hil[view]'"),
+        ("PIL", "view", "PIL is not installed: pip install 'xethru-hil[view]'"),
         ("PIL", "slam", "PIL is not installed: pip install 'xethru-hil[slam]'"),
         ("xethru_protocol.nothing", "slam", None),
         (None, None, None),
@@ -89,6 +104,12 @@ def test_names_the_extra(module: str | None, own: str | None, line: str | None) 
             ["replay", "FILE"],
             2,
             r"uwb-slam: \w+ is not installed: pip install 'xethru-hil\[slam\]'",
+        ),
+        (
+            "slam.app.cli",
+            ["view", "FILE"],
+            2,
+            r"uwb-slam: \w+ is not installed: pip install 'xethru-hil\[view\]'",
         ),
     ],
 )
