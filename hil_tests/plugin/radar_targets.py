@@ -109,7 +109,7 @@ CAPABILITIES: Mapping[str, str] = {
     "files": "a file system that answers",
     "unplug": "only emulated ones can be unplugged by a program",
     "power": "--hil-power-cmd CMD switches the power of a real one",
-    "faults": "only emulated ones have faults to order",
+    "faults": "only emulated radars have faults",
     "uart": "USB, tcp:// and pseudo-terminals have no baud rate",
     "virtual_time": "waiting must cost nothing",
 }
@@ -126,7 +126,7 @@ class TargetError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class InjectedFault:
-    """One fault that a test has ordered for an emulated radar.
+    """One fault that a test has armed at an emulated radar.
 
     `injected` returns how often it took effect so far; `clear` ends it.
     """
@@ -146,7 +146,7 @@ class RadarTarget(ABC):
 
     The base of radars of your own, too: a subclass has `open_line`, and what else it can do.
     ``capabilities`` names what tests may require, ``description`` is shown in the summary,
-    ``serial_number`` is what the module said, empty before it was asked. ``bytes_per_s`` is the
+    ``serial_number`` is what the module reported, empty before. ``bytes_per_s`` is the
     capacity of the line, infinite but on a UART; ``scene_text`` the scene file of an emulated
     radar; ``lock_target`` the name to lock against other sessions (None: no other process can
     reach the radar).
@@ -206,7 +206,7 @@ class RadarTarget(ABC):
 
     def inject(self, kind: str, keys: Mapping[str, Any]) -> InjectedFault:
         """Arm a fault; keys as of `emulator.faults.plan.fault_spec`."""
-        raise TargetError(f"{self.spec.name} has no faults to order: it is not emulated")
+        raise TargetError(f"{self.spec.name} takes no faults: it is not emulated")
 
     def close(self) -> None:  # noqa: B027 - an optional hook
         """Release processes and ports."""
