@@ -99,6 +99,7 @@ What it asks for is done to every radar, unless --radar names one.
   fault clear [ID]               disarm one, or all
   unplug [SECONDS] | plug        take the port away, give it back
   reset                          restart the module, as by its watchdog
+  people [SECONDS]               what is true of the scene's people, now or at a scene time
   pause | resume | rate R | seek SECONDS | loop on|off | filter [KIND...]   of a playback
 
 Prints the answer as one JSON line. Exit 1 when the emulator refuses. For example:
@@ -206,8 +207,10 @@ def request_of(words: Sequence[str]) -> dict[str, Any]:  # noqa: PLR0911 - one r
             return {"verb": "fault add", "fault": _fault(kind, keys)}
         case ["rate", rate]:
             return {"verb": "rate", "value": _number(rate)}
-        case ["seek", seconds]:
-            return {"verb": "seek", "seconds": _number(seconds)}
+        case ["people"]:
+            return {"verb": "people"}
+        case ["seek" | "people" as verb, seconds]:
+            return {"verb": verb, "seconds": _number(seconds)}
         case ["loop", "on" | "off" as loop]:
             return {"verb": "loop", "value": loop == "on"}
         case ["filter", *names]:
@@ -525,8 +528,8 @@ def _add_product(serve: argparse.ArgumentParser) -> None:
     serve.add_argument(
         "--model",
         choices=["x4m300", "x4m200"],
-        default="x4m300",
-        help="product: with the presence profile, or with the respiration profile (default x4m300)",
+        help="product: with the presence profile, or with the respiration profile (default: what "
+        "the scene says of each module, else x4m300)",
     )
     serve.add_argument(
         "--option",

@@ -13,12 +13,13 @@ from typing import TextIO
 
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
+from emulator.echo.people import people_truth
 from emulator.faults.faulty_device import FaultyDevice, InnerDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
 from emulator.module.memory import Identity
-from emulator.module.settings import MODELS, DeviceOptions
+from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
 from emulator.playback import PlayStream, played_radars
-from emulator.ports.control import Control, ControlSocket
+from emulator.ports.control import Control, ControlSocket, People
 from emulator.ports.folders import (
     Announcement,
     DirectoryMemory,
@@ -109,11 +110,14 @@ class FaultSession:
                     )
 
     def control(
-        self, folder: Path, players: Mapping[str, PlayStream] | None = None
+        self,
+        folder: Path,
+        players: Mapping[str, PlayStream] | None = None,
+        people: People | None = None,
     ) -> ControlSocket:
         """Open the control socket; `LinkError` if it cannot be had."""
         path = socket_path(folder, self._cleanup, CONTROL_NAME)
-        offered = ControlSocket(path, Control(self.devices, players))
+        offered = ControlSocket(path, Control(self.devices, players, people, self._zero_ns))
         self._cleanup.callback(offered.close)
         return offered
 
@@ -159,16 +163,16 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             changes = {"port_on_reset": "stay" if stays else "vanish"} | dict(options.option)
             if options.firmware is not None:
                 changes["firmware"] = options.firmware
-            device_options = DeviceOptions.of_model(options.model, **changes)
-            if device_options.shipped_profile not in device_options.profiles:
-                raise CannotServeError(
-                    "--option: shipped_profile must be one of profiles", exit_code=2
-                )
-            order_code = MODELS[options.model].order_code
             devices = []
             for index, radar in enumerate(scene.radars):
+                model = options.model or radar.model or STOCK_MODEL
+                device_options = DeviceOptions.of_model(model, **changes)
+                if device_options.shipped_profile not in device_options.profiles:
+                    raise CannotServeError(
+                        "--option: shipped_profile must be one of profiles", exit_code=2
+                    )
                 device = radar_device(
-                    Identity(serial=radar.serial, order_code=order_code),
+                    Identity(serial=radar.serial, order_code=MODELS[model].order_code),
                     echo_source(scene, index, options.seed),
                     options.pace,
                     scene_time_zero_ns=zero_ns,
@@ -190,7 +194,9 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                     )
                 )
             session.check_names()
-            control = session.control(folder)
+            control = session.control(
+                folder, people=partial(people_truth, scene, seed=options.seed)
+            )
             feed = None
             if not options.bare:
                 feed = OdometryFeed(

@@ -32,6 +32,14 @@ if importlib.util.find_spec("hypothesis") is not None:
     vars(providers)["is_local_module_file"] = lambda path: False
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--vendor-examples",
+        metavar="DIR",
+        help="also run the vendor's Python examples that are in DIR, by 'xethru legacy'",
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Register the one marker that tests outside the plugin use; let signals end what tests start.
 

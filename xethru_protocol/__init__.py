@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from xethru_protocol.driver.frames import Frame, FrameGeometry
     from xethru_protocol.driver.link import RawConfig
     from xethru_protocol.driver.radar import X4M300
-    from xethru_protocol.recordings import Recorder, RecordingReader, read_recording
+    from xethru_protocol.recordings import Recorder, RecordingReader, load, read_recording
     from xethru_protocol.transport import find_ports
     from xethru_protocol.wire.codes import NoiseMapControl, OutputFeature, ProfileId
     from xethru_protocol.wire.errors import (
@@ -53,6 +53,7 @@ __all__ = [
     "ResponseTimeout",
     "XeThruError",
     "find_ports",
+    "load",
     "read_recording",
 ]
 
@@ -61,7 +62,7 @@ _HOMES = {
     "driver.async_radar": ("AsyncX4M300",),
     "driver.frames": ("Frame", "FrameGeometry"),
     "driver.link": ("RawConfig",),
-    "recordings": ("Recorder", "RecordingReader", "read_recording"),
+    "recordings": ("Recorder", "RecordingReader", "load", "read_recording"),
     "transport": ("find_ports",),
     "wire.codes": ("NoiseMapControl", "OutputFeature", "ProfileId"),
     "wire.errors": (

@@ -8,7 +8,7 @@ PACKAGES = {
     "mcap": ("lz4", "mcap", "zstandard"),
     "emulator": ("pydantic", "scipy"),
     "slam": ("joblib", "matplotlib", "numba", "PIL", "rosbags", "sklearn", "threadpoolctl"),
-    "view": ("pyarrow", "rerun", "rerun_cli"),
+    "live": ("pyarrow", "rerun", "rerun_cli"),
     "dask": ("distributed",),
     "gtsam": ("gtsam",),
 }
@@ -16,7 +16,7 @@ PACKAGES = {
 
 INCLUDED = {
     "slam": ("emulator", "mcap"),
-    "view": ("emulator", "mcap", "slam"),
+    "view": ("emulator", "live", "mcap", "slam"),
     "hil": ("emulator", "mcap"),
 }
 """Extras that an extra includes."""
@@ -33,12 +33,16 @@ def what_is_missing(error: ModuleNotFoundError, *, extra: str | None = None) -> 
     Parameters
     ----------
     extra
-        The extra that the program needs in any case. It is named instead of one that it includes,
-        so that one command is enough.
+        The extra that the program needs in any case. One that includes both is named, if there is
+        one, so that one command is enough.
     """
     package = (error.name or "").partition(".")[0]
     for found, packages in PACKAGES.items():
         if package in packages:
-            named = extra if extra and found in INCLUDED.get(extra, ()) else found
+            own = extra or found
+            wholes = (
+                one for one in (own, *INCLUDED) if {own, found} <= {one, *INCLUDED.get(one, ())}
+            )
+            named = next(wholes, found)
             return f"{package} is not installed: {install_command(named)}"
     return None

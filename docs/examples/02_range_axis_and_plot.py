@@ -1,9 +1,9 @@
 """Plot echoes over range.
 
-A module counts ranges with a speed of light of 3.0e8 m/s; multiplied by 0.9993 they are true
-metres. With `downconversion` the module sends complex baseband samples, 181 in place of 1431, whose
-magnitude is the strength of the echoes without the carrier. The mean of many frames has less noise:
-what stands still stays, and noise of changing phase cancels.
+A module counts ranges with a speed of light of 3.0e8 m/s; `true_ranges_m` has them in metres. With
+`downconversion` the module sends complex baseband samples, 181 in place of 1431, whose magnitude is
+the strength of the echoes without the carrier. The mean of many frames has less noise: what stands
+still stays, and noise of changing phase cancels.
 
 The example averages two seconds, prints the strongest echoes and saves a picture. With a module of
 your own: `python 02_range_axis_and_plot.py /dev/ttyACM0`. It prints
@@ -23,8 +23,6 @@ import numpy as np
 from emulator import emulated_port
 from xethru_protocol import X4M300, RawConfig
 
-TRUE_METRES = 299_792_458 / 3.0e8  # in one metre of the module
-
 
 def main(port: str) -> None:
     with X4M300.open(port) as radar:
@@ -32,7 +30,7 @@ def main(port: str) -> None:
         radar.start(17)
         frames = np.array([frame.samples for frame in radar.frames(34)])
 
-    ranges_m = geometry.ranges_m * TRUE_METRES
+    ranges_m = geometry.true_ranges_m
     strengths = np.abs(frames.mean(axis=0))
     threshold = 5 * np.median(strengths)
     for k in range(1, len(strengths) - 1):

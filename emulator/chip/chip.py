@@ -29,7 +29,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.chip.downconversion import CHANNELS, TAP_COUNT, downconvert
+from xethru_protocol.processing.downconversion import CHANNELS, TAP_COUNT, ChannelTaps
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import ErrorCode, X4Error, X4Setting
 from xethru_protocol.wire.messages import REGISTERS, DataFloat, X4Value
@@ -741,6 +741,35 @@ def _baseband_values(
     i_values = i_raw.astype(np.float32) * factor
     q_values = -(q_raw.astype(np.float32) * factor)
     return np.concatenate([i_values, q_values], axis=1)
+
+
+def downconvert(
+    rf_counters: NDArray[np.int64], taps: ChannelTaps, first_line: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Filter and decimate RF counters into raw I and Q lines, in exact integers.
+
+    Parameters
+    ----------
+    rf_counters
+        Shape (n_frames, 8 * (n_lines - 1) + 32), int64; sample 0 lies
+        ``taps.lead_samples`` before the RF sample of the first line.
+    first_line
+        Index of the first line in the captured frame; its parity selects the sign.
+
+    Returns
+    -------
+    Raw I and raw Q (before the sign change of protocol reference 9.7), each of shape
+    (n_frames, n_lines), int64. `xethru_protocol.processing.downconversion` says what the chip does.
+
+    Source: protocol reference 9.7 and 9.8.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(rf_counters, TAP_COUNT, axis=1)
+    windows = windows[:, :: x4.BASEBAND_DECIMATION]
+    # integer matrix products never reach BLAS: exact and the same on every machine
+    lines = windows @ np.array([taps.i_taps, taps.q_taps], dtype=np.int64).T
+    signs = np.array([taps.line_sign**parity for parity in (0, 1)], dtype=np.int64)
+    lines *= signs[(first_line + np.arange(lines.shape[1])) % 2][:, np.newaxis]
+    return lines[:, :, 0], lines[:, :, 1]
 
 
 _GETTERS: dict[X4Setting, Callable[[Chip], X4Value]] = {

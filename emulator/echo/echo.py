@@ -25,13 +25,17 @@ Place of a radar
 Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
     R is half the length of the path; c = 299 792 458 m/s; offset is the module's range error; L is
     the label of sample 0 in module metres (c_module = 3.0e8 m/s, protocol reference 9.1).
-Amplitude a of rod, point, person (``emulator.echo.reflections``)
+Amplitude a of rod, point, person, mover (``emulator.echo.reflections``)
     amplitude_1m R**-1.5 (rod) or R**-2 (point), times the beam cos(angle)**n, the root of TX power
     and the module's gain. Radar equation for amplitudes (Skolnik, Introduction to Radar Systems):
     a point spreads twice as a sphere, a long rod once as a sphere and once as a cylinder. The
     beam's n makes the two-way -3 dB full width 65 degrees; no hard edge, nothing from behind.
-    Aspect is left out, and the law is held at 5 cm from there inwards. People move
-    (``emulator.scene.motion``) and are placed anew for every frame, like the robot.
+    Aspect is left out but for people, and the law is held at 5 cm from there inwards. People
+    (``emulator.scene.people``) and movers (``emulator.scene.motion``) are placed anew for every
+    frame, like the robot.
+Chest of a person (``emulator.scene.people``)
+    R is the distance less the chest's displacement times a share; the amplitude goes with the root
+    of the cross section times another. Both shares depend on the angle at which the chest is seen.
 Cylinder
     Its surface, at R - radius, weakened by (1 / s) sqrt((1 + radius) / (s + radius)) over the
     distance s to it: geometric optics of a convex mirror.
@@ -56,10 +60,10 @@ Floor, ceiling (``emulator.echo.targets``)
     from floor to ceiling and make a right angle with it, which sends back what comes: half path
     s = sqrt(d**2 + h**2) over the distance d to the surface, amplitude_1m / (d sqrt(s)) for a rod
     (stationary phase along it, both orders of bouncing half of the first Fresnel zone each) and
-    sqrt((1 + radius) / (d + radius)) / s for a cylinder. Points and people are at the antenna's
-    height: legs of sqrt(d**2 + (2 h)**2), half path and spread as for ghosts. Beam and antenna as
-    for the leg's angle off boresight, elevation included. Walls have no such images, and no wave
-    goes by floor and ceiling on the same leg. Shadows are those of the straight leg.
+    sqrt((1 + radius) / (d + radius)) / s for a cylinder. Points, people and movers are at the
+    antenna's height: legs of sqrt(d**2 + (2 h)**2), half path and spread as for ghosts. Beam and
+    antenna as for the leg's angle off boresight, elevation included. Walls have no such images, and
+    no wave goes by floor and ceiling on the same leg. Shadows are those of the straight leg.
 Wander (``emulator.echo.model_error``)
     Of a target seen under the bearing beta, from target to radar: range + a (0.7 cos(2 beta +
     phi_1) + 0.5 cos(5 beta + phi_2)) - rho; amplitude times max(0.1, 1 + c cos(3 beta + phi_3) +
@@ -89,9 +93,9 @@ Ghosts (``emulator.echo.walls``)
 Shadow and transmission (``emulator.echo.walls``)
     Each leg is multiplied, per face it crosses, by |t + (1 - t) (E_a + E_b)|: what passes through
     and what bends round both ends (single knife edge, ITU-R P.526). The bent way's own delay is
-    left out; people, rods and cylinders cast no shadow. Ends count as free edges also where two
-    walls meet, so an opaque joint lets some -12 dB past it; and where a leg's end crosses the line
-    of a wall beyond its end, what bends round that end appears at once, by up to -6 dB.
+    left out; people, movers, rods and cylinders cast no shadow. Ends count as free edges also
+    where two walls meet, so an opaque joint lets some -12 dB past it; and where a leg's end crosses
+    the line of a wall beyond its end, what bends round that end appears at once, by up to -6 dB.
 Phase
     Each reflector's is fixed by its name (SHA-256), for every radar, aspect and seed.
 Phase jitter j
@@ -140,6 +144,7 @@ from numpy.typing import NDArray
 from emulator.chip.chip import CaptureSettings, EchoSource
 from emulator.echo.model_error import Bursts, Stamps, TargetPairs, Wander
 from emulator.echo.other_modules import OtherModules
+from emulator.echo.people import mover_scatterer, person_scatterer
 from emulator.echo.receiver import CarrierJitter, Receiver, one_count
 from emulator.echo.reflections import (
     SPEED_OF_LIGHT_MPS,
@@ -147,7 +152,6 @@ from emulator.echo.reflections import (
     Reflections,
     Viewpoint,
     direct_reflections,
-    person_scatterer,
     reflection_phase_rad,
     sum_of_pulses,
     viewpoint,
@@ -177,6 +181,7 @@ class ScenePaths:
     def __init__(self, scene: Scene, radar: RadarSpec, seed: int) -> None:
         self._scene = scene
         self._radar = radar
+        self._seed = seed
         self._trajectory = scene.trajectory()
         self._targets = Targets(scene.targets, seed)
         self._wander = Wander(scene.targets, seed)
@@ -200,7 +205,8 @@ class ScenePaths:
         heights = self._scene.heights
         scatterers = [
             *self._targets.scatterers(t_ns),
-            *(person_scatterer(person, t_ns) for person in self._scene.people),
+            *(person_scatterer(each, t_ns, view, self._seed) for each in self._scene.people),
+            *(mover_scatterer(each, t_ns) for each in self._scene.movers),
         ]
         direct = [direct_reflections(each, view) for each in scatterers]
         if self._wander:

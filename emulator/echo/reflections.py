@@ -23,13 +23,6 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scene.motion import (
-    AMPLITUDE_OF_1_M2,
-    PersonSpec,
-    chest_displacement_m,
-    positions_m,
-    present,
-)
 from emulator.scene.scene import AntennaSpec, PulseSpec, RadarSpec, TargetSpec
 from xethru_protocol.wire.x4 import CARRIER_HZ, SAMPLING_RATE_HZ
 
@@ -244,7 +237,7 @@ class Reflections:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scatterers:
-    """Reflectors that send an echo everywhere: points, rods, cylinders, people.
+    """Reflectors that send an echo everywhere: points, rods, cylinders, people, movers.
 
     Arrays have the shape (k,), or (n_frames, k) for what moves; x and y are those of their axes,
     world frame.
@@ -371,21 +364,6 @@ def target_scatterers(targets: tuple[TargetSpec, ...]) -> Scatterers:
         radius_m=radius_m,
         swell_m=radius_m,
         phase_rad=np.array([reflection_phase_rad(target.name) for target in targets]),
-    )
-
-
-def person_scatterer(person: PersonSpec, t_ns: NDArray[np.int64]) -> Scatterers:
-    """Return a person at scene times of shape (n_frames,), int64: k = 1."""
-    position = positions_m(person, t_ns)
-    strength = AMPLITUDE_OF_1_M2 * math.sqrt(person.rcs_m2)
-    return Scatterers(
-        x_m=position[:, :1],
-        y_m=position[:, 1:],
-        strength=np.where(present(person, t_ns), strength, 0.0)[:, np.newaxis],
-        exponent=np.array([RANGE_EXPONENT["point"]]),
-        radius_m=np.array([0.0]),
-        swell_m=chest_displacement_m(person, t_ns)[:, np.newaxis],
-        phase_rad=np.array([reflection_phase_rad(person.name)]),
     )
 
 

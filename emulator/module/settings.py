@@ -52,6 +52,8 @@ MODELS = {
         output=OutputFeature.RESP_STATUS,
     ),
 }
+STOCK_MODEL = "x4m300"
+"""Where neither the scene nor the user names one."""
 X4M300_PROFILES = frozenset({MODELS["x4m300"].profile})
 DEFAULT_BAUDRATE = 115_200
 """After every power-up; a rate is never saved."""

@@ -14,10 +14,16 @@
 | seek | seconds, radar | time of the recording |
 | loop | value, radar | true or false |
 | filter | kinds, radar | which kinds of messages are played; null: all |
+| people | seconds, radar | what is true of the people of a scene, at a scene time or now |
 
 ``stream`` in the state is the newest stream of radar frames: its number from 0 (INIT, a reset and
 a power cut end a stream) and the scene time of its frame with counter 1, without the radar's start
 skew; null before the first, and where the module is real or a recording.
+
+``people`` answers ``t_s``, the scene time, and for each person `emulator.echo.people.PersonTruth`
+with null for NaN: ``breaths_per_min`` now, ``mean_breaths_per_min`` of the last minute,
+``distance_m`` and ``towards_m`` by radar. Now is the wall clock's, which at ``--pace asap`` is not
+the time of the frames.
 
 Without ``radar`` all are meant. The answer is ``{"ok":true,...}``, or
 ``{"ok":false,"error":"..."}`` with the remedy.
@@ -26,17 +32,23 @@ Without ``radar`` all are meant. The answer is ``{"ok":true,...}``, or
 from __future__ import annotations
 
 import json
+import math
 import selectors
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emulator.device import Device
+from emulator.echo.people import PersonTruth
 from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlanError, parse_fault
 from emulator.playback import PlayStream, kinds
 from emulator.ports.sockets import SocketClient, SocketService
+from emulator.scene.people import SleepStage
 
 NS_PER_S = 1_000_000_000
 MOST_CLIENTS = 16
@@ -46,7 +58,12 @@ MOST_UNREAD = 1 << 20
 """Bytes of answers that wait for a client; then it is hung up on."""
 _READ = 65_536
 _LONGEST_S = 86_400.0 * 365
+_LATEST_TRUTH_S = 86_400.0 * 7
 _KEYS = ("verb", "radar", "fault", "id", "seconds", "value", "kinds")
+
+
+People = Callable[[NDArray[np.int64]], Sequence[PersonTruth]]
+"""Returns the truth about the people of a scene at scene times, shape (n,), ns."""
 
 
 class _RefusedError(Exception):
@@ -60,9 +77,13 @@ class Control:
         self,
         devices: Mapping[str, FaultyDevice],
         players: Mapping[str, PlayStream] | None = None,
+        people: People | None = None,
+        zero_ns: int = 0,
     ) -> None:
         self._devices = devices
         self._players = {} if players is None else players
+        self._people = people
+        self._zero_ns = zero_ns
 
     def answer(self, line: bytes, now_ns: int) -> bytes:
         """Return the answer to a line, with its line end; never raises."""
@@ -116,6 +137,17 @@ class Control:
                 "stream": _stream(device),
             }
         return {"t_ns": now_ns, "radars": radars}
+
+    def _truth(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        if self._people is None:
+            raise _RefusedError("there is no scene here; this verb is for `xethru-emulator serve`")
+        t_ns = now_ns - self._zero_ns
+        if asked.get("seconds") is not None:
+            t_ns = round(_number(asked, "seconds", _LATEST_TRUTH_S) * NS_PER_S)
+        people = self._people(np.array([t_ns], dtype=np.int64))
+        wanted = [device.name for device in self._named(asked)]
+        columns = [(number, name) for number, name in enumerate(self._devices) if name in wanted]
+        return {"t_s": t_ns / NS_PER_S, "people": [_person(one, columns) for one in people]}
 
     def _fault_add(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
         spec = parse_fault(asked.get("fault"))
@@ -201,12 +233,35 @@ VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any] | No
     "seek": Control._seek,
     "loop": Control._loop,
     "filter": Control._filter,
+    "people": Control._truth,
 }
 
 
 def _stream(device: FaultyDevice) -> dict[str, int] | None:
     begin = device.inner.stream_begin if isinstance(device.inner, Device) else None
     return None if begin is None else asdict(begin)
+
+
+def _person(truth: PersonTruth, radars: Sequence[tuple[int, str]]) -> dict[str, Any]:
+    """Return the first row of a truth as JSON; ``radars`` are columns and their names."""
+    row = {
+        key: None if math.isnan(value) else value
+        for key, value in (
+            ("breaths_per_min", float(truth.breaths_per_min[0])),
+            ("mean_breaths_per_min", float(truth.mean_breaths_per_min[0])),
+            ("chest_m", float(truth.chest_m[0])),
+        )
+    }
+    return {
+        "name": truth.name,
+        "present": bool(truth.present[0]),
+        "moves": bool(truth.moves[0]),
+        "position_m": truth.position_m[0].tolist(),
+        **row,
+        "sleep_stage": SleepStage(int(truth.sleep_stage[0])).name.lower(),
+        "distance_m": {name: float(truth.distance_m[0, column]) for column, name in radars},
+        "towards_m": {name: float(truth.towards_m[0, column]) for column, name in radars},
+    }
 
 
 def _faults(device: FaultyDevice) -> list[dict[str, Any]]:

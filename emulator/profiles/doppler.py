@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip.chip import Chip, EchoSource
-from emulator.chip.downconversion import CHANNELS
 from emulator.scene.scene import NoiseSpec
+from xethru_protocol.processing.downconversion import CHANNELS
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import MatrixInstance, X4Setting
 from xethru_protocol.wire.messages import X4Value

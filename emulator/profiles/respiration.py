@@ -10,10 +10,15 @@ Chest
 Rate
     The highest peak between 6 and 40 breaths a minute of the displacement's spectrum (Hann window,
     zero-padded); the window resolves 3 a minute. It is clear if the peak holds at least half of
-    the power above 3 a minute, and only then a rate is reported.
+    the power above 3 a minute and is no slope at the edge of the band, as a shift of the body
+    leaves one; only then a rate is reported.
 State
     Initialising until the matrices are full and the noise map is there; no movement without a
     detection; movement tracking while the person walks; breathing with a clear rate; else movement.
+
+The status, sleep and vital sign messages are of the same tick. Heart rate, its distance and its
+confidence are 0: no heartbeat is looked for. SLEEPSTAGE is not sent, because no output control
+switches it on (4.7).
 
 The reference gives the fields of messages only (7.4); everything here is ours. It is a test signal
 with a known answer and says nothing about what a real module measures.
@@ -57,12 +62,15 @@ class Respiration:
     rate_hz, chest_mm
         Breaths per second, and displacement of the chest towards the radar from its mean over
         20 s [mm]; 0 unless the state is BREATHING.
+    confidence
+        The peak's share of the power, 0 ... 1, likewise.
     """
 
     state: RespirationState
     person: Detection | None = None
     rate_hz: float = 0.0
     chest_mm: float = 0.0
+    confidence: float = 0.0
 
 
 def respiration(
@@ -79,14 +87,16 @@ def respiration(
     index = int(np.argmin(np.abs(sweep.range_m - person.distance_m)))
     pulses = processing.pulses(SLOW.instance)[:, index]
     chest_m = displacement_m(pulses, SPEED_OF_LIGHT_MPS / sweep.carrier_hz)
-    rate_hz = breathing_rate_hz(chest_m, SLOW.rate_hz)
-    if rate_hz is None:
+    found = breathing_rate_hz(chest_m, SLOW.rate_hz)
+    if found is None:
         return Respiration(state=RespirationState.MOVEMENT, person=person)
+    rate_hz, share = found
     return Respiration(
         state=RespirationState.BREATHING,
         person=person,
         rate_hz=rate_hz,
         chest_mm=1e3 * float(chest_m[-1]),
+        confidence=share,
     )
 
 
@@ -104,18 +114,25 @@ def displacement_m(pulses: NDArray[np.complex128], wavelength_m: float) -> NDArr
     return np.asarray((phase - phase.mean()) * wavelength_m / (4 * math.pi), dtype=np.float64)
 
 
-def breathing_rate_hz(chest_m: NDArray[np.float64], sampling_hz: float) -> float | None:
-    """Return the rate of a periodic displacement, shape (n,); None if it is not clear."""
+def breathing_rate_hz(
+    chest_m: NDArray[np.float64], sampling_hz: float
+) -> tuple[float, float] | None:
+    """Return the rate of a periodic displacement, shape (n,), and its share of the power.
+
+    None if it is not clear.
+    """
     window = 0.5 - 0.5 * np.cos(math.tau * np.arange(len(chest_m)) / len(chest_m))
     power = np.abs(np.fft.rfft((chest_m - chest_m.mean()) * window, _SPECTRUM)) ** 2
     frequency_hz = np.fft.rfftfreq(_SPECTRUM, 1 / sampling_hz)
     breaths = np.flatnonzero((frequency_hz >= SLOWEST_HZ) & (frequency_hz <= FASTEST_HZ))
     peak = int(breaths[np.argmax(power[breaths])])
+    if power[peak - 1 : peak + 2].max() > power[peak]:  # the slope of what lies outside the band
+        return None
     lobe_hz = 2 * sampling_hz / len(chest_m)  # half the width of the window's main lobe
     near = np.abs(frequency_hz - frequency_hz[peak]) <= lobe_hz
     total = float(power[(frequency_hz >= _LEAST_HZ) | near].sum())
-    clear = total > 0 and float(power[near].sum()) >= _CLEAR * total
-    return float(frequency_hz[peak]) if clear else None
+    share = float(power[near].sum()) / total if total > 0 else 0.0
+    return (float(frequency_hz[peak]), share) if share >= _CLEAR else None
 
 
 # --- messages
@@ -130,6 +147,49 @@ def status(counter: int, now: Respiration, sensitivity: int) -> m.RespStatus:
         distance_m=0.0 if person is None else person.distance_m,
         movement_mm=now.chest_mm,
         signal_quality=0 if person is None else signal_quality(person, sensitivity),
+    )
+
+
+def sleep_status(
+    counter: int, now: Respiration, presence: Presence, sensitivity: int
+) -> m.SleepStatus:
+    """Return the status with the zone's average movement, 0...100 (`presence.movement_list`)."""
+    person = now.person
+    return m.SleepStatus(
+        counter=counter,
+        state=now.state,
+        rpm=60 * now.rate_hz,
+        distance_m=0.0 if person is None else person.distance_m,
+        signal_quality=0 if person is None else signal_quality(person, sensitivity),
+        movement_slow=presence.movement_slow[0],
+        movement_fast=presence.movement_fast[0],
+    )
+
+
+def vital_signs(
+    counter: int, now: Respiration, processing: PresenceProcessing, sweep: ProfileSweep
+) -> m.VitalSigns:
+    """Return rate, distance and confidence 0...1 (assumed), and the zone's average movement.
+
+    Movement is normalised as in `normalized_movement_list`; start and end are those of the zone.
+    """
+    slow, fast = (
+        _normalized(processing.excess.get(matrix.instance), sweep) for matrix in (SLOW, FAST)
+    )
+    zone_m = sweep.range_m[sweep.in_zone]
+    return m.VitalSigns(
+        counter=counter,
+        state=now.state,
+        respiration_rate=60 * now.rate_hz,
+        respiration_distance_m=0.0 if now.person is None else now.person.distance_m,
+        respiration_confidence=now.confidence,
+        heart_rate=0.0,
+        heart_distance_m=0.0,
+        heart_confidence=0.0,
+        normalized_movement_slow=float(np.mean(slow)),
+        normalized_movement_fast=float(np.mean(fast)),
+        normalized_movement_start_m=float(zone_m[0]),
+        normalized_movement_end_m=float(zone_m[-1]),
     )
 
 

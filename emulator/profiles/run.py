@@ -81,6 +81,8 @@ _BASEBAND = (OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE)
 _PRESENCE = (OutputFeature.PRESENCE_SINGLE, OutputFeature.PRESENCE_MOVINGLIST)
 _RESPIRATION = (
     OutputFeature.RESP_STATUS,
+    OutputFeature.SLEEP_STATUS,
+    OutputFeature.VITAL_SIGNS,
     OutputFeature.RESPIRATION_MOVINGLIST,
     OutputFeature.RESPIRATION_DETECTIONLIST,
     OutputFeature.RESPIRATION_NORMALIZEDMOVEMENTLIST,
@@ -326,7 +328,17 @@ class ProfileRun:
                 return respiration.detection_list(counter, presence)
             case OutputFeature.RESPIRATION_NORMALIZEDMOVEMENTLIST:
                 return respiration.normalized_movement_list(counter, self.processing, self._sweep)
+        return self._breathing(feature, counter, presence, sensitivity)
+
+    def _breathing(
+        self, feature: OutputFeature, counter: int, presence: Presence, sensitivity: int
+    ) -> Response:
         now = respiration.respiration(presence, self.processing, self._sweep)
+        match feature:
+            case OutputFeature.SLEEP_STATUS:
+                return respiration.sleep_status(counter, now, presence, sensitivity)
+            case OutputFeature.VITAL_SIGNS:
+                return respiration.vital_signs(counter, now, self.processing, self._sweep)
         return respiration.status(counter, now, sensitivity)
 
     def _powers(self, feature: int) -> Powers:

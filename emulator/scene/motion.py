@@ -1,13 +1,8 @@
-"""Where the robot and people are at any time.
+"""Where the robot is at any time, and things that swing; people are in `emulator.scene.people`.
 
 The world frame is the robot's start pose: it stands at the origin with heading zero (along x)
 until scene time 0, drives, and stands still again at the end. Between knots position and heading
 are linear in time, so a pose at any nanosecond is exact and needs no integration.
-
-A person is a point reflector that moves: its echo falls with R**-2, and its range is the distance
-to a point on its path less the chest's displacement ``breath_amplitude_m sin(2 pi f t)``, so the
-carrier's phase follows every movement continuously. Limbs, the sway of walking, heartbeat,
-shadowing and the body's extent are left out.
 """
 
 from __future__ import annotations
@@ -15,11 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from emulator.scene.tables import Number, Table, matching
 
@@ -35,7 +30,7 @@ Name = Annotated[
     Field(max_length=40),
     matching("[a-z][a-z0-9_]*", "of small letters, digits and _, a letter first"),
 ]
-_Seconds = Annotated[Number, Field(ge=0, le=86_400)]
+Degrees = Annotated[Number, Field(ge=-360, le=360)]
 
 # A turn smaller than this is straight on; a U-turn within it of -180 deg is taken as +180 deg.
 _ANGLE_TOLERANCE_RAD = 1e-9
@@ -153,60 +148,37 @@ def carried(path: Trajectory, *, at_ns: int, skips_ns: int, takes_ns: int) -> Tr
     )
 
 
-class PersonSpec(Table):
-    """One person, in the world frame.
+class MoverSpec(Table):
+    """A thing that swings to and fro, such as a fan or a curtain, in the world frame.
 
-    It is in the scene from ``enters_s`` to ``leaves_s`` (for ever if that is left out), and walks
-    from the moment it enters. ``walk`` selects what happens at the last waypoint: ``once`` stays
-    there, ``to_and_fro`` turns back, ``round`` goes on to the first one. One waypoint: it stands.
-    ``rcs_m2`` is its radar cross section; breathing is ``breaths_per_min`` and the amplitude of
-    the chest (half of its travel). The reflection phase is fixed by the name.
+    Its echo is that of a point which lies ``swing_m sin(2 pi rate_hz t)`` from ``x_m``, ``y_m`` in
+    the direction ``direction_deg``, counter-clockwise from x. Its amplitude is ``amplitude_1m (1 +
+    fading cos(2 pi rate_hz t))``: a blade shows its face once a passage. The reflection phase is
+    fixed by the name.
     """
 
     name: Name
-    waypoints_m: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=1000)]
-    speed_mps: Annotated[Number, Field(ge=1e-3, le=10)] = 1.0
-    walk: Literal["once", "to_and_fro", "round"] = "once"
-    enters_s: _Seconds = 0.0
-    leaves_s: _Seconds | None = None
-    rcs_m2: Annotated[Number, Field(gt=0, le=100)] = 1.0
-    breaths_per_min: Annotated[Number, Field(ge=0, le=60)] = 15.0
-    breath_amplitude_m: Annotated[Number, Field(ge=0, le=0.05)] = 0.004
-
-    @model_validator(mode="after")
-    def _leaves_after_it_enters(self) -> PersonSpec:
-        if self.leaves_s is not None and self.leaves_s <= self.enters_s:
-            raise ValueError("leaves_s: must be later than enters_s")
-        return self
+    x_m: Metres
+    y_m: Metres
+    rate_hz: Annotated[Number, Field(gt=0, le=1000)]
+    swing_m: Annotated[Number, Field(ge=0, le=1)]
+    direction_deg: Degrees = 0.0
+    amplitude_1m: Annotated[Number, Field(gt=0, le=10)] = 0.015
+    fading: Annotated[Number, Field(ge=0, le=1)] = 0.0
 
 
-def positions_m(person: PersonSpec, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return where a person is, shape (n, 2) [m], world frame, at scene times of shape (n,)."""
-    stops = list(person.waypoints_m)
-    if person.walk == "round":
-        stops.append(stops[0])
-    elif person.walk == "to_and_fro":
-        stops.extend(reversed(stops[:-1]))
-    path = np.array(stops, dtype=np.float64)
-    steps = np.diff(path, axis=0)
-    ends_m = np.concatenate([[0.0], np.cumsum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2))])
-    length_m = float(ends_m[-1])
-    walked_m = np.maximum(t_ns / 1e9 - person.enters_s, 0.0) * person.speed_mps
-    if person.walk != "once" and length_m > 0:
-        walked_m = np.fmod(walked_m, length_m)
-    at_x = np.interp(walked_m, ends_m, path[:, 0])
-    at_y = np.interp(walked_m, ends_m, path[:, 1])
-    return np.stack([at_x, at_y], axis=1)
-
-
-def present(person: PersonSpec, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return whether a person is in the scene, shape (n,)."""
-    t_s = t_ns / 1e9
-    there: NDArray[np.bool_] = t_s >= person.enters_s
-    return there if person.leaves_s is None else there & (t_s < person.leaves_s)
-
-
-def chest_displacement_m(person: PersonSpec, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return how far the chest is out towards the radar, shape (n,) [m]."""
-    turns = np.fmod(t_ns / 1e9 * (person.breaths_per_min / 60), 1.0)
-    return np.asarray(person.breath_amplitude_m * np.sin(math.tau * turns), dtype=np.float64)
+def swings(
+    mover: MoverSpec, t_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where a mover is, shape (n, 2) [m], world frame, and the factor on its amplitude."""
+    turned_rad = math.tau * np.fmod(t_ns / 1e9 * mover.rate_hz, 1.0)
+    direction_rad = math.radians(mover.direction_deg)
+    out_m = mover.swing_m * np.sin(turned_rad)
+    places_m = np.stack(
+        [
+            mover.x_m + out_m * math.cos(direction_rad),
+            mover.y_m + out_m * math.sin(direction_rad),
+        ],
+        axis=1,
+    )
+    return places_m, 1 + mover.fading * np.cos(turned_rad)

@@ -58,14 +58,15 @@ class Purpose(IntEnum):
     STAMPS = 4
     BURSTS = 5
     SCINTILLATION = 6
+    PERSON = 7
     WANDER = 4096  # not 7: published results hold these streams
 
 
 def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:
     """Return the number of a stream; ``part``, 0 ... 255, numbers those of one purpose.
 
-    ``serial`` is a module's serial number, or a target's place in its scene, from 0: what belongs
-    to a target is the same for all radars.
+    ``serial`` is a module's serial number, a target's place in its scene, from 0, or a number below
+    2**40 made of a person's name: what belongs to a target or a person is the same for all radars.
 
     >>> stream_of(202305070101, Purpose.RECEIVER_NOISE)
     202305070101

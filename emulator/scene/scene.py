@@ -20,13 +20,15 @@ from pydantic import Field, StrictBool, StrictInt, field_validator, model_valida
 from emulator.chip.chip import ModuleClock
 from emulator.scene.motion import (
     AMPLITUDE_OF_1_M2,
+    Degrees,
     Metres,
+    MoverSpec,
     Name,
-    PersonSpec,
     Trajectory,
     carried,
     drive,
 )
+from emulator.scene.people import PersonSpec
 from emulator.scene.rooms import FAMILIES, MOST_ROOMS, room_of, room_tables
 from emulator.scene.tables import Number, SerialNumber, Table, is_name, load_table
 from xethru_protocol.validation import shown
@@ -38,7 +40,6 @@ LONGEST_DRIVE_S = 24 * 3600
 MOST_ODOMETRY_LINES = 500_000
 """A day at the default rate; all lines are computed before the ports open."""
 
-Degrees = Annotated[Number, Field(ge=-360, le=360)]
 Sigma = Annotated[Number, Field(ge=0, le=1)]
 Seconds = Annotated[Number, Field(gt=0, le=86_400)]
 CorrelationTime = Annotated[Number, Field(ge=1e-3, le=86_400)]
@@ -93,7 +94,7 @@ class AntennaSpec(Table):
 
 
 class RadarSpec(Table):
-    """One X4M300 on the robot.
+    """One module on the robot: an X4M300, or the ``model`` that is named.
 
     ``x_m``, ``y_m`` and ``yaw_deg`` place the antennas' phase centre and boresight in the body
     frame (x forward, y left, yaw counter-clockwise). ``range_offset_m`` is added to every true
@@ -109,6 +110,7 @@ class RadarSpec(Table):
 
     name: Name
     serial: SerialNumber
+    model: Literal["x4m300", "x4m200"] | None = None
     x_m: Metres
     y_m: Metres
     yaw_deg: Degrees
@@ -435,6 +437,7 @@ class Scene(Table):
     radars: Annotated[tuple[RadarSpec, ...], Field(min_length=1, max_length=64)]
     targets: tuple[TargetSpec, ...] = ()
     people: Annotated[tuple[PersonSpec, ...], Field(max_length=32)] = ()
+    movers: Annotated[tuple[MoverSpec, ...], Field(max_length=32)] = ()
     walls: Annotated[tuple[WallSpec, ...], Field(max_length=64)] = ()
     objects: Annotated[tuple[ObjectSpec, ...], Field(max_length=64)] = ()
     other_modules: Annotated[tuple[OtherModuleSpec, ...], Field(max_length=32)] = ()
@@ -454,6 +457,7 @@ class Scene(Table):
             ("radars.serial", [radar.serial for radar in self.radars]),
             ("targets.name", [target.name for target in self.targets]),
             ("people.name", [person.name for person in self.people]),
+            ("movers.name", [mover.name for mover in self.movers]),
             ("walls.name", [wall.name for wall in self.walls]),
             ("objects.name", [box.name for box in self.objects]),
             ("other_modules.name", [module.name for module in self.other_modules]),

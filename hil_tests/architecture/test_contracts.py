@@ -29,6 +29,7 @@ PLANTED = {
     "no-circles": ("xethru_protocol/wire/__init__.py", "import xethru_protocol.driver"),
     "protocol-light": ("xethru_protocol/cli/__init__.py", "import scipy"),
     "sans-io": ("emulator/chip/__init__.py", "import time"),
+    "processing": ("xethru_protocol/processing/__init__.py", "import xethru_protocol.wire.x4"),
     "driver-transport": ("xethru_protocol/driver/__init__.py", "import socket"),
     "pyserial-once": ("emulator/ports/__init__.py", "import serial"),
     "emulator-light": ("emulator/echo/__init__.py", "import sklearn"),

@@ -231,15 +231,16 @@ class InProcessTarget(RadarTarget):
         from emulator.device import radar_device
         from emulator.echo.echo import echo_source
         from emulator.module.memory import Identity
-        from emulator.module.settings import DeviceOptions
+        from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
         from hil_tests.faulty import FaultyLine
 
         radar = self._scene.radars[self._index]
+        model = radar.model or STOCK_MODEL
         device = radar_device(
-            Identity(serial=radar.serial),
+            Identity(serial=radar.serial, order_code=MODELS[model].order_code),
             echo_source(self._scene, self._index, self.spec.seed),
             Pace.REALTIME,
-            options=DeviceOptions(firmware=self.spec.firmware),
+            options=DeviceOptions.of_model(model, firmware=self.spec.firmware),
         )
         self._line = FaultyLine(device)
         self.clock_ns = self._line.clock_ns

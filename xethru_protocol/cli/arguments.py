@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 _LONGEST_S = 1e9  # 30 years
+_FRAME_AREA_M = (0.2, 9.4)
 
 
 def not_empty(text: str) -> str:
@@ -54,6 +55,8 @@ seconds = _number(float, lambda value: 0 < value <= _LONGEST_S, "seconds, more t
 metres = _number(float, lambda value: -1000 <= value <= 1000, "metres between -1000 and 1000")
 sensitivity = _number(int, lambda value: 0 <= value <= 9, "a whole number from 0 to 9")
 at_least_one = _number(int, lambda value: value >= 1, "a whole number from 1 on")
+playback_rate = _number(float, lambda value: 0 <= value < math.inf, "a number from 0 on")
+window = _number(float, lambda value: 20 <= value <= 600, "seconds, from 20 to 600")
 # rates that a module could be set to (Protocol reference 4.10)
 baud_rate = _number(
     int, lambda value: 600 <= value <= 10_000_000, "a whole number from 600 to 10000000"
@@ -86,6 +89,43 @@ def split_limit(text: str) -> tuple[str, float]:
     return "bytes", math.ceil(float(number) * _UNITS[unit])
 
 
+def memory_limit(text: str) -> str:
+    if not re.fullmatch(r"[1-9]\d*(MB|GB)", text):
+        raise ArgumentTypeError(f"{shown(text)} must be like 500MB or 2GB")
+    return text
+
+
+_NAMED = re.compile(r"([A-Za-z]\w*)=(.+)")
+
+
+def named_port(text: str) -> tuple[str, str]:
+    """Return name and port of a module; the name is that of the port where none is given.
+
+    >>> named_port("left=/dev/ttyACM0"), named_port("/dev/ttyACM0"), named_port("tcp://pi:5000")
+    (('left', '/dev/ttyACM0'), ('ttyACM0', '/dev/ttyACM0'), ('pi_5000', 'tcp://pi:5000'))
+    """
+    if found := _NAMED.fullmatch(not_empty(text)):
+        return found[1], found[2]
+    return re.sub(r"\W", "_", text.rstrip("/").rpartition("/")[2]) or "module", text
+
+
+def text_source(text: str) -> tuple[str, str, int]:
+    """Return name, source and baud rate of a column of text.
+
+    >>> text_source("belt=-"), text_source("ecg=/dev/ttyUSB1@9600")
+    (('belt', '-', 115200), ('ecg', '/dev/ttyUSB1', 9600))
+    """
+    found = _NAMED.fullmatch(text)
+    if found is None:
+        raise ArgumentTypeError(
+            f"{shown(text)} must be NAME=- for standard input, or NAME=PORT, NAME=PORT@BAUDRATE"
+        )
+    source, at, rate = found[2].rpartition("@")
+    if at and rate.isdecimal():
+        return found[1], source, int(baud_rate(rate))
+    return found[1], found[2], 115200
+
+
 def base_name(text: str) -> tuple[str, str]:
     kind, equals, name = text.partition("=")
     if not (kind and equals and re.fullmatch(r"[\w.+-]+", name)):
@@ -111,13 +151,15 @@ def _add_command(
     return parser
 
 
-def _add_port(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--port",
-        type=not_empty,
-        required=True,
-        help="serial port, for example /dev/ttyACM0, or tcp://HOST:PORT, rfc2217://HOST:PORT",
-    )
+_PORT_HELP = "serial port, for example /dev/ttyACM0, or tcp://HOST:PORT, rfc2217://HOST:PORT"
+
+
+def _add_port(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
+    parser.add_argument("--port", type=not_empty, required=required, help=_PORT_HELP)
+    _add_baudrate(parser)
+
+
+def _add_baudrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--baudrate",
         type=baud_rate,
@@ -134,7 +176,6 @@ def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
         "--frame-area",
         nargs=2,
         type=metres,
-        default=(0.2, 9.4),
         metavar=("START", "END"),
         help="range to read, in module metres (default 0.2 9.4)",
     )
@@ -150,7 +191,7 @@ def raw_config(arguments: argparse.Namespace) -> "RawConfig":
     """Return the settings of raw radar frames; ends the program on wrong usage."""
     from xethru_protocol.driver.link import RawConfig
 
-    start_m, end_m = arguments.frame_area
+    start_m, end_m = arguments.frame_area or _FRAME_AREA_M
     if start_m >= end_m:
         arguments.refuse("argument --frame-area: START must be smaller than END")
     return RawConfig(frame_area_m=(start_m, end_m), downconversion=arguments.baseband)
@@ -212,6 +253,16 @@ def _add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
+def _add_frames(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--frames",
+        choices=("auto", "rf", "baseband"),
+        default="auto",
+        help="what radar frames hold, which most recordings do not say (default: from the "
+        "module's answers if they are there, else by how smooth the values are over range)",
+    )
+
+
 def _add_radar(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--radar",
@@ -219,6 +270,86 @@ def _add_radar(one: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="which radar of a session that holds several",
     )
+
+
+def _add_live_source(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "recording",
+        type=not_empty,
+        nargs="?",
+        metavar="RECORDING",
+        help="any recording with radar frames, else a module at --port; --frame-area, --fps and "
+        "--baseband add what a recording does not say",
+    )
+    _add_port(one, required=False)
+    one.add_argument(
+        "--rate",
+        type=playback_rate,
+        default=1.0,
+        metavar="R",
+        help="play a recording at this multiple of real time; 0: as fast as it goes (default 1)",
+    )
+    _add_radar(one)
+    _add_raw_settings(one)
+    one.add_argument("--count", type=at_least_one, help="stop after COUNT frames")
+    one.add_argument(
+        "--window",
+        type=window,
+        default=60.0,
+        metavar="S",
+        help="seconds of frames in which a breathing rate is found, 20 to 600 (default 60)",
+    )
+
+
+_NO_MEDICAL_DEVICE = "Breathing is an estimate for experiments: this is no medical device."
+
+
+def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    one = _add_command(
+        commands,
+        "view",
+        "show what a radar sees, live or of a recording",
+        "live.view:view",
+        "Waterfall, newest frame, range-Doppler and breathing in a window of Rerun (the extra "
+        "live), in a browser or as text. Ends when the viewer is closed or by Ctrl-C; the module "
+        f"is stopped. {_NO_MEDICAL_DEVICE}",
+    )
+    _add_live_source(one)
+    where = one.add_mutually_exclusive_group()
+    where.add_argument(
+        "--web", action="store_true", help="serve a page for a browser of this machine"
+    )
+    where.add_argument(
+        "--terminal",
+        action="store_true",
+        help="draw with text, in place on a terminal, else a picture every 10 s; needs no extra. "
+        "NO_COLOR=1 leaves colours out",
+    )
+    one.add_argument(
+        "--clutter",
+        choices=("none", "mean", "exponential", "svd"),
+        default="mean",
+        help="how what stands still is removed: not at all, by a running mean of 64 frames "
+        "(default), by a high-pass with a time constant of 50 frames, or by singular values",
+    )
+    one.add_argument(
+        "--memory",
+        type=memory_limit,
+        default="1GB",
+        metavar="SIZE",
+        help="most memory of the viewer, such as 500MB (default 1GB)",
+    )
+    one = _add_command(
+        commands,
+        "vital",
+        "show breathing and presence, live or of a recording",
+        "live.vital:vital",
+        "One line a second: breaths per minute, where, and how much of the movement is breathing "
+        "(confidence, 0 to 1), or why there is no answer; on a terminal one line that is "
+        f"rewritten. {_NO_MEDICAL_DEVICE}",
+    )
+    _add_live_source(one)
+    _add_json(one)
 
 
 def _add_flash(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -256,6 +387,23 @@ def _add_export(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     one.add_argument("--force", action="store_true", help="replace FILE if it exists")
 
 
+def _add_legacy(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    one = _add_command(
+        commands,
+        "legacy",
+        "run a Python script that was written for ModuleConnector",
+        "legacy:legacy",
+        "As 'python SCRIPT ARGS', but 'import pymoduleconnector' finds this project's driver. The "
+        "module is left as the script leaves it. Exit code: the script's, 1 after an error, 130 "
+        "after Ctrl-C.",
+    )
+    one.add_argument("script", type=not_empty, metavar="SCRIPT", help="file of the script")
+    rest = one.add_argument(
+        "arguments", nargs=argparse.REMAINDER, metavar="ARGS", help="arguments of the script"
+    )
+    rest.required = False  # there may be none; only Python from 3.12 on knows
+
+
 def _add_simple(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     for name, about, run in (
         ("ping", "check whether a module answers", "module:ping"),
@@ -265,6 +413,90 @@ def _add_simple(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         one = _add_command(commands, name, about, run)
         _add_port(one)
         _add_json(one)
+
+
+def _add_record(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    one = _add_command(
+        commands,
+        "record",
+        "write what a module sends to files",
+        "record:record",
+        "Ends at --count or --duration, by Ctrl-C, or when the module is unplugged or the disk "
+        "is full; what came until then is kept and complete. Progress goes to stderr, a summary "
+        "to stdout.",
+    )
+    one.add_argument(
+        "--port",
+        type=named_port,
+        action="append",
+        dest="ports",
+        required=True,
+        metavar="[NAME=]PORT",
+        help=f"{_PORT_HELP}; with --out FILE.mcap up to 8 times, with names for the file (default: "
+        "the port's)",
+    )
+    _add_baudrate(one)
+    one.add_argument(
+        "--out",
+        type=not_empty,
+        metavar="DIR|FILE.mcap",
+        help="directory for a recording in the vendor's format (ModuleConnector), or one MCAP file "
+        "for all modules and other sensors",
+    )
+    one.add_argument(
+        "--text",
+        type=text_source,
+        action="append",
+        default=[],
+        metavar="NAME=SOURCE",
+        help="with --out FILE.mcap: also record lines of text, such as of a breathing belt, each "
+        "with its time; SOURCE is - for standard input or a serial port, PORT or PORT@BAUDRATE; "
+        "may be given several times",
+    )
+    one.add_argument(
+        "--wire",
+        type=not_empty,
+        metavar="FILE",
+        help="also, or only, write all bytes of both directions here (.xtwire)",
+    )
+    one.add_argument(
+        "--profile",
+        choices=("raw", "presence", "respiration", "none"),
+        default="raw",
+        help="raw: radar frames (default); presence: the X4M300's own profile; respiration: that "
+        "of an X4M200 or X4M210, with sleep; none: only listen to what the module is sending, and "
+        "send it nothing",
+    )
+    _add_raw_settings(one)
+    group = one.add_argument_group("presence and respiration")
+    group.add_argument(
+        "--output",
+        type=not_empty,
+        metavar="NAMES",
+        help="what the profile sends, and nothing else (default: what it is set to), separated by "
+        "commas: iq or ap, pulsedoppler, pulsedoppler-byte, noisemap, noisemap-byte; of presence "
+        "single, movinglist; of respiration status, sleep, vitalsigns, movinglist, detectionlist, "
+        "normalizedmovementlist",
+    )
+    group.add_argument(
+        "--zone",
+        nargs=2,
+        type=metres,
+        metavar=("START", "END"),
+        help="detection zone in metres (default: what it is set to)",
+    )
+    group.add_argument(
+        "--sensitivity", type=sensitivity, metavar="N", help="0 ... 9 (default: what it is set to)"
+    )
+    _add_recording_options(one)
+    one.add_argument("--count", type=at_least_one, help="stop after COUNT messages")
+    one.add_argument(
+        "--duration", type=seconds, metavar="S", help="stop after S seconds of recording"
+    )
+    one.add_argument(
+        "--force", action="store_true", help="replace a recording that is there already"
+    )
+    _add_json(one)
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -315,66 +547,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     _add_raw_settings(one)
     one.add_argument("--count", type=at_least_one, help="stop after COUNT frames")
     one.add_argument("--samples", action="store_true", help="print the samples, too")
-    one = _add_command(
-        commands,
-        "record",
-        "write what a module sends to files",
-        "record:record",
-        "Ends at --count or --duration, by Ctrl-C, or when the module is unplugged or the disk "
-        "is full; what came until then is kept and complete. Progress goes to stderr, a summary "
-        "to stdout.",
-    )
-    _add_port(one)
-    one.add_argument(
-        "--out",
-        type=not_empty,
-        metavar="DIR",
-        help="directory for a recording in the vendor's format (ModuleConnector)",
-    )
-    one.add_argument(
-        "--wire",
-        type=not_empty,
-        metavar="FILE",
-        help="also, or only, write all bytes of both directions here",
-    )
-    one.add_argument(
-        "--profile",
-        choices=("raw", "presence", "respiration", "none"),
-        default="raw",
-        help="raw: radar frames (default); presence: the X4M300's own profile; respiration: that "
-        "of an X4M200 or X4M210, with sleep; none: only listen to what the module is sending, and "
-        "send it nothing",
-    )
-    _add_raw_settings(one)
-    group = one.add_argument_group("presence and respiration")
-    group.add_argument(
-        "--output",
-        type=not_empty,
-        metavar="NAMES",
-        help="what the profile sends, and nothing else (default: what it is set to), separated by "
-        "commas: iq or ap, pulsedoppler, pulsedoppler-byte, noisemap, noisemap-byte; of presence "
-        "single, movinglist; of respiration status, sleep, vitalsigns, movinglist, detectionlist, "
-        "normalizedmovementlist",
-    )
-    group.add_argument(
-        "--zone",
-        nargs=2,
-        type=metres,
-        metavar=("START", "END"),
-        help="detection zone in metres (default: what it is set to)",
-    )
-    group.add_argument(
-        "--sensitivity", type=sensitivity, metavar="N", help="0 ... 9 (default: what it is set to)"
-    )
-    _add_recording_options(one)
-    one.add_argument("--count", type=at_least_one, help="stop after COUNT messages")
-    one.add_argument(
-        "--duration", type=seconds, metavar="S", help="stop after S seconds of recording"
-    )
-    one.add_argument(
-        "--force", action="store_true", help="replace a recording that is there already"
-    )
-    _add_json(one)
+    _add_live(commands)
+    _add_record(commands)
     one = _add_command(
         commands,
         "dump",
@@ -388,13 +562,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "file", type=not_empty, metavar="FILE", help="file or directory of a recording"
     )
     one.add_argument("--samples", action="store_true", help="print arrays whole")
-    one.add_argument(
-        "--frames",
-        choices=("auto", "rf", "baseband"),
-        default="auto",
-        help="what radar frames hold, which most recordings do not say (default: from the "
-        "module's answers if they are there, else by how smooth the values are over range)",
-    )
+    _add_frames(one)
     _add_radar(one)
     _add_json(one)
 
@@ -404,7 +572,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "turn a recording into another format",
         "recordings:convert",
         "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture), .pcap (of a wire "
-        "capture, for Wireshark); a name without suffix is a directory in the vendor's format.",
+        "capture, for Wireshark); .csv and .mat (MATLAB) for frames as arrays; a name without "
+        "suffix is a directory in the vendor's format.",
     )
     one.add_argument(
         "source",
@@ -414,10 +583,20 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     one.add_argument("target", type=not_empty, metavar="TARGET", help="file or directory to write")
     _add_radar(one)
+    _add_frames(one)
+    one.add_argument(
+        "--frame-area",
+        nargs=2,
+        type=metres,
+        metavar=("START", "END"),
+        help="frame area as the module read it back, in module metres, for arrays of a recording "
+        "that does not say it",
+    )
     one.add_argument("--force", action="store_true", help="replace TARGET if it exists")
     _add_json(one)
 
     _add_export(commands)
+    _add_legacy(commands)
     one = _add_command(
         commands,
         "decode",

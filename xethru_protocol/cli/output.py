@@ -57,6 +57,11 @@ def print_text(text: str) -> None:
     if STDOUT.stream is None:  # started with it closed
         raise CommandFailed("standard output is closed; nothing can be printed")
     STDOUT.write(text)
+    check_output()
+
+
+def check_output() -> None:
+    """Raise what `print_text` does if standard output takes no more."""
     failure = STDOUT.failure
     if isinstance(failure, BrokenPipeError):
         raise failure

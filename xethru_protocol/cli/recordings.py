@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypedDict
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from xethru_protocol.recordings import (
     recording_facts,
 )
 from xethru_protocol.recordings import convert as convert_recording
+from xethru_protocol.recordings.array_files import is_array_file
 from xethru_protocol.recordings.records import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
@@ -153,6 +154,7 @@ def _from_hex(line: bytes, name: str, number: int) -> bytes:
         ) from None
 
 
+_DOWNCONVERSION = {"baseband": True, "rf": False}  # by --frames
 _FEW = 3  # elements of an array that are shown
 _LONGEST_TEXT = 60
 
@@ -168,7 +170,7 @@ def dump(arguments: Namespace) -> int:
             payload = encode(message, bulk=bulk)
             print_json(_as_json(framing, payload, message) | {"t_ns": t_ns})
     else:
-        downconversion = {"baseband": True, "rf": False}.get(arguments.frames)
+        downconversion = _DOWNCONVERSION.get(arguments.frames)
         summary = describe_recording(file, radar=radar, downconversion=downconversion)
         for line in _head(summary):
             print_line(line)
@@ -265,10 +267,28 @@ def _text(value: Any, whole: bool) -> str:  # noqa: ANN401 - any JSON value
     return text if whole or len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 
 
+class _Given(TypedDict, total=False):
+    """What is known of the frames of a recording that does not say it."""
+
+    area_m: tuple[float, float]
+    downconversion: bool
+
+
+def _given(arguments: Namespace) -> _Given:
+    given: _Given = {}
+    if arguments.frame_area is not None:
+        start_m, end_m = arguments.frame_area
+        given["area_m"] = start_m, end_m
+    if arguments.frames in _DOWNCONVERSION:
+        given["downconversion"] = _DOWNCONVERSION[arguments.frames]
+    return given
+
+
 def convert(arguments: Namespace) -> int:
     """Write a recording in another format; 1 if a part of it could not be read."""
     source, target = arguments.source, arguments.target
-    recording_facts(source)  # raises before anything is removed
+    if not is_array_file(Path(source)):
+        recording_facts(source)  # raises before anything is removed
     path = Path(target)
     if is_part_of(Path(source), path):
         raise RecordingError(f"{source} cannot be converted into itself")
@@ -283,7 +303,9 @@ def convert(arguments: Namespace) -> int:
     files_to_replace((path,), replace=arguments.force)
     with _whole(path, replace=arguments.force) as fresh:
         try:
-            done = convert_recording(source, str(fresh), show, radar=arguments.radar)
+            done = convert_recording(
+                source, str(fresh), show, radar=arguments.radar, **_given(arguments)
+            )
         finally:
             progress.finish(lambda: f"{newest} messages")
     if arguments.json:
@@ -299,7 +321,8 @@ def convert(arguments: Namespace) -> int:
             }
         )
     else:
-        print_line(f"{target}: {counted(done.messages, 'message')}")
+        noun = "frame" if path.suffix in {".csv", ".mat"} else "message"
+        print_line(f"{target}: {counted(done.messages, noun)}")
     for name, number in sorted(done.skipped.items()):
         warn(f"xethru convert: {number} {name} left out: the format has no place for them")
     warn_of("convert", done.faults)

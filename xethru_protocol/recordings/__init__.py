@@ -1,16 +1,17 @@
 """Recordings of everything a module sent: read, written, converted.
 
-`read_recording` takes any of them; `RecordingWriter` writes what the vendor's ModuleConnector
-does, `Recorder` what a driver receives; `RecordingReader` reads one record by record, with seek,
-peek and filter; `WireCapture` keeps the bytes of a port; `convert` goes from any to any. The rest
-is in the modules of this package: layouts and meta file of the vendor's format first.
+`load` gives any of them as arrays, `read_recording` its messages; `RecordingWriter` writes what the
+vendor's ModuleConnector does, `Recorder` what a driver receives; `RecordingReader` reads one record
+by record, with seek, peek and filter; `WireCapture` keeps the bytes of a port; `convert` goes from
+any to any. The rest is in the modules of this package: layouts and meta file of the vendor's format
+first.
 """
 
+from xethru_protocol.recordings.arrays import RadarArrays, Recording, TextColumn, load
+from xethru_protocol.recordings.conversion import Conversion, convert
 from xethru_protocol.recordings.formats import (
-    Conversion,
     RecordingFormat,
     RecordingSummary,
-    convert,
     describe_recording,
     read_recording,
     recording_facts,
@@ -18,7 +19,7 @@ from xethru_protocol.recordings.formats import (
     recording_radars,
 )
 from xethru_protocol.recordings.frame_layout import FrameLayout
-from xethru_protocol.recordings.recorder import Recorder
+from xethru_protocol.recordings.recorder import Recorder, SessionRecorder
 from xethru_protocol.recordings.records import (
     RadarFacts,
     RecordingError,
@@ -38,9 +39,11 @@ __all__ = [
     "Chunk",
     "Conversion",
     "FrameLayout",
+    "RadarArrays",
     "RadarFacts",
     "Record",
     "Recorder",
+    "Recording",
     "RecordingError",
     "RecordingFacts",
     "RecordingFault",
@@ -49,10 +52,13 @@ __all__ = [
     "RecordingReader",
     "RecordingSummary",
     "RecordingWriter",
+    "SessionRecorder",
     "Split",
+    "TextColumn",
     "WireCapture",
     "convert",
     "describe_recording",
+    "load",
     "read_chunks",
     "read_note",
     "read_recording",

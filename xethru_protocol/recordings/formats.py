@@ -1,27 +1,19 @@
-"""Every kind of recording: which kind a path is, its messages, its summary, conversion.
-
-What is lost, and nothing else: vendor directories cut times to 1 ms, know none before the first
-message's, give a message without a time that of the one before, have no place for answers, system
-messages and the like, nor for the counter of RESP_STATUS; text files of theirs lose the payload
-bits of a NaN. A recording that was split into files or directories comes out as one. Only wire
-captures hold what the host sent and how messages lay in packets. Messages are written as the
-message table encodes them: with a trailer or NUL that was left out, without what lies behind the
-last field.
-"""
+"""Every kind of recording: which kind a path is, its messages, its summary."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from xethru_protocol.extras import what_is_missing
-from xethru_protocol.recordings import npz, pcap, wire_capture
+from xethru_protocol.recordings import npz, wire_capture
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.records import (
     FaultHandler,
     RadarFacts,
+    RecordingContent,
     RecordingError,
     RecordingFacts,
     RecordingFault,
@@ -30,8 +22,6 @@ from xethru_protocol.recordings.records import (
 )
 from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
-from xethru_protocol.recordings.vendor.writer import RecordingWriter
-from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
 
 RecordingFormat = Literal["vendor", "wire", "mcap", "npz"]
@@ -87,6 +77,11 @@ def recording_format(path: Path | str) -> RecordingFormat:
     for magic, found in _MAGICS.items():
         if start.startswith(magic):
             return found
+    if path.suffix in {".csv", ".mat"}:
+        raise RecordingError(
+            f"{path} holds no messages, at most arrays, which xethru_protocol.load and 'xethru"
+            " convert' read"
+        )
     raise RecordingError(
         f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
         " a wire capture (.xtwire), MCAP or .npz"
@@ -94,7 +89,7 @@ def recording_format(path: Path | str) -> RecordingFormat:
 
 
 @contextmanager
-def _optional_packages() -> Iterator[None]:
+def optional_packages() -> Iterator[None]:
     """Import what knows MCAP; RecordingError without the packages that it needs."""
     try:
         yield
@@ -127,14 +122,14 @@ def read_recording(
     path = Path(path)
     found = recording_format(path)
     if found != "mcap":
-        _refuse_name(path, radar)
+        refuse_name(path, radar)
     match found:
         case "wire":
             yield from wire_capture.read_wire(path, on_fault)
         case "npz":
             yield from npz.read_npz(path)
         case "mcap":
-            with _optional_packages():
+            with optional_packages():
                 from xethru_protocol.recordings.mcap import read_mcap
 
             yield from read_mcap(path, on_fault, radar)
@@ -142,7 +137,7 @@ def read_recording(
             yield from read_vendor(path, on_fault)
 
 
-def _refuse_name(path: Path, radar: str | None) -> None:
+def refuse_name(path: Path, radar: str | None) -> None:
     if radar is not None:
         raise RecordingError(f"{path} is of one radar and names none; leave the name out")
 
@@ -152,10 +147,25 @@ def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
     path = Path(path)
     if recording_format(path) != "mcap":
         return (RadarFacts(),)
-    with _optional_packages():
+    with optional_packages():
         from xethru_protocol.recordings.mcap import mcap_radars
 
     return mcap_radars(path)
+
+
+def recording_content(path: Path | str) -> RecordingContent:
+    """Return radars and texts; only MCAP has names, descriptions and texts.
+
+    RecordingError if there is nothing to read.
+    """
+    path = Path(path)
+    if recording_format(path) != "mcap":
+        recording_facts(path)  # raises
+        return RecordingContent(radars={"": {}})
+    with optional_packages():
+        from xethru_protocol.recordings.mcap import mcap_content
+
+    return mcap_content(path)
 
 
 def recording_facts(path: Path | str) -> RecordingFacts:
@@ -167,7 +177,7 @@ def recording_facts(path: Path | str) -> RecordingFacts:
         case "npz":
             return npz.npz_facts(path)
         case "mcap":
-            with _optional_packages():
+            with optional_packages():
                 from xethru_protocol.recordings.mcap import mcap_facts
 
             return mcap_facts(path)
@@ -213,123 +223,3 @@ def describe_recording(
         frames=layouts.layouts(),
         faults=tuple(faults),
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Conversion:
-    """What a conversion did: messages written, and by name those the format has no place for."""
-
-    messages: int
-    skipped: dict[str, int]
-    faults: tuple[RecordingFault, ...]
-
-
-def convert(
-    source: Path | str,
-    target: Path | str,
-    on_progress: Callable[[int], None] | None = None,
-    *,
-    radar: str | None = None,
-) -> Conversion:
-    """Write a recording again in the format that the target's suffix names.
-
-    RecordingError if the source cannot be read, the target exists or cannot be written, or its
-    suffix names no format.
-
-    Parameters
-    ----------
-    source
-        Any recording that `read_recording` takes.
-    target
-        A new file ``*.mcap``, ``*.npz``, ``*.xtwire`` or, of a wire capture, ``*.pcap``; a name
-        without suffix is a new directory of ModuleConnector.
-    on_progress
-        Called with the number of messages so far, every thousand and at the end.
-    radar
-        Which radar of a session of several, as in `read_recording`.
-    """
-    source, target = Path(source), Path(target)
-    faults: list[RecordingFault] = []
-    if target.suffix == pcap.SUFFIX:
-        if recording_format(source) != "wire":
-            raise RecordingError(
-                f"{source} has no raw bytes, which {target} needs; record them with"
-                " 'xethru record --wire', or take them out of a session with 'uwb-slam convert'"
-            )
-        _refuse_name(source, radar)
-        if target.exists():
-            raise RecordingError(f"{target} exists already")
-        packets = pcap.write_pcap(source, target, faults.append)
-        return Conversion(messages=packets, skipped={}, faults=tuple(faults))
-    write = _writer(target)
-    facts = recording_facts(source)
-    n_messages = 0
-
-    def counted() -> TimedMessages:
-        nonlocal n_messages
-        for timed in read_recording(source, faults.append, radar=radar):
-            yield timed
-            n_messages += 1
-            if on_progress is not None and n_messages % 1000 == 0:
-                on_progress(n_messages)
-
-    skipped = write(target, counted(), facts) or {}
-    if on_progress is not None:
-        on_progress(n_messages)
-    return Conversion(
-        messages=n_messages - sum(skipped.values()), skipped=skipped, faults=tuple(faults)
-    )
-
-
-_Writer = Callable[[Path, TimedMessages, RecordingFacts], dict[str, int] | None]
-
-
-def _writer(target: Path) -> _Writer:
-    """Return what writes ``target``; it returns by name how many messages it left out, if any."""
-    if target.is_dir() or not target.suffix:
-        return _write_vendor
-    writer: _Writer
-    match target.suffix:
-        case ".mcap":
-            with _optional_packages():
-                from xethru_protocol.recordings.mcap import write_mcap
-
-            writer = write_mcap
-        case npz.SUFFIX:
-            writer = npz.write_npz
-        case wire_capture.SUFFIX:
-            writer = _write_wire
-        case unknown:
-            raise RecordingError(
-                f"{target}: no format has the suffix {unknown}; known are .mcap, {npz.SUFFIX},"
-                f" {wire_capture.SUFFIX}, {pcap.SUFFIX}, and none for a directory of"
-                " ModuleConnector"
-            )
-    if target.exists():
-        raise RecordingError(f"{target} exists already")
-    return writer
-
-
-def _write_vendor(target: Path, messages: TimedMessages, facts: RecordingFacts) -> dict[str, int]:
-    skipped: Counter[str] = Counter()
-    last_ns = 0
-    with RecordingWriter(
-        target,
-        session_id=facts.session_id,
-        profile_id=facts.profile_id,
-        parameter_file=facts.parameter_file,
-        user_header=facts.user_header,
-    ) as writer:
-        for message, t_ns in messages:
-            last_ns = last_ns if t_ns is None else t_ns
-            if not writer.write(message, last_ns):
-                skipped[message_name(message)] += 1
-        writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
-    return dict(skipped)
-
-
-def _write_wire(target: Path, messages: TimedMessages, facts: RecordingFacts) -> None:
-    module = Connection(Role.MODULE)
-    with wire_capture.WireCapture(target, {"facts": facts.as_json()}) as capture:
-        for message, t_ns in messages:
-            capture.write("rx", module.send(message), t_ns)

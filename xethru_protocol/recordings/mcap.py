@@ -42,8 +42,10 @@ from mcap.writer import CompressionType, Writer
 from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.recordings.frame_layout import FrameGeometries
 from xethru_protocol.recordings.records import (
+    MODULE_METRES,
     FaultHandler,
     RadarFacts,
+    RecordingContent,
     RecordingError,
     RecordingFacts,
     RecordingFault,
@@ -726,16 +728,23 @@ def statistics_of(path: Path) -> Statistics:
 
 
 _FACTS = "xethru-hil recording"
-_LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
 _RADAR = "module"
 _CONTENT = frozenset({"frame", "payload"})
 """Topics of messages."""
+TEXT_TOPIC = "/text/"
+"""Before the name of a column of text; its messages are String, a line each."""
 _UNTIMED = {"xethru-hil": "time unknown"}
 
 
-class _RecordingWriter:
-    def __init__(self, writer: McapWriter) -> None:
+class RadarTopics:
+    """The topics of one radar. ``about`` has what is known of it, by the names in its info."""
+
+    def __init__(
+        self, writer: McapWriter, name: str = _RADAR, about: Mapping[str, Any] | None = None
+    ) -> None:
         self._writer = writer
+        self._name = name
+        self._about = about or {}
         self._channels: dict[tuple[str, bool], int] = {}
         self._others = 0
         self._has_info = False
@@ -766,7 +775,7 @@ class _RecordingWriter:
         self._has_info = True
         geometry = self._geometry(frame)
         info: dict[str, object] = {
-            "name": _RADAR,
+            "name": self._name,
             "serial": "",
             "port": "",
             "x_m": None,
@@ -778,7 +787,8 @@ class _RecordingWriter:
             "n_bins": None if geometry is None else geometry.n_bins,
             "rate_hz": None,
             "settings": self._geometries.answers,
-            "length_unit": _LENGTH_UNIT,
+            "length_unit": MODULE_METRES,
+            **self._about,
         }
         self._add("info", STRING, pack_string(json.dumps(info)), t_ns, 0)
 
@@ -797,7 +807,7 @@ class _RecordingWriter:
         key = topic, t_ns is not None
         if key not in self._channels:
             self._channels[key] = self._writer.add_channel(
-                f"/radar/{_RADAR}/{topic}",
+                f"/radar/{self._name}/{topic}",
                 schema,
                 SCHEMAS[schema].encode(),
                 _UNTIMED if t_ns is None else {},
@@ -824,7 +834,7 @@ def write_mcap(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> 
     with writing(path), written_whole(path) as fresh, fresh.open("wb") as stream:
         writer = McapWriter(stream)
         writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
-        recording = _RecordingWriter(writer)
+        recording = RadarTopics(writer)
         for message, t_ns in messages:
             recording.write(message, t_ns)
         writer.finish()
@@ -876,32 +886,45 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
 
 def mcap_radars(path: Path) -> tuple[RadarFacts, ...]:
     """Return the radars of a file in the order of their first topics; damage is ignored."""
-    names: dict[str, None] = {}  # a set in order
-    facts: dict[str, RadarFacts] = {}
+    return tuple(_radar_facts(name, info) for name, info in mcap_content(path).radars.items())
+
+
+def mcap_content(path: Path) -> RecordingContent:
+    """Return radars in the order of their first topics, and texts; damage is ignored."""
+    radars: dict[str, Mapping[str, Any]] = {}
+    infos: dict[str, Mapping[str, Any]] = {}
+    texts: dict[str, list[tuple[int, str]]] = {}
     for entry in _entries_of(path, lambda fault: None):
         if isinstance(entry, Metadata):
             continue
         name, part = _radar_topic(entry.topic)
-        if isinstance(entry, Channel) and part in _CONTENT:
-            names[name] = None
+        if entry.topic.startswith(TEXT_TOPIC):
+            lines = texts.setdefault(entry.topic.removeprefix(TEXT_TOPIC), [])
+            if isinstance(entry, Message):
+                with suppress(ValueError, struct.error):
+                    lines.append((entry.t_ns, unpack_string(entry.data)))
+        elif isinstance(entry, Channel) and part in _CONTENT:
+            radars.setdefault(name, {})
         elif isinstance(entry, Message) and part == "info":
-            facts[name] = _radar_facts(name, entry.data)
-    return tuple(facts.get(name, RadarFacts(name=name)) for name in names)
+            with suppress(ValueError, RecursionError, struct.error):
+                info = json.loads(unpack_string(entry.data))
+                infos[name] = info if isinstance(info, dict) else {}
+    described = {name: infos.get(name, {}) for name in radars}
+    return RecordingContent(radars=described, texts=texts)
 
 
 def _names(path: Path) -> str:
     return ", ".join(sorted(facts.name or "" for facts in mcap_radars(path)))
 
 
-def _radar_facts(name: str, data: bytes) -> RadarFacts:
+def _radar_facts(name: str, info: Mapping[str, Any]) -> RadarFacts:
     """Read a latched info; facts without content if it is invalid."""
     try:
-        info = json.loads(unpack_string(data))
         start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
         # the read-back of baseband ends at the last bin, that of RF one behind it
         steps = int(info["n_bins"]) - (bin_m > 4 * RF_BIN_M)
         area_m = start_m, start_m + bin_m * steps
-    except (KeyError, ValueError, TypeError, OverflowError, RecursionError, struct.error):
+    except (KeyError, ValueError, TypeError, OverflowError):
         return RadarFacts(name=name)
     serial = info.get("serial")
     return RadarFacts(

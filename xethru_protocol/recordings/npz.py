@@ -14,6 +14,10 @@ Everything else is ragged: ``message_payload`` u1, cut at ``message_end``, with 
 ``message_index``, ``message_name`` and ``message_fields``, the fields as JSON for reading (the
 payload decides). ``facts`` are those of the recording, as JSON.
 
+Where all frames have one layout, plain arrays of them lie beside the messages they came in:
+``iq`` or ``rf`` and the others of `array_files`, for programs that read nothing else. They repeat
+what the messages hold, and are not read here.
+
 An archive that was cut cannot be read at all: it is for finished recordings. Samples are written
 and read a message at a time; only headers and what is no bulk message are held in memory.
 """
@@ -26,7 +30,7 @@ import shutil
 import zipfile
 import zlib
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -36,6 +40,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.format import read_array_header_1_0, read_magic, write_array, write_array_header_1_0
 
+from xethru_protocol.recordings.array_files import Frames, add_arrays
 from xethru_protocol.recordings.records import (
     NO_TIME_NS,
     RecordingError,
@@ -145,8 +150,15 @@ class _Others:
         _add(archive, "message_fields", np.array(self.fields, dtype=np.str_))
 
 
-def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> None:
+def write_npz(
+    path: Path,
+    messages: Iterable[Timed],
+    facts: RecordingFacts,
+    arrays: Callable[[], Frames | None] = lambda: None,
+) -> None:
     """Write messages to a new archive; samples wait in unnamed files beside it meanwhile.
+
+    ``arrays`` gives the frames among the messages for plain arrays, None for no such.
 
     RecordingError if the file exists or cannot be written; then it is not left behind.
     """
@@ -173,6 +185,8 @@ def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> N
             others.save(archive)
             for part in bulk.values():
                 part.save(archive)
+            if (frames := arrays()) is not None and frames.kind is not None:
+                add_arrays(archive, frames, frames.kind)
 
 
 def _new_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
@@ -209,7 +223,11 @@ def npz_facts(path: Path) -> RecordingFacts:
 def _open(path: Path, problem: str) -> Iterator[_Archive]:
     """Open an archive of this module; every error of damage becomes one with ``problem``."""
     try:
-        with reading(path), np.load(path, allow_pickle=False) as archive:
+        with (
+            reading(path),
+            path.open("rb") as stream,
+            np.load(stream, allow_pickle=False) as archive,
+        ):
             if "format" not in archive or str(archive["format"]) != FORMAT:
                 raise RecordingError(f"{path} is a numpy archive, and no recording of this program")
             yield archive

@@ -1,13 +1,14 @@
-"""Records what a driver receives while the program goes on using it."""
+"""Records what drivers receive: one, while the program goes on using it, or several in one file."""
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Protocol, Self, Unpack
+from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
 from xethru_protocol.driver.conversation import Listener
-from xethru_protocol.recordings.records import RecordingError
+from xethru_protocol.recordings.formats import optional_packages
+from xethru_protocol.recordings.records import GrowingFile, RecordingError
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE
 from xethru_protocol.recordings.vendor.writer import (
     RecordingOptions,
@@ -16,6 +17,9 @@ from xethru_protocol.recordings.vendor.writer import (
     session_directory,
 )
 from xethru_protocol.wire.rows import Response
+
+if TYPE_CHECKING:
+    from xethru_protocol.recordings.mcap import RadarTopics
 
 
 class HasListener(Protocol):
@@ -155,3 +159,115 @@ class Recorder:
             self.failure = error
             if self._on_error is not None:
                 self._on_error(error)
+
+
+class SessionRecorder:
+    """Writes what several radars send, and lines of other sensors, to one new MCAP file.
+
+    Its methods may be called by several threads. A chunk is handed to the operating system after
+    256 KiB or a second, whole or not at all: a process that is killed, or a full disk, costs the
+    last one. Needs the extra ``mcap``.
+
+    Parameters
+    ----------
+    path
+        RecordingError if it exists or cannot be made.
+    clock
+        That of all drivers [ns]; the file has its times since 1970, by the system's clock when the
+        file was made.
+
+    Attributes
+    ----------
+    failure
+        Why nothing more is written; None if all is well.
+    """
+
+    def __init__(self, path: Path, *, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        with optional_packages():
+            from xethru_protocol.recordings import mcap
+        self._mcap = mcap
+        self.path = path
+        self.failure: RecordingError | None = None
+        self._clock = clock
+        self._since_1970_ns = time.time_ns() - clock()
+        self._flushed_ns = clock()
+        self._lock = threading.Lock()
+        self._closed = False
+        self._pieces = _Pieces(path)
+        self._writer = mcap.McapWriter(self._pieces)  # type: ignore[arg-type]  # writes, flush, tell
+        self._pieces.hand_over()
+        self._radars: dict[str, RadarTopics] = {}
+        self._texts: dict[str, int] = {}
+
+    def add_radar(self, name: str, about: Mapping[str, Any]) -> None:
+        """Name a radar before its first message; ``about`` is by the names in its info topic."""
+        self._radars[name] = self._mcap.RadarTopics(self._writer, name, about)
+
+    def add_text(self, name: str) -> None:
+        """Name a column of text before its first line."""
+        schema = self._mcap.SCHEMAS[self._mcap.STRING].encode()
+        topic = f"{self._mcap.TEXT_TOPIC}{name}"
+        self._texts[name] = self._writer.add_channel(topic, self._mcap.STRING, schema, {})
+
+    def write(self, name: str, message: Response, arrival_ns: int) -> bool:
+        """Write what a radar sent; returns whether that went well."""
+        t_ns = arrival_ns + self._since_1970_ns
+        return self._write(lambda: self._radars[name].write(message, t_ns))
+
+    def write_line(self, name: str, line: str, arrival_ns: int) -> bool:
+        """Write a line of another sensor; returns whether that went well."""
+        t_ns = arrival_ns + self._since_1970_ns
+        data = self._mcap.pack_string(line)
+        return self._write(lambda: self._writer.add_message(self._texts[name], t_ns, data, t_ns))
+
+    def close(self) -> None:
+        """Complete the file; calling it again does nothing."""
+        self._write(self._writer.finish, is_last=True)
+        with self._lock:
+            self._closed = True
+            self._pieces.close()
+
+    def _write(self, write: Callable[[], None], *, is_last: bool = False) -> bool:
+        """Write, and hand to the operating system what is due; nothing after a failure."""
+        with self._lock:
+            if self._closed or self.failure is not None:
+                return False
+            try:
+                write()
+                now_ns = self._clock()
+                if now_ns - self._flushed_ns >= _CHUNK_NS and not is_last:
+                    self._flushed_ns = now_ns
+                    self._writer.end_chunk()
+                self._pieces.hand_over()
+            except RecordingError as error:
+                self.failure = error
+            return self.failure is None
+
+
+_CHUNK_NS = 1_000_000_000
+
+
+class _Pieces:
+    """A stream for mcap's writer whose bytes reach a new file in whole pieces."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = GrowingFile(path)
+        self._waiting = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._file.size + len(self._waiting)
+
+    def flush(self) -> None:
+        """Do nothing: `hand_over` ends a piece."""
+
+    def hand_over(self) -> None:
+        if self._waiting:
+            self._file.append(bytes(self._waiting))
+            self._waiting = bytearray()
+
+    def close(self) -> None:
+        self._file.close()

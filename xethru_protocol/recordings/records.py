@@ -1,9 +1,9 @@
 """What every kind of recording holds: messages with their times, and facts about the whole."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from io import FileIO
 from pathlib import Path
 from typing import Any, Self, get_type_hints
@@ -111,6 +111,7 @@ class GrowingFile:
 
 
 MS_NS = 1_000_000
+MODULE_METRES = "module metres, c = 3.0e8 m/s"  # unit of lengths in the description of a radar
 NO_TIME_NS = -(2**63)  # stands for an unknown time
 LATEST_MS = 2**63 // MS_NS - 2**32
 """Latest time at which a recording may begin [ms since 1970]: each of its times [ns], at most
@@ -132,6 +133,18 @@ class RadarFacts:
     name: str | None = None
     serial: str | None = None
     area_m: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingContent:
+    """The radars of a recording by name, and lines of other sensors, each with its time [ns].
+
+    A radar has its description as an MCAP file holds it, or an empty one; the only radar of a
+    recording without names is ``""``.
+    """
+
+    radars: Mapping[str, Mapping[str, Any]]
+    texts: Mapping[str, Sequence[tuple[int, str]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from emulator.echo.reflections import Scatterers
 from emulator.echo.walls import faces_of, passing, spread
-from emulator.scene.motion import PersonSpec
+from emulator.scene.people import PersonSpec
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M, ObjectSpec, TargetSpec, WallSpec
 from hil_tests.unit.emulator.rooms import WAVELENGTH_M, heard, radar_at
 

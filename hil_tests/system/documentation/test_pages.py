@@ -58,7 +58,9 @@ pytestmark = [
     pytest.mark.skipif(not README.exists(), reason="documents are in the source tree"),
 ]
 
-_UNTIL_CTRL_C = re.compile(r"xethru-emulator (serve|play|proxy)\b|xethru stream (?!.*--count)")
+_UNTIL_CTRL_C = re.compile(
+    r"xethru-emulator (serve|play|proxy)\b|xethru (stream|view|vital) (?!.*--count)"
+)
 _ONLY_PARSED = re.compile(r"(pip|make|sudo)\b|pytest --pyargs")
 _NUMBER = r"\d+(?:\.\d+)?"
 

@@ -253,7 +253,7 @@ def test_a_viewer_that_ends_late_for_want_of_a_driver_is_named(
     fake = tmp_path / "rerun"
     fake.write_text(_ENDS_SOON.format(python=sys.executable))
     fake.chmod(0o755)
-    monkeypatch.setattr("slam.app.view.viewer.executable", lambda: fake)
+    monkeypatch.setattr("slam.app.view.viewer.ViewerProcess.executable", lambda self: fake)
     picture = tmp_path / "view.png"
     assert main(["view", str(session), "--screenshot", str(picture)]) == 1
     last = capsys.readouterr().err.splitlines()[-1]

@@ -31,7 +31,7 @@ from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording
 from slam.app.view.rerun_recording import RrdReader, count_rows, rr
-from slam.app.view.viewer import LiveView, executable
+from slam.app.view.viewer import LiveView, ViewerProcess
 from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
@@ -189,7 +189,15 @@ def saving_viewer(saved: Path) -> Iterator[str]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = [str(executable()), "--save", str(saved), "--bind", "127.0.0.1", "--port", str(port)]
+    command = [
+        str(ViewerProcess.executable()),
+        "--save",
+        str(saved),
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        str(port),
+    ]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
         try:
             wait_until(lambda: connects(port), process)

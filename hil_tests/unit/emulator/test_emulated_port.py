@@ -1,5 +1,6 @@
 """An emulated module in one line of Python, and control of it."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,21 @@ def test_a_running_emulator_is_controlled_by_its_port(tmp_path: Path) -> None:
         FileNotFoundError, match=f"no emulator answers: No such file.*{tmp_path}/port"
     ):
         control(tmp_path / "port", "state")
+
+
+def test_a_scene_says_what_its_modules_are_and_what_is_true_of_its_people() -> None:
+    with emulated_port("two_people", "--pace", "asap") as port:
+        for name, product in (("respiration", "X4M200"), ("presence", "X4M300")):
+            with open_radar(str(Path(port).with_name(name))) as radar:
+                assert radar.info().order_code == product
+        near, far = control(port, "people 100")["people"]
+    assert near["distance_m"]["presence"] == pytest.approx(math.hypot(1.2, 0.3))
+    assert 17 < far["mean_breaths_per_min"] < 19
+    with (
+        emulated_port("two_people", "--pace", "asap", "--model", "x4m300") as port,
+        open_radar(port) as radar,
+    ):
+        assert radar.info().order_code == "X4M300"
 
 
 def test_a_package_of_the_same_name_in_the_current_folder_is_not_run(

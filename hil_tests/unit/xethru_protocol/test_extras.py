@@ -61,6 +61,8 @@ def test_the_table_of_included_extras_agrees_with_the_requirements(extra: str) -
         ("mcap.writer", "slam", "mcap is not installed: pip install 'xethru-hil[slam]'"),
         ("mcap.writer", None, "mcap is not installed: pip install 'xethru-hil[mcap]'"),
         ("rerun", "slam", "rerun is not installed: pip install 'xethru-hil[view]'"),
+        ("rerun", "live", "rerun is not installed: pip install 'xethru-hil[live]'"),
+        ("rerun", None, "rerun is not installed: pip install 'xethru-hil[live]'"),
         ("PIL", "view", "PIL is not installed: pip install 'xethru-hil[view]'"),
         ("PIL", "slam", "PIL is not installed: pip install 'xethru-hil[slam]'"),
         ("xethru_protocol.nothing", "slam", None),

@@ -27,7 +27,8 @@ from slam.app.run.output import print_text
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
-from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
+from slam.app.view.viewer import LiveView, ViewerProcess
+from xethru_protocol.cli.live.viewer import ViewerKind
 from xethru_protocol.system import StopFlag, one_line, written_whole
 
 _MAGIC = b"RRF"
@@ -82,7 +83,7 @@ def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -
         come to rest, or the picture cannot be written.
     """
     with ViewerProcess(ViewerKind.HEADLESS) as process:
-        process.wait_until_ready(stop)
+        process.wait_until_ready(stop.check)
         try:
             picture = _settled(process, rrd, at_s, stop)
         except (ConnectionError, RuntimeError, TimeoutError) as error:

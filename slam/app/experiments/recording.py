@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from emulator.chip import Pace
-from emulator.chip.downconversion import CHANNELS, TAP_COUNT
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S, SPEED_OF_LIGHT_MPS
@@ -46,6 +45,7 @@ from slam.app.experiments import Result, table
 from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label, note
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.processing.downconversion import CHANNELS, TAP_COUNT
 from xethru_protocol.recordings import RecordingError, read_recording
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.messages import BasebandIq

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.chip.chip import Chip
-from emulator.chip.downconversion import CHANNELS, downconvert
+from emulator.chip.chip import Chip, downconvert
 from hil_tests.unit.emulator.doubles import FormulaSource, working_point
+from xethru_protocol.processing.downconversion import CHANNELS
 from xethru_protocol.wire.codes import X4Setting
 
 Samples = NDArray[np.float64]

@@ -2,6 +2,8 @@
 
 import math
 
+import pytest
+
 from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
@@ -22,8 +24,10 @@ from xethru_protocol.wire.codes import (
 SECOND = 1_000_000_000
 
 
-def transport_of_the_corridor(options: DeviceOptions | None = None) -> LoopbackTransport:
-    scene = load_scene("visitor")
+def transport_of_the_corridor(
+    options: DeviceOptions | None = None, name: str = "visitor"
+) -> LoopbackTransport:
+    scene = load_scene(name)
     identity = Identity(serial=scene.radars[0].serial)
     source = echo_source(scene, 0, 0)
     return LoopbackTransport(radar_device(identity, source, Pace.REALTIME, options=options))
@@ -95,3 +99,25 @@ def test_an_x4m200_is_set_up_by_the_same_methods() -> None:
         assert 15 < transport.clock_ns() / SECOND - began_s < 25
         assert radar.read_message(m.RespirationMovingList).counter >= first.counter
         assert radar.read_message(m.RespStatus).counter > first.counter
+
+
+@pytest.mark.parametrize(
+    ("name", "distance_m", "rate", "wander"),
+    [("sleeper", 1.6, 13.0, 0.06), ("two_people", 1.2042, 12.0, 0.05), ("desk", 0.9, 16.0, 0.1)],
+)
+def test_the_respiration_profile_knows_who_is_at_rest(
+    name: str, distance_m: float, rate: float, wander: float
+) -> None:
+    """The nearest person of a scene; rates wander in a band, and 20 s resolve 3 a minute."""
+    transport = transport_of_the_corridor(DeviceOptions.of_model("x4m200"), name)
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        radar.profile.load(ProfileId.XTS_ID_APP_RESPIRATION_2)
+        radar.profile.set_noise_map(NoiseMapControl(6))
+        radar.profile.set_output(OutputFeature.SLEEP_STATUS)
+        radar.profile.run()
+        radar.profile.wait_until_initialized()
+        for _ in range(25):
+            sleep = radar.read_message(m.SleepStatus)
+            assert sleep.state == RespirationState.BREATHING
+            assert abs(sleep.rpm - rate) < wander * rate + 1.5
+            assert abs(sleep.distance_m - distance_m) < 0.06

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator.chip.chip import CaptureSettings
-from emulator.chip.downconversion import CHANNELS, TAP_COUNT, downconvert
+from emulator.chip.chip import CaptureSettings, downconvert
 from emulator.echo.receiver import GRIDS, ClutterField
 from emulator.scene.scene import ClutterSpec
 from hil_tests.unit.emulator.rooms import PAPER
+from xethru_protocol.processing.downconversion import CHANNELS, TAP_COUNT
 from xethru_protocol.wire.x4 import BASEBAND_DECIMATION, CARRIER_HZ, RF_BIN_M, SAMPLING_RATE_HZ
 
 CAPTURE = PAPER

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from emulator.echo.reflections import beam_gain
-from emulator.scene.motion import PersonSpec
+from emulator.scene.people import PersonSpec
 from emulator.scene.scene import MultipathSpec
 from hil_tests.unit.emulator.rooms import heard, radar_at, target, wall
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emulator.chip.downconversion import CHANNELS, TAP_COUNT, downconvert
+from emulator.chip.chip import downconvert
 from emulator.echo.echo import echo_source
 from emulator.echo.receiver import CarrierJitter
 from emulator.scene.scene import JitterSpec, LeakageSpec
 from hil_tests.unit.emulator.rooms import PAPER, radar_at, room, target
+from xethru_protocol.processing.downconversion import CHANNELS, TAP_COUNT
 
 SERIAL = 202305070101
 BOTH = JitterSpec(white_rad=0.0056, slow_rad=0.032, slow_correlation_s=4.0)

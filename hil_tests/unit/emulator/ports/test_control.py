@@ -4,6 +4,7 @@ import json
 import selectors
 import socket
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from emulator.cli import request_of
+from emulator.echo.people import people_truth
 from emulator.ports.control import LONGEST_LINE, Control, ControlSocket
+from emulator.scene.people import PersonSpec
 from hil_tests.faulty import FaultyLine
 from hil_tests.patience import seconds
+from hil_tests.unit.emulator.rooms import radar_at, room
 from xethru_protocol.wire.errors import Disconnected
 
 
@@ -78,6 +82,46 @@ def test_a_reset_is_a_reboot(line: FaultyLine) -> None:
     assert radar.reboots == 1
 
 
+def test_people_are_as_their_table_says(line: FaultyLine) -> None:
+    """15 breaths a minute, 4 mm: the chest is out after 1 s, in after 3 s; it enters at 1 s."""
+    stands = PersonSpec(name="somebody", waypoints_m=((3.0, 4.0),), enters_s=1.0)
+    scene = room(radar_at(0, 0, 0), people=(stands,))
+    zero_ns = 7_000_000_000
+    control = Control(
+        {"radar_1": line.device}, people=partial(people_truth, scene), zero_ns=zero_ns
+    )
+
+    def asked(now_ns: int, **keys: Any) -> dict[str, Any]:  # noqa: ANN401 - JSON
+        said: dict[str, Any] = json.loads(
+            control.answer(json.dumps({"verb": "people", **keys}).encode(), now_ns)
+        )
+        return said
+
+    answer = asked(zero_ns + 3_000_000_000)
+    assert answer["ok"]
+    assert answer["t_s"] == 3.0
+    (one,) = answer["people"]
+    chest_m = pytest.approx(-0.004)
+    assert one == {
+        "name": "somebody",
+        "present": True,
+        "moves": False,
+        "position_m": [3.0, 4.0],
+        "breaths_per_min": 15.0,
+        "mean_breaths_per_min": None,
+        "chest_m": chest_m,
+        "sleep_stage": "awake",
+        "distance_m": {"radar_1": 5.0},
+        "towards_m": {"radar_1": chest_m},
+    }
+    (later,) = asked(0, seconds=61.0, radar="radar_1")["people"]
+    assert later["mean_breaths_per_min"] == pytest.approx(15.0)
+    (before,) = asked(zero_ns, radar="radar_1")["people"]
+    assert (before["present"], before["breaths_per_min"]) == (False, None)
+    assert "radar: must be one of radar_1" in asked(zero_ns, radar="nose")["error"]
+    assert "seconds: must be a number" in asked(zero_ns, seconds=1e9)["error"]
+
+
 @pytest.mark.parametrize(
     ("asked", "place"),
     [
@@ -95,6 +139,7 @@ def test_a_reset_is_a_reboot(line: FaultyLine) -> None:
         ({"verb": "unplug", "seconds": float("inf")}, "seconds: "),
         ({"verb": "rate", "value": 10**400}, "value: "),
         ({"verb": "pause"}, "nothing is played here"),
+        ({"verb": "people"}, "there is no scene here"),
         ({"verb": "rate", "value": "fast"}, "value: "),
         ({"verb": "loop", "value": 1}, "value: "),
         ({"verb": "filter", "kinds": [1]}, "kinds: "),
@@ -120,6 +165,8 @@ def test_no_line_breaks_it(line: bytes) -> None:
         ("unplug 2.5", {"verb": "unplug", "seconds": 2.5}),
         ("fault clear 3", {"verb": "fault clear", "id": 3}),
         ("rate 0", {"verb": "rate", "value": 0.0}),
+        ("people", {"verb": "people"}),
+        ("people 90", {"verb": "people", "seconds": 90.0}),
         ("loop off", {"verb": "loop", "value": False}),
         ("filter", {"verb": "filter", "kinds": None}),
         ("filter data-float", {"verb": "filter", "kinds": ["data-float"]}),

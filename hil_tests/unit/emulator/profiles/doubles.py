@@ -9,7 +9,7 @@ from emulator.echo.echo import SceneEcho
 from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions, ProfileSettings
 from emulator.profiles.run import ProfileStream
-from emulator.scene.motion import PersonSpec
+from emulator.scene.people import PersonSpec
 from emulator.scene.scene import LeakageSpec, NoiseSpec, Scene, empty_room
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m

@@ -93,14 +93,95 @@ def test_rate_and_displacement_of_a_phase_modulated_tone(
     pulses = 1e-3 * (3 - 2j) + 1e-3 * np.exp(1j * (4 * math.pi / wavelength_m * chest_m + 1.1))
     found_m = displacement_m(pulses, wavelength_m)
     assert found_m == pytest.approx(chest_m - chest_m.mean(), abs=0.02 * amplitude_m)
-    found_hz = breathing_rate_hz(found_m, SLOW.rate_hz)
+    found = breathing_rate_hz(found_m, SLOW.rate_hz)
+    assert found is not None
+    found_hz, confidence = found
     assert found_hz == pytest.approx(rate_hz, abs=0.5 / WINDOW_S)
+    assert 0.9 < confidence <= 1
 
 
 def test_noise_has_no_rate() -> None:
     rng = np.random.default_rng(5)
     rates = [breathing_rate_hz(rng.standard_normal(SLOW.pulses), SLOW.rate_hz) for _ in range(200)]
     assert sum(rate is not None for rate in rates) <= 20
+
+
+def test_a_step_has_no_rate() -> None:
+    """Of a body that shifts: its spectrum falls through the band, without a peak in it."""
+    for at in range(20, 65, 5):
+        chest_m = np.where(np.arange(SLOW.pulses) > at, 0.03, 0.0)
+        assert breathing_rate_hz(chest_m, SLOW.rate_hz) is None
+
+
+def test_sleep_and_vital_signs_are_of_the_same_breath() -> None:
+    """Three messages a tick; a person at 15 breaths a minute, no heart rate (7.4)."""
+    features = (OutputFeature.RESP_STATUS, OutputFeature.SLEEP_STATUS, OutputFeature.VITAL_SIGNS)
+    stream, _ = profile(
+        room(standing(3.0, breaths_per_min=15.0)),
+        model="x4m200",
+        outputs=dict.fromkeys(features, 1),
+    )
+    heard = [message for _, message in heard_until(stream, 40 * SECOND)]
+    assert len(heard) % 3 == 0
+    for status, sleep, vital in zip(heard[::3], heard[1::3], heard[2::3], strict=True):
+        assert isinstance(status, m.RespStatus)
+        assert isinstance(sleep, m.SleepStatus)
+        assert isinstance(vital, m.VitalSigns)
+        assert status.counter == sleep.counter == vital.counter
+        assert status.state == sleep.state == vital.state
+        assert status.rpm == round(sleep.rpm)
+        assert sleep.rpm == vital.respiration_rate
+        assert status.distance_m == sleep.distance_m == vital.respiration_distance_m
+        assert status.signal_quality == sleep.signal_quality
+        assert (vital.heart_rate, vital.heart_distance_m, vital.heart_confidence) == (0, 0, 0)
+    assert isinstance(status, m.RespStatus)
+    assert isinstance(sleep, m.SleepStatus)
+    assert isinstance(vital, m.VitalSigns)
+    assert status.state == RespirationState.BREATHING
+    assert sleep.rpm == pytest.approx(15.0, abs=60 / WINDOW_S / 2)
+    assert 0.9 < vital.respiration_confidence <= 1
+    assert sleep.movement_slow > 3 * sleep.movement_fast
+    assert 0 < vital.normalized_movement_slow < 1
+    zone_m = (vital.normalized_movement_start_m, vital.normalized_movement_end_m)
+    assert zone_m == pytest.approx((0.40, 9.40), abs=BIN_M)
+
+
+@pytest.mark.parametrize(
+    ("shape", "rate"),
+    [
+        ({"breath_pattern": "realistic"}, 15.0),
+        ({"breath_pattern": "realistic", "heart_amplitude_m": 0.0003}, 15.0),
+        ({"facing_deg": 0.0}, 15.0),  # the back: 1 mm of 4 mm
+        ({"facing_deg": 90.0}, 15.0),
+        ({"posture": "prone"}, 15.0),
+        ({"posture": "supine", "rate_wander": 0.1}, 15.0),
+    ],
+)
+def test_posture_and_pattern_leave_the_rate(shape: dict[str, object], rate: float) -> None:
+    person = standing(2.0, breaths_per_min=rate, **shape)
+    late = [one for _, one in statuses(room(person), 32)][21:]
+    assert {one.state for one in late} == {RespirationState.BREATHING}
+    for one in late:
+        assert one.rpm == pytest.approx(rate, abs=60 / WINDOW_S / 2)
+
+
+@pytest.mark.parametrize(
+    ("posture", "facing_deg", "share"), [("upright", 0.0, 0.25), ("upright", 180.0, 1.0)]
+)
+def test_movement_is_what_is_seen_of_the_chest(
+    posture: str, facing_deg: float, share: float
+) -> None:
+    """The radar looks along x at a back (0 degrees) or a front."""
+    person = standing(2.0, posture=posture, facing_deg=facing_deg, breath_amplitude_m=0.008)
+    heard = statuses(room(person, quiet=True), 45)[22:]
+    assert max(one.movement_mm for _, one in heard) == pytest.approx(8 * share, rel=0.25)
+
+
+def test_nobody_breathes_in_apnoea() -> None:
+    """60 s of rest in every 61 s: from 20 s into it on there is nothing to see."""
+    person = standing(2.0, apnoea={"every_s": 61.0, "lasts_s": 60.0})
+    states = [one.state for at, one in statuses(room(person), 58) if at > 27]
+    assert set(states) == {RespirationState.NO_MOVEMENT}
 
 
 def test_lists_say_where() -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from emulator.echo.reflections import direct_reflections, person_scatterer, viewpoint
-from emulator.scene.motion import PersonSpec, chest_displacement_m, positions_m
+from emulator.echo.people import person_scatterer
+from emulator.echo.reflections import direct_reflections, viewpoint
+from emulator.scene.people import PersonSpec, chest_displacement_m, positions_m
 from emulator.scene.scene import load_scene
 from hil_tests.unit.emulator.rooms import radar_at
 

@@ -12,6 +12,7 @@ from emulator.scene.tables import shipped_names
 RADAR = '[[radars]]\nname = "left"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.2\nyaw_deg = 90.0\n'
 HEAD = 'name = "mine"\nenvironment = "lab"\ndescription = "a scene"\n'
 GOOD = HEAD + RADAR
+MOVER = '[[movers]]\nname = "fan"\nx_m = 1.0\ny_m = 0.0\nswing_m = 0.01\n'
 PERSON = '[[people]]\nname = "a"\nwaypoints_m = [[1.0, 0.0]]\n'
 FAR = '[path]\nwaypoints_m = [[0, 0], [1000, 0]]\nlaps = ["forward"]\n'
 OUT_OF_BOUNDS = [
@@ -111,6 +112,14 @@ def test_a_scene_is_frozen() -> None:
         (GOOD + PERSON + "pulse = 70", "people[0].pulse: unknown key; allowed are name, way"),
         (GOOD + PERSON + "leaves_s = 2.0\nenters_s = 2.0", "people[0]: leaves_s: must be later"),
         (GOOD + PERSON + PERSON, "people.name: each must be unique"),
+        (GOOD + PERSON + 'posture = "flat"', 'people[0].posture: must be "upright", "supine", '),
+        (
+            GOOD + PERSON + "[people.sleep]\n",
+            "people[0]: posture: who sleeps must be supine, prone",
+        ),
+        (GOOD + PERSON + "apnoea.lasts_s = 9\n", "people[0].apnoea.every_s: missing"),
+        (GOOD + MOVER + "rate_hz = 0\n", "movers[0].rate_hz: must be greater than 0, not 0"),
+        (GOOD + 2 * (MOVER + "rate_hz = 1\n"), "movers.name: each must be unique"),
     ],
 )
 def test_a_bad_scene_is_one_line_that_names_the_place(

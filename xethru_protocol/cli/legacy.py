@@ -1,0 +1,118 @@
+"""``xethru legacy``: runs a script that was written for the vendor's library ModuleConnector."""
+
+import argparse
+import builtins
+import re
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Collection
+from pathlib import Path
+from types import CodeType, ModuleType, TracebackType
+
+import xethru_protocol
+from xethru_protocol import legacy as pymoduleconnector
+from xethru_protocol.wire.errors import XeThruError
+
+_OURS = str(Path(xethru_protocol.__file__).parent)
+_INTERRUPTED = 130
+
+# What Python 3 says of statements of Python 2, and such statements where it says no more than
+# "invalid syntax".
+_MESSAGES_OF_PYTHON_2 = re.compile(
+    r"Missing parentheses in call to|multiple exception types must be parenthesized"
+    r"|leading zeros in decimal integer|inconsistent use of tabs|invalid decimal literal"
+)
+_STATEMENTS_OF_PYTHON_2 = re.compile(
+    r"^\s*(print|exec)\s+[^=(]|^\s*except\s+[\w.]+\s*,|^\s*raise\s+[\w.]+\s*,|<>|`|\bur?['\"]|\d[lL]\b"
+)
+
+
+class _ScriptError(XeThruError):
+    """A script cannot be read or compiled."""
+
+
+def legacy(arguments: argparse.Namespace) -> int:
+    path = Path(arguments.script)
+    code = _compiled(path)
+    if code is None:
+        return 1
+    main = ModuleType("__main__")
+    vars(main).update(__file__=str(path), __builtins__=builtins)
+    running = threading.enumerate()
+    before = sys.argv, sys.path[0], sys.modules["__main__"]
+    # Ctrl-C is the script's, which may catch it
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        sys.argv = [str(path), *arguments.arguments]
+        sys.path[0] = str(path.resolve().parent)
+        sys.modules["__main__"] = main
+        pymoduleconnector.install()
+        exec(code, vars(main))
+        _join_threads(running)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except Exception as error:
+        shown = error.with_traceback(_of_script(error.__traceback__))
+        sys.excepthook(type(shown), shown, shown.__traceback__)
+        return 1
+    finally:
+        pymoduleconnector.close_all()
+        pymoduleconnector.remove()
+        sys.argv, sys.path[0], sys.modules["__main__"] = before
+        signal.signal(signal.SIGINT, handler)
+    return 0
+
+
+def _compiled(path: Path) -> CodeType | None:
+    """Compile a script; None if it is no Python 3 and its error was shown."""
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise _ScriptError(f"{path} cannot be read: {error.strerror or error}") from None
+    try:
+        return compile(source, str(path), "exec", dont_inherit=True)
+    except SyntaxError as error:
+        if _is_python_2(error):
+            raise _ScriptError(
+                f"{path} is Python 2 ({error.msg}, line {error.lineno}): convert it, by "
+                f"'2to3 -w {path.name}' of a Python before 3.13, or 'futurize -w {path.name}' of "
+                "the package future, and run the result"
+            ) from None
+        traceback.print_exception(error, limit=0)
+    except ValueError as error:  # null bytes
+        raise _ScriptError(f"{path} is no Python script: {error}") from None
+    return None
+
+
+def _is_python_2(error: SyntaxError) -> bool:
+    return bool(
+        _MESSAGES_OF_PYTHON_2.search(error.msg) or _STATEMENTS_OF_PYTHON_2.search(error.text or "")
+    )
+
+
+def _join_threads(others: Collection[threading.Thread]) -> None:
+    """Wait for threads that the script started, as Python does at its end."""
+    for thread in threading.enumerate():
+        if thread not in others and not thread.daemon:
+            thread.join()
+
+
+def _of_script(trace: TracebackType | None) -> TracebackType | None:
+    """Return a traceback without the frames of this package at both of its ends."""
+    while trace is not None and _is_ours(trace):
+        trace = trace.tb_next
+    frames = []
+    while trace is not None:
+        frames.append(trace)
+        trace = trace.tb_next
+    while frames and _is_ours(frames[-1]):
+        frames.pop()
+    for frame in reversed(frames):
+        trace = TracebackType(trace, frame.tb_frame, frame.tb_lasti, frame.tb_lineno)
+    return trace
+
+
+def _is_ours(trace: TracebackType) -> bool:
+    return trace.tb_frame.f_code.co_filename.startswith(_OURS)

@@ -1,0 +1,177 @@
+"""Where the frames of a live command come from: a module, or a recording at its own pace."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from xethru_protocol.cli.arguments import raw_config
+from xethru_protocol.cli.output import CommandFailed, frame_rate, module_at, print_warnings, warn_of
+from xethru_protocol.driver.frames import Samples
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.recordings.arrays import RadarArrays, load
+from xethru_protocol.recordings.records import RecordingFault
+from xethru_protocol.validation import shown
+from xethru_protocol.wire.x4 import real_frame_rate
+
+_BLOCK_FRAMES = 64
+_UNKNOWN_NS = int(np.iinfo(np.int64).min)
+
+
+class TimedFrame(NamedTuple):
+    """One frame: its time since the first one, and RF or complex baseband, shape (n_bins,)."""
+
+    t_s: float
+    samples: Samples
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameSource:
+    """Frames of one radar.
+
+    Attributes
+    ----------
+    name
+        Port or path, for people.
+    ranges_m
+        Where the bins lie, shape (n_bins,), as the module counts ranges.
+    is_iq
+        Whether frames are complex baseband, else RF.
+    frame_rate_hz
+        Frames per second, of the radar's own time.
+    tx_center_frequency
+        Setting of the transmitter, 3 or 4.
+    frames
+        The frames, in order. A module begins to send with the first that is asked for.
+    lost
+        Returns how many frames did not arrive.
+    faults
+        What of a recording could not be read, when its frames have been taken.
+    """
+
+    name: str
+    ranges_m: NDArray[np.float64]
+    is_iq: bool
+    frame_rate_hz: float
+    tx_center_frequency: int
+    frames: Iterable[TimedFrame]
+    lost: Callable[[], int] = lambda: 0
+    faults: Sequence[RecordingFault] = ()
+
+
+@contextmanager
+def open_source(arguments: Namespace) -> Iterator[FrameSource]:
+    """Open what the command line names; the module is stopped and closed when the block ends."""
+    if (arguments.recording is None) == (arguments.port is None):
+        arguments.refuse("name a recording, or the --port of a module")
+    if arguments.recording is not None:
+        source = _recorded(arguments)
+        yield source
+        warn_of(arguments.command, source.faults)
+        return
+    config = raw_config(arguments)
+    with module_at(arguments.port, arguments.baudrate) as radar:
+        geometry = radar.configure_raw(config)
+        wanted_hz = frame_rate(radar, arguments.fps)
+        yield FrameSource(
+            name=arguments.port,
+            ranges_m=geometry.ranges_m,
+            is_iq=geometry.downconversion,
+            frame_rate_hz=real_frame_rate(wanted_hz),
+            tx_center_frequency=config.tx_center_frequency,
+            frames=_streamed(radar, wanted_hz, arguments.count),
+            lost=lambda: radar.frames_lost,
+        )
+
+
+def _streamed(radar: X4M300, wanted_hz: float, count: int | None) -> Iterator[TimedFrame]:
+    """Yield frames as they come; their times follow from the chip's counter."""
+    rate_hz = radar.start(wanted_hz)
+    print_warnings(radar)
+    steps, before = 0, None
+    for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate_hz)):
+        if before is not None:
+            follows = frame.stream == before.stream and frame.counter > before.counter
+            steps += frame.counter - before.counter if follows else 1
+        before = frame
+        yield TimedFrame(steps / rate_hz, frame.samples)
+
+
+def _recorded(arguments: Namespace) -> FrameSource:
+    path = arguments.recording
+    faults: list[RecordingFault] = []
+    recording = load(
+        path,
+        faults.append,
+        area_m=arguments.frame_area,
+        downconversion=True if arguments.baseband else None,
+    )
+    if arguments.radar is None and len(recording.radars) > 1:
+        names = ", ".join(map(shown, recording.radars))
+        raise CommandFailed(f"{path} holds several radars: {names}; choose one: --radar NAME")
+    radar = recording.radar if arguments.radar is None else recording.named(arguments.radar)
+    if not radar.parts:
+        raise CommandFailed(f"{path} holds no radar frames")
+    frames = max(radar.parts, key=lambda part: part.n_frames)
+    if frames.kind is None:
+        raise CommandFailed(f"{path} does not say what its frames are; if baseband: --baseband")
+    rate_hz = arguments.fps or frames.frame_rate_hz
+    if rate_hz is None:
+        raise CommandFailed(f"{path} does not say its frame rate; add --fps F")
+    if frames.ranges_m is None:
+        raise CommandFailed(
+            f"{path} does not say where its bins lie; add its --frame-area START END"
+        )
+    return FrameSource(
+        name=path,
+        ranges_m=frames.ranges_m,
+        is_iq=frames.kind == "iq",
+        frame_rate_hz=rate_hz,
+        tx_center_frequency=_tx_center_frequency(frames),
+        frames=_paced(
+            islice(_all_frames(frames, rate_hz, with_times=arguments.fps is None), arguments.count),
+            arguments.rate,
+        ),
+        faults=faults,
+    )
+
+
+def _tx_center_frequency(frames: RadarArrays) -> int:
+    found = frames.settings.get("TXCENTERFREQUENCY")
+    return found if isinstance(found, int) else RawConfig().tx_center_frequency
+
+
+def _all_frames(radar: RadarArrays, rate_hz: float, *, with_times: bool) -> Iterator[TimedFrame]:
+    """Yield the frames of a recording; where their time is not known, at equal intervals."""
+    steps, known_s, before_ns = -1, 0.0, _UNKNOWN_NS
+    for block in radar.blocks(_BLOCK_FRAMES):
+        frames = block.iq if block.kind == "iq" else block.rf
+        assert frames is not None, "of this kind"
+        times_ns = np.full(len(frames), _UNKNOWN_NS)
+        if with_times and block.t_ns is not None:
+            times_ns = block.t_ns
+        for samples, t_ns in zip(frames, times_ns.tolist(), strict=True):
+            if _UNKNOWN_NS in (t_ns, before_ns):
+                steps += 1
+            else:
+                known_s += max((t_ns - before_ns) * 1e-9, 0.0)
+            before_ns = t_ns
+            yield TimedFrame(known_s + steps / rate_hz, samples)
+
+
+def _paced(frames: Iterator[TimedFrame], rate: float) -> Iterator[TimedFrame]:
+    """Yield frames when their time has come; at rate 0 at once."""
+    began_s = time.monotonic()
+    for frame in frames:
+        if rate:
+            time.sleep(max(began_s + frame.t_s / rate - time.monotonic(), 0.0))
+        yield frame

@@ -1,0 +1,686 @@
+"""Recordings as arrays: `load` gives frames, times and ranges of any recording.
+
+The frames of a radar are a matrix with one row per frame: float32 RF amplitudes or complex64
+baseband. Every way in which a module sends baseband becomes I + jQ with the sign as sent (Protocol
+reference 6.1, 7.1, 7.5): all I then all Q of a radar frame, BASEBAND_IQ, BASEBAND_AP as amplitude *
+exp(j phase), RADAR_BASEBAND_FLOAT, and Q15, whose integers are multiplied by the scaling factor.
+RADAR_RF holds counts of the chip.
+
+Nothing is read before the first question. Then a file is read once for what describes its frames,
+12 bytes each, and again for the samples: all of them by `RadarArrays.iq`, a part at a time by
+`RadarArrays.blocks`.
+"""
+
+import math
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.driver.link import CONFIG_SETTINGS
+from xethru_protocol.recordings.array_files import (
+    DTYPES,
+    Frames,
+    Kind,
+    Samples,
+    Settings,
+    is_array_file,
+    read_array_file,
+)
+from xethru_protocol.recordings.formats import (
+    message_name,
+    read_recording,
+    recording_content,
+    refuse_name,
+)
+from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayout, FrameLayouts
+from xethru_protocol.recordings.records import (
+    MODULE_METRES,
+    NO_TIME_NS,
+    FaultHandler,
+    RecordingError,
+    RecordingFault,
+    report,
+)
+from xethru_protocol.validation import shown
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.messages import (
+    REGISTERS,
+    BasebandAp,
+    BasebandIq,
+    DataFloat,
+    RadarBasebandFloat,
+    RadarBasebandQ15,
+    RadarMessage,
+    RadarRf,
+    RadarRfNormalized,
+    ReplyByte,
+    ReplyFloat,
+    ReplyInt,
+)
+from xethru_protocol.wire.x4 import TRUE_PER_MODULE_METRE, real_frame_rate
+
+_BLOCK = 1024
+
+
+class RadarArrays:
+    """Frames of one radar as arrays.
+
+    A frame's number is its row in every array. Where a recording holds frames of several layouts,
+    since the frame area was changed or different messages were recorded, `parts` has one entry for
+    each, and the arrays of the whole raise `RecordingError`.
+    """
+
+    def __init__(self, name: str, find: Callable[[], Sequence[Frames]], nothing: str) -> None:
+        self.name = name
+        self._find = find
+        self._nothing = nothing
+
+    @cached_property
+    def _all(self) -> tuple[Frames, ...]:
+        return tuple(self._find())
+
+    @property
+    def frames(self) -> Frames:
+        """What the arrays are made of; RecordingError without frames, and for several layouts."""
+        if len(self._all) == 1:
+            return self._all[0]
+        if not self._all:
+            raise RecordingError(f"{self._nothing} holds no radar frames")
+        listed = "; ".join(f"{frames.n_frames} of {frames.about}" for frames in self._all[:4])
+        more = "" if len(self._all) <= 4 else f"; and {len(self._all) - 4} other layouts"
+        raise RecordingError(
+            f"{self._nothing} holds frames of {len(self._all)} layouts, which have no common "
+            f"array: {listed}{more}; choose one: parts[0], parts[1] ..."
+        )
+
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{frames.n_frames} frames of {frames.about}" for frames in self._all)
+        return f"<RadarArrays {self.name}: {parts or 'no frames'}>"
+
+    @property
+    def parts(self) -> tuple["RadarArrays", ...]:
+        """The frames of each layout, in the order of their first frames."""
+        return tuple(_of(self.name, frames, self._nothing) for frames in self._all)
+
+    @property
+    def kind(self) -> Kind | None:
+        """``"rf"`` or ``"iq"``; None where it is not known, or there are no frames."""
+        return self.frames.kind if self._all else None
+
+    @property
+    def n_frames(self) -> int:
+        return sum(frames.n_frames for frames in self._all)
+
+    @property
+    def n_bins(self) -> int:
+        """Bins of a frame; 0 without frames."""
+        return self.frames.n_bins if self._all else 0
+
+    @cached_property
+    def _samples(self) -> Samples:
+        (whole,) = self._blocks(max(self.n_frames, 1))
+        return whole
+
+    def _of_kind(self, kind: Kind) -> Samples | None:
+        found = self.frames.kind
+        if found is None:
+            raise RecordingError(
+                f"{self._nothing}: its frames of {self.frames.n_bins} values may be RF or complex "
+                "baseband; say which: load(path, downconversion=True or False)"
+            )
+        return self._samples if found == kind else None
+
+    @property
+    def rf(self) -> npt.NDArray[np.float32] | None:
+        """RF amplitudes, shape (n_frames, n_bins), float32; None of baseband."""
+        return self._of_kind("rf")
+
+    @property
+    def iq(self) -> npt.NDArray[np.complex64] | None:
+        """Complex baseband, shape (n_frames, n_bins), complex64; None of RF."""
+        return self._of_kind("iq")
+
+    @property
+    def counter(self) -> npt.NDArray[np.uint32] | None:
+        """Frame counters, shape (n_frames,); None if unknown."""
+        return self.frames.counter
+
+    @property
+    def t_ns(self) -> npt.NDArray[np.int64] | None:
+        """Times of arrival, shape (n_frames,), ns since 1970; None if none is known.
+
+        A session of ``uwb-slam`` has session time, which is that of its odometry.
+
+        A single unknown time is the least int64, which is NaT in ``t_ns.view("datetime64[ns]")``.
+        """
+        return self.frames.t_ns
+
+    @property
+    def ranges_m(self) -> npt.NDArray[np.float64] | None:
+        """Range of each bin, shape (n_bins,) [module metres], as on the wire; None if unknown."""
+        return self.frames.ranges_m
+
+    @property
+    def true_ranges_m(self) -> npt.NDArray[np.float64] | None:
+        """Range of each bin, shape (n_bins,) [m], by the speed of light; None if unknown.
+
+        The firmware takes 3.0e8 m/s for light, so what it gives is 0.07 % too long. Protocol
+        reference 9.1.
+        """
+        ranges_m = self.ranges_m
+        return None if ranges_m is None else ranges_m * TRUE_PER_MODULE_METRE
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of the chip by their names in `X4Setting`, as far as they are known.
+
+        FRAMEAREA and FRAMEBINCOUNT are the module's answers.
+        """
+        return self.frames.settings if self._all else {}
+
+    @cached_property
+    def frame_rate_hz(self) -> float | None:
+        """Frames per second: by the settings, else by times and counters; None if unknown.
+
+        A setting gives the rate of the chip's timer (Protocol reference 9.6). Times give the slope
+        of a line through them over the counter, along the longest run of rising counters.
+        """
+        frames = self.frames
+        if frames.frame_rate_hz is not None:
+            return frames.frame_rate_hz
+        return _rate_hz(frames.t_ns, frames.counter)
+
+    def blocks(self, n_frames: int = _BLOCK) -> Iterator["RadarArrays"]:
+        """Yield the frames in parts of ``n_frames``, the last one shorter, each in memory.
+
+        For recordings that are larger than memory: the file is read as the parts are taken.
+        """
+        if n_frames < 1:
+            raise RecordingError(f"a block needs a frame, not {n_frames}")
+        if not self._all:
+            return
+        frames = self.frames
+        self._of_kind_known()
+        begin = 0
+        for samples in self._blocks(n_frames):
+            rows = slice(begin, begin + len(samples))
+            begin = rows.stop
+            block = replace(
+                frames,
+                chunks=partial(_once, samples),
+                n_frames=len(samples),
+                counter=None if frames.counter is None else frames.counter[rows],
+                t_ns=None if frames.t_ns is None else frames.t_ns[rows],
+                frame_rate_hz=self.frame_rate_hz,
+            )
+            made = _of(self.name, block, self._nothing)
+            made._samples = samples
+            yield made
+
+    def _of_kind_known(self) -> None:
+        if self.frames.kind is None:
+            self._of_kind("iq")
+
+    def _blocks(self, n_frames: int) -> Iterator[Samples]:
+        """Yield arrays of ``n_frames`` rows, the last one shorter; one of none without frames."""
+        frames = self.frames
+        assert frames.kind is not None, "asked before"
+        left = frames.n_frames
+        block: Samples = np.empty((min(n_frames, left), frames.n_bins), DTYPES[frames.kind])
+        filled = 0
+        for chunk in frames.chunks():
+            at = 0
+            while at < len(chunk) and left:
+                taken = min(len(chunk) - at, len(block) - filled)
+                block[filled : filled + taken] = chunk[at : at + taken]
+                at += taken
+                filled += taken
+                left -= taken
+                if filled == len(block):
+                    yield block
+                    filled = 0
+                    block = np.empty((min(n_frames, left), frames.n_bins), block.dtype)
+            if not left:
+                break
+        if left:
+            raise RecordingError(f"{self._nothing} has changed since it was loaded; load it again")
+        if not frames.n_frames:
+            yield block
+
+
+def _once(samples: Samples) -> Iterator[Samples]:
+    yield samples
+
+
+def _of(name: str, frames: Frames, nothing: str) -> RadarArrays:
+    return RadarArrays(name, lambda: (frames,), nothing)
+
+
+def _rate_hz(
+    t_ns: npt.NDArray[np.int64] | None, counter: npt.NDArray[np.uint32] | None
+) -> float | None:
+    if t_ns is None:
+        return None
+    known = t_ns != NO_TIME_NS
+    times = t_ns[known]
+    if counter is None:
+        counts = np.arange(len(times), dtype=np.float64)
+    else:
+        counts = counter[known].astype(np.float64)
+        falls = np.flatnonzero(np.diff(counts) <= 0) + 1
+        ends = np.concatenate([[0], falls, [len(counts)]])
+        longest = int(np.argmax(np.diff(ends)))
+        run = slice(ends[longest], ends[longest + 1])
+        times, counts = times[run], counts[run]
+    if len(times) < 2:
+        return None
+    seconds = (times - times[0]) * 1e-9
+    seconds -= seconds.mean()
+    counts = counts - counts.mean()
+    slope_s = float(seconds @ counts / (counts @ counts))
+    return 1 / slope_s if slope_s > 0 else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TextColumn:
+    """Lines of another sensor, recorded beside the radars: ``lines[k]`` came at ``t_ns[k]``.
+
+    ``t_ns`` has shape (n,), ns since 1970, on the clock of the frames.
+    """
+
+    name: str
+    t_ns: npt.NDArray[np.int64]
+    lines: tuple[str, ...]
+
+    @property
+    def values(self) -> npt.NDArray[np.float64] | None:
+        """Numbers of the lines, shape (n,), or (n, k) where a line has k > 1; None if not numeric.
+
+        They are separated by commas, semicolons or blanks. A line with other content, such as a
+        title or a line that was cut, has NaN; where most are such, the column is not numeric.
+
+        >>> TextColumn(name="belt", t_ns=np.arange(3), lines=("v", "1.5", "2")).values
+        array([nan, 1.5, 2. ])
+        """
+        rows = [_numbers(line) for line in self.lines]
+        lengths = Counter(len(row) for row in rows if row)
+        if not lengths:
+            return None
+        width, count = lengths.most_common(1)[0]
+        if 2 * count < len(rows):
+            return None
+        nothing = (math.nan,) * width
+        table = np.array([row if len(row) == width else nothing for row in rows], np.float64)
+        return table[:, 0] if width == 1 else table
+
+
+def _numbers(line: str) -> tuple[float, ...]:
+    """Return the numbers of a line; none if it holds anything else."""
+    try:
+        return tuple(map(float, line.replace(",", " ").replace(";", " ").split()))
+    except ValueError:
+        return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Given:
+    """What a caller knows about the frames of a recording; None: what the recording says."""
+
+    area_m: tuple[float, float] | None = None
+    range_start_m: float | None = None
+    bin_length_m: float | None = None
+    downconversion: bool | None = None
+
+    def __post_init__(self) -> None:
+        steps = (self.range_start_m, self.bin_length_m)
+        if self.area_m is not None and steps != (None, None):
+            raise RecordingError("give area_m, or range_start_m and bin_length_m, not both")
+        if (self.range_start_m is None) != (self.bin_length_m is None):
+            raise RecordingError("range_start_m and bin_length_m are given together")
+        for value in (*(self.area_m or ()), *steps):
+            if value is not None and not math.isfinite(value):
+                raise RecordingError(f"a range cannot be {value}")
+
+    def ranges_m(self, n_bins: int, kind: Kind | None) -> npt.NDArray[np.float64] | None:
+        """Return the range of each bin, shape (n_bins,), as given; None if it is not."""
+        if self.area_m is not None and kind is not None:
+            return FrameGeometry.from_read_back(
+                area_m=self.area_m, n_bins=n_bins, downconversion=kind == "iq"
+            ).ranges_m
+        if self.range_start_m is not None and self.bin_length_m is not None:
+            return steps_m(self.range_start_m, self.bin_length_m, n_bins)
+        return None
+
+
+def steps_m(start_m: float, bin_m: float, n_bins: int) -> npt.NDArray[np.float64]:
+    return start_m + np.arange(n_bins, dtype=np.float64) * bin_m
+
+
+class _Layout(NamedTuple):
+    """What frames with a common array have in common; lengths in module metres."""
+
+    message: str
+    n_values: int
+    start_m: float | None
+    bin_m: float | None
+    downconversion: bool | None  # of DATA FLOAT, by the module's answers
+
+
+class _Row(NamedTuple):
+    layout: _Layout
+    counter: int
+    values: npt.NDArray[Any]  # of DATA FLOAT as sent, else in the dtype of its kind
+    t_ns: int | None
+
+
+@dataclass(slots=True)
+class _Column:
+    settings: Settings
+    rates_hz: set[float | None] = field(default_factory=set)
+    counter: "array[int]" = field(default_factory=lambda: array("I"))
+    t_ns: "array[int]" = field(default_factory=lambda: array("q"))
+
+
+class _Messages:
+    """Frames among the messages of one radar of a recording.
+
+    ``info`` is what an MCAP file says about the radar: see `mcap.McapContent`.
+    """
+
+    def __init__(
+        self, path: Path, radar: str | None, given: Given, info: Mapping[str, Any]
+    ) -> None:
+        self._path = path
+        self._radar = radar
+        self._given = given
+        self._info = info if info.get("length_unit") == MODULE_METRES else {}
+        self._settings: dict[str, Any] = {}
+
+    def find(self, on_fault: FaultHandler) -> list[Frames]:
+        """Read the recording once for what describes its frames."""
+        columns: dict[_Layout, _Column] = {}
+        layouts = FrameLayouts(self._given.downconversion)
+        for row in self._rows(on_fault, layouts):
+            column = columns.get(row.layout)
+            if column is None:
+                column = columns[row.layout] = _Column(dict(self._settings))
+            column.rates_hz.add(self._settings.get(X4Setting.FPS.name))
+            column.counter.append(row.counter)
+            column.t_ns.append(NO_TIME_NS if row.t_ns is None else row.t_ns)
+        found = layouts.layouts()
+        return [self._frames(layout, column, found) for layout, column in columns.items()]
+
+    def _frames(self, layout: _Layout, column: _Column, found: Mapping[int, FrameLayout]) -> Frames:
+        kind: Kind | None = "rf" if layout.message.startswith("RADAR_RF") else "iq"
+        n_bins = layout.n_values
+        if layout.message == _RAW:
+            downconversion = found[n_bins].downconversion
+            if self._given.downconversion is None and layout.downconversion is not None:
+                downconversion = layout.downconversion
+            kind = None if downconversion is None else "iq" if downconversion else "rf"
+            n_bins = n_bins // 2 if downconversion else n_bins
+        ranges_m = self._given.ranges_m(n_bins, kind)
+        if ranges_m is None and layout.start_m is not None and layout.bin_m is not None:
+            ranges_m = steps_m(layout.start_m, layout.bin_m, n_bins)
+        t_ns = np.array(column.t_ns, np.int64)
+        rate_hz = column.rates_hz.pop() if len(column.rates_hz) == 1 else None
+        what = {"rf": "RF bins", "iq": "complex bins", None: "values"}[kind]
+        return Frames(
+            about=f"{n_bins} {what} ({layout.message})",
+            kind=kind,
+            chunks=lambda: self._chunks(layout, kind),
+            n_frames=len(t_ns),
+            n_bins=n_bins,
+            counter=np.array(column.counter, np.uint32),
+            t_ns=t_ns if (t_ns != NO_TIME_NS).any() else None,
+            ranges_m=ranges_m,
+            frame_rate_hz=real_frame_rate(rate_hz) or None if rate_hz is not None else None,
+            settings=column.settings,
+        )
+
+    def _chunks(self, layout: _Layout, kind: Kind | None) -> Iterator[Samples]:
+        for row in self._rows(lambda fault: None):
+            if row.layout == layout:
+                values = row.values
+                if kind == "iq" and values.dtype != np.complex64:
+                    values = _complex(*np.split(values, 2))
+                yield values[np.newaxis]
+
+    def _rows(self, on_fault: FaultHandler, layouts: FrameLayouts | None = None) -> Iterator[_Row]:
+        geometries = FrameGeometries()
+        self._settings = _settings_of(self._info)
+        for message, t_ns in read_recording(self._path, on_fault, radar=self._radar):
+            if layouts is not None:
+                layouts.take(message)
+            match message:
+                case DataFloat(content_id=0):
+                    yield self._raw(message, geometries.of(message), t_ns)
+                case BasebandIq() | BasebandAp() | RadarMessage():
+                    layout = _Layout(
+                        message_name(message),
+                        message.num_bins,
+                        message.range_offset_m,
+                        message.bin_length_m,
+                        None,
+                    )
+                    if isinstance(message, RadarMessage):
+                        self._settings[X4Setting.FPS.name] = float(message.frames_per_s)
+                    yield _Row(layout, message.counter, _samples(message), t_ns)
+                case ReplyByte() | ReplyInt() | ReplyFloat():
+                    geometries.take(message)
+                    self._take_setting(message)
+
+    def _raw(self, message: DataFloat, geometry: FrameGeometry | None, t_ns: int | None) -> _Row:
+        n_values = len(message.values)
+        layout = _Layout(_RAW, n_values, None, None, None)
+        if geometry is not None:
+            start_m, bin_m = geometry.range_start_m, geometry.bin_length_m
+            layout = _Layout(_RAW, n_values, start_m, bin_m, geometry.downconversion)
+        elif (n_bins := self._info.get("n_bins")) in (n_values, n_values / 2):
+            described = self._info.get("range_start_m"), self._info.get("bin_length_m")
+            layout = _Layout(_RAW, n_values, *described, n_bins != n_values)
+        return _Row(layout, message.info, message.values, t_ns)
+
+    def _take_setting(self, message: ReplyByte | ReplyInt | ReplyFloat) -> None:
+        if message.content_id in _SETTINGS and message.values:
+            values = tuple(message.values)
+            name = X4Setting(message.content_id).name
+            self._settings[name] = values[0] if len(values) == 1 else values
+
+
+_RAW = "DATA FLOAT"
+_SETTINGS = frozenset(X4Setting) - REGISTERS
+
+
+def _settings_of(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings in the description of a radar, by their names in `X4Setting`.
+
+    A recording has the module's answers, a session the fields of `RawConfig`.
+    """
+    found = info.get("settings")
+    settings: dict[str, Any] = {}
+    for name, value in found.items() if isinstance(found, dict) else ():
+        setting = CONFIG_SETTINGS.get(name)
+        if setting is X4Setting.FRAMEAREA:
+            continue  # as it was asked for; where the bins lie is in the description itself
+        if setting is None and name in X4Setting.__members__:
+            setting = X4Setting[name]
+        if setting is not None and value is not None:
+            value = int(value) if isinstance(value, bool) else value
+            settings[setting.name] = tuple(value) if isinstance(value, list) else value
+    rate_hz = info.get("rate_hz")
+    if isinstance(rate_hz, int | float) and rate_hz > 0:
+        settings[X4Setting.FPS.name] = float(rate_hz)
+    return settings
+
+
+def _samples(message: BasebandIq | BasebandAp | RadarMessage) -> Samples:
+    match message:
+        case BasebandAp(amplitude=amplitude, phase=phase):
+            return _complex(amplitude * np.cos(phase), amplitude * np.sin(phase))
+        case BasebandIq(i=i, q=q) | RadarBasebandFloat(i=i, q=q):
+            return _complex(i, q)
+        case RadarBasebandQ15():
+            return message.iq
+        case RadarRf() | RadarRfNormalized():
+            return message.samples.astype(np.float32)
+    raise AssertionError(f"no frame: {message_name(message)}")
+
+
+def _complex(i: npt.NDArray[np.float32], q: npt.NDArray[np.float32]) -> npt.NDArray[np.complex64]:
+    """I + jQ; parts are kept as they are, also beside infinities, which 1j * q does not."""
+    iq = np.empty(i.shape, np.complex64)
+    iq.real, iq.imag = i, q
+    return iq
+
+
+class Recording(RadarArrays):
+    """A recording as arrays, made by `load`: those of its only radar, and of each by name.
+
+    Where there are several radars, the arrays of the whole raise `RecordingError`.
+
+    Attributes
+    ----------
+    path
+        As given.
+    radars
+        By name; the only radar of a recording without names is ``""``.
+    texts
+        Lines of other sensors, by the name of their column.
+    """
+
+    def __init__(
+        self, path: Path, radars: Mapping[str, RadarArrays], texts: Mapping[str, TextColumn]
+    ) -> None:
+        super().__init__("", lambda: self.radar._all, str(path))
+        self.path = path
+        self.radars = radars
+        self.texts = texts
+
+    def __repr__(self) -> str:
+        parts = [*map(repr, self.radars.values()), *(f"text {name}" for name in self.texts)]
+        return f"<Recording {self.path}: {', '.join(parts)}>"
+
+    @property
+    def radar(self) -> RadarArrays:
+        """The only radar; RecordingError if there are several."""
+        if len(self.radars) != 1:
+            names = ", ".join(map(shown, self.radars)) or "none"
+            raise RecordingError(
+                f"{self.path} holds {len(self.radars)} radars, not one: {names}; "
+                "choose one: --radar NAME, in Python .radars[NAME]"
+            )
+        (radar,) = self.radars.values()
+        return radar
+
+    def named(self, name: str) -> RadarArrays:
+        """Return a radar by name; RecordingError if there is none of that name."""
+        if name not in self.radars:
+            refuse_name(self.path, None if any(self.radars) else name)
+            names = ", ".join(map(shown, self.radars)) or "none"
+            raise RecordingError(f"{self.path} holds no radar {shown(name)}; it holds {names}")
+        return self.radars[name]
+
+    @cached_property
+    def _samples(self) -> Samples:
+        return self.radar._samples
+
+
+def load(
+    path: Path | str,
+    on_fault: FaultHandler | None = None,
+    *,
+    area_m: tuple[float, float] | None = None,
+    range_start_m: float | None = None,
+    bin_length_m: float | None = None,
+    downconversion: bool | None = None,
+) -> Recording:
+    """Return a recording as arrays, which are read when they are first used.
+
+    What a recording does not say is None in the result, and can be given: where the bins lie, by
+    ``area_m`` or by the other two, and what its frames are.
+
+    Parameters
+    ----------
+    path
+        Any recording that `read_recording` takes, or a file of arrays: ``.csv``, ``.mat`` or
+        ``.npz`` with ``iq`` or ``rf`` of shape (n_frames, n_bins), and, if known, ``t_ns``,
+        ``counter``, ``ranges_m``, ``frame_rate_hz``.
+    on_fault
+        Called with what could not be read, such as the end of a file that was cut; the rest is
+        read all the same. None: lost messages raise `RecordingError`.
+    area_m
+        Frame area as the module read it back: range of the first bin, and of the last one of
+        baseband or the one behind the last of RF [module metres]. Protocol reference 9.4.
+    range_start_m, bin_length_m
+        Range of the first bin, and from bin to bin [module metres].
+    downconversion
+        Whether radar frames are baseband, which recordings of the vendor's format do not say: it
+        is inferred from how smooth frames are over range.
+
+    Raises
+    ------
+    RecordingError
+        There is nothing to read here, or, when arrays are first used, the recording is damaged.
+
+    Examples
+    --------
+    ::
+
+        recording = load("rec")
+        power = np.abs(recording.iq).mean(axis=0)
+        plt.plot(recording.true_ranges_m, power)
+    """
+    path = Path(path)
+    given = Given(
+        area_m=area_m,
+        range_start_m=range_start_m,
+        bin_length_m=bin_length_m,
+        downconversion=downconversion,
+    )
+    if is_array_file(path):
+        return Recording(path, {"": RadarArrays("", _of_file(path, given), str(path))}, {})
+    content = recording_content(path)
+    reported: set[RecordingFault] = set()
+
+    def note(fault: RecordingFault) -> None:
+        """Report each fault once: every radar of a file meets all of its faults."""
+        if fault in reported:
+            return
+        reported.add(fault)
+        try:
+            report(fault, on_fault)
+        except RecordingError as error:
+            raise RecordingError(f"{error}; load(path, print) reads the rest") from None
+
+    def radar(name: str, info: Mapping[str, Any]) -> RadarArrays:
+        messages = _Messages(path, name or None, given, info)
+        return RadarArrays(name, lambda: messages.find(note), str(path))
+
+    radars = {name: radar(name, info) for name, info in content.radars.items()}
+    texts = {
+        name: TextColumn(
+            name=name,
+            t_ns=np.array([t_ns for t_ns, _ in lines], np.int64),
+            lines=tuple(line for _, line in lines),
+        )
+        for name, lines in content.texts.items()
+    }
+    return Recording(path, radars, texts)
+
+
+def _of_file(path: Path, given: Given) -> Callable[[], Sequence[Frames]]:
+    def find() -> Sequence[Frames]:
+        frames = read_array_file(path)
+        ranges_m = given.ranges_m(frames.n_bins, frames.kind)
+        return [frames if ranges_m is None else replace(frames, ranges_m=ranges_m)]
+
+    return find

@@ -1,0 +1,195 @@
+"""Conversion of any recording into any format.
+
+What is lost, and nothing else: vendor directories cut times to 1 ms, know none before the first
+message's, give a message without a time that of the one before, have no place for answers, system
+messages and the like, nor for the counter of RESP_STATUS; text files of theirs lose the payload
+bits of a NaN. A recording that was split into files or directories comes out as one. Only wire
+captures hold what the host sent and how messages lay in packets. Messages are written as the
+message table encodes them: with a trailer or NUL that was left out, without what lies behind the
+last field. ``.csv`` and ``.mat`` hold the frames only, as `load` gives them; ``.npz`` has them
+beside the messages. Lines of other sensors are in MCAP only.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from xethru_protocol.recordings import npz, pcap, wire_capture
+from xethru_protocol.recordings.array_files import (
+    SUFFIXES,
+    Frames,
+    is_array_file,
+    write_array_file,
+)
+from xethru_protocol.recordings.arrays import Recording, load
+from xethru_protocol.recordings.formats import (
+    message_name,
+    optional_packages,
+    read_recording,
+    recording_content,
+    recording_facts,
+    recording_format,
+    refuse_name,
+)
+from xethru_protocol.recordings.records import (
+    RecordingError,
+    RecordingFacts,
+    RecordingFault,
+    TimedMessages,
+)
+from xethru_protocol.recordings.vendor.writer import RecordingWriter
+from xethru_protocol.wire.connection import Connection, Role
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conversion:
+    """What a conversion did: messages written, and by name those the format has no place for.
+
+    A file of arrays has frames in place of messages.
+    """
+
+    messages: int
+    skipped: dict[str, int]
+    faults: tuple[RecordingFault, ...]
+
+
+def convert(
+    source: Path | str,
+    target: Path | str,
+    on_progress: Callable[[int], None] | None = None,
+    *,
+    radar: str | None = None,
+    area_m: tuple[float, float] | None = None,
+    downconversion: bool | None = None,
+) -> Conversion:
+    """Write a recording again in the format that the target's suffix names.
+
+    RecordingError if the source cannot be read, the target exists or cannot be written, or its
+    suffix names no format.
+
+    Parameters
+    ----------
+    source
+        Any recording that `read_recording` takes.
+    target
+        A new file ``*.mcap``, ``*.npz``, ``*.xtwire`` or, of a wire capture, ``*.pcap``; ``*.csv``
+        or ``*.mat`` for arrays; a name without suffix is a new directory of ModuleConnector.
+    on_progress
+        Called with the number of messages so far, every thousand and at the end.
+    radar
+        Which radar of a session of several, as in `read_recording`.
+    area_m, downconversion
+        What the frames of a file of arrays are, where the source does not say it, as in `load`.
+    """
+    source, target = Path(source), Path(target)
+    faults: list[RecordingFault] = []
+    of_arrays = is_array_file(source)
+    if target.suffix in SUFFIXES and (of_arrays or target.suffix != npz.SUFFIX):
+        if target.exists():
+            raise RecordingError(f"{target} exists already")
+        loaded = load(source, faults.append, area_m=area_m, downconversion=downconversion)
+        frames = (loaded.radar if radar is None else loaded.named(radar)).frames
+        write_array_file(target, frames)
+        if on_progress is not None:
+            on_progress(frames.n_frames)
+        skipped = {f"lines of {name}": len(text.lines) for name, text in loaded.texts.items()}
+        return Conversion(messages=frames.n_frames, skipped=skipped, faults=tuple(faults))
+    if of_arrays:
+        raise RecordingError(
+            f"{source} holds arrays and no messages; it converts to {', '.join(SUFFIXES)}"
+        )
+    if target.suffix == pcap.SUFFIX:
+        if recording_format(source) != "wire":
+            raise RecordingError(
+                f"{source} has no raw bytes, which {target} needs; record them with"
+                " 'xethru record --wire', or take them out of a session with 'uwb-slam convert'"
+            )
+        refuse_name(source, radar)
+        if target.exists():
+            raise RecordingError(f"{target} exists already")
+        packets = pcap.write_pcap(source, target, faults.append)
+        return Conversion(messages=packets, skipped={}, faults=tuple(faults))
+    write = _writer(target)
+    if write is npz.write_npz:
+        known = load(source, lambda fault: None, area_m=area_m, downconversion=downconversion)
+        write = partial(npz.write_npz, arrays=lambda: _only_frames(known, radar))
+    facts = recording_facts(source)
+    n_messages = 0
+
+    def counted() -> TimedMessages:
+        nonlocal n_messages
+        for timed in read_recording(source, faults.append, radar=radar):
+            yield timed
+            n_messages += 1
+            if on_progress is not None and n_messages % 1000 == 0:
+                on_progress(n_messages)
+
+    skipped = write(target, counted(), facts) or {}
+    n_messages -= sum(skipped.values())
+    if on_progress is not None:
+        on_progress(n_messages)
+    for name, lines in recording_content(source).texts.items():
+        skipped[f"lines of {name}"] = len(lines)
+    return Conversion(messages=n_messages, skipped=skipped, faults=tuple(faults))
+
+
+def _only_frames(loaded: Recording, radar: str | None) -> Frames | None:
+    """Return the frames if all have one layout, which is known."""
+    parts = (loaded.radar if radar is None else loaded.named(radar)).parts
+    return parts[0].frames if len(parts) == 1 and parts[0].kind is not None else None
+
+
+_Writer = Callable[[Path, TimedMessages, RecordingFacts], dict[str, int] | None]
+
+
+def _writer(target: Path) -> _Writer:
+    """Return what writes ``target``; it returns by name how many messages it left out, if any."""
+    if target.is_dir() or not target.suffix:
+        return _write_vendor
+    writer: _Writer
+    match target.suffix:
+        case ".mcap":
+            with optional_packages():
+                from xethru_protocol.recordings.mcap import write_mcap
+
+            writer = write_mcap
+        case npz.SUFFIX:
+            writer = npz.write_npz
+        case wire_capture.SUFFIX:
+            writer = _write_wire
+        case unknown:
+            raise RecordingError(
+                f"{target}: no format has the suffix {unknown}; known are .mcap,"
+                f" {wire_capture.SUFFIX}, {pcap.SUFFIX}, {', '.join(SUFFIXES)}, and none for a"
+                " directory of ModuleConnector"
+            )
+    if target.exists():
+        raise RecordingError(f"{target} exists already")
+    return writer
+
+
+def _write_vendor(target: Path, messages: TimedMessages, facts: RecordingFacts) -> dict[str, int]:
+    skipped: Counter[str] = Counter()
+    last_ns = 0
+    with RecordingWriter(
+        target,
+        session_id=facts.session_id,
+        profile_id=facts.profile_id,
+        parameter_file=facts.parameter_file,
+        user_header=facts.user_header,
+    ) as writer:
+        for message, t_ns in messages:
+            last_ns = last_ns if t_ns is None else t_ns
+            if not writer.write(message, last_ns):
+                skipped[message_name(message)] += 1
+        writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
+    return dict(skipped)
+
+
+def _write_wire(target: Path, messages: TimedMessages, facts: RecordingFacts) -> None:
+    module = Connection(Role.MODULE)
+    with wire_capture.WireCapture(target, {"facts": facts.as_json()}) as capture:
+        for message, t_ns in messages:
+            capture.write("rx", module.send(message), t_ns)
