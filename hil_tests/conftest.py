@@ -44,11 +44,16 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register the one marker that tests outside the plugin use; let signals end what tests start.
 
     `nohup` and a shell's background jobs ignore some signals, and all children would inherit that.
+    Workers and the hundreds of processes that tests start share bytecode, also where the environment
+    forbids to write it: each would compile all sources again.
     """
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if IN_SOURCE_TREE:
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        sys.dont_write_bytecode = False
     if IN_SOURCE_TREE and getattr(config.option, "numprocesses", None):
         _compile_once()  # workers load what is compiled; each would compile all
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
