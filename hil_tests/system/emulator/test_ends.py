@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.codes import PongCode
 
 pytestmark = pytest.mark.slow
+THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +38,9 @@ def lines_of(path: str | None, most: int) -> list[str]:
     return data.decode().splitlines()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number", [THOROUGH(signal.SIGINT), THOROUGH(signal.SIGTERM), signal.SIGHUP]
+)
 def test_a_signal_ends_it_with_0_and_nothing_is_left(
     number: signal.Signals, tmp_path: Path, announcements: Path
 ) -> None:
@@ -54,8 +58,15 @@ def test_a_signal_ends_it_with_0_and_nothing_is_left(
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks /proc who catches signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.2, 0.4, 0.8])
+@pytest.mark.parametrize(
+    ("number", "delay_s"),
+    [
+        *((signal.SIGINT, delay_s) for delay_s in (0.0, 0.2, 0.8)),
+        *((signal.SIGTERM, delay_s) for delay_s in (0.05, 0.4)),
+        *(THOROUGH(signal.SIGTERM, delay_s) for delay_s in (0.0, 0.2, 0.8)),
+        *(THOROUGH(signal.SIGINT, delay_s) for delay_s in (0.05, 0.4)),
+    ],
+)
 def test_a_signal_during_the_start_ends_it_with_0(
     delay_s: float, number: signal.Signals, tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ The arrival of the first frame shows how long it took.
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -26,9 +27,7 @@ FPS = 17.0
 SOONEST_S, LATEST_S = 2.5, seconds(5)
 
 
-@pytest.fixture(params=["stay", "vanish", "rename"])
-def mode(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)
 
 
 @pytest.fixture
@@ -46,6 +45,7 @@ def where_it_is(serial: str) -> str | None:
     return next((port.path for port in find_ports() if port.serial == serial), None)
 
 
+@pytest.mark.parametrize("mode", [THOROUGH("stay"), THOROUGH("vanish"), "rename"])
 def test_with_the_port_closed(served: Served) -> None:
     with open_radar(served.paths[0]) as radar:
         asked_ns = time.monotonic_ns()
@@ -64,6 +64,7 @@ def test_with_the_port_closed(served: Served) -> None:
     assert back_s < LATEST_S
 
 
+@pytest.mark.parametrize("mode", [THOROUGH("stay"), "vanish", THOROUGH("rename")])
 def test_with_the_port_open(served: Served) -> None:
     with open_radar(served.paths[0]) as radar:
         asked_ns = time.monotonic_ns()
@@ -75,6 +76,7 @@ def test_with_the_port_open(served: Served) -> None:
         assert radar.info().serial_number == served.serials[0]
 
 
+@pytest.mark.parametrize("mode", ["stay", "vanish", THOROUGH("rename")])
 def test_while_streaming(served: Served, mode: str) -> None:
     with open_radar(served.paths[0], reconnect_s=10.0) as radar:
         geometry = radar.configure_raw(CONFIG)

@@ -84,7 +84,10 @@ def finished_counters(log: Path) -> list[int]:
 
 @pytest.mark.parametrize(
     ("which", "times", "code"),
-    [(signal.SIGINT, 1, 130), (signal.SIGHUP, 2, 129)],  # hang-ups of the kernel and the shell
+    [
+        pytest.param(signal.SIGINT, 1, 130, marks=pytest.mark.thorough),
+        (signal.SIGHUP, 2, 129),  # hang-ups of the kernel and the shell
+    ],
 )
 def test_a_signal_half_way(which: signal.Signals, times: int, code: int, tmp_path: Path) -> None:
     out = tmp_path / "out"

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ from slam.app.rig.emulated import EmulatorProcess
 from slam.app.rig.files import RigFile, RigRadar, write_rig
 from slam.app.run.output import Progress, note, print_table
 from xethru_protocol.system import locked
+
+THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)
 
 
 @pytest.mark.parametrize(("command", "option"), [("demo", "--out"), ("sweep", "--json")])
@@ -77,8 +80,17 @@ def trajectory(folder: Path) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
-@pytest.mark.parametrize(("scene", "code"), [("", 0), ("mars", 2)])
+@pytest.mark.parametrize(
+    ("scene", "code", "closed"),
+    [
+        ("", 0, ">&-"),
+        ("", 0, "<&- >&- 2>&-"),
+        ("mars", 2, "2>&-"),
+        THOROUGH("", 0, "2>&-"),
+        THOROUGH("mars", 2, ">&-"),
+        THOROUGH("mars", 2, "<&- >&- 2>&-"),
+    ],
+)
 def test_a_closed_standard_stream_changes_nothing(
     closed: str, scene: str, code: int, tmp_path: Path
 ) -> None:
