@@ -45,7 +45,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
     `nohup` and a shell's background jobs ignore some signals, and all children would inherit that.
     Workers and the hundreds of processes that tests start share bytecode, also where the environment
-    forbids to write it: each would compile all sources again.
+    forbids to write it: each would compile all sources again. None of them starts threads for
+    linear algebra: of several processes at once, these would wait for each other most of the time.
     """
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -54,6 +55,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if IN_SOURCE_TREE:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         sys.dont_write_bytecode = False
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if IN_SOURCE_TREE and getattr(config.option, "numprocesses", None):
         _compile_once()  # workers load what is compiled; each would compile all
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
