@@ -44,9 +44,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register the one marker that tests outside the plugin use; let signals end what tests start.
 
     `nohup` and a shell's background jobs ignore some signals, and all children would inherit that.
-    Workers and the hundreds of processes that tests start share bytecode, also where the environment
-    forbids to write it: each would compile all sources again. None of them starts threads for
-    linear algebra: of several processes at once, these would wait for each other most of the time.
+    Workers and the hundreds of processes that tests start share bytecode, also where the
+    environment forbids to write it: each would compile all sources again. None of them starts
+    threads for linear algebra: those of several processes wait for each other most of the time.
     """
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -55,7 +55,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if IN_SOURCE_TREE:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         sys.dont_write_bytecode = False
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        for library in ("OPENBLAS", "OMP"):
+            os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     if IN_SOURCE_TREE and getattr(config.option, "numprocesses", None):
         _compile_once()  # workers load what is compiled; each would compile all
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
