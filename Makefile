@@ -20,9 +20,9 @@ test-quick: $(VENV)/installed-test
 	$(PYTEST) -n auto --dist worksteal hil_tests/golden hil_tests/unit/xethru_protocol \
 		hil_tests/unit/slam --ignore hil_tests/unit/slam/app
 
-# And the cases that would take the default suite over five minutes of two cores.
+# And the cases and examples that would take the default suite over five minutes of two cores.
 test-all: $(VENV)/installed-test
-	$(PYTEST) -n auto -m ''
+	HYPOTHESIS_PROFILE=thorough $(PYTEST) -n auto -m ''
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --no-cache --check .

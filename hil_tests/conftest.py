@@ -24,7 +24,8 @@ if importlib.util.find_spec("hypothesis") is not None:
     # No verdict on speed, which is that of the machine.
     timeless = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
     # CI repeats the same examples; what it finds becomes an @example beside the test.
-    settings.register_profile("ci", timeless, derandomize=True, print_blob=True)
+    settings.register_profile("thorough", timeless, derandomize=True, print_blob=True)
+    settings.register_profile("ci", settings.get_profile("thorough"), max_examples=60)
     settings.register_profile("explore", timeless, max_examples=2000)
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
     # Hypothesis also draws constants of the modules loaded so far, hence other examples after other

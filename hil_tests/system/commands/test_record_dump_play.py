@@ -33,7 +33,13 @@ def payloads(messages: Sequence[dict[str, Any]]) -> list[str]:
     return [message["payload_hex"] for message in messages]
 
 
-@pytest.mark.parametrize("kind", [[], ["--baseband"]], ids=["rf", "baseband"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param([], id="rf"),
+        pytest.param(["--baseband"], id="baseband", marks=pytest.mark.thorough),
+    ],
+)
 def test_identical_messages(kind: list[str], tmp_path: Path, capsys: Capture) -> None:
     first, listened, again = (tmp_path / name for name in ("first", "listened", "again"))
     count = ("--count", str(FRAMES))

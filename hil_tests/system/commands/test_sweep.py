@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from hil_tests.patience import seconds, wait_until
+from hil_tests.system.recorded_session import write_shorter_scene
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.rig.emulated import end_tick
 from slam.app.sweep.run import make_case, run_case
@@ -40,7 +41,7 @@ def sweep(scene: Path, out: Path, *options: str) -> dict[str, Any]:
 
 
 def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
-    scene = write_short_scene(tmp_path)
+    scene = write_shorter_scene(tmp_path)
     alone = sweep(scene, tmp_path / "1.json", "--seeds", "3", "--jobs", "1")
     assert alone == sweep(scene, tmp_path / "2.json", "--seeds", "3", "--jobs", "2")
     assert [run["seed"] for run in alone["runs"]] == [0, 1, 2]
@@ -53,7 +54,7 @@ def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
-    scene = write_short_scene(tmp_path)
+    scene = write_shorter_scene(tmp_path)
     command = [
         *SWEEP,
         str(scene),
@@ -149,7 +150,7 @@ def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
 
 def test_a_cluster_gives_what_one_machine_gives(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    scene, stressed = write_short_scene(tmp_path), ("--seeds", "1", "--stress", "dropped")
+    scene, stressed = write_shorter_scene(tmp_path), ("--seeds", "1", "--stress", "dropped")
     with ExitStack() as stack:
         scheduler = stack.enter_context(dask("scheduler", *QUIET, "--port", "0"))
         address = scheduler_address(scheduler)

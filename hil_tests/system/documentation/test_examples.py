@@ -14,6 +14,8 @@ from hil_tests.paths import REPOSITORY
 
 FOLDER = REPOSITORY / "docs" / "examples"
 EXAMPLES = sorted(FOLDER.glob("*.py"))
+# What `commands/test_sweep.py` shows of a cluster in the default suite.
+THOROUGH = {"12_sweep_on_dask"}
 
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="examples are in the source tree")
 
@@ -30,7 +32,14 @@ def imported(program: ast.Module) -> set[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "example",
+    [
+        pytest.param(path, marks=[pytest.mark.thorough] * (path.stem in THOROUGH))
+        for path in EXAMPLES
+    ],
+    ids=lambda path: path.stem,
+)
 def test_an_example_prints_what_it_shows(example: Path, tmp_path: Path) -> None:
     program = ast.parse(example.read_text("utf-8"))
     for name in sorted(imported(program)):

@@ -106,7 +106,7 @@ def test_a_signal_ends_the_reading_of_a_degenerate_file(
     }[command]
     # while it imports, a signal ends the process, which is that of the tests here
     importlib.import_module(MODULES[command])
-    with signal_after(1.0) as sent:
+    with signal_after(0.5) as sent:
         code = main([command, str(degenerate), *options])
         ended = time.monotonic()
     assert code == 128 + signal.SIGTERM

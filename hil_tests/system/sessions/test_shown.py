@@ -185,7 +185,7 @@ def test_a_signal_leaves_what_was_there(
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("command", ["view", "report"])
+@pytest.mark.parametrize("command", ["view", pytest.param("report", marks=pytest.mark.thorough)])
 def test_a_full_disk_leaves_what_was_there(session: Path, tmp_path: Path, command: str) -> None:
     out = tmp_path / "shown"
     out.write_bytes(b"of an earlier run")
