@@ -7,7 +7,8 @@ is a short recorded run.
 - ``python`` with ``>>>`` is a doctest; with tests, it is run by pytest on ``emu:lab``; with a
   file's name as the comment on its first line, it is saved under that name; else it is executed.
   The names of a page's blocks are shared.
-- ``console``: each ``$`` line is run by a shell and must end with 0. Of a command that runs until
+- ``console``: each ``$`` line is run by a shell and must end with 0; `xethru` and `uwb-slam` alone
+  on a line run in this process, which has loaded what they import. Of a command that runs until
   Ctrl-C the lines that are shown must come, and it goes on until the page ends. What installs, make
   and the suite of an installed package are not run.
 - What a console block shows below a command is compared with its stdout, or, if that is empty, with
@@ -22,6 +23,7 @@ is a short recorded run.
 
 import contextlib
 import doctest
+import io
 import os
 import re
 import shlex
@@ -45,8 +47,10 @@ from hil_tests.patience import seconds
 from hil_tests.system.documentation.markdown_blocks import Block, Prompt, blocks_of, prompts_of
 from hil_tests.system.recorded_session import record_session
 from slam.app import cli as slam_cli
+from slam.app.cli import main as slam_main
 from slam.app.rig.files import load_rig
 from xethru_protocol.cli import arguments as xethru_cli
+from xethru_protocol.cli import main as xethru_main
 
 README = REPOSITORY / "README.md"
 DOCS = REPOSITORY / "docs"
@@ -63,6 +67,8 @@ _UNTIL_CTRL_C = re.compile(
 )
 _ONLY_PARSED = re.compile(r"(pip|make|sudo)\b|pytest --pyargs")
 _NUMBER = r"\d+(?:\.\d+)?"
+_HERE = re.compile(r"uwb-slam|xethru (?!legacy)")
+_SHELL = set("|&<>$`*?~")
 
 
 @pytest.fixture(scope="module")
@@ -150,11 +156,26 @@ class Reader:
             self._ends(prompt.command, prompt.shown)
 
     def _ends(self, command: str, shown: str) -> None:
+        if _HERE.match(command) and not set(command) & _SHELL:
+            self._ends_here(command, shown)
+            return
         with self._started(command, stderr=subprocess.PIPE) as process:
             printed, errors = process.communicate(timeout=seconds(20))
         if process.returncode == 0 and shown.strip():
             check_output(command, self._here(shown), printed or errors)
         assert process.returncode == 0, f"{command}\n{printed}\n{errors}"
+
+    def _ends_here(self, command: str, shown: str) -> None:
+        """Run a command in this process, where all that it imports is loaded already."""
+        printed, errors = io.StringIO(), io.StringIO()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("XDG_RUNTIME_DIR", str(self._folder))
+            with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
+                program, *words = shlex.split(self._here(command), comments=True)
+                code = (slam_main if program == "uwb-slam" else xethru_main)(words)
+        if code == 0 and shown.strip():
+            check_output(command, self._here(shown), printed.getvalue() or errors.getvalue())
+        assert code == 0, f"{command}\n{printed.getvalue()}\n{errors.getvalue()}"
 
     def _begins(self, prompt: Prompt) -> None:
         process = self._running.enter_context(self._started(prompt.command))
