@@ -4,9 +4,9 @@ The blocks of a page are taken in order, in one empty folder. `/dev/ttyACM0` and
 `tcp://192.168.0.7:3000` stand for an emulated module, which is also at `ports/radar_1`; `out/demo`
 is a short recorded run.
 
-- ``python`` with ``>>>`` is a doctest; with tests, it is run by pytest on ``emu:lab``; with a
-  file's name as the comment on its first line, it is saved under that name; else it is executed.
-  The names of a page's blocks are shared.
+- ``python`` with ``>>>`` is a doctest; with tests, it is run by pytest on ``emu:lab``, one process
+  for several blocks; with a file's name as the comment on its first line, it is saved under that
+  name; else it is executed. The names of a page's blocks are shared.
 - ``console``: each ``$`` line is run by a shell and must end with 0; `xethru` and `uwb-slam` alone
   on a line run in this process, which has loaded what they import. Of a command that runs until
   Ctrl-C the lines that are shown must come, and it goes on until the page ends. What installs, make
@@ -92,6 +92,7 @@ class Reader:
 
     def __init__(self, folder: Path, module: Served) -> None:
         self.names: dict[str, Any] = {"__name__": "__main__"}
+        self._tests: list[str] = []
         self._folder = folder
         (port,), (tcp_port,) = module.paths, module.tcp_ports
         self._places = {
@@ -134,13 +135,21 @@ class Reader:
             self.names.update(test.globs)
         elif named or re.search(r"^(async )?def test_", block.text, re.MULTILINE):
             name = named[1] if named else "test_mine.py"
+            if name in self._tests or not name.startswith("test_"):
+                self.run_tests()
             (self._folder / name).write_text(self._here(block.text))
             if name.startswith("test_"):
-                words = (*(sys.executable, "-m", "pytest", "-q"), name, "--radar", "emu:lab")
-                self._ends(shlex.join(words), "...passed in...")
+                self._tests.append(name)
         else:
             exec(self._compile(block), self.names)
             plt.close("all")
+
+    def run_tests(self) -> None:
+        """Run the tests that were saved since the last time, all by one pytest."""
+        names, self._tests = self._tests, []
+        if names:
+            words = (*(sys.executable, "-m", "pytest", "-q"), *names, "--radar", "emu:lab")
+            self._ends(shlex.join(words), "...passed in...")
 
     def _check_toml(self, block: Block) -> None:
         if "radars" in tomllib.loads(block.text):
@@ -150,6 +159,8 @@ class Reader:
 
     def _run_command(self, prompt: Prompt) -> None:
         check_words(prompt)
+        if not _ONLY_PARSED.match(prompt.command):
+            self.run_tests()
         if _UNTIL_CTRL_C.match(prompt.command):
             self._begins(prompt)
         elif not _ONLY_PARSED.match(prompt.command):
@@ -301,6 +312,7 @@ def test_every_block_does_what_it_shows(
             except BaseException as error:
                 error.add_note(f"in {block}")
                 raise
+        reader.run_tests()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

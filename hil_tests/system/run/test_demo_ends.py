@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from hil_tests.patience import catches, seconds, wait_until
+from hil_tests.system.recorded_session import write_shorter_scene
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import surviving_counters
 from slam.app.cli import main
@@ -113,7 +114,7 @@ def test_a_signal_half_way(which: signal.Signals, times: int, code: int, tmp_pat
 
 
 def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "slam.app.cli", "demo"]
+    command = [sys.executable, "-m", "slam.app.cli", "demo", "--preset", "paper"]
     command += ["--scene", str(write_short_scene(tmp_path)), "--out", str(tmp_path / "out")]
     limit = 1_000_000  # bytes, of which the session takes several times as many
     run = subprocess.run(
@@ -156,7 +157,7 @@ def test_a_signal_after_the_last_scan_costs_no_result(
         "--preset",
         "paper",
         "--scene",
-        str(write_short_scene(tmp_path)),
+        str(write_shorter_scene(tmp_path)),
         "--out",
         str(out),
     ]
