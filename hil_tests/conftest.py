@@ -1,9 +1,9 @@
 """Shared pytest configuration: Hypothesis profiles, slow tests, what an installed package runs."""
 
-import importlib
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -64,9 +64,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _compile_once() -> None:
-    for module in ("slam.front_end.kernels", "slam.robust.kernels"):
-        importlib.import_module(module)
-    sys.modules["slam.compiled"].compile_kernels()
+    """Compile the kernels, those of each file in a process: the first time it takes seconds."""
+    program = "import slam.{}.kernels, slam.compiled; slam.compiled.compile_kernels()"
+    compilers = [
+        subprocess.Popen([sys.executable, "-c", program.format(folder)], cwd=HERE.parent)
+        for folder in ("front_end", "robust")
+    ]
+    for compiler in compilers:
+        compiler.wait()
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:

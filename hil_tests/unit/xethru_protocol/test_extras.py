@@ -5,6 +5,8 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,11 @@ runpy.run_module("{program}", run_name="__main__")
 """
 
 
+@cache  # it reads the files of all packages
+def _installed() -> Mapping[str, list[str]]:
+    return importlib.metadata.packages_distributions()
+
+
 def _distribution(requirement: str) -> str:
     return re.split(r"[\[<>=]", requirement)[0]
 
@@ -29,7 +36,7 @@ def _distribution(requirement: str) -> str:
 @pytest.mark.skipif(not _PROJECT.exists(), reason="the requirements are in the source tree")
 @pytest.mark.parametrize("extra", PACKAGES)
 def test_the_table_agrees_with_the_requirements(extra: str) -> None:
-    found = importlib.metadata.packages_distributions()
+    found = _installed()
     ours = {found[package][0] for package in PACKAGES[extra] if package in found}
     missing = [package for package in PACKAGES[extra] if package not in found]
     if missing:
