@@ -50,12 +50,20 @@ class Window:
 def checked(
     iq: ArrayLike, ranges_m: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return frames and ranges as arrays of double precision; `ValueError` if they do not fit."""
+    """Return frames and ranges as arrays of double precision.
+
+    ValueError if they do not fit each other, or for NaN and infinities among the frames.
+    """
     frames = np.asarray(iq)
     ranges = np.asarray(ranges_m, dtype=np.float64)
     if frames.ndim != 2 or not np.iscomplexobj(frames) or frames.shape[1:] != ranges.shape:
         raise ValueError(
             f"frames of shape {frames.shape} and type {frames.dtype}: must be complex, one row per "
             f"frame, with a bin for each of the {ranges.size} ranges"
+        )
+    damaged = len(frames) - int(np.isfinite(frames).all(axis=1).sum())
+    if damaged:
+        raise ValueError(
+            f"{damaged} of {len(frames)} frames hold NaN or infinities; leave these frames out"
         )
     return frames.astype(np.complex128), ranges

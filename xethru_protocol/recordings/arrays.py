@@ -188,10 +188,15 @@ class RadarArrays:
 
     @cached_property
     def frame_rate_hz(self) -> float | None:
-        """Frames per second: by the settings, else by times and counters; None if unknown.
+        """Frames per second: by the setting FPS, else by times and counters; None if unknown.
 
-        A setting gives the rate of the chip's timer (Protocol reference 9.6). Times give the slope
-        of a line through them over the counter, along the longest run of rising counters.
+        The setting is the module's answer to GET FPS in a capture of its bytes, or the rate in the
+        description of an MCAP file or a file of arrays; it gives the rate of the chip's timer
+        (Protocol reference 9.6). The driver asks as soon as frames come, so the answer holds for
+        the frames before it, too. Without a setting, or with answers that differ, the rate is the
+        slope of a line through the times over the counter, along the longest run of rising
+        counters. It is the rate of arrival, which an emulated module at ``--pace asap`` or a host
+        that fell behind makes different from the radar's.
         """
         frames = self.frames
         if frames.frame_rate_hz is not None:
@@ -383,8 +388,8 @@ class _Row(NamedTuple):
 
 @dataclass(slots=True)
 class _Column:
-    settings: Settings
-    rates_hz: set[float | None] = field(default_factory=set)
+    settings: dict[str, Any]  # when the first frame came
+    fps: set[float] = field(default_factory=set)
     counter: "array[int]" = field(default_factory=lambda: array("I"))
     t_ns: "array[int]" = field(default_factory=lambda: array("q"))
 
@@ -412,7 +417,7 @@ class _Messages:
             column = columns.get(row.layout)
             if column is None:
                 column = columns[row.layout] = _Column(dict(self._settings))
-            column.rates_hz.add(self._settings.get(X4Setting.FPS.name))
+            column.fps.add(self._settings.get(X4Setting.FPS.name, 0.0))
             column.counter.append(row.counter)
             column.t_ns.append(NO_TIME_NS if row.t_ns is None else row.t_ns)
         found = layouts.layouts()
@@ -431,7 +436,13 @@ class _Messages:
         if ranges_m is None and layout.start_m is not None and layout.bin_m is not None:
             ranges_m = steps_m(layout.start_m, layout.bin_m, n_bins)
         t_ns = np.array(column.t_ns, np.int64)
-        rate_hz = column.rates_hz.pop() if len(column.rates_hz) == 1 else None
+        # the first frames come before the answer that gives their rate
+        running = {value for value in column.fps if real_frame_rate(value)}
+        settings, rate_hz = column.settings, None
+        if len(running) == 1:
+            (fps,) = running
+            settings = settings | {X4Setting.FPS.name: fps}
+            rate_hz = real_frame_rate(fps)
         what = {"rf": "RF bins", "iq": "complex bins", None: "values"}[kind]
         return Frames(
             about=f"{n_bins} {what} ({layout.message})",
@@ -442,8 +453,8 @@ class _Messages:
             counter=np.array(column.counter, np.uint32),
             t_ns=t_ns if (t_ns != NO_TIME_NS).any() else None,
             ranges_m=ranges_m,
-            frame_rate_hz=real_frame_rate(rate_hz) or None if rate_hz is not None else None,
-            settings=column.settings,
+            frame_rate_hz=rate_hz,
+            settings=settings,
         )
 
     def _chunks(self, layout: _Layout, kind: Kind | None) -> Iterator[Samples]:

@@ -16,9 +16,11 @@ import numpy.typing as npt
 import pytest
 from scipy.io import loadmat, savemat
 
+from emulator import emulated_port
 from hil_tests.paths import FIXTURES, real_raw_recording, real_recording, shared_data
 from hil_tests.unit.xethru_protocol.recordings.messages import frame, write_capture
 from xethru_protocol import Frame, FrameGeometry, load
+from xethru_protocol.cli import main
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingFault,
@@ -154,6 +156,49 @@ def test_the_modules_answers_give_ranges_and_settings(tmp_path: Path) -> None:
     assert np.asarray(recording.ranges_m) == pytest.approx([0.5, 1.0, 1.5, 2.0])
     assert recording.frame_rate_hz == pytest.approx(17.04938, abs=1e-5)  # 9.6
     assert recording.t_ns is None
+
+
+def rate_answer(fps: float) -> m.ReplyFloat:
+    return m.ReplyFloat(content_id=X4Setting.FPS, values=(fps,))
+
+
+@pytest.mark.parametrize(
+    ("answers", "rate_hz"),
+    [
+        pytest.param({}, 5000.0, id="never asked: by the times"),
+        pytest.param({2: 17.0}, 17.04938, id="asked when frames came already"),
+        pytest.param({0: 0.0, 2: 17.0}, 17.04938, id="asked while it stood, and again"),
+        pytest.param({0: 17.0, 4: 17.0}, 17.04938, id="asked twice"),
+        pytest.param({0: 17.0, 4: 50.0}, 5000.0, id="changed: by the times"),
+    ],
+)
+def test_the_rate_is_the_modules_answer_and_not_how_fast_frames_came(
+    tmp_path: Path, answers: Mapping[int, float], rate_hz: float
+) -> None:
+    """Frames 0.2 ms apart, as those of an emulated module that waits for nobody.
+
+    17 frames/s are 17.04938 by the chip's timer: Protocol reference 9.6.
+    """
+    sent: list[tuple[m.Response, int | None]] = []
+    for at in range(6):
+        if at in answers:
+            sent.append((rate_answer(answers[at]), at * MS // 5))
+        sent.append((frame(1 + at), at * MS // 5))
+    write_capture(tmp_path / "a.xtwire", sent)
+    recording = load(tmp_path / "a.xtwire")
+    assert recording.frame_rate_hz == pytest.approx(rate_hz, rel=1e-6)
+    assert {block.frame_rate_hz for block in recording.blocks(2)} == {recording.frame_rate_hz}
+    if rate_hz < 100:
+        assert recording.settings["FPS"] == 17.0
+
+
+def test_the_rate_of_a_capture_of_an_emulated_module_is_the_radars(tmp_path: Path) -> None:
+    path = tmp_path / "a.xtwire"
+    with emulated_port("--bare", "--pace", "asap") as port:
+        assert main(["record", "--port", port, "--wire", str(path), "--count", "40"]) == 0
+    recording = load(path)
+    assert recording.n_frames >= 40
+    assert recording.frame_rate_hz == pytest.approx(17.04938, abs=1e-5)  # 9.6
 
 
 def test_what_frames_are_is_asked_for_where_it_is_not_known(tmp_path: Path) -> None:
