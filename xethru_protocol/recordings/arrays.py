@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.driver.frames import FrameGeometry, complex_of
 from xethru_protocol.driver.link import CONFIG_SETTINGS
 from xethru_protocol.recordings.array_files import (
     DTYPES,
@@ -462,7 +462,7 @@ class _Messages:
             if row.layout == layout:
                 values = row.values
                 if kind == "iq" and values.dtype != np.complex64:
-                    values = _complex(*np.split(values, 2))
+                    values = complex_of(*np.split(values, 2))
                 yield values[np.newaxis]
 
     def _rows(self, on_fault: FaultHandler, layouts: FrameLayouts | None = None) -> Iterator[_Row]:
@@ -536,21 +536,14 @@ def _settings_of(info: Mapping[str, Any]) -> dict[str, Any]:
 def _samples(message: BasebandIq | BasebandAp | RadarMessage) -> Samples:
     match message:
         case BasebandAp(amplitude=amplitude, phase=phase):
-            return _complex(amplitude * np.cos(phase), amplitude * np.sin(phase))
+            return complex_of(amplitude * np.cos(phase), amplitude * np.sin(phase))
         case BasebandIq(i=i, q=q) | RadarBasebandFloat(i=i, q=q):
-            return _complex(i, q)
+            return complex_of(i, q)
         case RadarBasebandQ15():
             return message.iq
         case RadarRf() | RadarRfNormalized():
             return message.samples.astype(np.float32)
     raise AssertionError(f"no frame: {message_name(message)}")
-
-
-def _complex(i: npt.NDArray[np.float32], q: npt.NDArray[np.float32]) -> npt.NDArray[np.complex64]:
-    """I + jQ; parts are kept as they are, also beside infinities, which 1j * q does not."""
-    iq = np.empty(i.shape, np.complex64)
-    iq.real, iq.imag = i, q
-    return iq
 
 
 class Recording(RadarArrays):
