@@ -26,6 +26,8 @@ _DOPPLER_FRAMES = 64
 _CHEST_EVERY_S = 0.5
 _LEAST_RATE_HZ = 4.0
 _LEAST_BINS = 16
+_LONGEST_GAP_S = 0.5
+"""A third of the shortest breath: a longer gap without frames begins a new window."""
 _LEAST_RF_BINS = 160
 """16 lines of baseband, every 8th bin, and the filter's length."""
 
@@ -178,6 +180,10 @@ class VitalSigns:
     def take(self, frame: TimedFrame) -> NDArray[np.complex64]:
         """Take the next frame; return it as complex baseband."""
         iq = self.iq_of(frame)
+        if frame.t_s - self._t_s > _LONGEST_GAP_S + 1.0 / self._source.frame_rate_hz:
+            self._breathing.reset()
+            self._presence.reset()
+            self._heard = 0
         self._heard += 1
         self._t_s = frame.t_s
         self._breathing.update(iq)

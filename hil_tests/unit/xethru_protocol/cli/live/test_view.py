@@ -20,6 +20,7 @@ from emulator import emulated_port
 from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.cli.live.chest import (
+    RANGES_M,
     breathing,
     noise,
     recording,
@@ -71,6 +72,20 @@ def test_a_damaged_frame_is_left_out(tmp_path: Path, capsys: Capture) -> None:
     assert found["present"] is True
     assert main(["view", "--terminal", str(tmp_path / "damaged.npz"), "--rate", "0"]) == 0
     assert ", 1 lost" in capsys.readouterr().out
+
+
+def test_a_gap_begins_a_new_window(tmp_path: Path, capsys: Capture) -> None:
+    iq, t_s = target(breathing(100)), times_s(100)
+    arrived = (t_s < 65) | (t_s > 70)
+    path = tmp_path / "gap.npz"
+    t_ns = (1e9 * t_s).astype(np.int64)
+    np.savez(path, iq=iq[arrived], t_ns=t_ns[arrived], ranges_m=RANGES_M, frame_rate_hz=17.0)
+    answers = answers_of(path, capsys)
+    before = [one for one in answers if 61 < float(str(one["t_s"])) < 65]
+    after = [one for one in answers if float(str(one["t_s"])) > 70]
+    assert all(one["rate_bpm"] == pytest.approx(15.0, abs=0.5) for one in before)
+    assert {one["rate_bpm"] for one in after} == {None}
+    assert str(after[-1]["no_answer"]) == "listening: 30 of 60 s"
 
 
 def test_nobody_has_no_rate(tmp_path: Path, capsys: Capture) -> None:
