@@ -126,7 +126,13 @@ class RadarArrays:
 
     @cached_property
     def _samples(self) -> Samples:
-        (whole,) = self._blocks(max(self.n_frames, 1))
+        try:
+            (whole,) = self._blocks(max(self.n_frames, 1))
+        except MemoryError:
+            raise RecordingError(
+                f"{self._nothing}: its {self.n_frames} frames do not fit into memory; read them by "
+                "blocks()"
+            ) from None
         return whole
 
     def _of_kind(self, kind: Kind) -> Samples | None:
