@@ -26,6 +26,7 @@ from xethru_protocol.recordings import (
     SessionRecorder,
     TextColumn,
     convert,
+    read_recording,
 )
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
