@@ -578,8 +578,10 @@ class Recording(RadarArrays):
     @property
     def radar(self) -> RadarArrays:
         """The only radar; RecordingError if there are several."""
+        if not self.radars:
+            raise RecordingError(f"{self.path} holds no radar frames")
         if len(self.radars) != 1:
-            names = ", ".join(map(shown, self.radars)) or "none"
+            names = ", ".join(map(shown, self.radars))
             raise RecordingError(
                 f"{self.path} holds {len(self.radars)} radars, not one: {names}; "
                 "choose one: --radar NAME, in Python .radars[NAME]"
@@ -589,9 +591,11 @@ class Recording(RadarArrays):
 
     def named(self, name: str) -> RadarArrays:
         """Return a radar by name; RecordingError if there is none of that name."""
+        if not self.radars:
+            raise RecordingError(f"{self.path} holds no radar frames")
         if name not in self.radars:
             refuse_name(self.path, None if any(self.radars) else name)
-            names = ", ".join(map(shown, self.radars)) or "none"
+            names = ", ".join(map(shown, self.radars))
             raise RecordingError(f"{self.path} holds no radar {shown(name)}; it holds {names}")
         return self.radars[name]
 

@@ -561,3 +561,11 @@ def test_a_damaged_name_in_an_archive_does_not_break_the_line(tmp_path: Path) ->
     with pytest.raises(RecordingError, match=r"a\.npz") as caught:
         list(read_recording(tmp_path / "a.npz"))
     assert "\n" not in str(caught.value)
+
+
+def test_a_session_cut_before_its_first_radar_says_that_it_is_empty(tmp_path: Path) -> None:
+    SessionRecorder(tmp_path / "all.mcap").close()
+    recording = load(tmp_path / "all.mcap")
+    for call in (lambda: recording.iq, lambda: recording.named("left")):
+        with pytest.raises(RecordingError, match=r"all\.mcap holds no radar frames"):
+            call()
