@@ -18,7 +18,8 @@ those of two at most. With x_t the frame and y_t what is returned:
     of all gains: ``y_t`` is the last row of ``X - sum_k u_k s_k v_k*``. Nezirovic, Yarovoy and
     Ligthart, "Signal processing for improved detection of trapped victims using UWB radar", IEEE
     Trans. Geosci. Remote Sens. 48 (2010) 2005. Someone who moves much, and in few bins, can be
-    among them: take few components.
+    among them: take few components. A frame with a NaN or an infinity becomes NaN, and counts as 0
+    for the others.
 """
 
 from __future__ import annotations
@@ -131,9 +132,16 @@ class ClutterFilter:
         if self._state is None:
             self._state = np.zeros((self._window, self._window), dtype=ring.dtype)
         # products of all frames: their eigenvectors are the left singular vectors
-        products = ring @ row.conj()
+        with np.errstate(invalid="ignore", over="ignore"):
+            products = ring @ row.conj()
+        is_finite = bool(np.isfinite(products).all())
+        if not is_finite:  # there are no eigenvectors, for as long as the frame is in the window
+            ring[place] = 0
+            products = np.zeros_like(products)
         self._state[:, place] = products
         self._state[place] = products.conj()
+        if not is_finite:
+            return np.full_like(row, np.nan)
         taken = min(self._taken + 1, self._window)
         if not np.isfinite(self._state[:taken, :taken]).all():
             return np.full_like(row, np.nan)  # a frame of the window has no eigenvalues

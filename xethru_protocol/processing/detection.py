@@ -74,10 +74,10 @@ def cfar(
         raise ValueError(
             f"{training_bins} training_bins and {guard_bins} guard_bins: must be at least 1 and 0"
         )
-    if len(power) < 2 * guard_bins + 2:
+    if power.ndim != 1 or len(power) < 2 * guard_bins + 2:
         raise ValueError(
-            f"a profile of {len(power)} bins: with {guard_bins} guard_bins it must have at least "
-            f"{2 * guard_bins + 2}"
+            f"a profile of shape {power.shape}: it must have one dimension, and with {guard_bins} guard_bins at least "
+            f"{2 * guard_bins + 2} bins"
         )
     sums = np.concatenate([[0.0], np.cumsum(power)])
     bins = np.arange(len(power))

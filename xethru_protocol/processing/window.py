@@ -20,6 +20,10 @@ class Window:
     def __init__(
         self, n_bins: int, frame_rate_hz: float, *, window_s: float, every_s: float
     ) -> None:
+        check_rate(frame_rate_hz)
+        for name, seconds in (("window_s", window_s), ("every_s", every_s)):
+            if not 0 < seconds < math.inf:
+                raise ValueError(f"{name} {seconds:g}: must be above 0")
         self.n_frames = math.ceil(window_s * frame_rate_hz)
         self._every = max(round(every_s * frame_rate_hz), 1)
         # twice, so that the newest window is one piece
@@ -45,6 +49,12 @@ class Window:
         if beyond < 0 or beyond % self._every:
             return None
         return self._ring[place + 1 : place + 1 + self.n_frames]
+
+
+def check_rate(frame_rate_hz: float) -> None:
+    """Raise `ValueError` for a frame rate that is none."""
+    if not 0 < frame_rate_hz < math.inf:
+        raise ValueError(f"frame_rate_hz {frame_rate_hz:g}: must be above 0")
 
 
 def checked(

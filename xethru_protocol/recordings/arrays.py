@@ -126,7 +126,13 @@ class RadarArrays:
 
     @cached_property
     def _samples(self) -> Samples:
-        (whole,) = self._blocks(max(self.n_frames, 1))
+        try:
+            (whole,) = self._blocks(max(self.n_frames, 1))
+        except MemoryError:
+            raise RecordingError(
+                f"{self._nothing}: its {self.n_frames} frames do not fit into memory; read them by "
+                "blocks()"
+            ) from None
         return whole
 
     def _of_kind(self, kind: Kind) -> Samples | None:
@@ -576,8 +582,10 @@ class Recording(RadarArrays):
     @property
     def radar(self) -> RadarArrays:
         """The only radar; RecordingError if there are several."""
+        if not self.radars:
+            raise RecordingError(f"{self.path} holds no radar frames")
         if len(self.radars) != 1:
-            names = ", ".join(map(shown, self.radars)) or "none"
+            names = ", ".join(map(shown, self.radars))
             raise RecordingError(
                 f"{self.path} holds {len(self.radars)} radars, not one: {names}; "
                 "choose one: --radar NAME, in Python .radars[NAME]"
@@ -587,9 +595,11 @@ class Recording(RadarArrays):
 
     def named(self, name: str) -> RadarArrays:
         """Return a radar by name; RecordingError if there is none of that name."""
+        if not self.radars:
+            raise RecordingError(f"{self.path} holds no radar frames")
         if name not in self.radars:
             refuse_name(self.path, None if any(self.radars) else name)
-            names = ", ".join(map(shown, self.radars)) or "none"
+            names = ", ".join(map(shown, self.radars))
             raise RecordingError(f"{self.path} holds no radar {shown(name)}; it holds {names}")
         return self.radars[name]
 

@@ -94,6 +94,17 @@ def test_an_average_begins_anew_behind_a_damaged_frame(frames: NDArray[np.comple
     )
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
+def test_svd_takes_a_damaged_frame_for_zero(frames: NDArray[np.complex64], value: float) -> None:
+    damaged, zero = frames.astype(np.complex128), frames.astype(np.complex128)
+    damaged[20, 3], zero[20] = value, 0
+    filtered = remove_clutter(damaged, "svd", window=WINDOW)
+    assert np.isnan(filtered[20]).all()
+    rest = np.arange(len(frames)) != 20
+    expected = remove_clutter(zero, "svd", window=WINDOW)
+    np.testing.assert_allclose(filtered[rest], expected[rest], atol=1e-12)
+
+
 def test_other_frames_need_a_reset(frames: NDArray[np.complex64]) -> None:
     one = ClutterFilter("mean")
     one.update(frames)

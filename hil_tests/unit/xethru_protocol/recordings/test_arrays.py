@@ -7,6 +7,7 @@ read here with numpy by their layout alone, or are put into the messages here.
 import json
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from xethru_protocol.recordings import (
     SessionRecorder,
     TextColumn,
     convert,
+    read_recording,
 )
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
@@ -400,6 +402,64 @@ def test_arrays_that_do_not_fit_are_refused(
             _ = load(tmp_path / name).iq
 
 
+@pytest.mark.parametrize(
+    "held",
+    [
+        {"rf": np.full((3, 2), 1j)},
+        {"iq": np.zeros((3, 0))},
+        {"iq": np.zeros((3, 2)), "t_ns": np.full(3, 1e300)},
+        {"iq": np.zeros((3, 2)), "t_ns": np.zeros(3) + 1j},
+        {"iq": np.zeros((3, 2)), "counter": np.array([-1, 0, 1])},
+        {"iq": np.zeros((3, 2)), "counter": np.array([0.0, np.nan, 1])},
+        {"iq": np.zeros((3, 2)), "counter": np.array([0, 2**32, 1])},
+        {"iq": np.zeros((3, 2)), "frame_rate_hz": np.zeros(1)},
+        {"iq": np.zeros((3, 2)), "frame_rate_hz": np.full(1, np.nan)},
+        {"iq": np.zeros((3, 2)), "frame_rate_hz": np.full(1, 17j)},
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused(
+    tmp_path: Path, held: dict[str, npt.NDArray[Any]]
+) -> None:
+    np.savez(tmp_path / "a.npz", **held)  # type: ignore[arg-type]  # of allow_pickle
+    with pytest.raises(RecordingError, match=f"{list(held)[-1]} (is|has|holds|must)"):
+        _ = load(tmp_path / "a.npz").frame_rate_hz
+
+
+@pytest.mark.parametrize("shape", [(10**9, 10**6), (10**12, 0), (3, 2), (-1, -2), (-1, 2)])
+def test_a_head_that_promises_other_samples_is_refused(
+    tmp_path: Path, shape: tuple[int, int]
+) -> None:
+    about = f"{{'descr': '<c8', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    head = b"\x93NUMPY\x01\x00" + len(about).to_bytes(2, "little") + about
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("iq.npy", head + bytes(16))
+    with pytest.raises(RecordingError, match=r"a\.npz .* 16 bytes, which do not fit its shape"):
+        _ = load(tmp_path / "a.npz").iq
+
+
+def test_what_unpacks_to_more_than_belongs_there_is_refused(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "a.npz", iq=np.zeros((3, 2)), t_ns=np.zeros(10**6))
+    np.savez_compressed(tmp_path / "b.npz", iq=np.zeros((3, 2)), settings=np.array("[" * 10**7))
+    for name in ("a.npz", "b.npz"):
+        with pytest.raises(RecordingError, match="does not fit iq"):
+            _ = load(tmp_path / name).iq
+
+
+def test_samples_larger_than_memory_name_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.savez(tmp_path / "a.npz", iq=np.zeros((3, 2)))
+    recording = load(tmp_path / "a.npz")
+    assert recording.n_frames == 3
+
+    def full(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("xethru_protocol.recordings.arrays.np.empty", full)
+    with pytest.raises(RecordingError, match=r"a\.npz: its 3 frames .* blocks\(\)"):
+        _ = recording.iq
+
+
 def test_a_cut_archive_is_one_line(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", rf=np.random.default_rng(1).normal(size=(300, 50)))
     data = bytearray((tmp_path / "a.npz").read_bytes())
@@ -533,3 +593,24 @@ def test_arrays_are_read_once_and_shared() -> None:
     recording = load(RECORDINGS / "iq")
     assert recording.iq is recording.iq
     assert recording.radars[""].iq is recording.iq
+
+
+def test_a_damaged_name_in_an_archive_does_not_break_the_line(tmp_path: Path) -> None:
+    convert(RECORDINGS / "iq", tmp_path / "a.npz")
+    data = (tmp_path / "a.npz").read_bytes()
+    # the content of a member whose name has a line feed is wrong
+    begin = data.index(b"facts.npy")
+    other = bytearray(data.replace(b"facts.npy", b"fac\ns.npy"))
+    other[begin + 40] ^= 255
+    (tmp_path / "a.npz").write_bytes(other)
+    with pytest.raises(RecordingError, match=r"a\.npz") as caught:
+        list(read_recording(tmp_path / "a.npz"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_session_cut_before_its_first_radar_says_that_it_is_empty(tmp_path: Path) -> None:
+    SessionRecorder(tmp_path / "all.mcap").close()
+    recording = load(tmp_path / "all.mcap")
+    for call in (lambda: recording.iq, lambda: recording.named("left")):
+        with pytest.raises(RecordingError, match=r"all\.mcap holds no radar frames"):
+            call()

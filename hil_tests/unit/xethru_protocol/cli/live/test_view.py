@@ -85,7 +85,7 @@ def test_a_gap_begins_a_new_window(tmp_path: Path, capsys: Capture) -> None:
     after = [one for one in answers if float(str(one["t_s"])) > 70]
     assert all(one["rate_bpm"] == pytest.approx(15.0, abs=0.5) for one in before)
     assert {one["rate_bpm"] for one in after} == {None}
-    assert str(after[-1]["no_answer"]) == "listening: 30 of 60 s"
+    assert str(after[-1]["no_answer"]) == "listening: 29 of 60 s"
 
 
 def test_nobody_has_no_rate(tmp_path: Path, capsys: Capture) -> None:
