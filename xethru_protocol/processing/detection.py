@@ -76,8 +76,8 @@ def cfar(
         )
     if power.ndim != 1 or len(power) < 2 * guard_bins + 2:
         raise ValueError(
-            f"a profile of shape {power.shape}: it must have one dimension, and with {guard_bins} guard_bins at least "
-            f"{2 * guard_bins + 2} bins"
+            f"a profile of shape {power.shape}: it must have one dimension, and with "
+            f"{guard_bins} guard_bins at least {2 * guard_bins + 2} bins"
         )
     sums = np.concatenate([[0.0], np.cumsum(power)])
     bins = np.arange(len(power))

@@ -96,7 +96,7 @@ def test_arguments_out_of_range_are_named() -> None:
         "window_s inf": lambda: PresenceMonitor(np.ones(20), RATE_HZ, window_s=float("inf")),
         "window_s 0": lambda: PresenceMonitor(np.ones(20), RATE_HZ, window_s=0),
         "every_s nan": lambda: BreathingMonitor(np.ones(20), RATE_HZ, every_s=float("nan")),
-        "without NaN": lambda: phase_at(np.full((9, 4), np.nan + 0j), np.ones(4), 1.0),
+        "9 of 9 frames hold NaN": lambda: phase_at(np.full((9, 4), np.nan + 0j), np.ones(4), 1.0),
         r"\(9, 0\)": lambda: phase_at(np.ones((9, 0), complex), np.ones(0), 1.0),
     }
     for match, call in calls.items():
