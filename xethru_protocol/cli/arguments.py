@@ -420,7 +420,7 @@ def _add_record(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         commands,
         "record",
         "write what a module sends to files",
-        "record:record",
+        "record.command:record",
         "Ends at --count or --duration, by Ctrl-C, or when the module is unplugged or the disk "
         "is full; what came until then is kept and complete. Progress goes to stderr, a summary "
         "to stdout.",

@@ -53,7 +53,9 @@ def legacy(arguments: argparse.Namespace) -> int:
         _join_threads(running)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except Exception as error:
+    except (SystemExit, BrokenPipeError):  # of a script's output, whose reader has ended
+        raise
+    except BaseException as error:
         shown = error.with_traceback(_of_script(error.__traceback__))
         sys.excepthook(type(shown), shown, shown.__traceback__)
         return 1
@@ -81,8 +83,9 @@ def _compiled(path: Path) -> CodeType | None:
                 "the package future, and run the result"
             ) from None
         traceback.print_exception(error, limit=0)
-    except ValueError as error:  # null bytes
-        raise _ScriptError(f"{path} is no Python script: {error}") from None
+    except (ValueError, RecursionError, MemoryError) as error:  # null bytes, or nested too deeply
+        reason = str(error) or "it is nested too deeply"
+        raise _ScriptError(f"{path} is no Python script: {reason}") from None
     return None
 
 

@@ -310,7 +310,8 @@ class Frame:
         return self.geometry.true_ranges_m
 
 
-def _complex(i: Float32s, q: Float32s) -> NDArray[np.complex64]:
+def complex_of(i: Float32s, q: Float32s) -> NDArray[np.complex64]:
+    """Return I + jQ, shape (n,); parts are kept beside infinities, which 1j * q does not."""
     iq = np.empty(i.size, np.complex64)
     iq.real = i
     iq.imag = q
@@ -433,7 +434,7 @@ class FrameQueue:
         if self.lattice is not None:
             self._statistics.off_lattice_samples += self._count_off(self.lattice, values)
         n = geometry.n_bins
-        samples = _complex(values[:n], values[n:]) if geometry.downconversion else values
+        samples = complex_of(values[:n], values[n:]) if geometry.downconversion else values
         self._queue(message.info, samples, geometry, arrival_ns)
 
     def _count_off(self, lattice: Lattice, values: Float32s) -> int:
@@ -477,7 +478,7 @@ class FrameQueue:
         if geometry != self._baseband_geometry:
             self._baseband_geometry = geometry
         self._queue(
-            message.counter, _complex(message.i, message.q), self._baseband_geometry, arrival_ns
+            message.counter, complex_of(message.i, message.q), self._baseband_geometry, arrival_ns
         )
 
     def _queue(

@@ -171,7 +171,9 @@ class Connection:
                     warned = True
                     report(
                         f"{call} has waited {_TOO_LONG_S:g} s for a message of {self.source.name}; "
-                        "was its output switched on, and the radar or the profile started?"
+                        "was its output switched on, and the radar or the profile started? Frames "
+                        "of XEP come in mode MANUAL only: set_sensor_mode(XTID_SM_STOP, 0), then "
+                        "(XTID_SM_MANUAL, 0)"
                     )
 
     def close(self) -> None:

@@ -1,7 +1,9 @@
 """Clutter removal: what stands still is subtracted, what moves stays.
 
 Every method looks back only, so frame by frame and all at once give the same numbers, and the first
-frames have less to look back on. With x_t the frame and y_t what is returned:
+frames have less to look back on. A frame with a NaN makes results NaN: under ``exponential`` its
+own only, behind which the average begins anew; under ``svd`` those of a window, under ``mean``
+those of two at most. With x_t the frame and y_t what is returned:
 
 ``mean``
     ``y_t = x_t - (x_t-w+1 + ... + x_t) / w``, the mean of the newest w = ``window`` frames. All
@@ -16,7 +18,8 @@ frames have less to look back on. With x_t the frame and y_t what is returned:
     of all gains: ``y_t`` is the last row of ``X - sum_k u_k s_k v_k*``. Nezirovic, Yarovoy and
     Ligthart, "Signal processing for improved detection of trapped victims using UWB radar", IEEE
     Trans. Geosci. Remote Sens. 48 (2010) 2005. Someone who moves much, and in few bins, can be
-    among them: take few components.
+    among them: take few components. A frame with a NaN or an infinity becomes NaN, and counts as 0
+    for the others.
 """
 
 from __future__ import annotations
@@ -118,6 +121,8 @@ class ClutterFilter:
     def _less_exponential(self, row: _Values, ring: _Values) -> _Values:
         if self._state is None:
             self._state = row.copy()
+        # begins anew behind a NaN, which would stay for ever
+        self._state = np.where(np.isfinite(self._state), self._state, row)
         self._state += self._alpha * (row - self._state)
         return row - self._state
 
@@ -127,10 +132,19 @@ class ClutterFilter:
         if self._state is None:
             self._state = np.zeros((self._window, self._window), dtype=ring.dtype)
         # products of all frames: their eigenvectors are the left singular vectors
-        products = ring @ row.conj()
+        with np.errstate(invalid="ignore", over="ignore"):
+            products = ring @ row.conj()
+        is_finite = bool(np.isfinite(products).all())
+        if not is_finite:  # there are no eigenvectors, for as long as the frame is in the window
+            ring[place] = 0
+            products = np.zeros_like(products)
         self._state[:, place] = products
         self._state[place] = products.conj()
+        if not is_finite:
+            return np.full_like(row, np.nan)
         taken = min(self._taken + 1, self._window)
+        if not np.isfinite(self._state[:taken, :taken]).all():
+            return np.full_like(row, np.nan)  # a frame of the window has no eigenvalues
         _, vectors = np.linalg.eigh(self._state[:taken, :taken])
         clutter = vectors[:, -self._components :]
         stands: _Values = (clutter[place] @ clutter.conj().T) @ ring[:taken]

@@ -70,8 +70,15 @@ def cfar(
     power = np.abs(np.asarray(profile, dtype=np.float64)) ** 2
     if not 0 < false_alarm_rate < 1:
         raise ValueError(f"false_alarm_rate {false_alarm_rate:g}: must be between 0 and 1")
-    if training_bins < 1 or guard_bins < 0 or len(power) < 2 * guard_bins + 3:
-        raise ValueError(f"a profile of {len(power)} bins: too short for the training bins")
+    if training_bins < 1 or guard_bins < 0:
+        raise ValueError(
+            f"{training_bins} training_bins and {guard_bins} guard_bins: must be at least 1 and 0"
+        )
+    if power.ndim != 1 or len(power) < 2 * guard_bins + 2:
+        raise ValueError(
+            f"a profile of shape {power.shape}: it must have one dimension, and with "
+            f"{guard_bins} guard_bins at least {2 * guard_bins + 2} bins"
+        )
     sums = np.concatenate([[0.0], np.cumsum(power)])
     bins = np.arange(len(power))
 

@@ -8,10 +8,13 @@ frequencies reads A**2, whatever the window.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from xethru_protocol.processing.window import check_rate
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 CARRIER_HZ = 7.29e9
@@ -78,8 +81,18 @@ def range_doppler(
         At least the number of frames, which it is if left out; more interpolate.
     carrier_hz
         For the velocities.
+
+    Raises
+    ------
+    ValueError
+        For another shape or an argument out of its range.
     """
     frames = np.asarray(iq)
+    check_rate(frame_rate_hz)
+    if frames.ndim != 2:
+        raise ValueError(f"frames of shape {frames.shape}: must have (n_frames, n_bins)")
+    if not 0 < carrier_hz < math.inf:
+        raise ValueError(f"carrier_hz {carrier_hz:g}: must be above 0")
     length = _transform_length(len(frames), n_frequencies)
     window = hann(len(frames))
     weighted = frames * (window / window.sum())[:, np.newaxis]
@@ -118,12 +131,18 @@ def spectrogram(
     Raises
     ------
     ValueError
-        For fewer frames than a window.
+        For fewer frames than a window, another shape or an argument out of its range.
     """
     values = np.asarray(iq_bin)
+    if values.ndim != 1:
+        raise ValueError(f"a bin of shape {values.shape}: must have (n_frames,), as iq[:, k]")
+    if window < 2:
+        raise ValueError(f"window {window}: must be at least 2 frames")
+    if step is not None and step < 1:
+        raise ValueError(f"step {step}: must be at least 1 frame")
     if len(values) < window:
         raise ValueError(f"{len(values)} frames: a window has {window}")
-    step = step or max(window // 4, 1)
+    step = max(window // 4, 1) if step is None else step
     windows = np.lib.stride_tricks.sliding_window_view(values, window)[::step]
     found = range_doppler(
         windows.T, frame_rate_hz, n_frequencies=n_frequencies, carrier_hz=carrier_hz

@@ -10,9 +10,15 @@ Noise
     1.94``; the Hann window correlates neighbouring frequencies (squared correlations 4/9 and 1/36,
     on either side). Its quantile at ``1 - rate / (2 n_bins)`` is the threshold (Wilson and
     Hilferty, Proc. Nat. Acad. Sci. 17 (1931) 684): ``(1 - 1/(9 L) + z / (3 sqrt(L)))**3``, with z
-    that of the normal distribution. So the share of windows of noise alone with anybody in them is
-    at most ``false_alarm_rate``, by the union bound over bins and two bands: slow, as breathing,
-    and all.
+    that of the normal distribution. The rate is divided among the bins and two bands: slow, as
+    breathing, and all.
+
+    So ``false_alarm_rate`` is nominal, no bound: it assumes noise that is complex Gaussian, equal
+    and independent in all bins, and whose power is known. That power is estimated, and the fewer
+    bins there are, the more false alarms this adds. Of windows of white noise, 10 s at 17 frames/s
+    and a nominal rate of 5 %, somebody was found in 11.0 % with 16 bins, 9.1 % with 32, 6.5 % with
+    90 (4000 windows each) and 6.5 % with 181 (2000 windows); with 90 bins and the true power of the
+    noise in 5.1 % (4000), and at the nominal rate of 0.1 % in 0.135 % (20 000).
 What stands still
     A jitter of the carrier's phase moves every echo. Power of movement in a bin must also exceed
     ``LEAST_PHASE_RAD**2`` of the power that stands still in it.
@@ -76,14 +82,15 @@ def presence(
     ranges_m
         Shape (n_bins,).
     false_alarm_rate
-        Share of windows of noise alone in which somebody may be found, between 0 and 1.
+        Nominal share of windows of noise alone in which somebody is found, between 0 and 1. The
+        measured share is greater, the more so with few bins: see the module's docstring.
     carrier_hz
         For velocities.
 
     Raises
     ------
     ValueError
-        For arrays that do not fit each other, or too few frames or bins.
+        For arrays that do not fit each other, too few frames or bins, or frames with a NaN.
 
     The module's docstring has the formulas.
     """

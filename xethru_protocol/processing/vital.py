@@ -104,6 +104,8 @@ def phase_at(iq: ArrayLike, ranges_m: ArrayLike, range_m: float) -> NDArray[np.f
         The bin nearest to it, and two on either side, are used.
     """
     frames, ranges = checked(iq, ranges_m)
+    if not frames.size or not np.isfinite(frames).all():
+        raise ValueError(f"frames of shape {frames.shape}: must be some, without NaN and infinity")
     echo = _echo_near(frames, int(np.argmin(np.abs(ranges - range_m))))
     return np.unwrap(np.angle(echo - circle_centre(echo)))
 
@@ -152,7 +154,8 @@ def breathing_rate(
     Raises
     ------
     ValueError
-        For arrays that do not fit each other, fewer frames than 20 s or a rate that is too low.
+        For arrays that do not fit each other, fewer frames than 20 s, a rate that is too low, or
+        frames with a NaN.
     """
     return next(iter(breathing_rates(iq, ranges_m, frame_rate_hz, carrier_hz=carrier_hz)), None)
 
@@ -164,10 +167,32 @@ def breathing_rates(
     *,
     carrier_hz: float = CARRIER_HZ,
 ) -> Iterator[Breathing]:
-    """Yield all who breathe at rest, strongest first, of four ranges at most.
+    """Yield rate and range of each person who breathes at rest, the strongest echo first.
 
-    Arguments and errors are those of `breathing_rate`. A strong one can appear again farther away,
-    by way of a wall, at the same rate.
+    The four strongest candidates are looked at, as the module's docstring defines them. The search
+    ends at the first of them whose body moves, since its echo covers weaker ones; nothing is
+    yielded if something passes. One person can be found twice: a second time at a longer range and
+    the same rate, by an echo over a wall.
+
+    Parameters
+    ----------
+    iq
+        Shape (n_frames, n_bins), complex, clutter included; 60 s are usual, 20 s the least.
+    ranges_m
+        Shape (n_bins,).
+    frame_rate_hz
+        At least 4; frames are taken at equal intervals.
+    carrier_hz
+        For lengths from phases.
+
+    Yields
+    ------
+    Each person's rate, confidence and range; nothing where `breathing_rate` returns None.
+
+    Raises
+    ------
+    ValueError
+        When the first one is asked for, as of `breathing_rate`.
     """
     frames, ranges = checked(iq, ranges_m)
     if frame_rate_hz < 2 * _HIGHEST_HZ:

@@ -22,6 +22,7 @@ Other files with these variables or columns are read, too. Only this file loads 
 import csv
 import itertools
 import json
+import math
 import re
 import struct
 import zipfile
@@ -99,6 +100,7 @@ class Frames:
     settings: Settings
 
 
+_NUMBERS: Mapping[Kind, str] = {"rf": "real numbers", "iq": "numbers"}
 _DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, TypeError, IndexError),
     *(csv.Error, OverflowError, struct.error, MemoryError, RuntimeError),
@@ -162,14 +164,17 @@ def _frames(
     path: Path,
     kind: Kind,
     shape: tuple[int, ...],
+    dtype: np.dtype[Any],
     *,
     chunks: Callable[[], Iterator[Samples]],
     beside: Mapping[str, Any],
     settings: Settings | None = None,
 ) -> Frames:
     """Check the variables ``beside`` the samples of ``shape``; ValueError for wrong ones."""
-    if len(shape) != 2:
+    if len(shape) != 2 or (shape[0] > 0 and shape[1] == 0):
         raise ValueError(f"{kind} has shape {shape}, must have (n_frames, n_bins)")
+    if dtype.kind not in ("fciub" if kind == "iq" else "fiub"):
+        raise ValueError(f"{kind} holds {dtype}, must hold {_NUMBERS[kind]}")
 
     def vector(name: str, length: int, dtype: Any) -> npt.NDArray[Any] | None:  # noqa: ANN401
         values = beside.get(name)
@@ -180,9 +185,18 @@ def _frames(
             raise ValueError(f"{name} has {len(values)} values, must have {length}")
         if values.dtype.kind == "f" and dtype == np.int64:
             values = np.where(np.isfinite(values), values, NO_TIME_NS)
+        if values.dtype.kind == "c":
+            raise ValueError(f"{name} holds complex numbers, must hold real ones")
+        if values.dtype.kind in "fiu" and dtype != np.float64 and length:
+            least, most = np.iinfo(dtype).min, np.iinfo(dtype).max
+            is_finite = bool(np.isfinite(values).all())
+            if not is_finite or int(values.min()) < least or int(values.max()) > most:
+                raise ValueError(f"{name} must hold numbers from {least} to {most}")
         return values.astype(dtype)
 
     rate_hz = vector("frame_rate_hz", 1, np.float64)
+    if rate_hz is not None and not 0 < rate_hz[0] < np.inf:
+        raise ValueError(f"frame_rate_hz is {rate_hz[0]:g}, must be above 0, or left out")
     what = {"rf": "RF bins", "iq": "complex bins"}[kind]
 
     def checked() -> Iterator[Samples]:
@@ -252,21 +266,40 @@ def _json(settings: Settings) -> npt.NDArray[Any]:
 def _read_npz(path: Path) -> Frames:
     with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
         kind = _kind_in(archive.files)
-        names = [name for name in _VECTORS if name in archive.files]
-        beside = {name: archive[name] for name in names}
-        settings = json.loads(str(archive["settings"])) if "settings" in archive.files else {}
-        with archive.zip.open(f"{kind}.npy") as stream:
-            shape, _, _ = _header(stream)
+        shape, dtype = _declared(archive.zip, kind)
+        names = [name for name in (*_VECTORS, "settings") if name in archive.files]
+        for name in names:  # before it is unpacked, which may take more memory than there is
+            room = _LONGEST_SETTINGS if name == "settings" else 8 * max(*shape[:2], 2)
+            length, of = _declared(archive.zip, name)
+            if math.prod(length) * of.itemsize > 4 * room:
+                raise ValueError(f"{name} has shape {length}, which does not fit {kind} of {shape}")
+        beside = {name: archive[name] for name in names if name != "settings"}
+        settings = json.loads(str(archive["settings"])) if "settings" in names else {}
     if not isinstance(settings, dict):
         raise ValueError("its settings are no table")
     settings = {
         name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()
     }
     chunks = partial(_npz_chunks, path, kind)
-    return _frames(path, kind, shape, chunks=chunks, beside=beside, settings=settings)
+    return _frames(path, kind, shape, dtype, chunks=chunks, beside=beside, settings=settings)
 
 
 _VECTORS = ("t_ns", "counter", "ranges_m", "frame_rate_hz")
+_LONGEST_SETTINGS = 1 << 20
+
+
+def _declared(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type of an array by its head; ValueError if the archive has less or more."""
+    member = archive.getinfo(f"{name}.npy")
+    with archive.open(member) as stream:
+        shape, _, dtype = _header(stream)
+        held = member.file_size - stream.tell()
+    shape = tuple(map(int, shape))
+    if dtype.hasobject:
+        raise ValueError(f"{name} holds objects of Python, must hold numbers")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != held:
+        raise ValueError(f"{name} has {held} bytes, which do not fit its shape {shape}")
+    return shape, dtype
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
@@ -383,8 +416,6 @@ def _read_mat(path: Path) -> Frames:
         raise ValueError(f"no MATLAB file, or a damaged one: {reason_of(error)}") from None
     kind = _kind_in(found)
     samples = np.asarray(found[kind])
-    if samples.dtype.kind not in "fciu":
-        raise ValueError(f"{kind} does not hold numbers")
     settings = found.get("settings")
     table: dict[str, Any] = {}
     for name in (settings.dtype.names or ()) if isinstance(settings, np.ndarray) else ():
@@ -395,7 +426,9 @@ def _read_mat(path: Path) -> Frames:
     def chunks() -> Iterator[Samples]:
         yield samples.astype(DTYPES[kind])
 
-    return _frames(path, kind, samples.shape, chunks=chunks, beside=found, settings=table)
+    return _frames(
+        path, kind, samples.shape, samples.dtype, chunks=chunks, beside=found, settings=table
+    )
 
 
 # --- .csv ---------------------------------------------------------------------------------------
@@ -488,7 +521,7 @@ def _read_csv(path: Path) -> Frames:
                 iq.real, iq.imag = values[:, :n_bins], values[:, n_bins:]
                 yield iq
 
-    return _frames(path, kind, (n_frames, n_bins), chunks=chunks, beside=beside)
+    return _frames(path, kind, (n_frames, n_bins), DTYPES[kind], chunks=chunks, beside=beside)
 
 
 @contextmanager

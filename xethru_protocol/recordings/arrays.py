@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.driver.frames import FrameGeometry, complex_of
 from xethru_protocol.driver.link import CONFIG_SETTINGS
 from xethru_protocol.recordings.array_files import (
     DTYPES,
@@ -126,7 +126,13 @@ class RadarArrays:
 
     @cached_property
     def _samples(self) -> Samples:
-        (whole,) = self._blocks(max(self.n_frames, 1))
+        try:
+            (whole,) = self._blocks(max(self.n_frames, 1))
+        except MemoryError:
+            raise RecordingError(
+                f"{self._nothing}: its {self.n_frames} frames do not fit into memory; read them by "
+                "blocks()"
+            ) from None
         return whole
 
     def _of_kind(self, kind: Kind) -> Samples | None:
@@ -188,10 +194,15 @@ class RadarArrays:
 
     @cached_property
     def frame_rate_hz(self) -> float | None:
-        """Frames per second: by the settings, else by times and counters; None if unknown.
+        """Frames per second: by the setting FPS, else by times and counters; None if unknown.
 
-        A setting gives the rate of the chip's timer (Protocol reference 9.6). Times give the slope
-        of a line through them over the counter, along the longest run of rising counters.
+        The setting is the module's answer to GET FPS in a capture of its bytes, or the rate in the
+        description of an MCAP file or a file of arrays; it gives the rate of the chip's timer
+        (Protocol reference 9.6). The driver asks as soon as frames come, so the answer holds for
+        the frames before it, too. Without a setting, or with answers that differ, the rate is the
+        slope of a line through the times over the counter, along the longest run of rising
+        counters. It is the rate of arrival, which an emulated module at ``--pace asap`` or a host
+        that fell behind makes different from the radar's.
         """
         frames = self.frames
         if frames.frame_rate_hz is not None:
@@ -383,8 +394,8 @@ class _Row(NamedTuple):
 
 @dataclass(slots=True)
 class _Column:
-    settings: Settings
-    rates_hz: set[float | None] = field(default_factory=set)
+    settings: dict[str, Any]  # when the first frame came
+    fps: set[float] = field(default_factory=set)
     counter: "array[int]" = field(default_factory=lambda: array("I"))
     t_ns: "array[int]" = field(default_factory=lambda: array("q"))
 
@@ -412,7 +423,7 @@ class _Messages:
             column = columns.get(row.layout)
             if column is None:
                 column = columns[row.layout] = _Column(dict(self._settings))
-            column.rates_hz.add(self._settings.get(X4Setting.FPS.name))
+            column.fps.add(self._settings.get(X4Setting.FPS.name, 0.0))
             column.counter.append(row.counter)
             column.t_ns.append(NO_TIME_NS if row.t_ns is None else row.t_ns)
         found = layouts.layouts()
@@ -431,7 +442,13 @@ class _Messages:
         if ranges_m is None and layout.start_m is not None and layout.bin_m is not None:
             ranges_m = steps_m(layout.start_m, layout.bin_m, n_bins)
         t_ns = np.array(column.t_ns, np.int64)
-        rate_hz = column.rates_hz.pop() if len(column.rates_hz) == 1 else None
+        # the first frames come before the answer that gives their rate
+        running = {value for value in column.fps if real_frame_rate(value)}
+        settings, rate_hz = column.settings, None
+        if len(running) == 1:
+            (fps,) = running
+            settings = settings | {X4Setting.FPS.name: fps}
+            rate_hz = real_frame_rate(fps)
         what = {"rf": "RF bins", "iq": "complex bins", None: "values"}[kind]
         return Frames(
             about=f"{n_bins} {what} ({layout.message})",
@@ -442,8 +459,8 @@ class _Messages:
             counter=np.array(column.counter, np.uint32),
             t_ns=t_ns if (t_ns != NO_TIME_NS).any() else None,
             ranges_m=ranges_m,
-            frame_rate_hz=real_frame_rate(rate_hz) or None if rate_hz is not None else None,
-            settings=column.settings,
+            frame_rate_hz=rate_hz,
+            settings=settings,
         )
 
     def _chunks(self, layout: _Layout, kind: Kind | None) -> Iterator[Samples]:
@@ -451,7 +468,7 @@ class _Messages:
             if row.layout == layout:
                 values = row.values
                 if kind == "iq" and values.dtype != np.complex64:
-                    values = _complex(*np.split(values, 2))
+                    values = complex_of(*np.split(values, 2))
                 yield values[np.newaxis]
 
     def _rows(self, on_fault: FaultHandler, layouts: FrameLayouts | None = None) -> Iterator[_Row]:
@@ -525,21 +542,14 @@ def _settings_of(info: Mapping[str, Any]) -> dict[str, Any]:
 def _samples(message: BasebandIq | BasebandAp | RadarMessage) -> Samples:
     match message:
         case BasebandAp(amplitude=amplitude, phase=phase):
-            return _complex(amplitude * np.cos(phase), amplitude * np.sin(phase))
+            return complex_of(amplitude * np.cos(phase), amplitude * np.sin(phase))
         case BasebandIq(i=i, q=q) | RadarBasebandFloat(i=i, q=q):
-            return _complex(i, q)
+            return complex_of(i, q)
         case RadarBasebandQ15():
             return message.iq
         case RadarRf() | RadarRfNormalized():
             return message.samples.astype(np.float32)
     raise AssertionError(f"no frame: {message_name(message)}")
-
-
-def _complex(i: npt.NDArray[np.float32], q: npt.NDArray[np.float32]) -> npt.NDArray[np.complex64]:
-    """I + jQ; parts are kept as they are, also beside infinities, which 1j * q does not."""
-    iq = np.empty(i.shape, np.complex64)
-    iq.real, iq.imag = i, q
-    return iq
 
 
 class Recording(RadarArrays):
@@ -572,8 +582,10 @@ class Recording(RadarArrays):
     @property
     def radar(self) -> RadarArrays:
         """The only radar; RecordingError if there are several."""
+        if not self.radars:
+            raise RecordingError(f"{self.path} holds no radar frames")
         if len(self.radars) != 1:
-            names = ", ".join(map(shown, self.radars)) or "none"
+            names = ", ".join(map(shown, self.radars))
             raise RecordingError(
                 f"{self.path} holds {len(self.radars)} radars, not one: {names}; "
                 "choose one: --radar NAME, in Python .radars[NAME]"
@@ -583,9 +595,11 @@ class Recording(RadarArrays):
 
     def named(self, name: str) -> RadarArrays:
         """Return a radar by name; RecordingError if there is none of that name."""
+        if not self.radars:
+            raise RecordingError(f"{self.path} holds no radar frames")
         if name not in self.radars:
             refuse_name(self.path, None if any(self.radars) else name)
-            names = ", ".join(map(shown, self.radars)) or "none"
+            names = ", ".join(map(shown, self.radars))
             raise RecordingError(f"{self.path} holds no radar {shown(name)}; it holds {names}")
         return self.radars[name]
 

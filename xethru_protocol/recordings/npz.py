@@ -52,6 +52,7 @@ from xethru_protocol.recordings.records import (
 )
 from xethru_protocol.recordings.vendor.layouts import BINARY_KINDS, KIND_OF_MESSAGE, BinaryKind
 from xethru_protocol.system import written_whole
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.rows import Response
 
@@ -137,9 +138,9 @@ class _Others:
     def add(self, message: Response) -> None:
         self.payload += encode(message)
         self.end.append(len(self.payload))
-        name, shown = describe(message)
+        name, fields = describe(message)
         self.names.append(name)
-        self.fields.append(json.dumps(shown))
+        self.fields.append(json.dumps(fields))
 
     def save(self, archive: zipfile.ZipFile) -> None:
         _add(archive, "message_index", np.array(self.index, np.int64))
@@ -203,7 +204,7 @@ def read_npz(path: Path) -> TimedMessages:
     with _open(path, " is cut or damaged") as archive, contextlib.ExitStack() as cleanup:
         # Checksums are of whole arrays: without this, damaged samples would come out first.
         if (damaged := archive.zip.testzip()) is not None:
-            raise ValueError(f"the checksum of {damaged} is wrong")
+            raise ValueError(f"the checksum of {shown(damaged)} is wrong")
         found = [_other_messages(archive)]
         found += [
             _bulk_messages(kind, archive, cleanup)

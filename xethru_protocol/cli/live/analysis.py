@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from xethru_protocol.cli.live.sources import FrameSource, TimedFrame
 from xethru_protocol.cli.output import CommandFailed
 from xethru_protocol.processing.clutter import ClutterFilter, Method
-from xethru_protocol.processing.doppler import (
-    CARRIER_HZ,
-    SPEED_OF_LIGHT_MPS,
-    RangeDoppler,
-    range_doppler,
-)
+from xethru_protocol.processing.doppler import SPEED_OF_LIGHT_MPS, RangeDoppler, range_doppler
 from xethru_protocol.processing.downconversion import downconvert, line_bins
 from xethru_protocol.processing.presence import Presence, PresenceMonitor
 from xethru_protocol.processing.vital import Breathing, BreathingMonitor, phase_at
@@ -31,6 +26,8 @@ _DOPPLER_FRAMES = 64
 _CHEST_EVERY_S = 0.5
 _LEAST_RATE_HZ = 4.0
 _LEAST_BINS = 16
+_LONGEST_GAP_S = 0.5
+"""A third of the shortest breath: a longer gap without frames begins a new window."""
 _LEAST_RF_BINS = 160
 """16 lines of baseband, every 8th bin, and the filter's length."""
 
@@ -96,6 +93,8 @@ class LiveUpdate:
         Port or recording, and the clutter filter's method.
     t_s, n_frames, n_lost, frame_rate_hz
         Time of the newest frame, frames so far, frames that did not arrive, frames per second.
+    carrier_hz
+        Centre frequency of the pulse.
     ranges_m
         Shape (n_bins,).
     profile
@@ -122,6 +121,7 @@ class LiveUpdate:
     n_frames: int
     n_lost: int
     frame_rate_hz: float
+    carrier_hz: float
     ranges_m: NDArray[np.float64]
     profile: Floats
     rf_ranges_m: NDArray[np.float64] | None
@@ -161,8 +161,11 @@ class VitalSigns:
         if not source.is_iq:
             center = source.tx_center_frequency
             self.ranges_m = source.ranges_m[line_bins(n_bins, tx_center_frequency=center)]
-        self._presence = PresenceMonitor(self.ranges_m, rate_hz)
-        self._breathing = BreathingMonitor(self.ranges_m, rate_hz, window_s=window_s)
+        carrier_hz = source.carrier_hz
+        self._presence = PresenceMonitor(self.ranges_m, rate_hz, carrier_hz=carrier_hz)
+        self._breathing = BreathingMonitor(
+            self.ranges_m, rate_hz, window_s=window_s, carrier_hz=carrier_hz
+        )
         self._heard, self._t_s = 0, 0.0
 
     def iq_of(self, frame: TimedFrame) -> NDArray[np.complex64]:
@@ -177,6 +180,10 @@ class VitalSigns:
     def take(self, frame: TimedFrame) -> NDArray[np.complex64]:
         """Take the next frame; return it as complex baseband."""
         iq = self.iq_of(frame)
+        if frame.t_s - self._t_s > _LONGEST_GAP_S + 1.0 / self._source.frame_rate_hz:
+            self._breathing.reset()
+            self._presence.reset()
+            self._heard = 0
         self._heard += 1
         self._t_s = frame.t_s
         self._breathing.update(iq)
@@ -233,13 +240,16 @@ class LiveAnalysis:
             n_frames=self._n_frames,
             n_lost=source.lost(),
             frame_rate_hz=source.frame_rate_hz,
+            carrier_hz=source.carrier_hz,
             ranges_m=self.vital.ranges_m,
             profile=np.abs(rows[-1]),
             rf_ranges_m=None if source.is_iq else source.ranges_m,
             rf=None if source.is_iq else np.array(self._newest.samples.real, dtype=np.float32),
             waterfall=np.abs(rows[::-1]),
             waterfall_s=self._n_rows / source.frame_rate_hz,
-            doppler=range_doppler(rows[-enough:], source.frame_rate_hz) if enough > 1 else None,
+            doppler=None
+            if enough < 2
+            else range_doppler(rows[-enough:], source.frame_rate_hz, carrier_hz=source.carrier_hz),
             chest_s=None if chest is None else chest[0],
             chest_mm=None if chest is None else chest[1],
             vital=vital,
@@ -261,7 +271,8 @@ class LiveAnalysis:
             self._chest_at_s = self._newest.t_s
             rows = self._newest_of(self._raw)[-self._n_frames :]
             phase = phase_at(rows, self.vital.ranges_m, breathing.range_m)
-            millimetres = phase * (1e3 * SPEED_OF_LIGHT_MPS / CARRIER_HZ / (4 * np.pi))
+            wavelength_mm = 1e3 * SPEED_OF_LIGHT_MPS / self._source.carrier_hz
+            millimetres = phase * (wavelength_mm / (4 * np.pi))
             since_s = (np.arange(len(rows)) - len(rows) + 1) / self._source.frame_rate_hz
             self._chest = since_s, millimetres - millimetres.mean()
         return self._chest

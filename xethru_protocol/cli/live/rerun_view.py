@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from xethru_protocol.cli.live.analysis import LiveUpdate
 from xethru_protocol.cli.live.picture import STEPS, in_decibels, levels, scale_of, ticks_m
-from xethru_protocol.processing.doppler import CARRIER_HZ, SPEED_OF_LIGHT_MPS
+from xethru_protocol.processing.doppler import SPEED_OF_LIGHT_MPS
 
 _WIDTH = 1000.0
 _LABEL_X = -50.0
@@ -138,7 +138,7 @@ class RerunPicture:
 
     def draw(self, update: LiveUpdate) -> None:
         start_m, end_m = float(update.ranges_m[0]), float(update.ranges_m[-1])
-        fastest_mps = SPEED_OF_LIGHT_MPS / CARRIER_HZ * update.frame_rate_hz / 4
+        fastest_mps = SPEED_OF_LIGHT_MPS / update.carrier_hz * update.frame_rate_hz / 4
         image = _Box(0, 700, start_m, end_m, 0, -update.waterfall_s)
         doppler = _Box(0, 400, start_m, end_m, fastest_mps, -fastest_mps)
         chest = _Box(0, 300, -update.waterfall_s, 0, 1, -1)

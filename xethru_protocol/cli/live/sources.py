@@ -19,12 +19,12 @@ from xethru_protocol.driver.frames import Samples
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings.arrays import RadarArrays, load
-from xethru_protocol.recordings.records import RecordingFault
+from xethru_protocol.recordings.records import NO_TIME_NS, RecordingFault
 from xethru_protocol.validation import shown
-from xethru_protocol.wire.x4 import real_frame_rate
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.x4 import CARRIER_HZ, real_frame_rate
 
 _BLOCK_FRAMES = 64
-_UNKNOWN_NS = int(np.iinfo(np.int64).min)
 
 
 class TimedFrame(NamedTuple):
@@ -53,7 +53,7 @@ class FrameSource:
     frames
         The frames, in order. A module begins to send with the first that is asked for.
     lost
-        Returns how many frames did not arrive.
+        Returns how many frames did not arrive, or held NaN or infinities and were left out.
     faults
         What of a recording could not be read, when its frames have been taken.
     """
@@ -66,6 +66,11 @@ class FrameSource:
     frames: Iterable[TimedFrame]
     lost: Callable[[], int] = lambda: 0
     faults: Sequence[RecordingFault] = ()
+
+    @property
+    def carrier_hz(self) -> float:
+        """Centre frequency of the pulse, of which Doppler and displacement are measured."""
+        return CARRIER_HZ[self.tx_center_frequency]
 
 
 @contextmanager
@@ -82,15 +87,31 @@ def open_source(arguments: Namespace) -> Iterator[FrameSource]:
     with module_at(arguments.port, arguments.baudrate) as radar:
         geometry = radar.configure_raw(config)
         wanted_hz = frame_rate(radar, arguments.fps)
+        frames = _Finite(_streamed(radar, wanted_hz, arguments.count))
         yield FrameSource(
             name=arguments.port,
             ranges_m=geometry.ranges_m,
             is_iq=geometry.downconversion,
             frame_rate_hz=real_frame_rate(wanted_hz),
             tx_center_frequency=config.tx_center_frequency,
-            frames=_streamed(radar, wanted_hz, arguments.count),
-            lost=lambda: radar.frames_lost,
+            frames=frames,
+            lost=lambda: radar.frames_lost + frames.n_left_out,
         )
+
+
+class _Finite:
+    """Frames without those that hold NaN or infinities, of which no spectrum can be made."""
+
+    def __init__(self, frames: Iterator[TimedFrame]) -> None:
+        self._frames = frames
+        self.n_left_out = 0
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        for frame in self._frames:
+            if np.isfinite(frame.samples).all():
+                yield frame
+            else:
+                self.n_left_out += 1
 
 
 def _streamed(radar: X4M300, wanted_hz: float, count: int | None) -> Iterator[TimedFrame]:
@@ -131,36 +152,43 @@ def _recorded(arguments: Namespace) -> FrameSource:
         raise CommandFailed(
             f"{path} does not say where its bins lie; add its --frame-area START END"
         )
+    finite = _Finite(_all_frames(frames, rate_hz, with_times=arguments.fps is None))
     return FrameSource(
         name=path,
         ranges_m=frames.ranges_m,
         is_iq=frames.kind == "iq",
         frame_rate_hz=rate_hz,
-        tx_center_frequency=_tx_center_frequency(frames),
-        frames=_paced(
-            islice(_all_frames(frames, rate_hz, with_times=arguments.fps is None), arguments.count),
-            arguments.rate,
-        ),
+        tx_center_frequency=_tx_center_frequency(path, frames),
+        frames=_paced(islice(finite, arguments.count), arguments.rate),
+        lost=lambda: finite.n_left_out,
         faults=faults,
     )
 
 
-def _tx_center_frequency(frames: RadarArrays) -> int:
-    found = frames.settings.get("TXCENTERFREQUENCY")
-    return found if isinstance(found, int) else RawConfig().tx_center_frequency
+def _tx_center_frequency(path: str, frames: RadarArrays) -> int:
+    """Return the setting of a recording; the default where the recording does not have it."""
+    found = frames.settings.get(X4Setting.TXCENTERFREQUENCY.name)
+    if found is None:
+        return RawConfig().tx_center_frequency
+    if found not in CARRIER_HZ:
+        raise CommandFailed(
+            f"{path} was recorded at TXCENTERFREQUENCY {found}, whose carrier is not known; "
+            "record at 3 or 4"
+        )
+    return int(found)
 
 
 def _all_frames(radar: RadarArrays, rate_hz: float, *, with_times: bool) -> Iterator[TimedFrame]:
     """Yield the frames of a recording; where their time is not known, at equal intervals."""
-    steps, known_s, before_ns = -1, 0.0, _UNKNOWN_NS
+    steps, known_s, before_ns = -1, 0.0, NO_TIME_NS
     for block in radar.blocks(_BLOCK_FRAMES):
         frames = block.iq if block.kind == "iq" else block.rf
         assert frames is not None, "of this kind"
-        times_ns = np.full(len(frames), _UNKNOWN_NS)
+        times_ns = np.full(len(frames), NO_TIME_NS)
         if with_times and block.t_ns is not None:
             times_ns = block.t_ns
         for samples, t_ns in zip(frames, times_ns.tolist(), strict=True):
-            if _UNKNOWN_NS in (t_ns, before_ns):
+            if NO_TIME_NS in (t_ns, before_ns):
                 steps += 1
             else:
                 known_s += max((t_ns - before_ns) * 1e-9, 0.0)

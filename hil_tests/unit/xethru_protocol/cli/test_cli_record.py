@@ -18,7 +18,7 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
-from xethru_protocol.cli.record import RecordingFiles
+from xethru_protocol.cli.record.files import RecordingFiles
 from xethru_protocol.recordings import (
     describe_recording,
     read_note,
@@ -407,7 +407,7 @@ def test_a_module_that_falls_silent(
     module: PtyModule, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "recording"
-    monkeypatch.setattr("xethru_protocol.cli.record.RawFrames.start", lambda self, radar: 0.2)
+    monkeypatch.setattr("xethru_protocol.cli.record.modes.RawFrames.start", lambda self, radar: 0.2)
     assert main(["record", "--port", module.path, "--out", str(out)]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 

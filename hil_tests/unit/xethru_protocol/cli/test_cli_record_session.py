@@ -233,7 +233,7 @@ def test_a_module_that_does_not_answer_costs_no_older_file(
 def test_a_module_that_falls_silent_is_named(
     module: PtyModule, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("xethru_protocol.cli.record.RawFrames.start", lambda self, radar: 0.2)
+    monkeypatch.setattr("xethru_protocol.cli.record.modes.RawFrames.start", lambda self, radar: 0.2)
     arguments = ["--port", f"mute={module.path}", "--out", str(tmp_path / "a.mcap")]
     assert main(["record", *arguments]) == 1
     errors = capsys.readouterr().err

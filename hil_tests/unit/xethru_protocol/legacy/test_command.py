@@ -54,6 +54,30 @@ def test_exit_code_is_the_scripts(script: Script) -> None:
     assert script("pass") == 0
 
 
+@pytest.mark.parametrize("name", ["BaseException", "GeneratorExit"])
+def test_an_exception_of_any_kind_shows_the_scripts_lines_only(
+    script: Script, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    assert script(f"raise {name}('text')") == 1
+    shown = capsys.readouterr().err
+    assert shown.rstrip().endswith(f"{name}: text")
+    assert shown.count("  File ") == 1
+
+
+def test_a_script_nested_too_deeply_is_one_line(
+    script: Script, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert script("-" * 200_000 + "1") == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_reader_that_has_ended_ends_the_script(
+    script: Script, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert script("raise BrokenPipeError") == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_a_script_reads_standard_input(
     script: Script, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

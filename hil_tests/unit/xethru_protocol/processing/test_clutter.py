@@ -73,13 +73,36 @@ def test_what_stands_still_goes_and_a_moving_echo_stays(method: Method) -> None:
     assert np.abs(filtered[:, 12]).mean() == pytest.approx(0.1, rel=0.1)
 
 
-def test_a_damaged_frame_is_forgotten(frames: NDArray[np.complex64]) -> None:
+@pytest.mark.parametrize("method", ["mean", "svd"])
+def test_a_damaged_frame_is_forgotten(frames: NDArray[np.complex64], method: Method) -> None:
     damaged = frames.copy()
     damaged[2] = np.nan
-    filtered = remove_clutter(damaged, "mean", window=WINDOW)
+    filtered = remove_clutter(damaged, method, window=WINDOW)
+    assert np.isnan(filtered[2]).all()
     np.testing.assert_allclose(
-        filtered[-10:], remove_clutter(frames, "mean", window=WINDOW)[-10:], atol=1e-6
+        filtered[-10:], remove_clutter(frames, method, window=WINDOW)[-10:], atol=1e-6
     )
+
+
+def test_an_average_begins_anew_behind_a_damaged_frame(frames: NDArray[np.complex64]) -> None:
+    damaged = frames.copy()
+    damaged[2] = np.nan
+    filtered = remove_clutter(damaged, "exponential", alpha=0.1)
+    assert np.isnan(filtered[2]).all()
+    np.testing.assert_allclose(
+        filtered[3:], remove_clutter(frames[3:], "exponential", alpha=0.1), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
+def test_svd_takes_a_damaged_frame_for_zero(frames: NDArray[np.complex64], value: float) -> None:
+    damaged, zero = frames.astype(np.complex128), frames.astype(np.complex128)
+    damaged[20, 3], zero[20] = value, 0
+    filtered = remove_clutter(damaged, "svd", window=WINDOW)
+    assert np.isnan(filtered[20]).all()
+    rest = np.arange(len(frames)) != 20
+    expected = remove_clutter(zero, "svd", window=WINDOW)
+    np.testing.assert_allclose(filtered[rest], expected[rest], atol=1e-12)
 
 
 def test_other_frames_need_a_reset(frames: NDArray[np.complex64]) -> None:

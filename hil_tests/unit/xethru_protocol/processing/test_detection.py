@@ -50,8 +50,17 @@ def test_profile_is_the_root_of_the_mean_power() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"false_alarm_rate": 0.0}, {"training_bins": 0}, {"guard_bins": 9}]
+    ("wrong", "match"),
+    [
+        ({"false_alarm_rate": 0.0}, "false_alarm_rate 0"),
+        ({"training_bins": 0}, "0 training_bins"),
+        ({"guard_bins": 10}, r"a profile of shape \(20,\).* at least 22"),
+    ],
 )
-def test_what_makes_no_threshold_raises(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"profile|false_alarm_rate"):
+def test_what_makes_no_threshold_raises(wrong: dict[str, float], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
         cfar(np.ones(20), **wrong)  # type: ignore[arg-type]
+
+
+def test_the_shortest_profile_has_a_training_bin_for_each_bin() -> None:
+    assert np.isfinite(cfar(np.ones(20), guard_bins=9).threshold).all()

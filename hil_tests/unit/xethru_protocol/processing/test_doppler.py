@@ -1,11 +1,15 @@
 """Range-Doppler maps and spectrograms: closed forms of tones, scipy's spectrogram, signs."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import scipy.signal
 from numpy.typing import NDArray
 
 from xethru_protocol.processing.doppler import range_doppler, spectrogram
+from xethru_protocol.processing.presence import PresenceMonitor
+from xethru_protocol.processing.vital import BreathingMonitor, phase_at
 
 RATE_HZ = 17.0
 WAVELENGTH_M = 299_792_458 / 7.29e9
@@ -64,3 +68,37 @@ def test_what_is_too_short_raises() -> None:
         range_doppler(np.ones((1, 4)), RATE_HZ)
     with pytest.raises(ValueError, match="n_frequencies 8"):
         range_doppler(np.ones((9, 4)), RATE_HZ, n_frequencies=8)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rate_that_is_none_raises(rate_hz: float) -> None:
+    ranges_m = np.linspace(0.4, 5, 20)
+    calls: list[Callable[[], object]] = [
+        lambda: range_doppler(np.ones((9, 4)), rate_hz),
+        lambda: spectrogram(noise(64), rate_hz),
+        lambda: BreathingMonitor(ranges_m, rate_hz),
+        lambda: PresenceMonitor(ranges_m, rate_hz),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match="frame_rate_hz"):
+            call()
+
+
+def test_arguments_out_of_range_are_named() -> None:
+    calls: dict[str, Callable[[], object]] = {
+        "window 1": lambda: spectrogram(noise(64), RATE_HZ, window=1),
+        "window -1": lambda: spectrogram(noise(64), RATE_HZ, window=-1),
+        "step 0": lambda: spectrogram(noise(64), RATE_HZ, step=0),
+        "step -1": lambda: spectrogram(noise(64), RATE_HZ, step=-1),
+        "carrier_hz 0": lambda: range_doppler(np.ones((9, 4)), RATE_HZ, carrier_hz=0),
+        "n_bins": lambda: range_doppler(np.ones(9), RATE_HZ),
+        "n_frames": lambda: spectrogram(np.ones((64, 2)), RATE_HZ),
+        "window_s inf": lambda: PresenceMonitor(np.ones(20), RATE_HZ, window_s=float("inf")),
+        "window_s 0": lambda: PresenceMonitor(np.ones(20), RATE_HZ, window_s=0),
+        "every_s nan": lambda: BreathingMonitor(np.ones(20), RATE_HZ, every_s=float("nan")),
+        "9 of 9 frames hold NaN": lambda: phase_at(np.full((9, 4), np.nan + 0j), np.ones(4), 1.0),
+        r"\(9, 0\)": lambda: phase_at(np.ones((9, 0), complex), np.ones(0), 1.0),
+    }
+    for match, call in calls.items():
+        with pytest.raises(ValueError, match=match):
+            call()

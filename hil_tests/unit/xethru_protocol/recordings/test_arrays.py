@@ -7,6 +7,7 @@ read here with numpy by their layout alone, or are put into the messages here.
 import json
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,18 @@ import numpy.typing as npt
 import pytest
 from scipy.io import loadmat, savemat
 
+from emulator import emulated_port
 from hil_tests.paths import FIXTURES, real_raw_recording, real_recording, shared_data
 from hil_tests.unit.xethru_protocol.recordings.messages import frame, write_capture
 from xethru_protocol import Frame, FrameGeometry, load
+from xethru_protocol.cli import main
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingFault,
     SessionRecorder,
     TextColumn,
     convert,
+    read_recording,
 )
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
@@ -154,6 +158,49 @@ def test_the_modules_answers_give_ranges_and_settings(tmp_path: Path) -> None:
     assert np.asarray(recording.ranges_m) == pytest.approx([0.5, 1.0, 1.5, 2.0])
     assert recording.frame_rate_hz == pytest.approx(17.04938, abs=1e-5)  # 9.6
     assert recording.t_ns is None
+
+
+def rate_answer(fps: float) -> m.ReplyFloat:
+    return m.ReplyFloat(content_id=X4Setting.FPS, values=(fps,))
+
+
+@pytest.mark.parametrize(
+    ("answers", "rate_hz"),
+    [
+        pytest.param({}, 5000.0, id="never asked: by the times"),
+        pytest.param({2: 17.0}, 17.04938, id="asked when frames came already"),
+        pytest.param({0: 0.0, 2: 17.0}, 17.04938, id="asked while it stood, and again"),
+        pytest.param({0: 17.0, 4: 17.0}, 17.04938, id="asked twice"),
+        pytest.param({0: 17.0, 4: 50.0}, 5000.0, id="changed: by the times"),
+    ],
+)
+def test_the_rate_is_the_modules_answer_and_not_how_fast_frames_came(
+    tmp_path: Path, answers: Mapping[int, float], rate_hz: float
+) -> None:
+    """Frames 0.2 ms apart, as those of an emulated module that waits for nobody.
+
+    17 frames/s are 17.04938 by the chip's timer: Protocol reference 9.6.
+    """
+    sent: list[tuple[m.Response, int | None]] = []
+    for at in range(6):
+        if at in answers:
+            sent.append((rate_answer(answers[at]), at * MS // 5))
+        sent.append((frame(1 + at), at * MS // 5))
+    write_capture(tmp_path / "a.xtwire", sent)
+    recording = load(tmp_path / "a.xtwire")
+    assert recording.frame_rate_hz == pytest.approx(rate_hz, rel=1e-6)
+    assert {block.frame_rate_hz for block in recording.blocks(2)} == {recording.frame_rate_hz}
+    if rate_hz < 100:
+        assert recording.settings["FPS"] == 17.0
+
+
+def test_the_rate_of_a_capture_of_an_emulated_module_is_the_radars(tmp_path: Path) -> None:
+    path = tmp_path / "a.xtwire"
+    with emulated_port("--bare", "--pace", "asap") as port:
+        assert main(["record", "--port", port, "--wire", str(path), "--count", "40"]) == 0
+    recording = load(path)
+    assert recording.n_frames >= 40
+    assert recording.frame_rate_hz == pytest.approx(17.04938, abs=1e-5)  # 9.6
 
 
 def test_what_frames_are_is_asked_for_where_it_is_not_known(tmp_path: Path) -> None:
@@ -355,6 +402,64 @@ def test_arrays_that_do_not_fit_are_refused(
             _ = load(tmp_path / name).iq
 
 
+@pytest.mark.parametrize(
+    "held",
+    [
+        {"rf": np.full((3, 2), 1j)},
+        {"iq": np.zeros((3, 0))},
+        {"iq": np.zeros((3, 2)), "t_ns": np.full(3, 1e300)},
+        {"iq": np.zeros((3, 2)), "t_ns": np.zeros(3) + 1j},
+        {"iq": np.zeros((3, 2)), "counter": np.array([-1, 0, 1])},
+        {"iq": np.zeros((3, 2)), "counter": np.array([0.0, np.nan, 1])},
+        {"iq": np.zeros((3, 2)), "counter": np.array([0, 2**32, 1])},
+        {"iq": np.zeros((3, 2)), "frame_rate_hz": np.zeros(1)},
+        {"iq": np.zeros((3, 2)), "frame_rate_hz": np.full(1, np.nan)},
+        {"iq": np.zeros((3, 2)), "frame_rate_hz": np.full(1, 17j)},
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused(
+    tmp_path: Path, held: dict[str, npt.NDArray[Any]]
+) -> None:
+    np.savez(tmp_path / "a.npz", **held)  # type: ignore[arg-type]  # of allow_pickle
+    with pytest.raises(RecordingError, match=f"{list(held)[-1]} (is|has|holds|must)"):
+        _ = load(tmp_path / "a.npz").frame_rate_hz
+
+
+@pytest.mark.parametrize("shape", [(10**9, 10**6), (10**12, 0), (3, 2), (-1, -2), (-1, 2)])
+def test_a_head_that_promises_other_samples_is_refused(
+    tmp_path: Path, shape: tuple[int, int]
+) -> None:
+    about = f"{{'descr': '<c8', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    head = b"\x93NUMPY\x01\x00" + len(about).to_bytes(2, "little") + about
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("iq.npy", head + bytes(16))
+    with pytest.raises(RecordingError, match=r"a\.npz .* 16 bytes, which do not fit its shape"):
+        _ = load(tmp_path / "a.npz").iq
+
+
+def test_what_unpacks_to_more_than_belongs_there_is_refused(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "a.npz", iq=np.zeros((3, 2)), t_ns=np.zeros(10**6))
+    np.savez_compressed(tmp_path / "b.npz", iq=np.zeros((3, 2)), settings=np.array("[" * 10**7))
+    for name in ("a.npz", "b.npz"):
+        with pytest.raises(RecordingError, match="does not fit iq"):
+            _ = load(tmp_path / name).iq
+
+
+def test_samples_larger_than_memory_name_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.savez(tmp_path / "a.npz", iq=np.zeros((3, 2)))
+    recording = load(tmp_path / "a.npz")
+    assert recording.n_frames == 3
+
+    def full(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("xethru_protocol.recordings.arrays.np.empty", full)
+    with pytest.raises(RecordingError, match=r"a\.npz: its 3 frames .* blocks\(\)"):
+        _ = recording.iq
+
+
 def test_a_cut_archive_is_one_line(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", rf=np.random.default_rng(1).normal(size=(300, 50)))
     data = bytearray((tmp_path / "a.npz").read_bytes())
@@ -488,3 +593,24 @@ def test_arrays_are_read_once_and_shared() -> None:
     recording = load(RECORDINGS / "iq")
     assert recording.iq is recording.iq
     assert recording.radars[""].iq is recording.iq
+
+
+def test_a_damaged_name_in_an_archive_does_not_break_the_line(tmp_path: Path) -> None:
+    convert(RECORDINGS / "iq", tmp_path / "a.npz")
+    data = (tmp_path / "a.npz").read_bytes()
+    # the content of a member whose name has a line feed is wrong
+    begin = data.index(b"facts.npy")
+    other = bytearray(data.replace(b"facts.npy", b"fac\ns.npy"))
+    other[begin + 40] ^= 255
+    (tmp_path / "a.npz").write_bytes(other)
+    with pytest.raises(RecordingError, match=r"a\.npz") as caught:
+        list(read_recording(tmp_path / "a.npz"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_session_cut_before_its_first_radar_says_that_it_is_empty(tmp_path: Path) -> None:
+    SessionRecorder(tmp_path / "all.mcap").close()
+    recording = load(tmp_path / "all.mcap")
+    for call in (lambda: recording.iq, lambda: recording.named("left")):
+        with pytest.raises(RecordingError, match=r"all\.mcap holds no radar frames"):
+            call()

@@ -32,6 +32,7 @@ def update(*, n_bins: int = 30, n_rows: int = 4, with_doppler: bool = False) -> 
         n_frames=3,
         n_lost=2,
         frame_rate_hz=2.0,
+        carrier_hz=7.29e9,
         ranges_m=np.linspace(1.0, 3.9, n_bins),
         profile=waterfall[0],
         rf_ranges_m=None,

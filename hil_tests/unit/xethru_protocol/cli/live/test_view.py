@@ -20,6 +20,7 @@ from emulator import emulated_port
 from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.cli.live.chest import (
+    RANGES_M,
     breathing,
     noise,
     recording,
@@ -61,6 +62,30 @@ def test_breathing_is_found_when_the_window_is_full(at_rest: Path, capsys: Captu
         assert answer["rate_bpm"] == pytest.approx(15.0, abs=0.5)
         assert answer["distance_m"] == pytest.approx(1.5, abs=0.06)
         assert (answer["present"], answer["moving"], answer["no_answer"]) == (True, False, None)
+
+
+def test_a_damaged_frame_is_left_out(tmp_path: Path, capsys: Capture) -> None:
+    iq = target(breathing(65))
+    iq[900, 3] = np.nan
+    found = answers_of(recording(tmp_path / "damaged.npz", iq), capsys)[-1]
+    assert found["rate_bpm"] == pytest.approx(15.0, abs=0.5)
+    assert found["present"] is True
+    assert main(["view", "--terminal", str(tmp_path / "damaged.npz"), "--rate", "0"]) == 0
+    assert ", 1 lost" in capsys.readouterr().out
+
+
+def test_a_gap_begins_a_new_window(tmp_path: Path, capsys: Capture) -> None:
+    iq, t_s = target(breathing(100)), times_s(100)
+    arrived = (t_s < 65) | (t_s > 70)
+    path = tmp_path / "gap.npz"
+    t_ns = (1e9 * t_s).astype(np.int64)
+    np.savez(path, iq=iq[arrived], t_ns=t_ns[arrived], ranges_m=RANGES_M, frame_rate_hz=17.0)
+    answers = answers_of(path, capsys)
+    before = [one for one in answers if 61 < float(str(one["t_s"])) < 65]
+    after = [one for one in answers if float(str(one["t_s"])) > 70]
+    assert all(one["rate_bpm"] == pytest.approx(15.0, abs=0.5) for one in before)
+    assert {one["rate_bpm"] for one in after} == {None}
+    assert str(after[-1]["no_answer"]) == "listening: 29 of 60 s"
 
 
 def test_nobody_has_no_rate(tmp_path: Path, capsys: Capture) -> None:
@@ -137,6 +162,36 @@ def test_clutter_goes_and_the_chest_stays(clutter: str, tmp_path: Path) -> None:
     assert update.chest_mm is not None
     # 8 mm from end to end
     assert np.ptp(update.chest_mm) == pytest.approx(8.0, rel=0.1)
+
+
+@pytest.mark.parametrize("tx_center_frequency", [3, 4])
+def test_lengths_and_speeds_are_those_of_the_carrier(
+    tmp_path: Path, tx_center_frequency: int
+) -> None:
+    """The chest moves by 8 mm, what creeps by 2 cm/s, at either centre frequency."""
+    creeping = 3.5 - 0.02 * times_s(25)
+    iq = target(breathing(25), tx_center_frequency) + target(creeping, tx_center_frequency)
+    path = recording(tmp_path / "high.npz", iq, tx_center_frequency)
+    arguments = parse(["view", str(path), "--rate", "0"])
+    with open_source(arguments) as source:
+        analysis = LiveAnalysis(source, clutter="mean", window_s=20.0)
+        for frame in source.frames:
+            analysis.take(frame)
+        update = analysis.update()
+    assert update.chest_mm is not None
+    assert np.ptp(update.chest_mm) == pytest.approx(8.0, rel=0.05)
+    assert update.doppler is not None
+    where = np.argmin(np.abs(update.ranges_m - creeping[-32]))
+    power = update.doppler.power[:, where]
+    found_mps = power @ update.doppler.velocities_mps / power.sum()
+    assert found_mps == pytest.approx(0.02, abs=0.001)
+
+
+def test_an_unknown_centre_frequency_is_one_line(tmp_path: Path, capsys: Capture) -> None:
+    path = recording(tmp_path / "a.npz", noise(30).astype(np.complex64), 5)
+    assert main(["view", "--terminal", str(path), "--rate", "0"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "TXCENTERFREQUENCY 5" in line
 
 
 def test_a_terminal_is_drawn_in_place(at_rest: Path) -> None:

@@ -1,0 +1,1 @@
+"""``xethru record``: what a module sends, written to files as it comes."""
