@@ -1,5 +1,6 @@
 """Shared pytest configuration: Hypothesis profiles, slow tests, what an installed package runs."""
 
+import gc
 import importlib.util
 import os
 import signal
@@ -85,6 +86,10 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 def pytest_report_collectionfinish() -> list[str]:
     left_out = "hil_tests: of an installed package the device suite runs, without a source tree"
     return [] if IN_SOURCE_TREE else [left_out]
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # collections look at what tests make, not again and again at all items
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
