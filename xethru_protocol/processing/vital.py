@@ -104,8 +104,8 @@ def phase_at(iq: ArrayLike, ranges_m: ArrayLike, range_m: float) -> NDArray[np.f
         The bin nearest to it, and two on either side, are used.
     """
     frames, ranges = checked(iq, ranges_m)
-    if not frames.size or not np.isfinite(frames).all():
-        raise ValueError(f"frames of shape {frames.shape}: must be some, without NaN and infinity")
+    if not frames.size:
+        raise ValueError(f"frames of shape {frames.shape}: must have frames and bins")
     echo = _echo_near(frames, int(np.argmin(np.abs(ranges - range_m))))
     return np.unwrap(np.angle(echo - circle_centre(echo)))
 
