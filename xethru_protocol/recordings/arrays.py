@@ -562,7 +562,7 @@ class Recording(RadarArrays):
     path
         As given.
     radars
-        By name; the only radar of a recording without names is ``""``.
+        By name, in that order; the only radar of a recording without names is ``""``.
     texts
         Lines of other sensors, by the name of their column.
     """
@@ -679,7 +679,7 @@ def load(
         messages = _Messages(path, name or None, given, info)
         return RadarArrays(name, lambda: messages.find(note), str(path))
 
-    radars = {name: radar(name, info) for name, info in content.radars.items()}
+    radars = {name: radar(name, info) for name, info in sorted(content.radars.items())}
     texts = {
         name: TextColumn(
             name=name,
