@@ -345,7 +345,10 @@ def match_or_new(
 
 
 def match_two(
-    state: State, points: Sequence[BodyPoint], others: Collection[int], parameters: BackEndParameters
+    state: State,
+    points: Sequence[BodyPoint],
+    others: Collection[int],
+    parameters: BackEndParameters,
 ) -> tuple[tuple[int, int], ...]:
     """Return which two of some points certainly are which landmarks, (place, row) each, or nothing.
 
