@@ -220,6 +220,7 @@ def find_known(
     scans: Sequence[RangeScan],
     side_of: Indices,
     parameters: BackEndParameters,
+    *,
     beacons: Sequence[int] = (),
 ) -> Known:
     """Return the likeliest one-to-one assignment of ranges without labels to landmarks.

@@ -108,7 +108,9 @@ class RobustBackEnd:
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
-        self._waiting: dict[int, Waiting] = {}  # beacons without a place, by label
+        # Beacons, whose ranges have labels: all labels heard, and by label those without a place
+        self._heard: set[int] = set()
+        self._waiting: dict[int, Waiting] = {}
         self._n_updates = 0
         # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[Pairs, int] = {}
@@ -214,8 +216,9 @@ class RobustBackEnd:
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         widened = [scan.with_added_sigma(added_m) for scan in scans]
         seen = self._walls.look(view(self.state, antennas), antennas)
+        beacons = self._beacon_rows()
         known = find_known(
-            self.state, seen, widened, self._side_of, self.parameters, self._beacon_rows()
+            self.state, seen, widened, self._side_of, self.parameters, beacons=beacons
         )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
@@ -379,10 +382,8 @@ class RobustBackEnd:
         return continued, float(white @ white), likelihoods
 
     def _beacon_rows(self) -> list[int]:
-        """Return the rows of landmarks that have labels."""
-        if not self._landmark_of_label:
-            return []
-        beacons = set(self._landmark_of_label.values())
+        """Return the rows of landmarks whose ranges have labels."""
+        beacons = {id_ for label, id_ in self._landmark_of_label.items() if label in self._heard}
         return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in beacons]
 
     def _take_labelled(
@@ -413,6 +414,7 @@ class RobustBackEnd:
         evidence += [(ids[row], miss) for _, _, row in refused]
         for scan in scans:
             for index, label in scan.labelled:
+                self._heard.add(label)
                 if label not in self._landmark_of_label:
                     if label not in self._waiting:
                         self._waiting[label] = Waiting(state.next_id)
@@ -441,9 +443,7 @@ class RobustBackEnd:
             if waiting.n_ranges < max(rule.min_ranges, waiting.try_at):
                 continue
             waiting.try_at = math.ceil(rule.growth * waiting.n_ranges)
-            landmark_id = initialise_beacon(
-                self._log, self.state, waiting.log_id, self.parameters
-            )
+            landmark_id = initialise_beacon(self._log, self.state, waiting.log_id, self.parameters)
             if landmark_id is not None:
                 del self._waiting[label]
                 self._landmark_of_label[label] = landmark_id
