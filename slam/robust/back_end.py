@@ -42,7 +42,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters, PointRule
-from slam.robust.solver.beacons import Waiting, initialise_beacon
+from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     find_split,
     is_due,
@@ -514,7 +514,7 @@ class RobustBackEnd:
             )
 
     def _delete_vanished(self) -> None:
-        vanished = self._existence.lost()
+        vanished = [id_ for id_ in self._existence.lost() if not self._is_where_it_was(id_)]
         for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
             self.state.remove(self.state.feature_ids.index(landmark_id))
@@ -523,6 +523,20 @@ class RobustBackEnd:
         if vanished:
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
+
+    def _is_where_it_was(self, landmark_id: int) -> bool:
+        """Return whether ranges beyond the gate are a beacon's after all, as the whole run has it.
+
+        A pose that was wrong is then corrected, and the beacon begins anew with its score.
+        """
+        row = self.state.feature_ids.index(landmark_id)
+        if row not in self._beacon_rows():
+            return False
+        self.relinearise()
+        if not is_heard_where_it_is(self._log, self.state, row, self.parameters):
+            return False
+        self._existence.renew(landmark_id)
+        return True
 
     def _merge(self) -> None:
         """Merge landmarks where that is certain, and the whole run allows it."""

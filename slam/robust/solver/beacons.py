@@ -158,14 +158,27 @@ def initialise_beacon(
         return None
     mine = best.problem.range_landmarks == best.row
     residual = measurement_residuals(best.problem, best.solution.estimate).residual[: len(mine)]
-    fits = np.abs(residual[mine]) <= parameters.relinearisation.outlier_sigmas
-    if np.mean(fits) < rule.least_share:
+    if _share_that_fits(residual[mine], parameters) < rule.least_share:
         return None
     landmark_id = _augmented(state, best.point_m)
     log.rename(log_id, landmark_id)
     adopt(log, state, best.problem, best.solution, parameters)
     log.since_solved = 0
     return landmark_id
+
+
+def is_heard_where_it_is(
+    log: RunLog, state: State, row: int, parameters: BackEndParameters
+) -> bool:
+    """Return whether enough of the newest ranges of a beacon fit its place; after a solution."""
+    rule, problem = parameters.beacons, log.problem(state, parameters)
+    mine = np.flatnonzero(problem.range_landmarks == row)[-rule.min_ranges :]
+    residual = measurement_residuals(problem, log.starts(state, problem)[0]).residual[mine]
+    return _share_that_fits(residual, parameters) >= rule.least_share
+
+
+def _share_that_fits(residual: Array, parameters: BackEndParameters) -> float:
+    return float(np.mean(np.abs(residual) <= parameters.relinearisation.outlier_sigmas))
 
 
 def _augmented(state: State, point_m: Array) -> int:
