@@ -438,11 +438,12 @@ class RobustBackEnd:
 
     def _initialise_beacons(self) -> None:
         """Bring the beacons into the map whose ranges have one place."""
-        rule = self.parameters.beacons
+        fewest = self.parameters.tracklets.min_frames
+        share = 1.0 + self.parameters.relinearisation.run_share
         for label, waiting in list(self._waiting.items()):
-            if waiting.n_ranges < max(rule.min_ranges, waiting.try_at):
+            if waiting.n_ranges < max(fewest, waiting.try_at):
                 continue
-            waiting.try_at = math.ceil(rule.growth * waiting.n_ranges)
+            waiting.try_at = math.ceil(share * waiting.n_ranges)
             landmark_id = initialise_beacon(self._log, self.state, waiting.log_id, self.parameters)
             if landmark_id is not None:
                 del self._waiting[label]

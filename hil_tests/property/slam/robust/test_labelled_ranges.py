@@ -20,7 +20,6 @@ from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
 from slam.robust.parameters import (
     BackEndParameters,
-    BeaconRule,
     RangeNoise,
     RelinearisationRule,
 )
@@ -119,7 +118,7 @@ def test_exact_ranges_from_a_bent_way_have_the_place_of_the_beacon_first() -> No
     antennas = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [3.0, 1.0], [3.0, 2.0]])
     for point in ([1.0, 4.0], [-2.0, -3.0], [5.0, 0.5], [1.4, 0.3]):
         ranges = np.hypot(*(antennas - point).T)
-        places = find_places(ranges, np.full(6, 0.01), antennas, BeaconRule())
+        places = find_places(ranges, np.full(6, 0.01), antennas, PARAMETERS)
         assert places[0] == pytest.approx(point, abs=1e-5)
 
 
@@ -127,7 +126,7 @@ def test_exact_ranges_from_a_straight_way_have_both_mirror_images() -> None:
     """The line y = x: the mirror image of (a, b) is (b, a)."""
     antennas = np.linspace(0.0, 3.0, 12)[:, None] * np.ones(2)
     ranges = np.hypot(*(antennas - [4.0, 1.0]).T)
-    places = find_places(ranges, np.full(12, 0.01), antennas, BeaconRule())
+    places = find_places(ranges, np.full(12, 0.01), antennas, PARAMETERS)
     for image in ([4.0, 1.0], [1.0, 4.0]):
         assert min(np.hypot(*(places - image).T)) <= 1e-5
     assert mirrored(np.array([4.0, 1.0]), antennas) == pytest.approx([1.0, 4.0])
