@@ -14,6 +14,7 @@ from slam.geometry import Rig
 from slam.results import SmoothedRun, UpdateReport
 from slam.robust import kernels
 from slam.robust.association import (
+    LONGEST_M,
     Antennas,
     Known,
     Pairs,
@@ -210,11 +211,12 @@ class RobustBackEnd:
 
         Without ``solve`` merges and the solution over all poses wait for a later time.
         """
-        antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
+        looks = [scan for scan in scans if scan.looks]
+        antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
-        widened = [scan.with_added_sigma(added_m) for scan in scans]
+        widened = [scan.with_added_sigma(added_m) for scan in looks]
         seen = self._walls.look(view(self.state, antennas), antennas)
         beacons = self._beacon_rows()
         known = find_known(
@@ -222,17 +224,17 @@ class RobustBackEnd:
         )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
-        continued, nis, likelihoods = self._correct(known, seen, scans, antennas)
+        continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
         if any(scan.labelled for scan in scans):
             used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
-            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, widened, antennas)
+            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, added_m)
             continued, nis = continued + of_beacons, nis + nis_of_beacons
             likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
-        self._delete_vanished()
+        self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:
             self._initialise_beacons()
@@ -387,14 +389,17 @@ class RobustBackEnd:
         return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in beacons]
 
     def _take_labelled(
-        self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
+        self, scans: Sequence[RangeScan], added_m: float
     ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
-        """Correct the state with the ranges that have labels; log them; place new beacons.
+        """Correct the state with the ranges that have labels, and log them all.
 
         Returns what `_correct` does. A range beyond the gate corrects nothing now; it is logged,
-        too: which are outliers, the solution over the whole run decides.
+        too: which are outliers, the solution over the whole run decides. ``added_m`` is added in
+        squares to the noise of ranges in the gate.
         """
         state = self.state
+        antennas = antennas_of(self.rig, scans, state.calibration, state.mounts_m)
+        widened = [scan.with_added_sigma(added_m) for scan in scans]
         rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
         row_of_label = {
             label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
@@ -415,7 +420,7 @@ class RobustBackEnd:
         for scan in scans:
             for index, label in scan.labelled:
                 self._heard.add(label)
-                if label not in self._landmark_of_label:
+                if label not in self._landmark_of_label and 0.0 < scan.ranges_m[index] < LONGEST_M:
                     if label not in self._waiting:
                         self._waiting[label] = Waiting(state.next_id)
                         state.next_id += 1
@@ -514,8 +519,14 @@ class RobustBackEnd:
                 sigma_m=sigma_m,
             )
 
-    def _delete_vanished(self) -> None:
-        vanished = [id_ for id_ in self._existence.lost() if not self._is_where_it_was(id_)]
+    def _delete_vanished(self, *, solve: bool) -> None:
+        """Delete landmarks that are not there any more; without ``solve``, no beacons."""
+        lost, beacons = self._existence.lost(), set()
+        if lost and self._heard:
+            beacons = {self.state.landmark_ids[row] for row in self._beacon_rows()}
+        vanished = [
+            id_ for id_ in lost if id_ not in beacons or (solve and not self._is_where_it_was(id_))
+        ]
         for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
             self.state.remove(self.state.feature_ids.index(landmark_id))
@@ -530,10 +541,8 @@ class RobustBackEnd:
 
         A pose that was wrong is then corrected, and the beacon begins anew with its score.
         """
-        row = self.state.feature_ids.index(landmark_id)
-        if row not in self._beacon_rows():
-            return False
         self.relinearise()
+        row = self.state.landmark_ids.index(landmark_id)
         if not is_heard_where_it_is(self._log, self.state, row, self.parameters):
             return False
         self._existence.renew(landmark_id)

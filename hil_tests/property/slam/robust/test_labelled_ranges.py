@@ -351,6 +351,39 @@ def test_the_question_of_a_carry_takes_ranges_with_labels() -> None:
     assert np.array_equal(branches.main.pose, path[-1])
 
 
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -1.0, 0.0])
+def test_numbers_that_are_no_ranges_are_left_out(wrong: float) -> None:
+    drive = drive_along(circles(60), 5)
+    one, path, _ = run(drive)
+    other = RobustBackEnd(RIG, PARAMETERS)
+    for number, increment in enumerate(drive.increments):
+        other.predict(increment)
+        (scan,) = drive.scans(number)
+        assert scan.labels is not None
+        both = replace(scan, ranges_m=(*scan.ranges_m, wrong), labels=scan.labels * 2)
+        other.update([both])
+    assert len(one.landmark_of_label) == len(BEACONS)
+    assert np.array_equal(other.pose, path[-1])
+
+
+def test_an_antenna_that_asks_beacons_misses_no_landmark_of_the_radars() -> None:
+    """It stands where a radar does, and its scans hold nothing but a beacon's range."""
+    world = simulate(LAB, 0, 7.4e-3, laps=1)
+    rig = paper_rig()
+    both = Rig(mounts=(*rig.mounts, replace(rig.mounts[0], name="antenna")))
+    ends = []
+    for mounted in (rig, both):
+        back_end = RobustBackEnd(mounted, parameters_for(LAB, 7.4e-3))
+        for increment, scans in zip(world.increments[:200], world.scans[:200], strict=True):
+            back_end.predict(increment)
+            asked = RangeScan(radar=4, ranges_m=(100.0,), labels=(5,))
+            back_end.update([*scans, asked] if mounted is both else scans)
+        assert not back_end.landmark_of_label
+        assert len(back_end.reported_rows()) >= 2
+        ends.append(back_end)
+    assert np.abs(ends[0].state.landmarks_m - ends[1].state.landmarks_m).max() <= 1e-3
+
+
 def test_two_ranges_with_one_label_are_an_error() -> None:
     with pytest.raises(ValueError, match="1 labels of 2 ranges"):
         RangeScan(radar=0, ranges_m=(1.0, 2.0), labels=(3,))
