@@ -111,7 +111,8 @@ def run(
 
 def place_of(back_end: RobustBackEnd, label: int) -> Array:
     row = back_end.state.landmark_ids.index(back_end.landmark_of_label[label])
-    return back_end.state.landmarks_m[row]
+    place: Array = back_end.state.landmarks_m[row]
+    return place
 
 
 def test_exact_ranges_from_a_bent_way_have_the_place_of_the_beacon_first() -> None:
@@ -280,7 +281,7 @@ def test_without_labels_nothing_changes_bit_for_bit() -> None:
             path.append(back_end.pose)
         assert len(back_end.state.landmark_ids) > 1
         paths.append(np.array(path))
-    assert np.array_equal(*paths)
+    assert np.array_equal(paths[0], paths[1])
 
 
 def test_a_beacon_beside_radars_changes_none_of_their_landmarks() -> None:
