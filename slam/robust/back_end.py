@@ -49,7 +49,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters
-from slam.robust.solver.beacons import Waiting, initialise_beacon
+from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     find_split,
     is_due,
@@ -116,7 +116,9 @@ class RobustBackEnd:
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
-        self._waiting: dict[int, Waiting] = {}  # beacons without a place, by label
+        # Beacons, whose ranges have labels: all labels heard, and by label those without a place
+        self._heard: set[int] = set()
+        self._waiting: dict[int, Waiting] = {}
         self._n_updates = 0
         # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[Pairs, int] = {}
@@ -218,36 +220,39 @@ class RobustBackEnd:
 
         Without ``solve`` merges and the solution over all poses wait for a later time.
         """
-        antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
+        looks = [scan for scan in scans if scan.looks]
+        antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         with_bearings = [scan for scan in scans if scan.bearings_rad is not None]
         if with_bearings:
             scans = [scan for scan in scans if scan.bearings_rad is None]
-        widened = [scan.with_added_sigma(added_m) for scan in scans]
+            looks = [scan for scan in looks if scan.bearings_rad is None]
+        widened = [scan.with_added_sigma(added_m) for scan in looks]
         seen = self._walls.look(view(self.state, antennas), antennas)
+        beacons = self._beacon_rows()
         known = find_known(
-            self.state, seen, widened, self._side_of, self.parameters, self._beacon_rows()
+            self.state, seen, widened, self._side_of, self.parameters, beacons=beacons
         )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
-        continued, nis, likelihoods = self._correct(known, seen, scans, antennas)
+        continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
         if any(scan.labelled for scan in scans):
             used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
-            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, widened, antennas)
+            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, added_m)
             continued, nis = continued + of_beacons, nis + nis_of_beacons
             likelihoods = [*likelihoods, *evidence]
         dof = len(continued)
         for scan in with_bearings:
-            points, nis_of_points, evidence = self._take_points(scan, added_m, antennas)
+            points, nis_of_points, evidence = self._take_points(scan, added_m)
             continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
             likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
-        self._delete_vanished()
+        self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:
             self._initialise_beacons()
@@ -271,8 +276,8 @@ class RobustBackEnd:
         """
         if not relinearise(self._log, self.state, self.parameters):
             return False
-        beacons = self._beacon_rows()
-        split = find_split(self._log, self.state, self.parameters, beacons)
+        labelled = self._labelled_rows()
+        split = find_split(self._log, self.state, self.parameters, labelled)
         if split is not None:
             state = self.state
             size = state.layout.landmark_size
@@ -361,21 +366,27 @@ class RobustBackEnd:
         return continued, float(white @ white), likelihoods
 
     def _beacon_rows(self) -> list[int]:
-        """Return the rows of landmarks that have labels."""
-        if not self._landmark_of_label:
-            return []
-        beacons = set(self._landmark_of_label.values())
+        """Return the rows of landmarks whose ranges have labels."""
+        beacons = {id_ for label, id_ in self._landmark_of_label.items() if label in self._heard}
         return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in beacons]
 
+    def _labelled_rows(self) -> list[int]:
+        """Return the rows of landmarks that have labels."""
+        labelled = set(self._landmark_of_label.values())
+        return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in labelled]
+
     def _take_labelled(
-        self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
+        self, scans: Sequence[RangeScan], added_m: float
     ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
-        """Correct the state with the ranges that have labels; log them; place new beacons.
+        """Correct the state with the ranges that have labels, and log them all.
 
         Returns what `_correct` does. A range beyond the gate corrects nothing now; it is logged,
-        too: which are outliers, the solution over the whole run decides.
+        too: which are outliers, the solution over the whole run decides. ``added_m`` is added in
+        squares to the noise of ranges in the gate.
         """
         state = self.state
+        antennas = antennas_of(self.rig, scans, state.calibration, state.mounts_m)
+        widened = [scan.with_added_sigma(added_m) for scan in scans]
         rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
         row_of_label = {
             label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
@@ -395,7 +406,8 @@ class RobustBackEnd:
         evidence += [(ids[row], miss) for _, _, row in refused]
         for scan in scans:
             for index, label in scan.labelled:
-                if label not in self._landmark_of_label:
+                self._heard.add(label)
+                if label not in self._landmark_of_label and 0.0 < scan.ranges_m[index] < LONGEST_M:
                     if label not in self._waiting:
                         self._waiting[label] = Waiting(state.next_id)
                         state.next_id += 1
@@ -418,11 +430,12 @@ class RobustBackEnd:
 
     def _initialise_beacons(self) -> None:
         """Bring the beacons into the map whose ranges have one place."""
-        rule = self.parameters.beacons
+        fewest = self.parameters.tracklets.min_frames
+        share = 1.0 + self.parameters.relinearisation.run_share
         for label, waiting in list(self._waiting.items()):
-            if waiting.n_ranges < max(rule.min_ranges, waiting.try_at):
+            if waiting.n_ranges < max(fewest, waiting.try_at):
                 continue
-            waiting.try_at = math.ceil(rule.growth * waiting.n_ranges)
+            waiting.try_at = math.ceil(share * waiting.n_ranges)
             landmark_id = initialise_beacon(self._log, self.state, waiting.log_id, self.parameters)
             if landmark_id is not None:
                 del self._waiting[label]
@@ -430,7 +443,7 @@ class RobustBackEnd:
                 self._existence.hit(landmark_id, waiting.n_ranges)
 
     def _take_points(
-        self, scan: RangeScan, added_m: float, antennas: Antennas
+        self, scan: RangeScan, added_m: float
     ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
         """Correct the state with a scan with bearings; log it; make landmarks of what is new.
 
@@ -439,6 +452,7 @@ class RobustBackEnd:
         """
         assert scan.bearings_rad is not None
         state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
+        antennas = antennas_of(self.rig, [scan], state.calibration, state.mounts_m)
         wide = scan.with_added_sigma(added_m)
         free = [
             index
@@ -450,20 +464,23 @@ class RobustBackEnd:
             label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
         }
         miss = math.log(1.0 - noise.detection_probability)
-        continued: list[tuple[int, int, int]] = []
         evidence: list[tuple[int, float]] = []
+        pairs: list[tuple[int, int]] = []
         nis = 0.0
         for _ in range(self.parameters.points.rounds):
             seen = view(state, antennas)
-            found = find_points(state, seen, wide, free, row_of_label, self.parameters)
+            hit = {row for _, row in pairs}
+            found = find_points(state, seen, wide, (free, hit, row_of_label), self.parameters)
             if not found.pairs:
                 break
+            pairs += found.pairs
             nis_of_pairs, likelihoods = self._correct_points(scan, seen, found.pairs, antennas)
             nis, evidence = nis + nis_of_pairs, evidence + likelihoods
             used = {index for index, _ in found.pairs}
             free = [index for index in free if index not in used]
-            continued += [(scan.radar, index, ids[row]) for index, row in found.pairs]
-        for _, _, landmark_id in continued:
+        continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
+        hit_ids = {landmark_id for _, _, landmark_id in continued}
+        for landmark_id in sorted(hit_ids):
             self._existence.hit(landmark_id)
         refused = [(index, ids[row]) for index, row in found.refused]
         for index, landmark_id in refused:
@@ -472,9 +489,8 @@ class RobustBackEnd:
             )
         # Those that are seen rarely are missed often.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
-        hit = {landmark_id for _, _, landmark_id in continued}
         missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
-        for landmark_id in sorted(missed - hit):
+        for landmark_id in sorted(missed - hit_ids):
             self._existence.miss(landmark_id, self.parameters.points.decay * odds)
             evidence.append((landmark_id, miss))
         far = {index for index, _ in refused}
@@ -484,8 +500,8 @@ class RobustBackEnd:
         points = [body_point(state, antennas, one, own_share) for one in detections]
         self._tentative.take(detections, points)
         if detections:
-            self._place_points(antennas, hit | missed)
-        return tuple(continued), nis, evidence
+            self._place_points(antennas, hit_ids | missed)
+        return continued, nis, evidence
 
     def _correct_points(
         self,
@@ -652,8 +668,14 @@ class RobustBackEnd:
                 sigma_m=sigma_m,
             )
 
-    def _delete_vanished(self) -> None:
-        vanished = self._existence.lost()
+    def _delete_vanished(self, *, solve: bool) -> None:
+        """Delete landmarks that are not there any more; without ``solve``, no beacons."""
+        lost, beacons = self._existence.lost(), set()
+        if lost and self._heard:
+            beacons = {self.state.landmark_ids[row] for row in self._beacon_rows()}
+        vanished = [
+            id_ for id_ in lost if id_ not in beacons or (solve and not self._is_where_it_was(id_))
+        ]
         for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
             self.state.remove(self.state.feature_ids.index(landmark_id))
@@ -663,6 +685,18 @@ class RobustBackEnd:
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
 
+    def _is_where_it_was(self, landmark_id: int) -> bool:
+        """Return whether ranges beyond the gate are a beacon's after all, as the whole run has it.
+
+        A pose that was wrong is then corrected, and the beacon begins anew with its score.
+        """
+        self.relinearise()
+        row = self.state.landmark_ids.index(landmark_id)
+        if not is_heard_where_it_is(self._log, self.state, row, self.parameters):
+            return False
+        self._existence.renew(landmark_id)
+        return True
+
     def _merge(self) -> None:
         """Merge landmarks where that is certain, and the whole run allows it."""
         rule, now = self.parameters.map, self._n_updates
@@ -670,7 +704,7 @@ class RobustBackEnd:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
-        merge = find_merge(self.state, rule, self._refused, self._beacon_rows())
+        merge = find_merge(self.state, rule, self._refused, self._labelled_rows())
         if merge is not None:
             self.merge_if_possible(merge.pairs)
 

@@ -280,26 +280,6 @@ class SplitRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BeaconRule:
-    """When ranges with one label have one place."""
-
-    min_ranges: Annotated[int, Origin.CHOSEN, "ranges"] = 10
-    """Fewest ranges of a beacon from which its place is looked for."""
-    growth: Annotated[float, Origin.BUDGET] = 1.2
-    """By what factor its ranges must have become more before the next search."""
-    directions: Annotated[int, Origin.BUDGET] = 16
-    """In how many directions from an antenna the search begins."""
-    most_places: Annotated[int, Origin.BUDGET, "places"] = 2
-    """For how many of the likeliest places the run is solved; the mirror image of the likeliest one
-    comes to these."""
-    margin_nats: Annotated[float, Origin.CHOSEN, "nats"] = 10.0
-    """By how much a place must be likelier than every other. The search is repeated, and its ranges
-    have errors in common, so this is more than `MARGIN_NATS`."""
-    least_share: Annotated[float, Origin.CHOSEN] = 0.6
-    """Least share of its ranges that must fit the place, as `TrackletRule.min_share`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BranchRule:
     """When the robot may have been carried, and when that is believed."""
 
@@ -358,10 +338,10 @@ class PointRule:
     most_misses: Annotated[int, Origin.BUDGET, "scans"] = 15
     """After so many scans without it, what has not become a landmark is forgotten."""
     unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 0.02
-    """How many landmarks per square metre may not be in the map yet: what a match competes with."""
+    """How many landmarks per square metre may not be in the map yet: a match must beat them."""
     sure_sigmas: Annotated[float, Origin.CHOSEN] = 2.0
-    """How surely a landmark must be predicted for its likeliest detection to be taken for it, in the
-    sensor's standard deviations. A new landmark has the error of its own detections."""
+    """How surely a landmark must be predicted for its likeliest detection to be taken for it, in
+    the sensor's standard deviations. A new landmark has the error of its own detections."""
     decay: Annotated[float, Origin.CHOSEN] = 0.5
     """Share of its expected hits that a landmark's score loses in misses: a sensor that detects a
     landmark rarely says little where it does not. A miss never counts more than `MapRule.miss`."""
@@ -384,4 +364,3 @@ class BackEndParameters:
     noise: NoiseRule = field(default_factory=NoiseRule)
     splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)
-    beacons: BeaconRule = field(default_factory=BeaconRule)
