@@ -570,6 +570,7 @@ class RobustBackEnd:
                 ids = enumerate(state.landmark_ids)
                 barred = {row for row, id_ in ids if id_ in others or id_ in beacons}
                 row, is_new = match_or_new(state, point, barred, parameters)
+                is_new = is_new and len(tentative.seen) >= parameters.points.new_hits
             if row is None and not is_new:
                 unclear.append((tentative, point))
             else:
