@@ -346,17 +346,16 @@ def match_or_new(
 
 def match_two(
     state: State,
-    points: Sequence[BodyPoint],
-    others: Collection[int],
+    points: Sequence[tuple[BodyPoint, Collection[int]]],
     parameters: BackEndParameters,
 ) -> tuple[tuple[int, int], ...]:
     """Return which two of some points are certainly which landmarks, place and row each, if any.
 
     Where the pose is unsure, one point alone may be any of several landmarks; the way from one to
-    the other does not depend on the pose.
+    the other does not depend on the pose. Each point comes with the rows that it is not.
     """
     limit, found = float(chdtri(2, TAIL_PROBABILITY)), []
-    for place, point in enumerate(points):
+    for place, (point, others) in enumerate(points):
         for row in near_rows(state, point, parameters.map.neighbourhood_m).tolist():
             rows = point_rows(state, row, point)
             if row not in others and rows.mahalanobis_sq <= limit:

@@ -347,6 +347,8 @@ class PointRule:
     decay: Annotated[float, Origin.CHOSEN] = 0.5
     """Share of its expected hits that a landmark's score loses in misses: a sensor that detects a
     landmark rarely says little where it does not. A miss never counts more than `MapRule.miss`."""
+    apart: Annotated[int, Origin.CHOSEN, "scans"] = 2
+    """Two that so many scans hold both are two."""
     rounds: Annotated[int, Origin.BUDGET] = 3
     """How often a scan is assigned: what is certain corrects the pose, and makes more certain."""
 
