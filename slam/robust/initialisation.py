@@ -361,6 +361,8 @@ def match_two(
             if row not in others and rows.mahalanobis_sq <= limit:
                 found.append((place, row, rows))
     density = parameters.points.unmapped_per_m2
+    # Neighbours come in groups that look alike, and say little of the heading.
+    least_m = 0.5 * parameters.map.neighbourhood_m
     joint = [
         identity(
             ((-1 - one, row), (-1 - other, second)),
@@ -369,7 +371,9 @@ def match_two(
             density,
         )
         for (one, row, mine), (other, second, theirs) in combinations(found, 2)
-        if one != other and row != second
+        if one != other
+        and row != second
+        and math.dist(points[one][0].point_m, points[other][0].point_m) >= least_m
     ]
     best = certain(joint)
     return () if best is None else tuple((-1 - key, row) for key, row in best.pairs)

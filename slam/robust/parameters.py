@@ -336,7 +336,7 @@ class PointRule:
     min_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
     """Fewest scans that must hold it: clutter has no past."""
     new_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
-    """The same of one without a label that is not in the map: what moves leaves the gate in time."""
+    """The same of one without a label that is not in the map: in time, what moves is elsewhere."""
     most_misses: Annotated[int, Origin.BUDGET, "scans"] = 15
     """After so many scans without it, what has not become a landmark is forgotten."""
     unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 0.02
