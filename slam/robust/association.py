@@ -25,7 +25,7 @@ least sum is found by branch and bound, as joint compatibility is (Neira and Tar
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,6 +59,21 @@ class RangeScan:
     # Ranges of echoes that several targets may share: no evidence of where anything is, nor that
     # nothing is there
     blurred_m: tuple[float, ...] = ()
+    # Of each range the id of the beacon that it is of, None where that is not known
+    labels: tuple[int | None, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.labels is not None and len(self.labels) != len(self.ranges_m):
+            raise ValueError(
+                f"{len(self.labels)} labels of {len(self.ranges_m)} ranges; there must be one, or "
+                "None, for each range"
+            )
+
+    @property
+    def labelled(self) -> tuple[tuple[int, int], ...]:
+        """Return index and label of each range that has a label."""
+        labels = enumerate(self.labels or ())
+        return tuple((index, label) for index, label in labels if label is not None)
 
     def sigma(self, index: int, otherwise_m: float) -> float:
         """Return the standard deviation [m] of one range; ``otherwise_m`` if there is none."""
@@ -205,11 +220,13 @@ def find_known(
     scans: Sequence[RangeScan],
     side_of: Indices,
     parameters: BackEndParameters,
+    beacons: Sequence[int] = (),
 ) -> Known:
-    """Return the likeliest one-to-one assignment of ranges to landmarks.
+    """Return the likeliest one-to-one assignment of ranges without labels to landmarks.
 
     ``side_of`` (r,) is the side of each radar. Those whose ranges the prior predicts less surely
-    than the radars' ``sigma_m`` take no part.
+    than the radars' ``sigma_m`` take no part, nor do the rows ``beacons``, whose ranges have labels
+    and which do not answer every time.
     """
     noise, rule, tracklets = parameters.ranges, parameters.continuation, parameters.tracklets
     ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
@@ -217,6 +234,7 @@ def find_known(
     has_frame[[scan.radar for scan in scans]] = True
     margin_m = rule.view_sigmas * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
+    inside[:, list(beacons)] = False
     rows = np.flatnonzero(inside.any(axis=0))
     layout, of_radars = state.layout, state.radar_columns
     at = np.concatenate([np.array([1, 2]), of_radars, layout.columns(rows)])
@@ -272,6 +290,62 @@ def find_known(
     )
 
 
+def find_labelled(
+    state: State,
+    seen: View,
+    scans: Sequence[RangeScan],
+    row_of_label: Mapping[int, int],
+    parameters: BackEndParameters,
+) -> tuple[Known, list[tuple[int, int, int]]]:
+    """Return the ranges whose labels say which landmark they are of, and those too far off for it.
+
+    Each is judged by itself, whatever the field of view: radar, index and row of those further off
+    than the quantile of chi-square are returned apart. ``row_of_label`` has the labels in the map.
+    """
+    layout, noise = state.layout, parameters.ranges
+    found = [
+        (scan.radar, index, row_of_label[label], scan.sigma(index, noise.sigma_m))
+        for scan in scans
+        for index, label in scan.labelled
+        if label in row_of_label
+    ]
+    rows = np.array(sorted({row for _, _, row, _ in found}), dtype=np.intp)
+    at = np.concatenate([np.array([1, 2]), state.radar_columns, layout.columns(rows)])
+    block, added_m = state.P.block(at), state.feature_added_sigmas_m
+    n_radars, k = len(state.offsets_m), layout.landmark_size
+    of_radar = {scan.radar: scan for scan in scans}
+    assigned, of_assigned, refused = [], [], []
+    for radar, index, row, sigma_m in found:
+        place = int(np.searchsorted(rows, row))
+        first = 2 + len(state.radar_columns) + k * place
+        h = np.zeros(len(at))
+        h[:2], h[2 + radar] = -seen.directions[radar, row], 1.0
+        if layout.has_mounts:
+            mount = 2 + n_radars + 2 * radar
+            h[mount : mount + 2] = -seen.directions[radar, row] @ seen.turned[radar]
+        h[first : first + 2] = seen.by_feature[radar, row]
+        if layout.has_radii:
+            h[first + 2] = -1.0
+        innovation_m = of_radar[radar].ranges_m[index] - float(seen.ranges_m[radar, row])
+        variance = float(h @ block @ h) + sigma_m**2 + float(added_m[row]) ** 2
+        # A range that is not a finite number fails, too.
+        if innovation_m**2 <= float(chdtri(1, TAIL_PROBABILITY)) * variance:
+            assigned.append((radar, index, place))
+            of_assigned.append(h)
+        else:
+            refused.append((radar, index, row))
+    known = Known(
+        rows=rows,
+        prior=np.zeros((len(rows), n_radars, n_radars)),
+        assigned=np.array(assigned, dtype=np.intp).reshape(-1, 3),
+        of_side=np.zeros((0, len(rows), 2), dtype=np.bool_),
+        unheard=np.zeros((len(rows), n_radars), dtype=np.bool_),
+        at=at,
+        H=np.array(of_assigned).reshape(-1, len(at)),
+    )
+    return known, refused
+
+
 def _padded(
     scans: Sequence[RangeScan], n_radars: int, noise: RangeNoise
 ) -> tuple[Array, Array, Array]:
@@ -285,6 +359,7 @@ def _padded(
         ranges_m[scan.radar, :k] = scan.ranges_m
         sigmas_m = noise.sigma_m if scan.sigmas_m is None else np.array(scan.sigmas_m)
         variances[scan.radar, :k] = np.square(sigmas_m)
+        ranges_m[scan.radar, [index for index, _ in scan.labelled]] = np.nan
         blurred_m[scan.radar, : len(scan.blurred_m)] = scan.blurred_m
     return ranges_m, variances, blurred_m
 

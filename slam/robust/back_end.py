@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from slam.robust.association import (
     View,
     antennas_of,
     find_known,
+    find_labelled,
     predicted_ranges,
     view,
 )
@@ -41,6 +42,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters, PointRule
+from slam.robust.solver.beacons import Waiting, initialise_beacon
 from slam.robust.solver.revision import (
     find_split,
     is_due,
@@ -106,6 +108,7 @@ class RobustBackEnd:
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
+        self._waiting: dict[int, Waiting] = {}  # beacons without a place, by label
         self._n_updates = 0
         # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[Pairs, int] = {}
@@ -118,6 +121,11 @@ class RobustBackEnd:
     @property
     def pose_covariance(self) -> Array:
         return self.state.pose_covariance()
+
+    @property
+    def landmark_of_label(self) -> Mapping[int, int]:
+        """Return the ids of the landmarks that have labels, by label."""
+        return self._landmark_of_label
 
     def copy(self) -> RobustBackEnd:
         """Return a back end that goes on from here by itself; what never changes is shared."""
@@ -206,17 +214,25 @@ class RobustBackEnd:
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         widened = [scan.with_added_sigma(added_m) for scan in scans]
         seen = self._walls.look(view(self.state, antennas), antennas)
-        known = find_known(self.state, seen, widened, self._side_of, self.parameters)
+        known = find_known(
+            self.state, seen, widened, self._side_of, self.parameters, self._beacon_rows()
+        )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
         continued, nis, likelihoods = self._correct(known, seen, scans, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
+        if any(scan.labelled for scan in scans):
+            used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
+            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, widened, antennas)
+            continued, nis = continued + of_beacons, nis + nis_of_beacons
+            likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
         self._delete_vanished()
         self._n_updates += 1
         if solve:
+            self._initialise_beacons()
             self._merge()
             if is_due(self._log, self.state, self.parameters):
                 self.relinearise()
@@ -273,7 +289,8 @@ class RobustBackEnd:
         """
         if not relinearise(self._log, self.state, self.parameters):
             return False
-        split = find_split(self._log, self.state, self.parameters)
+        beacons = self._beacon_rows()
+        split = find_split(self._log, self.state, self.parameters, beacons)
         if split is not None:
             state = self.state
             size = state.layout.landmark_size
@@ -361,6 +378,77 @@ class RobustBackEnd:
         state.apply(gain, weighted)
         return continued, float(white @ white), likelihoods
 
+    def _beacon_rows(self) -> list[int]:
+        """Return the rows of landmarks that have labels."""
+        if not self._landmark_of_label:
+            return []
+        beacons = set(self._landmark_of_label.values())
+        return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in beacons]
+
+    def _take_labelled(
+        self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
+    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
+        """Correct the state with the ranges that have labels; log them; place new beacons.
+
+        Returns what `_correct` does. A range beyond the gate corrects nothing now; it is logged,
+        too: which are outliers, the solution over the whole run decides.
+        """
+        state = self.state
+        rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+        row_of_label = {
+            label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
+        }
+        seen = view(state, antennas)
+        known, refused = find_labelled(state, seen, widened, row_of_label, self.parameters)
+        ids = state.landmark_ids.copy()
+        miss = math.log(1.0 - self.parameters.ranges.detection_probability)
+        for row in known.rows[known.assigned[:, 2]].tolist():
+            self._existence.hit(ids[row])
+        for _, _, row in refused:
+            self._existence.miss(ids[row])
+        of_radar = {scan.radar: scan for scan in scans}
+        for radar, index, row in refused:
+            self._log_range(of_radar[radar], index, ids[row], antennas)
+        continued, nis, evidence = self._correct(known, seen, scans, antennas)
+        evidence += [(ids[row], miss) for _, _, row in refused]
+        for scan in scans:
+            for index, label in scan.labelled:
+                if label not in self._landmark_of_label:
+                    if label not in self._waiting:
+                        self._waiting[label] = Waiting(state.next_id)
+                        state.next_id += 1
+                    waiting = self._waiting[label]
+                    waiting.n_ranges += 1
+                    self._log_range(scan, index, waiting.log_id, antennas)
+        return continued, nis, evidence
+
+    def _log_range(self, scan: RangeScan, index: int, id_: int, antennas: Antennas) -> None:
+        x_m, y_m = antennas.nominal_m[scan.radar].tolist()
+        self._log.add_range(
+            self._log.n_poses - 1,
+            scan.radar,
+            id_,
+            antenna=(x_m, y_m),
+            turn_rad=float(antennas.turns_rad[scan.radar]),
+            range_m=scan.ranges_m[index],
+            sigma_m=scan.sigma(index, self.parameters.ranges.sigma_m),
+        )
+
+    def _initialise_beacons(self) -> None:
+        """Bring the beacons into the map whose ranges have one place."""
+        rule = self.parameters.beacons
+        for label, waiting in list(self._waiting.items()):
+            if waiting.n_ranges < max(rule.min_ranges, waiting.try_at):
+                continue
+            waiting.try_at = math.ceil(rule.growth * waiting.n_ranges)
+            landmark_id = initialise_beacon(
+                self._log, self.state, waiting.log_id, self.parameters
+            )
+            if landmark_id is not None:
+                del self._waiting[label]
+                self._landmark_of_label[label] = landmark_id
+                self._existence.hit(landmark_id, waiting.n_ranges)
+
     def _initialise_landmarks(self) -> None:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""
         rule = self.parameters.tracklets
@@ -443,7 +531,7 @@ class RobustBackEnd:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
-        merge = find_merge(self.state, rule, self._refused)
+        merge = find_merge(self.state, rule, self._refused, self._beacon_rows())
         if merge is not None:
             self.merge_if_possible(merge.pairs)
 
@@ -462,5 +550,8 @@ class RobustBackEnd:
         for kept, gone in ids:
             self._existence.merge(kept, gone)
             self._log.rename(gone, kept)
+        merged = {gone: kept for kept, gone in ids}
+        labels = self._landmark_of_label.items()
+        self._landmark_of_label = {label: merged.get(id_, id_) for label, id_ in labels}
         self.relinearise()
         return True

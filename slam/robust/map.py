@@ -105,13 +105,23 @@ def named_pairs(state: State, pairs: Pairs) -> Pairs:
     return tuple(sorted((ids[kept], ids[gone]) for kept, gone in pairs))
 
 
-def find_merge(state: State, rule: MapRule, refused: Collection[Pairs] = ()) -> Identity | None:
+def find_merge(
+    state: State,
+    rule: MapRule,
+    refused: Collection[Pairs] = (),
+    distinct: Collection[int] = (),
+) -> Identity | None:
     """Return the merge to be tried now, of one pair or two, or None.
 
-    ``refused`` are those not to be tried, as ``named_pairs`` returns them.
+    ``refused`` are those not to be tried, as ``named_pairs`` returns them; of the rows ``distinct``
+    no two are one.
     """
     density = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
-    single = _candidates(state, density)
+    single = [
+        one
+        for one in _candidates(state, density)
+        if not all(row in distinct for row in one.pairs[0])
+    ]
     best = _certain(state, single, refused)
     if best is not None:
         return best

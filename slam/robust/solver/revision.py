@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -49,10 +49,17 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     solution = _solved(log, state, problem, parameters)
     if solution is None or not is_determined(solution.information):
         return False
+    adopt(log, state, problem, solution, parameters)
+    return True
+
+
+def adopt(
+    log: RunLog, state: State, problem: Problem, solution: Solution, parameters: BackEndParameters
+) -> None:
+    """Replace the belief by a solution, and let it choose the noise of ranges."""
     _replace(state, solution)
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state, parameters)
-    return True
 
 
 def _solved(
@@ -112,10 +119,12 @@ class Split:
     point_m: Array  # shape (2,): where they lie, map frame
 
 
-def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Split | None:
+def find_split(
+    log: RunLog, state: State, parameters: BackEndParameters, whole: Collection[int] = ()
+) -> Split | None:
     """Return the passage, or the landmark merged into another, that disagrees most with the rest.
 
-    To be called after a solution, whose poses are taken for true: of a group of ranges of one
+    The ranges of the rows ``whole`` are surely of their landmarks. To be called after a solution, whose poses are taken for true: of a group of ranges of one
     landmark, the smaller part, the cost must fall by more than chance and `BranchRule.price_nats`
     explain where the group has a place of its own.
     """
@@ -134,6 +143,7 @@ def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Spli
         means = np.add.reduceat(costs[order], starts) / sizes
         wholes = np.bincount(problem.range_landmarks)[keys[starts, 0]]
         suspects = (means > rule.suspect_mean) & (sizes >= rule.fewest) & (2 * sizes <= wholes)
+        suspects &= ~np.isin(keys[starts, 0], list(whole))
         for k in np.flatnonzero(suspects & (keys[starts, 0] < layout.n_landmarks)).tolist():
             at = order[starts[k] : starts[k] + sizes[k]]
             point_m, apart = _place_apart(problem, estimate, at, limit, rule.tried_m)

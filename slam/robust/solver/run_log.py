@@ -294,6 +294,16 @@ class RunLog:
         ranges = self._ranges.rows[rows]
         return ranges["landmark"].astype(np.intp), ranges["passage"].astype(np.intp)
 
+    def ranges_of(self, landmark_id: int) -> tuple[Array, Array, Array]:
+        """Return ranges (k,) by the id they were added with, noise (k,) and antennas (k, 2).
+
+        The antennas are on the trajectory last solved for, and that of the filter since, map frame.
+        """
+        ranges = self._ranges.rows[self._ranges.rows["landmark"] == landmark_id]
+        poses = self._causal.rows[ranges["pose"]]
+        antennas = poses[:, :2] + _turned(ranges["antenna"], poses[:, 2])
+        return ranges["range_m"].copy(), ranges["sigma_m"].astype(np.float64), antennas
+
     def split_off(self, rows: Indices, landmark_id: int) -> int:
         """Take ranges from their landmark and give them to a new one; return of how many poses."""
         ranges = self._ranges.rows_to_write()
