@@ -3,11 +3,13 @@
 ``NAME_Input.txt`` and ``NAME_GT.txt`` hold one measurement per line::
 
     range2     time [s]  range [m]  variance [m^2]  x  y [m] of the module  its id  SNR
-    odom2diff  time [s]  right  left  sideways [m/s]  distance of the wheels [m]  their variances
+    odom2diff  time [s]  left  right  sideways [m/s]  half the track [m]  their variances (3) [m^2/s^2]
     point2     time [s]  x  y [m]  covariance (4)                    in NAME_GT.txt
 
-The odometry of a time is the velocity up to then. Format: the readme of the data set Indoor_UWB in
-libRSF, TU Chemnitz. Lines of other kinds are an error.
+The odometry of a time is the velocity up to then: the robot moves with (left + right) / 2 and turns
+with (right - left) / (2 h). The readme of the data set calls the wheels right and left, and h their
+distance; libRSF itself reads it as above, and so it agrees with the truth. Format: the data set
+Indoor_UWB in libRSF, TU Chemnitz. Lines of other kinds are an error.
 """
 
 from __future__ import annotations
@@ -72,7 +74,7 @@ def read_run(path: FilePath) -> Run:
     for number, kind, values in _measurements(path, ("range2", "odom2diff")):
         if kind == "odom2diff":
             if values[4] <= 0.0:
-                raise bad_line(path, number, "the distance of the wheels must be positive")
+                raise bad_line(path, number, "half the track must be positive")
             if odometry and values[0] < odometry[-1][0]:
                 raise bad_line(path, number, "its time is before that of the odometry before")
             odometry.append(values)
@@ -92,10 +94,10 @@ def read_run(path: FilePath) -> Run:
     wheels = np.array(odometry)
     # A velocity is of the time up to its stamp: it holds from the stamp before.
     t_s = np.concatenate([wheels[:1, 0], wheels[:-1, 0]])
-    right, left, sideways, width = wheels[:, 1], wheels[:, 2], wheels[:, 3], wheels[:, 4]
+    left, right, sideways, half_m = wheels[:, 1], wheels[:, 2], wheels[:, 3], wheels[:, 4]
     at_s = np.unique([*wheels[:, 0].tolist(), *(t for t, _ in ranges)])
     at_s = at_s[(at_s >= wheels[0, 0]) & (at_s <= wheels[-1, 0])]
-    poses = positions_of(t_s, (right + left) / 2, sideways, (right - left) / width, at_s)
+    poses = positions_of(t_s, (right + left) / 2, sideways, (right - left) / (2.0 * half_m), at_s)
     steps = [
         Step(
             t_ns=t_ns,

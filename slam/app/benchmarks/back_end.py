@@ -1,0 +1,102 @@
+"""The robust back end on a data set: all that these benchmarks know of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.benchmarks.data_set import Array, Observation, Run, Sensor
+from slam.geometry import Mount, Rig
+from slam.robust.association import RangeScan
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.initialisation import RangeBearing
+from slam.robust.parameters import (
+    BackEndParameters,
+    PointRule,
+    RangeNoise,
+    RelinearisationRule,
+)
+from xethru_protocol.system import StopFlag
+
+_SIGMA_M = 0.1  # of ranges without one; all have one here
+_POINTS = PointRule(gate=9.21, new_gate=25.0, reach_m=20.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solution:
+    """What came out of a run."""
+
+    causal: Array  # (n, 3): the pose of each step as it was known then
+    smoothed: Array | None  # (n, 3): all poses solved for at once at the end
+    landmarks_m: Array  # (k, 2), map frame
+    seconds: float  # processor time
+
+
+def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Solution:
+    """Run all steps through the back end; without labels it must find out what is what itself."""
+    began = time.process_time()
+    back_end = RobustBackEnd(
+        Rig(mounts=(Mount(name="sensor", x_m=0.0, y_m=0.0, yaw_rad=0.0),)), parameters_of(sensor)
+    )
+    causal = []
+    for number, step in enumerate(run.steps):
+        stop.check()
+        if number:
+            back_end.predict(step.increment, step.covariance)
+        _see(back_end, step.observations, with_labels=with_labels)
+        causal.append(back_end.pose)
+    stop.check()
+    smoothed = back_end.smoothed(run.t_ns[1:])
+    return Solution(
+        causal=np.array(causal),
+        smoothed=None if smoothed is None else np.vstack([np.zeros(3), smoothed.poses]),
+        landmarks_m=back_end.state.landmarks_m[back_end.reported_rows()].copy(),
+        seconds=time.process_time() - began,
+    )
+
+
+def parameters_of(sensor: Sensor) -> BackEndParameters:
+    """Return the rules of the project for a room, with noise and size of this sensor's world."""
+    return BackEndParameters(
+        wheels=sensor.wheels,
+        ranges=RangeNoise(
+            sigma_m=_SIGMA_M,
+            huber_sigmas=2.0,
+            offset_sigma_m=sensor.range_offset_sigma_m,
+            detection_probability=sensor.detection_probability,
+            clutter_per_m=sensor.clutter / sensor.max_range_m,
+            field_of_view_rad=sensor.field_of_view_rad,
+            min_range_m=0.0,
+            max_range_m=sensor.max_range_m,
+        ),
+        relinearisation=RelinearisationRule(
+            key_m=sensor.shift_m, shift_m=sensor.shift_m, steps_per_slip=math.inf
+        ),
+    )
+
+
+def _see(back_end: RobustBackEnd, seen: Sequence[Observation], *, with_labels: bool) -> None:
+    if any(one.bearing_rad is not None for one in seen):
+        points = [
+            RangeBearing(
+                range_m=one.range_m,
+                bearing_rad=one.bearing_rad or 0.0,
+                covariance=np.diag([one.range_sigma_m**2, (one.bearing_sigma_rad or 0.0) ** 2]),
+                label=one.label if with_labels else None,
+            )
+            for one in seen
+        ]
+        back_end.update_points(points, _POINTS)
+        return
+    scan = RangeScan(
+        radar=0,
+        ranges_m=tuple([one.range_m for one in seen]),
+        sigmas_m=tuple([one.range_sigma_m for one in seen]),
+        labels=tuple([one.label for one in seen]) if with_labels else None,
+    )
+    back_end.update([scan] if seen else [])
