@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
@@ -43,6 +44,7 @@ from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 LONGEST_M = 1e6
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
+_NEVER = 1e9  # cost of an assignment that is ruled out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,8 +63,19 @@ class RangeScan:
     blurred_m: tuple[float, ...] = ()
     # Of each range the id of the beacon that it is of, None where that is not known
     labels: tuple[int | None, ...] | None = None
+    # Bearing of each range from the boresight, counter-clockwise, where the sensor measures it, and
+    # its standard deviation, where that is known better than `RangeNoise.bearing_sigma_rad`
+    bearings_rad: tuple[float, ...] | None = None
+    bearing_sigmas_rad: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        for name in ("bearings_rad", "bearing_sigmas_rad"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.ranges_m):
+                raise ValueError(
+                    f"{len(values)} {name} of {len(self.ranges_m)} ranges; there must be one for "
+                    "each range"
+                )
         if self.labels is not None and len(self.labels) != len(self.ranges_m):
             raise ValueError(
                 f"{len(self.labels)} labels of {len(self.ranges_m)} ranges; there must be one, or "
@@ -344,6 +357,140 @@ def find_labelled(
         H=np.array(of_assigned).reshape(-1, len(at)),
     )
     return known, refused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointView:
+    """Range and bearing of n landmarks as one radar should measure them."""
+
+    predicted: Array  # shape (n, 2): range [m], offsets included, and bearing [rad] from boresight
+    at: Indices  # shape (c,): columns of the error that H has entries for
+    H: Array  # shape (n, 2, c)
+
+
+def point_view(state: State, seen: View, radar: int, rows: Indices) -> PointView:
+    """Return what a radar should measure of landmarks in some rows, and its derivatives."""
+    layout, n = state.layout, len(rows)
+    at = np.concatenate([np.array([1, 2]), state.radar_columns, layout.columns(rows)])
+    u, ranges_m = seen.directions[radar, rows], seen.ranges_m[radar, rows]
+    distances_m = ranges_m - state.offsets_m[radar] + state.feature_radii_m[rows]
+    across = quarter_turn(u) / np.maximum(distances_m, _LEAST_RANGE_M)[:, None]
+    by_place = np.stack([u, across], axis=1)
+    H = np.zeros((n, 2, len(at)))
+    H[:, :, :2], H[:, 0, 2 + radar] = -by_place, 1.0
+    if layout.has_mounts:
+        mount = 2 + layout.n_radars + 2 * radar
+        H[:, :, mount : mount + 2] = -by_place @ seen.turned[radar]
+    first = 2 + len(state.radar_columns) + layout.landmark_size * np.arange(n)
+    for axis in range(2):
+        H[np.arange(n), :, first + axis] = by_place[:, :, axis]
+    if layout.has_radii:
+        H[np.arange(n), 0, first + 2] = -1.0
+    bearings_rad = seen.off_boresight_rad[radar, rows]
+    return PointView(predicted=np.column_stack([ranges_m, bearings_rad]), at=at, H=H)
+
+
+def point_variances(scan: RangeScan, indices: Sequence[int], noise: RangeNoise) -> Array:
+    """Return the variances of range [m^2] and bearing [rad^2] of some detections, (k, 2)."""
+    sigmas = [
+        (
+            scan.sigma(index, noise.sigma_m),
+            noise.bearing_sigma_rad
+            if scan.bearing_sigmas_rad is None
+            else scan.bearing_sigmas_rad[index],
+        )
+        for index in indices
+    ]
+    return np.square(np.array(sigmas).reshape(-1, 2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointMatches:
+    """What detections with bearings are against the map."""
+
+    pairs: tuple[tuple[int, int], ...]  # index in the scan and row of its landmark
+    refused: tuple[tuple[int, int], ...]  # the same of labelled ones too far off
+    missed: tuple[int, ...]  # rows surely in view of which nothing was seen
+
+
+def find_points(
+    state: State,
+    seen: View,
+    scan: RangeScan,
+    free: Sequence[int],
+    row_of_label: Mapping[int, int],
+    parameters: BackEndParameters,
+) -> PointMatches:
+    """Return which landmarks detections of a scan with bearings are of; ``free`` are their indices.
+
+    Labels decide where there are any; each of those is judged by itself. Of the others, the
+    likeliest one-to-one assignment is looked for, with the costs of ranges. A pair is taken if the
+    prior predicts the landmark more surely than the sensor measures it, or if it is certain: more
+    likely by `MARGIN_NATS` than that the detection is new, than any other landmark for it, and than
+    any other detection for the landmark.
+    """
+    assert scan.bearings_rad is not None
+    noise, rule, radar = parameters.ranges, parameters.continuation, scan.radar
+    inside = seen.inside(noise, rule.view_margin_rad, rule.view_sigmas * noise.sigma_m)[radar]
+    inside[len(state.landmark_ids) :] = False
+    inside[list(row_of_label.values())] = False
+    named = {
+        index: row_of_label[label]
+        for index, label in scan.labelled
+        if index in free and label in row_of_label
+    }
+    others = [index for index in free if scan.labels is None or scan.labels[index] is None]
+    rows = np.unique(np.concatenate([np.flatnonzero(inside), list(named.values())])).astype(np.intp)
+    if not len(rows):
+        return PointMatches(pairs=(), refused=(), missed=())
+    points, indices = point_view(state, seen, radar, rows), [*named, *others]
+    prior = points.H @ state.P.block(points.at) @ points.H.transpose(0, 2, 1)
+    prior[:, 0, 0] += np.square(state.feature_added_sigmas_m[rows])
+    measured = np.array([(scan.ranges_m[k], scan.bearings_rad[k]) for k in indices]).reshape(-1, 2)
+    variances = point_variances(scan, indices, noise)
+    nu = measured[:, None] - points.predicted
+    nu[..., 1] = wrap_angles(nu[..., 1])
+    S = prior + variances[:, None, :, None] * np.eye(2)
+    distance = np.einsum("kni,knij,knj->kn", nu, np.linalg.inv(S), nu)
+    is_near = distance <= float(chdtri(2, TAIL_PROBABILITY))
+    place = {row: at for at, row in enumerate(rows.tolist())}
+    pairs, refused = [], []
+    for k, (index, row) in enumerate(named.items()):
+        (pairs if is_near[k, place[row]] else refused).append((index, row))
+    k = len(named)
+    odds = noise.detection_probability / (1.0 - noise.detection_probability)
+    clutter = noise.clutter_per_m / noise.field_of_view_rad
+    own = np.flatnonzero(inside[rows])
+    if len(own) and others:
+        log_n = -0.5 * (distance + np.linalg.slogdet(math.tau * S)[1])[k:, own]
+        evidence = np.where(is_near[k:, own], log_n + math.log(odds / clutter), -math.inf)
+        cost = np.hstack(
+            [np.where(evidence > 0.0, -evidence, _NEVER), np.zeros((len(others),) * 2)]
+        )
+        chosen = linear_sum_assignment(cost)[1]
+        white = prior[own][None] / np.sqrt(variances[k:, None, :, None] * variances[k:, None, None])
+        is_sure = np.linalg.eigvalsh(white)[..., -1] <= 1.0
+        # Per metre and radian, as many unmapped landmarks as mapped ones
+        beta = density_per_m2(state.landmarks_m, parameters.map.neighbourhood_m)
+        new = np.log(np.maximum(1.0, beta * measured[k:, 0] * odds / clutter))
+        for one, at in enumerate(chosen.tolist()):
+            if at >= len(own):
+                continue
+            rivals = [new[one], *np.delete(evidence[one], at), *np.delete(evidence[:, at], one)]
+            if is_sure[one, at] or evidence[one, at] - max(rivals) > MARGIN_NATS:
+                pairs.append((others[one], int(rows[own[at]])))
+    inset, edge = parameters.map.view_inset_m, parameters.tracklets.edge_rad
+    well = seen.inside(noise, -edge, -inset)[radar, rows]
+    is_known = (
+        np.linalg.eigvalsh(
+            prior
+            / np.array([noise.sigma_m, noise.bearing_sigma_rad])
+            / np.array([[noise.sigma_m], [noise.bearing_sigma_rad]])
+        )[:, -1]
+        <= 1.0
+    )
+    missed = rows[well & is_known & ~is_near.any(axis=0)]
+    return PointMatches(pairs=tuple(pairs), refused=tuple(refused), missed=tuple(missed.tolist()))
 
 
 def _padded(

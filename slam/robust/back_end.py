@@ -10,10 +10,11 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry import Rig
+from slam.geometry import Rig, wrap_angles
 from slam.results import SmoothedRun, UpdateReport
 from slam.robust import kernels
 from slam.robust.association import (
+    LONGEST_M,
     Antennas,
     Known,
     Pairs,
@@ -22,26 +23,30 @@ from slam.robust.association import (
     antennas_of,
     find_known,
     find_labelled,
+    find_points,
+    point_variances,
+    point_view,
     predicted_ranges,
     view,
 )
 from slam.robust.initialisation import (
     BodyPoint,
-    RangeBearing,
+    Detection,
     Search,
     Sightings,
+    TentativePoint,
+    TentativePoints,
     Tracklet,
     UnassignedRanges,
-    assign,
+    body_point,
+    detections_of,
     initialise_landmark,
     match,
-    named_rows,
     point_guesses,
-    range_bearing_rows,
     update_with_point,
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
-from slam.robust.parameters import BackEndParameters, PointRule
+from slam.robust.parameters import BackEndParameters
 from slam.robust.solver.beacons import Waiting, initialise_beacon
 from slam.robust.solver.revision import (
     find_split,
@@ -103,6 +108,7 @@ class RobustBackEnd:
             scale,
             scale * parameters.wheels.walk_lever_m,
         )
+        self._tentative = TentativePoints(parameters)
         self._existence = Existence(parameters.map, rule.min_frames)
         self._log = RunLog(parameters.wheels, parameters.splits.gap_poses)
         self._walls = WallKeeper(self.state, parameters)
@@ -183,6 +189,7 @@ class RobustBackEnd:
         self._log.add_motion(increment, motion, is_loose=covariance is not None)
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
+        self._tentative.move(motion)
 
     def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
         """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
@@ -195,6 +202,7 @@ class RobustBackEnd:
         motion = Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=free, walk_variance=0.0)
         self._log.add_motion(increment, motion, is_loose=True)
         self._unassigned.clear()
+        self._tentative.clear()
         state = self.state
         state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
         for landmark_id, point_m, covariance in points:
@@ -212,6 +220,9 @@ class RobustBackEnd:
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
+        with_bearings = [scan for scan in scans if scan.bearings_rad is not None]
+        if with_bearings:
+            scans = [scan for scan in scans if scan.bearings_rad is None]
         widened = [scan.with_added_sigma(added_m) for scan in scans]
         seen = self._walls.look(view(self.state, antennas), antennas)
         known = find_known(
@@ -227,6 +238,11 @@ class RobustBackEnd:
             of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, widened, antennas)
             continued, nis = continued + of_beacons, nis + nis_of_beacons
             likelihoods = [*likelihoods, *evidence]
+        dof = len(continued)
+        for scan in with_bearings:
+            points, nis_of_points, evidence = self._take_points(scan, added_m, antennas)
+            continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
+            likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
         self._delete_vanished()
@@ -240,46 +256,10 @@ class RobustBackEnd:
         return UpdateReport(
             continued=continued,
             nis=nis,
-            dof=len(continued),
+            dof=dof,
             predicted=tuple(predicted),
             evidence=(*likelihoods, *((id_, miss) for id_ in missed)),
         )
-
-    def update_points(
-        self, points: Sequence[RangeBearing], rule: PointRule
-    ) -> tuple[int | None, ...]:
-        """Take in ranges and bearings of points seen from the newest pose.
-
-        If all points have labels, each is of the landmark with its label, or new; else they are
-        assigned by distance. Returns one landmark id per point, None for an ambiguous one left out.
-        """
-        state = self.state
-        rows = named_rows(state, points, self._landmark_of_label)
-        if rows is None:
-            rows = assign(state, points, rule)
-        found = [
-            None if row is None else self._see_point(point, row)
-            for point, row in zip(points, rows, strict=True)
-        ]
-        if is_due(self._log, self.state, self.parameters):
-            self.relinearise()
-        self._log.set_causal(state.pose)
-        return tuple(found)
-
-    def _see_point(self, point: RangeBearing, row: int) -> int:
-        """Update the landmark in a row with a point, or add one (row -1)."""
-        state = self.state
-        if row < 0:
-            landmark_id = initialise_landmark(state, point.body_point(state.n_fixed - HEAD_SIZE))
-            if point.label is not None:
-                self._landmark_of_label[point.label] = landmark_id
-        else:
-            landmark_id = state.landmark_ids[row]
-            rows = range_bearing_rows(state, row, point)
-            state.update(rows.at, rows.H, rows.residual, point.covariance)
-        self._existence.hit(landmark_id)
-        self._log.add_point(landmark_id, point.values, point.covariance)
-        return landmark_id
 
     def relinearise(self) -> bool:
         """Solve for all poses and replace the belief; return whether that worked.
@@ -441,13 +421,138 @@ class RobustBackEnd:
             if waiting.n_ranges < max(rule.min_ranges, waiting.try_at):
                 continue
             waiting.try_at = math.ceil(rule.growth * waiting.n_ranges)
-            landmark_id = initialise_beacon(
-                self._log, self.state, waiting.log_id, self.parameters
-            )
+            landmark_id = initialise_beacon(self._log, self.state, waiting.log_id, self.parameters)
             if landmark_id is not None:
                 del self._waiting[label]
                 self._landmark_of_label[label] = landmark_id
                 self._existence.hit(landmark_id, waiting.n_ranges)
+
+    def _take_points(
+        self, scan: RangeScan, added_m: float, antennas: Antennas
+    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
+        """Correct the state with a scan with bearings; log it; make landmarks of what is new.
+
+        Returns what `_correct` does. What is certain corrects the pose first, and is followed by
+        what is certain then. A labelled detection that is too far off is logged all the same.
+        """
+        assert scan.bearings_rad is not None
+        state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
+        wide = scan.with_added_sigma(added_m)
+        free = [
+            index
+            for index, pair in enumerate(zip(scan.ranges_m, scan.bearings_rad, strict=True))
+            if 0.0 < pair[0] < LONGEST_M and math.isfinite(pair[1])
+        ]
+        rows = {id_: row for row, id_ in enumerate(ids)}
+        row_of_label = {
+            label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
+        }
+        miss = math.log(1.0 - noise.detection_probability)
+        continued: list[tuple[int, int, int]] = []
+        evidence: list[tuple[int, float]] = []
+        nis = 0.0
+        for _ in range(self.parameters.points.rounds):
+            seen = view(state, antennas)
+            found = find_points(state, seen, wide, free, row_of_label, self.parameters)
+            if not found.pairs:
+                break
+            nis_of_pairs, likelihoods = self._correct_points(scan, seen, found.pairs, antennas)
+            nis, evidence = nis + nis_of_pairs, evidence + likelihoods
+            used = {index for index, _ in found.pairs}
+            free = [index for index in free if index not in used]
+            continued += [(scan.radar, index, ids[row]) for index, row in found.pairs]
+        for _, _, landmark_id in continued:
+            self._existence.hit(landmark_id)
+        refused = [(index, ids[row]) for index, row in found.refused]
+        for index, landmark_id in refused:
+            self._log_detections(
+                landmark_id, detections_of(scan, [index], self._log.n_poses - 1, antennas, noise)
+            )
+        # Those that are seen rarely are missed often.
+        odds = noise.detection_probability / (1.0 - noise.detection_probability)
+        hit = {landmark_id for _, _, landmark_id in continued}
+        missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
+        for landmark_id in sorted(missed - hit):
+            self._existence.miss(landmark_id, self.parameters.points.decay * odds)
+            evidence.append((landmark_id, miss))
+        far = {index for index, _ in refused}
+        free = [index for index in free if index not in far]
+        detections = detections_of(scan, free, self._log.n_poses - 1, antennas, noise)
+        points = [body_point(state, antennas, detection) for detection in detections]
+        for tentative in self._tentative.take(detections, points):
+            self._place_point(tentative)
+        return tuple(continued), nis, evidence
+
+    def _correct_points(
+        self,
+        scan: RangeScan,
+        seen: View,
+        pairs: Sequence[tuple[int, int]],
+        antennas: Antennas,
+    ) -> tuple[float, list[tuple[int, float]]]:
+        """Correct the state with detections of landmarks, index and row each; log them."""
+        assert scan.bearings_rad is not None
+        state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
+        indices, rows = [index for index, _ in pairs], [row for _, row in pairs]
+        view_of = point_view(state, seen, scan.radar, np.array(rows, dtype=np.intp))
+        measured = [(scan.ranges_m[index], scan.bearings_rad[index]) for index in indices]
+        innovations = np.array(measured) - view_of.predicted
+        innovations[:, 1] = wrap_angles(innovations[:, 1])
+        variances = point_variances(scan, indices, noise)
+        variances[:, 0] += np.square(state.feature_added_sigmas_m[rows])
+        gain, weighted, white, scales = kernels.weigh(
+            state.P.columns(view_of.at),
+            view_of.at,
+            np.ascontiguousarray(view_of.H.reshape(2 * len(pairs), -1)),
+            innovations.ravel(),
+            variances.ravel(),
+            noise.huber_sigmas,
+            state.range_errors.variance_share,
+        )
+        area = (noise.max_range_m - noise.min_range_m) * noise.field_of_view_rad
+        clutter = max(noise.clutter_per_m / noise.field_of_view_rad, len(scan.ranges_m) / area)
+        log_n = -0.5 * np.square(white) - 0.5 * math.log(math.tau) - np.log(scales)
+        log_n = log_n.reshape(-1, 2).sum(axis=1) + math.log(noise.detection_probability / clutter)
+        likelihoods = [(ids[row], value) for row, value in zip(rows, log_n.tolist(), strict=True)]
+        pose = self._log.n_poses - 1
+        for row, detection in zip(
+            rows, detections_of(scan, indices, pose, antennas, noise), strict=True
+        ):
+            self._log_detections(ids[row], [detection])
+        state.apply(gain, weighted)
+        return float(white @ white), likelihoods
+
+    def _log_detections(self, landmark_id: int, seen: Sequence[Detection]) -> None:
+        for one in seen:
+            self._log.add_range(
+                one.pose,
+                one.radar,
+                landmark_id,
+                antenna=one.nominal_m,
+                turn_rad=one.turn_rad,
+                range_m=one.range_m,
+                sigma_m=one.sigma_m,
+                bearing_rad=one.bearing_rad,
+                bearing_sigma_rad=one.bearing_sigma_rad,
+            )
+
+    def _place_point(self, tentative: TentativePoint) -> None:
+        """Let a tentative landmark be one of the map, or a new one."""
+        state, label = self.state, tentative.label
+        share = max(state.range_errors.variance_share, 1.0)
+        point = replace(tentative.point, covariance=share * tentative.point.covariance)
+        row = None
+        if label is None:
+            row = match(state, point, self.parameters.map.neighbourhood_m, self._beacon_rows())
+        if row is None:
+            landmark_id = initialise_landmark(state, point)
+            if label is not None:
+                self._landmark_of_label[label] = landmark_id
+        else:
+            landmark_id = state.landmark_ids[row]
+            update_with_point(state, row, point)
+        self._existence.hit(landmark_id, len(tentative.seen))
+        self._log_detections(landmark_id, tentative.seen)
 
     def _initialise_landmarks(self) -> None:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""

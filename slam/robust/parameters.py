@@ -46,6 +46,7 @@ class RangeNoise:
     """How one radar of the rig measures."""
 
     sigma_m: float = 7.4e-3  # standard deviation of a range
+    bearing_sigma_rad: float = 0.03  # standard deviation of a bearing, of a sensor that measures it
     # Added in squares to the front end's sigma of each range, wherever ranges are assigned: a
     # neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
     association_sigma_m: float = 0.0
@@ -159,6 +160,8 @@ class MapRule:
     """Scans between two looks for landmarks that may be one, and for evidence of a carry."""
     most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
     """How many of the likeliest merges are combined in twos."""
+    neighbourhood_m: Annotated[float, Origin.CHOSEN] = NEIGHBOURHOOD_M
+    """Distance within which landmarks are neighbours, in a world of another size than a room."""
     refused_updates: Annotated[int, Origin.BUDGET, "scans"] = 200
     """After how many scans a merge that the run did not allow is tried again."""
     miss: Annotated[float, Origin.CHOSEN, "hits"] = 1.5
@@ -345,14 +348,17 @@ class BranchRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointRule:
-    """How points with range and bearing find their landmarks.
+    """When detections with range and bearing that continue nothing are evidence of a landmark."""
 
-    No radar measures such points; who has a sensor that does gives the rule with them.
-    """
-
-    gate: float  # squared Mahalanobis distance below which a point may be a landmark
-    new_gate: float  # squared distance to every landmark above which a point is new
-    reach_m: float  # distance up to which landmarks are compared with a point
+    min_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
+    """Fewest scans that must hold it: clutter has no past, and what moves leaves the gate."""
+    most_misses: Annotated[int, Origin.BUDGET, "scans"] = 15
+    """After so many scans without it, what has not become a landmark is forgotten."""
+    decay: Annotated[float, Origin.CHOSEN] = 0.5
+    """Share of its expected hits that a landmark's score loses in misses: a sensor that detects a
+    landmark rarely says little where it does not. A miss never counts more than `MapRule.miss`."""
+    rounds: Annotated[int, Origin.BUDGET] = 3
+    """How often a scan is assigned: what is certain corrects the pose, and makes more certain."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -363,6 +369,7 @@ class BackEndParameters:
     ranges: RangeNoise = field(default_factory=RangeNoise)
     continuation: ContinuationRule = field(default_factory=ContinuationRule)
     tracklets: TrackletRule = field(default_factory=TrackletRule)
+    points: PointRule = field(default_factory=PointRule)
     map: MapRule = field(default_factory=MapRule)
     walls: WallRule = field(default_factory=WallRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)

@@ -130,17 +130,20 @@ def find_split(
     """
     problem = log.problem(state, parameters)
     estimate, n = log.starts(state, problem)[0], len(problem.ranges_m)
-    residual = measurement_residuals(problem, estimate).residual[:n]
+    residual = measurement_residuals(problem, estimate).residual
     limit, layout = parameters.relinearisation.outlier_sigmas, problem.layout
     rule, price = parameters.splits, parameters.branches.price_nats
-    costs = np.minimum(residual**2, limit**2)
+    of_rows, dof = np.minimum(residual**2, limit**2), np.ones(n)
+    costs = of_rows[:n]
+    costs[problem.with_bearing] += of_rows[n:]
+    dof[problem.with_bearing] += 1.0
     found: list[tuple[float, Split]] = []
     for edges in log.edges(problem.range_rows):
         order = np.lexsort((edges, problem.range_landmarks))
         keys = np.column_stack([problem.range_landmarks, edges])[order]
         starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1))
         sizes = np.diff(np.append(starts, n))
-        means = np.add.reduceat(costs[order], starts) / sizes
+        means = np.add.reduceat(costs[order], starts) / np.add.reduceat(dof[order], starts)
         wholes = np.bincount(problem.range_landmarks)[keys[starts, 0]]
         suspects = (means > rule.suspect_mean) & (sizes >= rule.fewest) & (2 * sizes <= wholes)
         suspects &= ~np.isin(keys[starts, 0], list(whole))
@@ -164,10 +167,6 @@ def _place_apart(
             for column in fields(Problem)
             if column.name.startswith("range")
         },
-        point_poses=problem.point_poses[:0],
-        point_landmarks=problem.point_landmarks[:0],
-        points=problem.points[:0],
-        point_roots=problem.point_roots[:0],
     )
     first = int(problem.layout.first_columns(problem.range_landmarks[at[:1]])[0]) - HEAD_SIZE
     best_m, least = estimate.fixed[first : first + 2], math.inf

@@ -1,6 +1,6 @@
 """The log of one run, and the problem of solving for all of it.
 
-Every step, range and point of the run is kept. The problem is stated in *keyframes*, every few
+Every step and every detection of the run is kept. The problem is stated in *keyframes*, every few
 centimetres or degrees: ranges from the poses between two of them are referred to the nearer one,
 through odometry as the calibration corrects it. With steps (d_i, a_i) and headings h_i within a
 segment of several steps, and e_i = Rot(h_i) d_i, odometry measures the segment's end in the frame
@@ -69,18 +69,21 @@ class Problem:
     range_turns: Array
     ranges_m: Array
     range_sigmas_m: Array  # shape (m,), noise of single ranges
-    # shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin, and a
-    # matrix that makes their noise white
-    point_poses: Indices
-    point_landmarks: Indices
-    points: Array
-    point_roots: Array
+    # shape (m,) each, NaN for a range without one: bearing in the body frame of the sample, and its
+    # noise
+    range_bearings_rad: Array
+    range_bearing_sigmas_rad: Array
     huber_sigmas: float = math.inf  # residuals beyond it weigh less
     variance_share: float = 1.0  # see `RangeErrors`
 
     @property
     def is_walking(self) -> bool:
         return bool(np.any(self.walks > 0.0))
+
+    @property
+    def with_bearing(self) -> Indices:
+        """Return which ranges have a bearing."""
+        return np.flatnonzero(~np.isnan(self.range_bearings_rad))
 
 
 def prior_sigmas(layout: Layout, parameters: BackEndParameters) -> Array:
@@ -187,7 +190,7 @@ def motion_covariances(chain: Chain, step_covariances: Array) -> Array:
 
 
 class RunLog:
-    """Steps, used ranges and points of a whole run, with the trajectory last solved for.
+    """Steps and used detections of a whole run, with the trajectory last solved for.
 
     Landmarks are named by id; merges rename, deletions drop what belonged to the landmark. One that
     has not been seen for more than ``gap_poses`` is in another passage when it is seen again.
@@ -205,9 +208,8 @@ class RunLog:
         whose = [("pose", np.int32), ("landmark", np.int32), ("passage", np.int32)]
         where = [("radar", np.int16), ("antenna", np.float64, 2), ("turn_rad", np.float32)]
         measured = [("range_m", np.float64), ("sigma_m", np.float32)]
-        self._ranges = PackedRows(np.dtype([*whose, *where, *measured]))
-        seen = [("point", np.float64, 2), ("root", np.float64, (2, 2))]
-        self._points = PackedRows(np.dtype([("pose", np.int32), ("landmark", np.int32), *seen]))
+        bearing = [("bearing_rad", np.float64), ("bearing_sigma_rad", np.float32)]
+        self._ranges = PackedRows(np.dtype([*whose, *where, *measured, *bearing]))
         self._names: dict[int, int | None] = {}
         # By landmark: its newest passage, and the last pose of that
         self._passages: dict[int, tuple[int, int]] = {}
@@ -259,8 +261,10 @@ class RunLog:
         range_m: float,
         sigma_m: float,
         turn_rad: float = 0.0,
+        bearing_rad: float = math.nan,
+        bearing_sigma_rad: float = math.nan,
     ) -> None:
-        """Append a range used.
+        """Append a range used, with its bearing in the body frame of the sample if it has one.
 
         ``antenna`` is in the body frame of the pose, its mount being where the rig has it, and
         ``turn_rad`` the robot's from the pose to the sample.
@@ -271,12 +275,8 @@ class RunLog:
             self._n_passages += 1
         self._passages[landmark_id] = passage, max(pose, last)
         whose = (pose, landmark_id, passage, radar)
-        self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m))
-
-    def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
-        self._mark_key()
-        self._points.append((self.n_poses - 1, landmark_id, point.tolist(), root.tolist()))
+        bearing = bearing_rad, bearing_sigma_rad
+        self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m, *bearing))
 
     def _mark_key(self) -> None:
         """Let the newest pose be a keyframe."""
@@ -328,12 +328,10 @@ class RunLog:
         """
         rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
         names = self._names | dict(same or {})
-        ranges, points = self._ranges.rows, self._points.rows
+        ranges = self._ranges.rows
         of_range = _rows_of(ranges["landmark"], names, rows)
-        of_point = _rows_of(points["landmark"], names, rows)
         range_rows = np.flatnonzero(of_range >= 0)
         ranges, of_range = ranges[range_rows], of_range[range_rows]
-        points, of_point = points[of_point >= 0], of_point[of_point >= 0]
         sigmas_m = ranges["sigma_m"].astype(np.float64)
         if state.added_sigmas_m:
             sigmas_m = np.hypot(sigmas_m, state.feature_added_sigmas_m[of_range])
@@ -363,10 +361,8 @@ class RunLog:
             range_turns=turn[pose] + ranges["turn_rad"],
             ranges_m=ranges["range_m"].copy(),
             range_sigmas_m=sigmas_m,
-            point_poses=np.searchsorted(keys, points["pose"]),
-            point_landmarks=of_point,
-            points=points["point"].copy(),
-            point_roots=points["root"].copy(),
+            range_bearings_rad=ranges["bearing_rad"].copy(),
+            range_bearing_sigmas_rad=ranges["bearing_sigma_rad"].astype(np.float64),
             huber_sigmas=parameters.ranges.huber_sigmas,
             variance_share=state.range_errors.variance_share,
         )
