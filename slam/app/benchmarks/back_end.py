@@ -14,17 +14,15 @@ from slam.app.benchmarks.data_set import Array, Observation, Run, Sensor
 from slam.geometry import Mount, Rig
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import (
     BackEndParameters,
-    PointRule,
+    MapRule,
     RangeNoise,
     RelinearisationRule,
 )
 from xethru_protocol.system import StopFlag
 
 _SIGMA_M = 0.1  # of ranges without one; all have one here
-_POINTS = PointRule(gate=9.21, new_gate=25.0, reach_m=20.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,7 +51,8 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
         stop.check()
         if number:
             back_end.predict(step.increment, step.covariance)
-        _see(back_end, step.observations, with_labels=with_labels)
+        seen = step.observations
+        back_end.update([_scan(seen, with_labels=with_labels)] if seen else [])
         causal.append(back_end.pose)
     stop.check()
     smoothed = back_end.smoothed(run.t_ns[1:])
@@ -79,29 +78,23 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
             min_range_m=0.0,
             max_range_m=sensor.max_range_m,
         ),
+        map=MapRule(neighbourhood_m=sensor.neighbourhood_m),
         relinearisation=RelinearisationRule(
             key_m=sensor.shift_m, shift_m=sensor.shift_m, steps_per_slip=math.inf
         ),
     )
 
 
-def _see(back_end: RobustBackEnd, seen: Sequence[Observation], *, with_labels: bool) -> None:
-    if any(one.bearing_rad is not None for one in seen):
-        points = [
-            RangeBearing(
-                range_m=one.range_m,
-                bearing_rad=one.bearing_rad or 0.0,
-                covariance=np.diag([one.range_sigma_m**2, (one.bearing_sigma_rad or 0.0) ** 2]),
-                label=one.label if with_labels else None,
-            )
-            for one in seen
-        ]
-        back_end.update_points(points, _POINTS)
-        return
-    scan = RangeScan(
+def _scan(seen: Sequence[Observation], *, with_labels: bool) -> RangeScan:
+    """Return a scan whose observations all have bearings, or none has."""
+    has_bearings = any(one.bearing_rad is not None for one in seen)
+    bearings = tuple([one.bearing_rad or 0.0 for one in seen])
+    bearing_sigmas = tuple([one.bearing_sigma_rad or 0.0 for one in seen])
+    return RangeScan(
         radar=0,
         ranges_m=tuple([one.range_m for one in seen]),
         sigmas_m=tuple([one.range_sigma_m for one in seen]),
+        bearings_rad=bearings if has_bearings else None,
+        bearing_sigmas_rad=bearing_sigmas if has_bearings else None,
         labels=tuple([one.label for one in seen]) if with_labels else None,
     )
-    back_end.update([scan] if seen else [])

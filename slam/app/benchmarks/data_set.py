@@ -110,6 +110,8 @@ class Sensor:
     clutter: float  # false observations per scan
     # Largest errors of a pose before the run is solved for again
     shift_m: float
+    # Distance within which landmarks are neighbours: they may be one, or be taken for each other
+    neighbourhood_m: float
     source: str
     range_offset_sigma_m: float = 0.0  # of the unknown constant error of all ranges
 

@@ -55,6 +55,7 @@ SENSOR = Sensor(
     clutter=0.01,
     shift_m=0.1,
     range_offset_sigma_m=0.1,
+    neighbourhood_m=1.5,
     source="ranges as the file says, 10 cm; two-way ranging has an offset of about as much",
 )
 

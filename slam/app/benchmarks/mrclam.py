@@ -61,6 +61,7 @@ SENSOR = Sensor(
     detection_probability=0.3,
     clutter=0.05,
     shift_m=0.1,
+    neighbourhood_m=1.5,
     source="velocities are commands, not counts of the wheels: a tenth; the range is from the height "
     "of a barcode in a picture of 960 x 720 pixels: 15 cm at five metres",
 )

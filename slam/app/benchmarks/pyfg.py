@@ -63,6 +63,7 @@ SENSOR = Sensor(
     detection_probability=0.9,
     clutter=0.01,
     shift_m=0.5,
+    neighbourhood_m=10.0,
     source="ranges as the file says, about 0.5 m; wheel encoders and a fibre-optic gyro: a hundredth "
     "in distance and turn. The covariances of EDGE_SE2 are the same for every step, also where the "
     "robot stands, and are not used",

@@ -61,6 +61,7 @@ SENSOR = Sensor(
     detection_probability=0.7,
     clutter=1.0,
     shift_m=0.5,
+    neighbourhood_m=5.0,
     source="a tenth in distance and turn, a degree per square root of a metre; a trunk is as wide as "
     "its centre is uncertain: half a metre; two beams of the laser: a degree",
 )
