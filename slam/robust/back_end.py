@@ -478,9 +478,10 @@ class RobustBackEnd:
         far = {index for index, _ in refused}
         free = [index for index in free if index not in far]
         detections = detections_of(scan, free, self._log.n_poses - 1, antennas, noise)
-        points = [body_point(state, antennas, detection) for detection in detections]
+        own_share = 1.0 - noise.common_share
+        points = [body_point(state, antennas, one, own_share) for one in detections]
         for tentative in self._tentative.take(detections, points):
-            self._place_point(tentative)
+            self._place_point(tentative, antennas)
         return tuple(continued), nis, evidence
 
     def _correct_points(
@@ -536,11 +537,15 @@ class RobustBackEnd:
                 bearing_sigma_rad=one.bearing_sigma_rad,
             )
 
-    def _place_point(self, tentative: TentativePoint) -> None:
+    def _place_point(self, tentative: TentativePoint, antennas: Antennas) -> None:
         """Let a tentative landmark be one of the map, or a new one."""
         state, label = self.state, tentative.label
         share = max(state.range_errors.variance_share, 1.0)
-        point = replace(tentative.point, covariance=share * tentative.point.covariance)
+        # What all its detections have in common, none of them averages out.
+        common_share = self.parameters.ranges.common_share
+        common = body_point(state, antennas, tentative.seen[-1], common_share).covariance
+        covariance = share * tentative.point.covariance + common
+        point = replace(tentative.point, covariance=covariance)
         row = None
         if label is None:
             row = match(state, point, self.parameters.map.neighbourhood_m, self._beacon_rows())

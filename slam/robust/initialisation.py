@@ -746,8 +746,13 @@ def detections_of(
     ]
 
 
-def body_point(state: State, antennas: Antennas, detection: Detection) -> BodyPoint:
-    """Return where a detection lies: at its range and bearing, the offset of the radar removed."""
+def body_point(
+    state: State, antennas: Antennas, detection: Detection, share: float = 1.0
+) -> BodyPoint:
+    """Return where a detection lies: at its range and bearing, the offset of the radar removed.
+
+    Of its variance a share is taken.
+    """
     radar, layout = detection.radar, state.layout
     angle = detection.bearing_rad + detection.turn_rad
     distance_m = detection.range_m - float(state.offsets_m[radar])
@@ -760,7 +765,7 @@ def body_point(state: State, antennas: Antennas, detection: Detection) -> BodyPo
         by_radar[:, mount : mount + 2] = rotation(detection.turn_rad)
     return BodyPoint(
         point_m=antennas.position_m[radar] + distance_m * turn[:, 0],
-        covariance=turn @ spread @ turn.T,
+        covariance=share * turn @ spread @ turn.T,
         by_offsets=by_radar,
         outward=turn[:, 0],
     )

@@ -47,6 +47,9 @@ class RangeNoise:
 
     sigma_m: float = 7.4e-3  # standard deviation of a range
     bearing_sigma_rad: float = 0.03  # standard deviation of a bearing, of a sensor that measures it
+    # Share of the variance of range and bearing that is one error in all detections of a passage,
+    # of a sensor that measures both: what is left is how well it repeats itself
+    common_share: float = 0.0
     # Added in squares to the front end's sigma of each range, wherever ranges are assigned: a
     # neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
     association_sigma_m: float = 0.0

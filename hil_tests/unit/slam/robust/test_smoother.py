@@ -15,12 +15,10 @@ from scipy.special import chdtri
 
 from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.unit.slam.robust.range_world import LAB, follow, parameters_for, simulate, step_of
-from slam.app.experiments.victoria_park import PARK_POINTS
 from slam.config import WheelNoise
 from slam.geometry import between, compose, paper_rig
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters, RelinearisationRule, SplitRule
 from slam.robust.solver.revision import is_determined, relinearise
 from slam.robust.solver.run_log import (
@@ -43,11 +41,6 @@ ANTENNAS = np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]])
 RULE = RelinearisationRule(iterations=40, outlier_sigmas=50.0, steps_per_slip=math.inf)
 
 
-def point_seen(pose: Array, mark: Array) -> Array:
-    x, y = mark - pose[:2]
-    return np.array([math.hypot(x, y) + 0.02, math.atan2(y, x) - pose[2] - 0.03])
-
-
 def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Problem, Estimate]:
     """Return a short run past three landmarks and a wall, and values near the truth.
 
@@ -68,6 +61,11 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
     places = poses[keys][at, :2] + arm
     z = np.linalg.norm(marks[np.minimum(seen, 2)] - places, axis=1)
     z[seen == 3] = 2.0 - places[seen == 3, 1]
+    turns = 0.1 * rng.standard_normal(len(at))
+    away = marks[np.minimum(seen, 2)] - places
+    bearings = np.arctan2(away[:, 1], away[:, 0]) - poses[keys][at, 2] - turns
+    bearings += 0.02 * rng.standard_normal(len(at))
+    bearings[(seen == 3) | (radars > 0)] = np.nan
     sigmas = np.full(layout.size, 0.5)
     sigmas[:3], sigmas[3:6], sigmas[layout.offsets] = 1e-2, (0.02, 0.02, 0.01), 0.005
     sigmas[layout.mounts] = 0.004
@@ -93,15 +91,11 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
         range_landmarks=seen,
         range_antennas=m,
         range_rows=np.arange(len(at)),
-        range_turns=0.1 * rng.standard_normal(len(at)),
+        range_turns=turns,
         ranges_m=z + 2e-3 * rng.standard_normal(len(z)),
         range_sigmas_m=np.full(len(z), 5e-3),
-        point_poses=np.array([1, 4], dtype=np.intp),
-        point_landmarks=np.array([0, 2], dtype=np.intp),
-        points=np.array(
-            [point_seen(poses[keys[1]], marks[0]), point_seen(poses[keys[4]], marks[2])]
-        ),
-        point_roots=np.tile(np.diag([50.0, 20.0]), (2, 1, 1)),
+        range_bearings_rad=bearings,
+        range_bearing_sigmas_rad=np.where(np.isnan(bearings), np.nan, 0.05),
     )
     return problem, Estimate(
         poses=poses[keys] + 0.02 * rng.standard_normal((k, 3)),
@@ -180,6 +174,7 @@ def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool 
         if n_cal > 1:
             walks = problem.walks[own].sum(axis=0)
             result.append((calibration[k + 1] - calibration[k]) / np.sqrt(walks))
+    bearings = []
     for i, (k, radar, row) in enumerate(
         zip(problem.range_poses, problem.range_radars, problem.range_landmarks, strict=True)
     ):
@@ -197,19 +192,13 @@ def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool 
             expected = d - np.cos(phi) * place[0] - np.sin(phi) * place[1]
         miss = expected + v[layout.offsets.start + radar] - problem.ranges_m[i]
         result.append(np.atleast_1d(miss / problem.range_sigmas_m[i]))
-    for k, row, point, root in zip(
-        problem.point_poses,
-        problem.point_landmarks,
-        problem.points,
-        problem.point_roots,
-        strict=True,
-    ):
-        first = layout.landmarks.start + layout.landmark_size * row
-        b = turn(poses[k, 2]).T @ (v[first : first + 2] - poses[k, :2])
-        # atan of a ratio: complex steps do not pass arctan2; the point lies ahead and left.
-        bearing = math.pi / 2 - np.arctan(b[0] / b[1])
-        result.append(root @ (np.array([np.sqrt(b @ b), bearing]) - point))
-    return np.concatenate(result)
+        if not np.isnan(problem.range_bearings_rad[i]):
+            # Turned by what was measured, the landmark lies ahead: complex steps do not pass
+            # arctan2.
+            measured = problem.range_turns[i] + problem.range_bearings_rad[i]
+            b = turn(poses[k, 2] + measured).T @ away
+            bearings.append(np.arctan(b[1] / b[0]) / problem.range_bearing_sigmas_rad[i])
+    return np.concatenate([*result, np.array(bearings)])
 
 
 def newest(n_poses: int, n_cal: int, size: int) -> NDArray[np.intp]:
@@ -454,15 +443,27 @@ def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
     """A target that comes back is a new landmark, not one that the map lacks."""
     parameters = parameters_for(LAB, 7.4e-3)
     back_end = RobustBackEnd(paper_rig(), parameters)
-    seen = RangeBearing(range_m=1.0, bearing_rad=1.5, covariance=1e-6 * np.eye(2), label=3)
-    far = RangeBearing(range_m=5.0, bearing_rad=0.0, covariance=1e-6 * np.eye(2), label=4)
-    first, _ = back_end.update_points([seen, far], PARK_POINTS)
-    silent = [RangeScan(radar=radar, ranges_m=()) for radar in range(N_RADARS)]
+    seen = RangeScan(
+        radar=0,
+        ranges_m=(1.0,),
+        sigmas_m=(1e-3,),
+        bearings_rad=(0.1,),
+        bearing_sigmas_rad=(1e-3,),
+        labels=(3,),
+    )
+    silent = [RangeScan(radar=0, ranges_m=(), bearings_rad=())]
+    for _ in range(5):
+        back_end.update([seen])
+    (first,) = back_end.state.landmark_ids
+    assert back_end.landmark_of_label == {3: first}
     for _ in range(40):
         back_end.update(silent)
     assert first not in back_end.state.landmark_ids
-    assert back_end.update_points([seen], PARK_POINTS) != (first,)
-    assert len(back_end.state.landmark_ids) == 2
+    assert not back_end.landmark_of_label
+    for _ in range(5):
+        back_end.update([seen])
+    (again,) = back_end.state.landmark_ids
+    assert again != first
 
 
 def drive_along(
