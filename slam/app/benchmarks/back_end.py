@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slam.app.benchmarks.data_set import Array, Observation, Run, Sensor
-from slam.geometry import Mount, Rig
+from slam.geometry import Mount, Rig, compose, has_moved
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import (
@@ -31,12 +31,17 @@ class Solution:
 
     causal: Array  # (n, 3): the pose of each step as it was known then
     smoothed: Array | None  # (n, 3): all poses solved for at once at the end
+    n_scans: int  # that were used
     landmarks_m: Array  # (k, 2), map frame
     seconds: float  # processor time
 
 
 def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Solution:
-    """Run all steps through the back end; without labels it must find out what is what itself."""
+    """Run all steps through the back end; without labels it must find out what is what itself.
+
+    A scan from where the last one was taken has the same errors once more and is not used; between
+    two scans that are used the path follows the odometry.
+    """
     with threadpool_limits(limits=1):  # the same numbers on every machine, and faster
         return _solve(run, sensor, stop, with_labels=with_labels)
 
@@ -46,19 +51,32 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
     back_end = RobustBackEnd(
         Rig(mounts=(Mount(name="sensor", x_m=0.0, y_m=0.0, yaw_rad=0.0),)), parameters_of(sensor)
     )
-    causal = []
-    for number, step in enumerate(run.steps):
+    causal, moved = [], np.zeros(3)  # since the last scan that was used
+    scan_of, moves, stamps_ns = [], [], []
+    for step in run.steps:
         stop.check()
-        if number:
-            back_end.predict(step.increment, step.covariance)
-        seen = step.observations
-        back_end.update([_scan(seen, with_labels=with_labels)] if seen else [])
-        causal.append(back_end.pose)
+        moved = compose(moved, step.increment)
+        is_first = not stamps_ns
+        if step.observations and (
+            is_first or has_moved(np.zeros(3), moved, sensor.least_move_m, sensor.least_turn_rad)
+        ):
+            back_end.predict(moved)
+            back_end.update([_scan(step.observations, with_labels=with_labels)])
+            moved = np.zeros(3)
+            stamps_ns.append(step.t_ns)
+        causal.append(compose(back_end.pose, moved))
+        scan_of.append(len(stamps_ns))
+        moves.append(moved)
     stop.check()
-    smoothed = back_end.smoothed(run.t_ns[1:])
+    solved = back_end.smoothed(np.array(stamps_ns, dtype=np.int64))
+    smoothed = None
+    if solved is not None:
+        poses = np.vstack([np.zeros(3), solved.poses])
+        smoothed = np.array([compose(poses[i], by) for i, by in zip(scan_of, moves, strict=True)])
     return Solution(
         causal=np.array(causal),
-        smoothed=None if smoothed is None else np.vstack([np.zeros(3), smoothed.poses]),
+        smoothed=smoothed,
+        n_scans=len(stamps_ns),
         landmarks_m=back_end.state.landmarks_m[back_end.reported_rows()].copy(),
         seconds=time.process_time() - began,
     )

@@ -37,7 +37,6 @@ class Step:
     t_ns: int
     # (3,): dx, dy [m], turn [rad] in the body frame of the step before; zero in the first step
     increment: Array
-    covariance: Array | None = None  # (3, 3) of the increment; None: as the wheels' model says
     observations: tuple[Observation, ...] = ()
 
 
@@ -108,6 +107,9 @@ class Sensor:
     field_of_view_rad: float  # full opening angle, about straight ahead
     detection_probability: float  # that a landmark in view is reported
     clutter: float  # false observations per scan
+    # A scan is used if the robot has moved so far since the last one that was, or turned so far
+    least_move_m: float
+    least_turn_rad: float
     # Largest errors of a pose before the run is solved for again
     shift_m: float
     # Distance within which landmarks are neighbours: they may be one, or be taken for each other

@@ -62,6 +62,8 @@ SENSOR = Sensor(
     field_of_view_rad=2.0 * math.pi,
     detection_probability=0.9,
     clutter=0.01,
+    least_move_m=0.0,
+    least_turn_rad=0.0,
     shift_m=0.5,
     neighbourhood_m=10.0,
     source="ranges as the file says, about 0.5 m; wheel encoders and a fibre-optic gyro: a hundredth "
@@ -213,8 +215,8 @@ def graph_of(run: Run, sensor: Sensor) -> FactorGraph:
     """Return a run whose observations have labels as a graph, for other solvers.
 
     True poses are interpolated, those before the first and behind the last are these; the truth has
-    no heading, which is dead reckoning's. A step that does not say its covariance has that of the
-    sensor's wheel model, and what is seen twice is written as range and bearing turned into a place.
+    no heading, which is dead reckoning's. Covariances of steps are those of the sensor's wheel model;
+    range and bearing are written as the place that they mean.
     """
     dead = run.dead_reckoning()
     clipped = np.clip(run.t_ns, run.truth.t_ns[0], run.truth.t_ns[-1])
@@ -232,18 +234,15 @@ def graph_of(run: Run, sensor: Sensor) -> FactorGraph:
             )
         )
         if number:
-            covariance = step.covariance
-            if covariance is None:
-                way_m = math.hypot(*step.increment[:2].tolist())
-                variances = sensor.wheels.step_variances(way_m, float(step.increment[2]))
-                covariance = np.diag(variances)
+            way_m = math.hypot(*step.increment[:2].tolist())
+            variances = sensor.wheels.step_variances(way_m, float(step.increment[2]))
             edges["EDGE_SE2"].append(
                 Edge(
                     t_ns=step.t_ns,
                     first=f"{_POSE}{number - 1}",
                     second=here,
                     values=tuple(step.increment.tolist()),
-                    covariance=tuple(covariance[np.triu_indices(3)].tolist()),
+                    covariance=tuple(np.diag(variances)[np.triu_indices(3)].tolist()),
                 )
             )
         for seen in step.observations:
