@@ -103,6 +103,7 @@ class Sensor:
     """
 
     wheels: WheelNoise
+    min_range_m: float
     max_range_m: float
     field_of_view_rad: float  # full opening angle, about straight ahead
     detection_probability: float  # that a landmark in view is reported
@@ -116,6 +117,8 @@ class Sensor:
     neighbourhood_m: float
     source: str
     range_offset_sigma_m: float = 0.0  # of the unknown constant error of all ranges
+    # Share of the variance of range and bearing that is one error as long as a landmark is in view
+    common_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -49,6 +49,7 @@ SENSOR = Sensor(
         floor_m=1e-4,
         floor_rad=1e-4,
     ),
+    min_range_m=0.0,
     max_range_m=10.0,
     field_of_view_rad=2.0 * math.pi,
     detection_probability=0.9,

@@ -56,6 +56,7 @@ SENSOR = Sensor(
         floor_m=1e-4,
         floor_rad=1e-4,
     ),
+    min_range_m=0.5,
     max_range_m=8.0,
     field_of_view_rad=math.radians(60.0),
     detection_probability=0.3,

@@ -56,6 +56,7 @@ SENSOR = Sensor(
         floor_m=1e-3,
         floor_rad=1e-4,
     ),
+    min_range_m=1.0,
     max_range_m=80.0,
     field_of_view_rad=math.pi,
     detection_probability=0.7,
