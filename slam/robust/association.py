@@ -433,7 +433,6 @@ def find_points(
     noise, rule, radar = parameters.ranges, parameters.continuation, scan.radar
     inside = seen.inside(noise, rule.view_margin_rad, rule.view_sigmas * noise.sigma_m)[radar]
     inside[len(state.landmark_ids) :] = False
-    inside[list(row_of_label.values())] = False
     named = {
         index: row_of_label[label]
         for index, label in scan.labelled
@@ -460,7 +459,8 @@ def find_points(
     k = len(named)
     odds = noise.detection_probability / (1.0 - noise.detection_probability)
     clutter = noise.clutter_per_m / noise.field_of_view_rad
-    own = np.flatnonzero(inside[rows])
+    is_free = inside[rows] & ~np.isin(rows, list(row_of_label.values()))
+    own, most = np.flatnonzero(is_free), parameters.points.sure_sigmas**2
     if len(own) and others:
         log_n = -0.5 * (distance + np.linalg.slogdet(math.tau * S)[1])[k:, own]
         evidence = np.where(is_near[k:, own], log_n + math.log(odds / clutter), -math.inf)
@@ -469,10 +469,10 @@ def find_points(
         )
         chosen = linear_sum_assignment(cost)[1]
         white = prior[own][None] / np.sqrt(variances[k:, None, :, None] * variances[k:, None, None])
-        is_sure = np.linalg.eigvalsh(white)[..., -1] <= 1.0
-        # Per metre and radian, as many unmapped landmarks as mapped ones
-        beta = density_per_m2(state.landmarks_m, parameters.map.neighbourhood_m)
-        new = np.log(np.maximum(1.0, beta * measured[k:, 0] * odds / clutter))
+        is_sure = np.linalg.eigvalsh(white)[..., -1] <= most
+        # A square metre is the more radians wide, the nearer it is.
+        beta = parameters.points.unmapped_per_m2 * measured[k:, 0]
+        new = np.log(np.maximum(1.0, beta * odds / clutter))
         for one, at in enumerate(chosen.tolist()):
             if at >= len(own):
                 continue
@@ -487,7 +487,7 @@ def find_points(
             / np.array([noise.sigma_m, noise.bearing_sigma_rad])
             / np.array([[noise.sigma_m], [noise.bearing_sigma_rad]])
         )[:, -1]
-        <= 1.0
+        <= most
     )
     missed = rows[well & is_known & ~is_near.any(axis=0)]
     return PointMatches(pairs=tuple(pairs), refused=tuple(refused), missed=tuple(missed.tolist()))

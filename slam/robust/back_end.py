@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -42,6 +42,7 @@ from slam.robust.initialisation import (
     detections_of,
     initialise_landmark,
     match,
+    match_or_new,
     point_guesses,
     update_with_point,
 )
@@ -481,7 +482,7 @@ class RobustBackEnd:
         own_share = 1.0 - noise.common_share
         points = [body_point(state, antennas, one, own_share) for one in detections]
         for tentative in self._tentative.take(detections, points):
-            self._place_point(tentative, antennas)
+            self._place_point(tentative, antennas, hit | missed)
         return tuple(continued), nis, evidence
 
     def _correct_points(
@@ -537,8 +538,13 @@ class RobustBackEnd:
                 bearing_sigma_rad=one.bearing_sigma_rad,
             )
 
-    def _place_point(self, tentative: TentativePoint, antennas: Antennas) -> None:
-        """Let a tentative landmark be one of the map, or a new one."""
+    def _place_point(
+        self, tentative: TentativePoint, antennas: Antennas, others: Collection[int]
+    ) -> None:
+        """Let a tentative landmark be one of the map, or a new one, where either is certain.
+
+        The landmarks with the ids ``others`` are not it: this scan says where they are.
+        """
         state, label = self.state, tentative.label
         share = max(state.range_errors.variance_share, 1.0)
         # What all its detections have in common, none of them averages out.
@@ -546,9 +552,15 @@ class RobustBackEnd:
         common = body_point(state, antennas, tentative.seen[-1], common_share).covariance
         covariance = share * tentative.point.covariance + common
         point = replace(tentative.point, covariance=covariance)
-        row = None
+        row, is_new = None, True
         if label is None:
-            row = match(state, point, self.parameters.map.neighbourhood_m, self._beacon_rows())
+            known = [row for row, id_ in enumerate(state.landmark_ids) if id_ in others]
+            row, is_new = match_or_new(
+                state, point, {*known, *self._beacon_rows()}, self.parameters
+            )
+        if row is None and not is_new:
+            self._tentative.keep(tentative)
+            return
         if row is None:
             landmark_id = initialise_landmark(state, point)
             if label is not None:

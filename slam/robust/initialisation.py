@@ -33,7 +33,7 @@ waits as a tentative landmark, and becomes one when enough scans hold it and the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import TypeAlias
@@ -310,18 +310,10 @@ def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp
     return np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) <= reach_m)
 
 
-def match(
-    state: State,
-    point: BodyPoint,
-    neighbourhood_m: float = NEIGHBOURHOOD_M,
-    labelled: Sequence[int] = (),
-) -> int | None:
-    """Return the row of the landmark that a point certainly is, or None.
-
-    The rows ``labelled`` are of landmarks that are known by their labels.
-    """
-    near = [row for row in near_rows(state, point, neighbourhood_m) if row not in labelled]
-    density = density_per_m2(state.landmarks_m, neighbourhood_m)
+def match(state: State, point: BodyPoint) -> int | None:
+    """Return the row of the landmark that a point certainly is, or None."""
+    near = near_rows(state, point, NEIGHBOURHOOD_M).tolist()
+    density = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
     return certain_row({row: point_rows(state, row, point) for row in near}, density)
 
 
@@ -335,6 +327,21 @@ def certain_row(found: Mapping[int, FeatureRows], density: float) -> int | None:
         [identity(((SEEN, row),), rows.residual, rows.S, density) for row, rows in found.items()]
     )
     return None if best is None else best.pairs[0][1]
+
+
+def match_or_new(
+    state: State, point: BodyPoint, others: Collection[int], parameters: BackEndParameters
+) -> tuple[int | None, bool]:
+    """Return the row of the landmark that a point certainly is, or None, and whether it is new.
+
+    It is new if it passes the gate of no landmark; the rows ``others`` are not it. If both are
+    possible, it is neither.
+    """
+    near = near_rows(state, point, parameters.map.neighbourhood_m).tolist()
+    found = {row: point_rows(state, row, point) for row in near if row not in others}
+    limit = float(chdtri(2, TAIL_PROBABILITY))
+    is_new = all(rows.mahalanobis_sq > limit for rows in found.values())
+    return certain_row(found, parameters.points.unmapped_per_m2), is_new
 
 
 def update_with_point(state: State, row: int, point: BodyPoint) -> float:
@@ -813,6 +820,10 @@ class TentativePoints:
 
     def clear(self) -> None:
         self._points = []
+
+    def keep(self, one: TentativePoint) -> None:
+        """Take back what may be a landmark that is in the map."""
+        self._points.append(one)
 
     def take(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> list[TentativePoint]:
         """Take in the detections of a scan, with their points; return new landmarks.

@@ -357,6 +357,11 @@ class PointRule:
     """Fewest scans that must hold it: clutter has no past, and what moves leaves the gate."""
     most_misses: Annotated[int, Origin.BUDGET, "scans"] = 15
     """After so many scans without it, what has not become a landmark is forgotten."""
+    unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 0.02
+    """How many landmarks per square metre may not be in the map yet: what a match competes with."""
+    sure_sigmas: Annotated[float, Origin.CHOSEN] = 2.0
+    """How surely a landmark must be predicted for its likeliest detection to be taken for it, in the
+    sensor's standard deviations. A new landmark has the error of its own detections."""
     decay: Annotated[float, Origin.CHOSEN] = 0.5
     """Share of its expected hits that a landmark's score loses in misses: a sensor that detects a
     landmark rarely says little where it does not. A miss never counts more than `MapRule.miss`."""

@@ -244,7 +244,7 @@ def test_true_points_pass_their_gate_as_often_as_it_says() -> None:
     """Drawn from the distribution of the state's own errors, by its own formulas."""
     rng = np.random.default_rng(12)
     noise = replace(NOISE, clutter_per_m=1e-12, bearing_sigma_rad=0.02)
-    state = one_landmark(1e-4 * np.array([[0.2, 0.1], [0.1, 0.3]]))
+    state = one_landmark(1e-6 * np.array([[2.0, 1.0], [1.0, 3.0]]))
     of = point_view(state, view(state, antennas_of(paper_rig(), (), np.zeros(3))), 0, np.array([0]))
     S = of.H[0] @ state.P.block(of.at) @ of.H[0].T
     S += np.diag([noise.sigma_m**2, noise.bearing_sigma_rad**2])
