@@ -88,6 +88,11 @@ class RangeScan:
         labels = enumerate(self.labels or ())
         return tuple((index, label) for index, label in labels if label is not None)
 
+    @property
+    def looks(self) -> bool:
+        """Return whether the radar looked for whatever is there, and did not ask beacons only."""
+        return self.labels is None or None in self.labels
+
     def sigma(self, index: int, otherwise_m: float) -> float:
         """Return the standard deviation [m] of one range; ``otherwise_m`` if there is none."""
         return otherwise_m if self.sigmas_m is None else self.sigmas_m[index]
@@ -233,6 +238,7 @@ def find_known(
     scans: Sequence[RangeScan],
     side_of: Indices,
     parameters: BackEndParameters,
+    *,
     beacons: Sequence[int] = (),
 ) -> Known:
     """Return the likeliest one-to-one assignment of ranges without labels to landmarks.
@@ -320,7 +326,7 @@ def find_labelled(
         (scan.radar, index, row_of_label[label], scan.sigma(index, noise.sigma_m))
         for scan in scans
         for index, label in scan.labelled
-        if label in row_of_label
+        if label in row_of_label and 0.0 < scan.ranges_m[index] < LONGEST_M
     ]
     rows = np.array(sorted({row for _, _, row, _ in found}), dtype=np.intp)
     at = np.concatenate([np.array([1, 2]), state.radar_columns, layout.columns(rows)])
@@ -341,7 +347,6 @@ def find_labelled(
             h[first + 2] = -1.0
         innovation_m = of_radar[radar].ranges_m[index] - float(seen.ranges_m[radar, row])
         variance = float(h @ block @ h) + sigma_m**2 + float(added_m[row]) ** 2
-        # A range that is not a finite number fails, too.
         if innovation_m**2 <= float(chdtri(1, TAIL_PROBABILITY)) * variance:
             assigned.append((radar, index, place))
             of_assigned.append(h)

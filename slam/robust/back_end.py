@@ -48,7 +48,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters
-from slam.robust.solver.beacons import Waiting, initialise_beacon
+from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     find_split,
     is_due,
@@ -115,7 +115,9 @@ class RobustBackEnd:
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
-        self._waiting: dict[int, Waiting] = {}  # beacons without a place, by label
+        # Beacons, whose ranges have labels: all labels heard, and by label those without a place
+        self._heard: set[int] = set()
+        self._waiting: dict[int, Waiting] = {}
         self._n_updates = 0
         # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[Pairs, int] = {}
@@ -217,26 +219,29 @@ class RobustBackEnd:
 
         Without ``solve`` merges and the solution over all poses wait for a later time.
         """
-        antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
+        looks = [scan for scan in scans if scan.looks or scan.bearings_rad is not None]
+        antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         with_bearings = [scan for scan in scans if scan.bearings_rad is not None]
         if with_bearings:
             scans = [scan for scan in scans if scan.bearings_rad is None]
-        widened = [scan.with_added_sigma(added_m) for scan in scans]
+            looks = [scan for scan in looks if scan.bearings_rad is None]
+        widened = [scan.with_added_sigma(added_m) for scan in looks]
         seen = self._walls.look(view(self.state, antennas), antennas)
+        beacons = self._beacon_rows()
         known = find_known(
-            self.state, seen, widened, self._side_of, self.parameters, self._beacon_rows()
+            self.state, seen, widened, self._side_of, self.parameters, beacons=beacons
         )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
-        continued, nis, likelihoods = self._correct(known, seen, scans, antennas)
+        continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
         if any(scan.labelled for scan in scans):
             used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
-            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, widened, antennas)
+            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, added_m)
             continued, nis = continued + of_beacons, nis + nis_of_beacons
             likelihoods = [*likelihoods, *evidence]
         dof = len(continued)
@@ -246,7 +251,7 @@ class RobustBackEnd:
             likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
-        self._delete_vanished()
+        self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:
             self._initialise_beacons()
@@ -360,21 +365,22 @@ class RobustBackEnd:
         return continued, float(white @ white), likelihoods
 
     def _beacon_rows(self) -> list[int]:
-        """Return the rows of landmarks that have labels."""
-        if not self._landmark_of_label:
-            return []
-        beacons = set(self._landmark_of_label.values())
+        """Return the rows of landmarks whose ranges have labels."""
+        beacons = {id_ for label, id_ in self._landmark_of_label.items() if label in self._heard}
         return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in beacons]
 
     def _take_labelled(
-        self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
+        self, scans: Sequence[RangeScan], added_m: float
     ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
-        """Correct the state with the ranges that have labels; log them; place new beacons.
+        """Correct the state with the ranges that have labels, and log them all.
 
         Returns what `_correct` does. A range beyond the gate corrects nothing now; it is logged,
-        too: which are outliers, the solution over the whole run decides.
+        too: which are outliers, the solution over the whole run decides. ``added_m`` is added in
+        squares to the noise of ranges in the gate.
         """
         state = self.state
+        antennas = antennas_of(self.rig, scans, state.calibration, state.mounts_m)
+        widened = [scan.with_added_sigma(added_m) for scan in scans]
         rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
         row_of_label = {
             label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
@@ -394,7 +400,8 @@ class RobustBackEnd:
         evidence += [(ids[row], miss) for _, _, row in refused]
         for scan in scans:
             for index, label in scan.labelled:
-                if label not in self._landmark_of_label:
+                self._heard.add(label)
+                if label not in self._landmark_of_label and 0.0 < scan.ranges_m[index] < LONGEST_M:
                     if label not in self._waiting:
                         self._waiting[label] = Waiting(state.next_id)
                         state.next_id += 1
@@ -417,11 +424,12 @@ class RobustBackEnd:
 
     def _initialise_beacons(self) -> None:
         """Bring the beacons into the map whose ranges have one place."""
-        rule = self.parameters.beacons
+        fewest = self.parameters.tracklets.min_frames
+        share = 1.0 + self.parameters.relinearisation.run_share
         for label, waiting in list(self._waiting.items()):
-            if waiting.n_ranges < max(rule.min_ranges, waiting.try_at):
+            if waiting.n_ranges < max(fewest, waiting.try_at):
                 continue
-            waiting.try_at = math.ceil(rule.growth * waiting.n_ranges)
+            waiting.try_at = math.ceil(share * waiting.n_ranges)
             landmark_id = initialise_beacon(self._log, self.state, waiting.log_id, self.parameters)
             if landmark_id is not None:
                 del self._waiting[label]
@@ -635,8 +643,14 @@ class RobustBackEnd:
                 sigma_m=sigma_m,
             )
 
-    def _delete_vanished(self) -> None:
-        vanished = self._existence.lost()
+    def _delete_vanished(self, *, solve: bool) -> None:
+        """Delete landmarks that are not there any more; without ``solve``, no beacons."""
+        lost, beacons = self._existence.lost(), set()
+        if lost and self._heard:
+            beacons = {self.state.landmark_ids[row] for row in self._beacon_rows()}
+        vanished = [
+            id_ for id_ in lost if id_ not in beacons or (solve and not self._is_where_it_was(id_))
+        ]
         for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
             self.state.remove(self.state.feature_ids.index(landmark_id))
@@ -645,6 +659,18 @@ class RobustBackEnd:
         if vanished:
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
+
+    def _is_where_it_was(self, landmark_id: int) -> bool:
+        """Return whether ranges beyond the gate are a beacon's after all, as the whole run has it.
+
+        A pose that was wrong is then corrected, and the beacon begins anew with its score.
+        """
+        self.relinearise()
+        row = self.state.landmark_ids.index(landmark_id)
+        if not is_heard_where_it_is(self._log, self.state, row, self.parameters):
+            return False
+        self._existence.renew(landmark_id)
+        return True
 
     def _merge(self) -> None:
         """Merge landmarks where that is certain, and the whole run allows it."""

@@ -49,6 +49,10 @@ class Existence:
         """Count a frame that should have hit a landmark and did not, by no more than ``most``."""
         self._records[landmark_id].score -= min(self._rule.miss, most)
 
+    def renew(self, landmark_id: int) -> None:
+        """Let the score begin anew; the hits remain."""
+        self._records[landmark_id].score = 0.0
+
     def lost(self) -> list[int]:
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
 

@@ -280,26 +280,6 @@ class SplitRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BeaconRule:
-    """When ranges with one label have one place."""
-
-    min_ranges: Annotated[int, Origin.CHOSEN, "ranges"] = 10
-    """Fewest ranges of a beacon from which its place is looked for."""
-    growth: Annotated[float, Origin.BUDGET] = 1.2
-    """By what factor its ranges must have become more before the next search."""
-    directions: Annotated[int, Origin.BUDGET] = 16
-    """In how many directions from an antenna the search begins."""
-    most_places: Annotated[int, Origin.BUDGET, "places"] = 2
-    """For how many of the likeliest places the run is solved; the mirror image of the likeliest one
-    comes to these."""
-    margin_nats: Annotated[float, Origin.CHOSEN, "nats"] = 10.0
-    """By how much a place must be likelier than every other. The search is repeated, and its ranges
-    have errors in common, so this is more than `MARGIN_NATS`."""
-    least_share: Annotated[float, Origin.CHOSEN] = 0.6
-    """Least share of its ranges that must fit the place, as `TrackletRule.min_share`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BranchRule:
     """When the robot may have been carried, and when that is believed."""
 
@@ -384,4 +364,3 @@ class BackEndParameters:
     noise: NoiseRule = field(default_factory=NoiseRule)
     splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)
-    beacons: BeaconRule = field(default_factory=BeaconRule)

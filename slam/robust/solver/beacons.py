@@ -3,11 +3,11 @@
 Ranges of one beacon from a straight way have two places, mirror images of each other. So the ranges
 of a beacon that is not in the map wait in the log of the run. Now and then places are looked for
 where they have a least sum of squares, the trajectory being taken for true. The whole run is solved
-for with the beacon at each of them, and at the mirror image of the best one: the likeliest place is
-the beacon's if every other is less likely by a margin, most ranges fit, and it is known well enough
-for ranges to be linear there. Over a spread e across the direction to it, the circle of a range r
-bends away from its tangent by e^2 / (2 r), which must be less than the noise of a range. That
-solution becomes the belief: all ranges so far then count, and none twice.
+for with the beacon at the two likeliest, and at the mirror image of the first. The likeliest place
+then is the beacon's if every other is less likely by `BranchRule.price_nats`, most ranges fit, and
+it is known well enough for ranges to be linear there: over a spread e across the direction to it,
+the circle of a range r bends away from its tangent by e^2 / (2 r), which must be less than the
+noise of a range. That solution becomes the belief: all ranges so far then count, and none twice.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from slam.robust.parameters import TAIL_PROBABILITY, BackEndParameters, BeaconRule
+from slam.robust.parameters import TAIL_PROBABILITY, BackEndParameters
 from slam.robust.solver.revision import adopt, is_determined
 from slam.robust.solver.run_log import Problem, RunLog
 from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
@@ -29,10 +29,6 @@ from slam.robust.state import HEAD_SIZE, Array, State, quarter_turn, rotation
 _ANYWHERE_M2 = 1.0
 # Steps of the search for places, its damping, and what keeps directions finite
 _STEPS, _DAMPING, _LEAST_M = 30, 1e-3, 1e-9
-# Residuals that weigh less, in standard deviations, in that search alone
-_HUBER_SIGMAS = 2.0
-# Places closer than this share of the median range are one.
-_SAME_SHARE = 0.02
 
 
 @dataclass(slots=True)
@@ -44,14 +40,16 @@ class Waiting:
     try_at: int = 0  # number of ranges from which on its place is looked for
 
 
-def find_places(ranges_m: Array, sigmas_m: Array, antennas_m: Array, rule: BeaconRule) -> Array:
+def find_places(
+    ranges_m: Array, sigmas_m: Array, antennas_m: Array, parameters: BackEndParameters
+) -> Array:
     """Return where ranges from some antennas (k, 2) may cross, (m, 2) [m], likeliest first.
 
-    These are minima of Huber's cost, each reached from points on circles about three antennas. All
-    are returned, the mirror image of the first one across the way of the antennas included.
+    These are the two least minima of Huber's cost that are reached from circles about three of the
+    antennas, and the mirror image of the first one across the way of the antennas.
     """
-    k = len(ranges_m)
-    angles = np.arange(rule.directions) * (math.tau / rule.directions)
+    k, huber = len(ranges_m), parameters.ranges.huber_sigmas
+    angles = np.arange(0.0, math.tau, parameters.tracklets.single_step_rad)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     points = np.concatenate(
         [antennas_m[i] + ranges_m[i] * ring for i in sorted({0, k // 2, k - 1})]
@@ -66,7 +64,7 @@ def find_places(ranges_m: Array, sigmas_m: Array, antennas_m: Array, rule: Beaco
     for _ in range(_STEPS):
         u, white = residuals(points)
         J = u / sigmas_m[None, :, None]
-        weight = _HUBER_SIGMAS / np.maximum(np.abs(white), _HUBER_SIGMAS)
+        weight = np.minimum(huber / np.maximum(np.abs(white), _LEAST_M), 1.0)
         information = np.einsum("mk,mki,mkj->mij", weight, J, J)
         trace = np.trace(information, axis1=1, axis2=2)
         information += _DAMPING * trace[:, None, None] * np.eye(2)
@@ -75,15 +73,12 @@ def find_places(ranges_m: Array, sigmas_m: Array, antennas_m: Array, rule: Beaco
         length = np.hypot(change[:, 0], change[:, 1])
         points = points - change * np.minimum(1.0, reach_m / np.maximum(length, _LEAST_M))[:, None]
     white = np.abs(residuals(points)[1])
-    costs = np.sum(white**2 - np.maximum(white - _HUBER_SIGMAS, 0.0) ** 2, axis=1)
-    found: list[Array] = []
-    for place in points[np.argsort(costs, kind="stable")]:
-        gaps = [math.hypot(*(place - other)) for other in found]
-        if min(gaps, default=math.inf) > _SAME_SHARE * reach_m:
-            found.append(place)
-        if len(found) == rule.most_places:
-            break
-    return np.array([*found, mirrored(found[0], antennas_m)])
+    costs = np.sum(white**2 - np.maximum(white - huber, 0.0) ** 2, axis=1)
+    ranked = points[np.argsort(costs, kind="stable")]
+    first = ranked[0]
+    # What is closer than the noise of a range is the same minimum.
+    others = ranked[np.hypot(*(ranked - first).T) > float(np.median(sigmas_m))]
+    return np.array([first, *others[:1], mirrored(first, antennas_m)])
 
 
 def mirrored(point_m: Array, antennas_m: Array) -> Array:
@@ -135,11 +130,10 @@ def initialise_beacon(
 
     ``log_id`` is that of its ranges in the log. Then the solution of the whole run is the belief.
     """
-    rule = parameters.beacons
     ranges_m, sigmas_m, antennas_m = log.ranges_of(log_id)
     candidates = [
         candidate
-        for point_m in find_places(ranges_m, sigmas_m, antennas_m, rule)
+        for point_m in find_places(ranges_m, sigmas_m, antennas_m, parameters)
         if (candidate := _solved_with(log, state, log_id, point_m, parameters)) is not None
     ]
     if not candidates:
@@ -151,21 +145,34 @@ def initialise_beacon(
     for other in candidates:
         away = other.place_m - best.place_m
         is_same = away @ np.linalg.solve(covariance, away) <= chdtri(2, TAIL_PROBABILITY)
-        if not is_same and other.cost - best.cost < 2.0 * rule.margin_nats:
+        if not is_same and other.cost - best.cost < 2.0 * parameters.branches.price_nats:
             return None
     spread_m2 = float(np.linalg.eigvalsh(seen)[-1])
     if spread_m2 > 2.0 * float(np.median(ranges_m)) * float(np.median(sigmas_m)):
         return None
     mine = best.problem.range_landmarks == best.row
     residual = measurement_residuals(best.problem, best.solution.estimate).residual[: len(mine)]
-    fits = np.abs(residual[mine]) <= parameters.relinearisation.outlier_sigmas
-    if np.mean(fits) < rule.least_share:
+    if _share_that_fits(residual[mine], parameters) < parameters.tracklets.min_share:
         return None
     landmark_id = _augmented(state, best.point_m)
     log.rename(log_id, landmark_id)
     adopt(log, state, best.problem, best.solution, parameters)
     log.since_solved = 0
     return landmark_id
+
+
+def is_heard_where_it_is(
+    log: RunLog, state: State, row: int, parameters: BackEndParameters
+) -> bool:
+    """Return whether enough of the newest ranges of a beacon fit its place; after a solution."""
+    rule, problem = parameters.tracklets, log.problem(state, parameters)
+    mine = np.flatnonzero(problem.range_landmarks == row)[-rule.min_frames :]
+    residual = measurement_residuals(problem, log.starts(state, problem)[0]).residual[mine]
+    return _share_that_fits(residual, parameters) >= rule.min_share
+
+
+def _share_that_fits(residual: Array, parameters: BackEndParameters) -> float:
+    return float(np.mean(np.abs(residual) <= parameters.relinearisation.outlier_sigmas))
 
 
 def _augmented(state: State, point_m: Array) -> int:

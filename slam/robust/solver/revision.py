@@ -124,9 +124,10 @@ def find_split(
 ) -> Split | None:
     """Return the passage, or the landmark merged into another, that disagrees most with the rest.
 
-    The ranges of the rows ``whole`` are surely of their landmarks. To be called after a solution, whose poses are taken for true: of a group of ranges of one
-    landmark, the smaller part, the cost must fall by more than chance and `BranchRule.price_nats`
-    explain where the group has a place of its own.
+    The ranges of the rows ``whole`` are surely of their landmarks. To be called after a solution,
+    whose poses are taken for true: of a group of ranges of one landmark, the smaller part, the cost
+    must fall by more than chance and `BranchRule.price_nats` explain where the group has a place of
+    its own.
     """
     problem = log.problem(state, parameters)
     estimate, n = log.starts(state, problem)[0], len(problem.ranges_m)
