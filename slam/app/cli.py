@@ -473,8 +473,8 @@ _COMMANDS = (
         _add_benchmark,
         "Runs the back end of preset robust on all drives of a public data set that you have "
         "fetched, with and without the ids of landmarks where the data allow, and prints each "
-        "path's error against the truth, beside dead reckoning. Writes paths as TUM text, a picture "
-        "NAME.png and NAME.json. docs/benchmarks.md says where the data are from.",
+        "path's error against the truth, beside dead reckoning. Writes paths as TUM text, a "
+        "picture NAME.png and NAME.json. docs/benchmarks.md says where the data are from.",
     ),
     _Command(
         "sweep",

@@ -26,7 +26,7 @@ BENCHMARKS: Mapping[str, Benchmark] = {
         module="mrclam",
     ),
     "victoria-park": Benchmark(
-        help="a car among trees, range and bearing by laser (inputs.dat, measurements.dat, gps.dat)",
+        help="a car among trees, range and bearing by laser (inputs, measurements, gps.dat)",
         module="victoria_park",
     ),
     "plaza": Benchmark(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +86,8 @@ class Run:
 
     @property
     def has_bearings(self) -> bool:
-        return any(seen.bearing_rad is not None for step in self.steps for seen in step.observations)
+        seen = (one for step in self.steps for one in step.observations)
+        return any(one.bearing_rad is not None for one in seen)
 
     def dead_reckoning(self) -> Array:
         """Return where the increments alone lead, shape (n, 3), from the origin."""
@@ -173,7 +175,7 @@ def _twist_steps(duration_s: Array, forward: Array, left: Array, turn: Array) ->
 
 def increments_of(poses: Array) -> list[Array]:
     """Return the motion to each of the poses (k, 3) from the one before; zero for the first."""
-    return [np.zeros(3), *(between(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True))]
+    return [np.zeros(3), *(between(a, b) for a, b in pairwise(poses))]
 
 
 def nanoseconds(seconds: Array) -> NDArray[np.int64]:
@@ -192,7 +194,7 @@ def nanoseconds(seconds: Array) -> NDArray[np.int64]:
 
 
 def step_times(times_s: Array, first_s: float, last_s: float, most_gap_s: float) -> Array:
-    """Return ascending times from first to last: the given ones, and others so that none is missing.
+    """Return ascending times from first to last: the given ones in there, and others.
 
     Between two of them there is no more than ``most_gap_s``.
     """

@@ -3,7 +3,7 @@
 ``NAME_Input.txt`` and ``NAME_GT.txt`` hold one measurement per line::
 
     range2     time [s]  range [m]  variance [m^2]  x  y [m] of the module  its id  SNR
-    odom2diff  time [s]  left  right  sideways [m/s]  half the track [m]  their variances (3) [m^2/s^2]
+    odom2diff  time [s]  left  right  sideways [m/s]  half the track [m]  variances (3)
     point2     time [s]  x  y [m]  covariance (4)                    in NAME_GT.txt
 
 The odometry of a time is the velocity up to then: the robot moves with (left + right) / 2 and turns
@@ -121,9 +121,7 @@ def read_run(path: FilePath) -> Run:
     )
 
 
-def _measurements(
-    path: FilePath, kinds: tuple[str, ...]
-) -> list[tuple[int, str, list[float]]]:
+def _measurements(path: FilePath, kinds: tuple[str, ...]) -> list[tuple[int, str, list[float]]]:
     what = f"libRSF text with lines of {' and '.join(kinds)}"
     found_lines = []
     for number, (kind, *words) in rows_of(path, what):

@@ -65,8 +65,8 @@ SENSOR = Sensor(
     least_turn_rad=0.03,
     shift_m=0.1,
     neighbourhood_m=1.5,
-    source="velocities are commands, not counts of the wheels: a tenth; the range is from the height "
-    "of a barcode in a picture of 960 x 720 pixels: 15 cm at five metres",
+    source="velocities are commands, not counts of the wheels: a tenth; the range is from the "
+    "height of a barcode in a picture: 15 cm; a bearing, with the mount of the camera: 0.03 rad",
 )
 
 
@@ -84,11 +84,12 @@ def read_data_set(folder: FilePath) -> DataSet:
             f"{folder}: holds no {_BARCODES} with a Robot1_Odometry.dat beside it, nor do its "
             f"folders; {REMEDY}"
         )
-    return DataSet(name="mrclam", title="MRCLAM: robots among cylinders", sensor=SENSOR, runs=tuple(runs))
+    title = "MRCLAM: robots among cylinders"
+    return DataSet(name="mrclam", title=title, sensor=SENSOR, runs=tuple(runs))
 
 
 def read_run(folder: FilePath, robot: str) -> Run:
-    """Read the drive of one robot, such as ``Robot1``; observations of other robots are left out."""
+    """Read the drive of one robot, such as ``Robot1``, without what it saw of other robots."""
     subject_of = {
         int(barcode): int(subject)
         for subject, barcode in read_table(folder / _BARCODES, ("subject", "barcode")).tolist()

@@ -62,4 +62,5 @@ def _draw_map(axes: Axes, scored: ScoredRun, *, small: bool) -> None:
     reckoned = scored.ate_rmse_m[ODOMETRY]
     separator = "\n" if small else ": "
     text = f"{_STYLES[best[0]][0]} {best[1]:.2f} m, dead reckoning {reckoned:.2f} m"
-    label(axes, f"{scored.run.name}{separator}{text}", "x [m]", "y [m]", fontsize=8 if small else 10)
+    title = f"{scored.run.name}{separator}{text}"
+    label(axes, title, "x [m]", "y [m]", fontsize=8 if small else 10)

@@ -21,6 +21,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -67,14 +68,16 @@ SENSOR = Sensor(
     least_turn_rad=0.0,
     shift_m=0.5,
     neighbourhood_m=10.0,
-    source="ranges as the file says, about 0.5 m; wheel encoders and a fibre-optic gyro: a hundredth "
-    "in distance and turn. The covariances of EDGE_SE2 are the same for every step, also where the "
-    "robot stands, and are not used",
+    source="ranges as the file says, about 0.5 m; wheel encoders and a fibre-optic gyro: two "
+    "hundredths in distance and turn. The covariances of EDGE_SE2 are the same for every step, also "
+    "where the robot stands, and are not used",
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
+    """A true pose."""
+
     t_ns: int
     name: str
     x_m: float
@@ -84,6 +87,8 @@ class Pose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Landmark:
+    """A true place."""
+
     name: str
     x_m: float
     y_m: float
@@ -91,7 +96,7 @@ class Landmark:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Edge:
-    """A measurement: (dx, dy, turn) of a pose, (x, y) of a landmark, or a range; its covariance."""
+    """A measurement: (dx, dy, turn) of a pose, (x, y) of a landmark, or a range."""
 
     t_ns: int
     first: str
@@ -106,11 +111,12 @@ class FactorGraph:
 
     poses: tuple[Pose, ...] = ()
     landmarks: tuple[Landmark, ...] = ()
-    edges: Mapping[str, tuple[Edge, ...]] = field(default_factory=dict)  # by kind, such as EDGE_RANGE
+    # By kind, such as EDGE_RANGE
+    edges: Mapping[str, tuple[Edge, ...]] = field(default_factory=dict)
 
 
 def read_pyfg(path: FilePath) -> FactorGraph:
-    """Read a graph; AppError names the line that is none of it, or names what no line defines."""
+    """Read a graph; AppError names a line that is none of it, or what no line defines."""
     poses: dict[str, Pose] = {}
     landmarks: dict[str, Landmark] = {}
     edges: dict[str, list[Edge]] = defaultdict(list)
@@ -196,9 +202,11 @@ def write_pyfg(path: FilePath, graph: FactorGraph) -> None:
     for landmark in graph.landmarks:
         lines.append(f"VERTEX_XY {landmark.name} {_words((landmark.x_m, landmark.y_m))}")
     for kind, edges in graph.edges.items():
-        for edge in edges:
-            numbers = _words((*edge.values, *edge.covariance))
-            lines.append(f"{kind} {_stamp(edge.t_ns)} {edge.first} {edge.second} {numbers}")
+        lines += [
+            f"{kind} {_stamp(edge.t_ns)} {edge.first} {edge.second} "
+            + _words((*edge.values, *edge.covariance))
+            for edge in edges
+        ]
     with naming(path), written_whole(path) as fresh:
         fresh.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
 
@@ -216,8 +224,8 @@ def graph_of(run: Run, sensor: Sensor) -> FactorGraph:
     """Return a run whose observations have labels as a graph, for other solvers.
 
     True poses are interpolated, those before the first and behind the last are these; the truth has
-    no heading, which is dead reckoning's. Covariances of steps are those of the sensor's wheel model;
-    range and bearing are written as the place that they mean.
+    no heading, which is dead reckoning's. Covariances of steps are those of the sensor's wheel
+    model; range and bearing are written as the place that they mean.
     """
     dead = run.dead_reckoning()
     clipped = np.clip(run.t_ns, run.truth.t_ns[0], run.truth.t_ns[-1])
@@ -296,10 +304,10 @@ def run_of(path: FilePath, graph: FactorGraph) -> Run:
         raise AppError(f"{path}: holds no EDGE_SE2; a drive has odometry")
     names = [edges[0].first, *(edge.second for edge in edges)]
     if [edge.first for edge in edges] != names[:-1] or len(set(names)) != len(graph.poses):
-        raise AppError(f"{path}: its EDGE_SE2 are no chain through all poses; a drive is one robot's")
+        raise AppError(f"{path}: its EDGE_SE2 are no chain through all poses of one robot")
     pose_of = {pose.name: pose for pose in graph.poses}
     chain = [pose_of[name] for name in names]
-    if any(b.t_ns <= a.t_ns for a, b in zip(chain, chain[1:], strict=False)):
+    if any(b.t_ns <= a.t_ns for a, b in pairwise(chain)):
         raise AppError(f"{path}: the times of its poses do not increase along EDGE_SE2")
     seen: dict[str, list[Observation]] = defaultdict(list)
     for edge in graph.edges.get("EDGE_RANGE", ()):

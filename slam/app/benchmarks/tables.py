@@ -29,7 +29,8 @@ def read_lines(path: Path, what: str) -> list[str]:
         number = error.object[: error.start].count(b"\n") + 1
         raise AppError(f"{path}, line {number}: no ASCII text; it must be {what}") from None
     except OSError as error:
-        raise AppError(f"{path}: cannot be read: {reason_of(error)}; it is {what}; {REMEDY}") from None
+        reason = reason_of(error)
+        raise AppError(f"{path}: cannot be read: {reason}; it is {what}; {REMEDY}") from None
     if not text.strip():
         raise AppError(f"{path}: holds nothing; it must be {what}; {REMEDY}")
     return text.split("\n")

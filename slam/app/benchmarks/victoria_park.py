@@ -65,8 +65,8 @@ SENSOR = Sensor(
     least_turn_rad=0.05,
     shift_m=0.5,
     neighbourhood_m=5.0,
-    source="a tenth in distance and turn, a degree per square root of a metre; a trunk is as wide as "
-    "its centre is uncertain: half a metre; two beams of the laser: a degree",
+    source="a tenth in distance and turn, a degree per square root of a metre; the centre of a "
+    "trunk is uncertain by its width: half a metre; two beams of the laser: a degree",
 )
 
 

@@ -34,18 +34,15 @@ _COLUMNS = {
 }
 
 
-def run_benchmark(
-    stop: StopFlag, *, name: str, data: Path, out: Path, as_json: bool
-) -> None:
+def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: bool) -> None:
     """Run all drives of a data set; write paths, picture and numbers, print a table or JSON.
 
     Raises AppError if a file is missing, is not what it should be, or cannot be written.
     """
+    read = import_module(f"slam.app.benchmarks.{BENCHMARKS[name].module}").read_data_set
+    data_set: DataSet = read(data)
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
-    read = import_module(f"slam.app.benchmarks.{BENCHMARKS[name].module}").read_data_set
-    print_progress(f"reading {data}")
-    data_set: DataSet = read(data)
     runs = []
     for run in data_set.runs:
         stop.check()

@@ -13,7 +13,7 @@ from slam.app.benchmarks.data_set import Path as Places
 from slam.app.benchmarks.data_set import Run
 from slam.app.benchmarks.evaluation import associated
 from slam.app.cli import main
-from slam.app.odometry.track import read_tum
+from slam.app.odometry.track import Trajectory, read_tum
 
 
 def write(name: str, folder: Path) -> Path:
@@ -65,7 +65,7 @@ def test_a_benchmark_is_better_than_dead_reckoning(
         assert min(image.size) > 400
 
 
-def _ate_m(estimate, truth) -> float:  # type: ignore[no-untyped-def]
+def _ate_m(estimate: Trajectory, truth: Trajectory) -> float:
     """Return the ATE with complex numbers: the best turn has a closed form there."""
     inside = (truth.stamps_ns >= estimate.stamps_ns[0]) & (
         truth.stamps_ns <= estimate.stamps_ns[-1]

@@ -90,10 +90,6 @@ def test_librsf_turns_by_the_difference_of_right_and_left(tmp_path: Path) -> Non
     assert dead_reckoning_error_m(run) < 1e-6
 
 
-def _read_mrclam(folder: Path) -> DataSet:
-    return mrclam.read_data_set(worlds.write_mrclam(folder, duration_s=2.0))
-
-
 def _damage(path: Path, line: int, text: str) -> None:
     lines = path.read_text(encoding="ascii").split("\n")
     lines[line - 1] = text
@@ -113,34 +109,35 @@ SET = "MRCLAM_Dataset1"
 
 
 @pytest.mark.parametrize(
-    ("name", "file", "line", "text", "expected"),
+    ("name", "place", "text", "expected"),
     [
-        ("mrclam", f"{SET}/Robot1_Odometry.dat", 5, "1 2", "2 numbers, not 3"),
-        ("mrclam", f"{SET}/Robot1_Odometry.dat", 5, "1 0 0", "before that of the line before"),
-        ("mrclam", f"{SET}/Robot1_Measurement.dat", 3, "1248272273 60 x 0", '"x" is no finite'),
-        ("mrclam", f"{SET}/Robot1_Groundtruth.dat", 2, "1 nan 0 0", '"nan" is no finite'),
-        ("mrclam", f"{SET}/Barcodes.dat", 2, "1 1_0", '"1_0" is no finite'),
-        ("victoria-park", "inputs.dat", 3, "0.2 5", "2 numbers, not 3"),
-        ("victoria-park", "inputs.dat", 3, "0.2 5 1.3", "no car steers"),
-        ("victoria-park", "measurements.dat", 1, "inf 1 1 1", '"inf" is no finite'),
-        ("victoria-park", "gps.dat", 4, "a b c", '"a" is no finite'),
-        ("plaza", "a.pyfg", 2, "VERTEX_SE3:QUAT 1 A1 0 0 0 0 0 0 1", "is not one of"),
-        ("plaza", "a.pyfg", 2, "VERTEX_SE2 1 A0 0 0 0", "A0 is defined twice"),
-        ("plaza", "a.pyfg", 2, "VERTEX_SE2 1 A1 0 0", "2 numbers behind the names"),
-        ("plaza", "a.pyfg", 2, "VERTEX_SE2 1 Aa 0 0 0", "a letter and a number"),
-        ("plaza", "a.pyfg", 2, "EDGE_RANGE 1 A0 L0 1 0", "covariance is not positive"),
-        ("plaza", "a.pyfg", 2, "EDGE_RANGE 1 A0 L9 1 1", "no line defines L9"),
-        ("plaza", "a.pyfg", 2, "EDGE_RANGE 1e300 A0 L0 1 1", "no time in seconds"),
-        ("uwb-indoor", "Small_Input.txt", 4, "gnss2 1 2", "begins with range2 or odom2diff"),
-        ("uwb-indoor", "Small_Input.txt", 4, "range2 1 2", "2 numbers, range2 has 7"),
-        ("uwb-indoor", "Small_Input.txt", 4, "range2 1 2 0 0 0 1 0", "must be positive"),
-        ("uwb-indoor", "Small_Input.txt", 3, "odom2diff 1 0 0 0 0 1 1 1", "half the track"),
-        ("uwb-indoor", "Small_GT.txt", 2, "point2 0 0 0 0 0 0 x", '"x" is no finite'),
+        ("mrclam", (f"{SET}/Robot1_Odometry.dat", 5), "1 2", "2 numbers, not 3"),
+        ("mrclam", (f"{SET}/Robot1_Odometry.dat", 5), "1 0 0", "before that of the line before"),
+        ("mrclam", (f"{SET}/Robot1_Measurement.dat", 3), "1248272273 60 x 0", '"x" is no finite'),
+        ("mrclam", (f"{SET}/Robot1_Groundtruth.dat", 2), "1 nan 0 0", '"nan" is no finite'),
+        ("mrclam", (f"{SET}/Barcodes.dat", 2), "1 1_0", '"1_0" is no finite'),
+        ("victoria-park", ("inputs.dat", 3), "0.2 5", "2 numbers, not 3"),
+        ("victoria-park", ("inputs.dat", 3), "0.2 5 1.3", "no car steers"),
+        ("victoria-park", ("measurements.dat", 1), "inf 1 1 1", '"inf" is no finite'),
+        ("victoria-park", ("gps.dat", 4), "a b c", '"a" is no finite'),
+        ("plaza", ("a.pyfg", 2), "VERTEX_SE3:QUAT 1 A1 0 0 0 0 0 0 1", "is not one of"),
+        ("plaza", ("a.pyfg", 2), "VERTEX_SE2 1 A0 0 0 0", "A0 is defined twice"),
+        ("plaza", ("a.pyfg", 2), "VERTEX_SE2 1 A1 0 0", "2 numbers behind the names"),
+        ("plaza", ("a.pyfg", 2), "VERTEX_SE2 1 Aa 0 0 0", "a letter and a number"),
+        ("plaza", ("a.pyfg", 2), "EDGE_RANGE 1 A0 L0 1 0", "covariance is not positive"),
+        ("plaza", ("a.pyfg", 2), "EDGE_RANGE 1 A0 L9 1 1", "no line defines L9"),
+        ("plaza", ("a.pyfg", 2), "EDGE_RANGE 1e300 A0 L0 1 1", "no time in seconds"),
+        ("uwb-indoor", ("Small_Input.txt", 4), "gnss2 1 2", "begins with range2 or odom2diff"),
+        ("uwb-indoor", ("Small_Input.txt", 4), "range2 1 2", "2 numbers, range2 has 7"),
+        ("uwb-indoor", ("Small_Input.txt", 4), "range2 1 2 0 0 0 1 0", "must be positive"),
+        ("uwb-indoor", ("Small_Input.txt", 3), "odom2diff 1 0 0 0 0 1 1 1", "half the track"),
+        ("uwb-indoor", ("Small_GT.txt", 2), "point2 0 0 0 0 0 0 x", '"x" is no finite'),
     ],
 )
 def test_a_damaged_line_is_named_with_the_remedy(
-    tmp_path: Path, name: str, file: str, line: int, text: str, expected: str
+    tmp_path: Path, name: str, place: tuple[str, int], text: str, expected: str
 ) -> None:
+    file, line = place
     write, read = WRITERS[name]
     write(tmp_path, duration_s=2.0)
     _damage(tmp_path / file, line, text)

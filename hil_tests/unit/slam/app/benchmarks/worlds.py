@@ -164,9 +164,7 @@ def write_librsf(folder: Path, *, duration_s: float = 60.0) -> Path:
         asked = n % len(BEACONS_M)
         range_m = math.dist((x, y), BEACONS_M[asked]) + RANGE_SIGMA_M * rng.standard_normal()
         place = map(repr, BEACONS_M[asked].tolist())
-        lines.append(
-            ["range2", f"{t:.9f}", repr(range_m), "0.01", *place, str(105 + asked), "0"]
-        )
+        lines.append(["range2", f"{t:.9f}", repr(range_m), "0.01", *place, str(105 + asked), "0"])
     folder.mkdir(parents=True, exist_ok=True)
     write_rows(folder / "Small_Input.txt", lines)
     write_rows(folder / "Small_GT.txt", truth)
