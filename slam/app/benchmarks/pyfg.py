@@ -9,8 +9,8 @@ One item per line; times in seconds, metres, radians, covariances as upper trian
     EDGE_RANGE   time pose landmark range variance
 
 Names are a letter and a number; those of landmarks begin with L. Graphs in three dimensions and
-priors are no drives on a floor and are an error. Format: PyFactorGraph and CORA, Marine Robotics
-Group, MIT.
+priors are no drives on a floor and are an error. Format: the files of PyFactorGraph and
+CORA, Marine Robotics Group.
 """
 
 from __future__ import annotations
