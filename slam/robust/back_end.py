@@ -43,6 +43,7 @@ from slam.robust.initialisation import (
     initialise_landmark,
     match,
     match_or_new,
+    match_two,
     point_guesses,
     update_with_point,
 )
@@ -489,8 +490,9 @@ class RobustBackEnd:
         detections = detections_of(scan, free, self._log.n_poses - 1, antennas, noise)
         own_share = 1.0 - noise.common_share
         points = [body_point(state, antennas, one, own_share) for one in detections]
-        for tentative in self._tentative.take(detections, points):
-            self._place_point(tentative, antennas, hit | missed)
+        self._tentative.take(detections, points)
+        if detections:
+            self._place_points(antennas, hit | missed)
         return tuple(continued), nis, evidence
 
     def _correct_points(
@@ -546,33 +548,48 @@ class RobustBackEnd:
                 bearing_sigma_rad=one.bearing_sigma_rad,
             )
 
-    def _place_point(
-        self, tentative: TentativePoint, antennas: Antennas, others: Collection[int]
-    ) -> None:
-        """Let a tentative landmark be one of the map, or a new one, where either is certain.
+    def _place_points(self, antennas: Antennas, others: Collection[int]) -> None:
+        """Let tentative landmarks be ones of the map, or new ones, where either is certain.
 
-        The landmarks with the ids ``others`` are not it: this scan says where they are.
+        The landmarks with the ids ``others`` are none of them: this scan says where they are.
         """
-        state, label = self.state, tentative.label
-        share = max(state.range_errors.variance_share, 1.0)
-        # What all its detections have in common, none of them averages out.
+        state, parameters = self.state, self.parameters
+        waiting, beacons = self._tentative.take_out(), set(self._landmark_of_label.values())
+        unclear: list[tuple[TentativePoint, BodyPoint]] = []
+        for tentative in waiting:
+            point, row, is_new = self._common(tentative, antennas), None, True
+            if tentative.label is None:
+                ids = enumerate(state.landmark_ids)
+                barred = {row for row, id_ in ids if id_ in others or id_ in beacons}
+                row, is_new = match_or_new(state, point, barred, parameters)
+            if row is None and not is_new:
+                unclear.append((tentative, point))
+            else:
+                self._place_point(tentative, point, row)
+        ids = enumerate(state.landmark_ids)
+        barred = {row for row, id_ in ids if id_ in others or id_ in beacons}
+        points = [point for _, point in unclear]
+        placed = dict(match_two(state, points, barred, parameters))
+        for place, row in placed.items():
+            self._place_point(*unclear[place], row)
+        for place, (tentative, _) in enumerate(unclear):
+            if place not in placed:
+                self._tentative.keep(tentative)
+
+    def _common(self, tentative: TentativePoint, antennas: Antennas) -> BodyPoint:
+        """Return a tentative point with the errors that all its detections have in common."""
+        share = max(self.state.range_errors.variance_share, 1.0)
         common_share = self.parameters.ranges.common_share
-        common = body_point(state, antennas, tentative.seen[-1], common_share).covariance
-        covariance = share * tentative.point.covariance + common
-        point = replace(tentative.point, covariance=covariance)
-        row, is_new = None, True
-        if label is None:
-            known = [row for row, id_ in enumerate(state.landmark_ids) if id_ in others]
-            row, is_new = match_or_new(
-                state, point, {*known, *self._beacon_rows()}, self.parameters
-            )
-        if row is None and not is_new:
-            self._tentative.keep(tentative)
-            return
+        common = body_point(self.state, antennas, tentative.seen[-1], common_share).covariance
+        return replace(tentative.point, covariance=share * tentative.point.covariance + common)
+
+    def _place_point(self, tentative: TentativePoint, point: BodyPoint, row: int | None) -> None:
+        """Update the landmark in a row with a tentative one, or add it to the map."""
+        state = self.state
         if row is None:
             landmark_id = initialise_landmark(state, point)
-            if label is not None:
-                self._landmark_of_label[label] = landmark_id
+            if tentative.label is not None:
+                self._landmark_of_label[tentative.label] = landmark_id
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)

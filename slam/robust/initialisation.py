@@ -344,6 +344,48 @@ def match_or_new(
     return certain_row(found, parameters.points.unmapped_per_m2), is_new
 
 
+def match_two(
+    state: State,
+    points: Sequence[BodyPoint],
+    others: Collection[int],
+    parameters: BackEndParameters,
+) -> tuple[tuple[int, int], ...]:
+    """Return which two of some points certainly are which landmarks, (place, row) each, or nothing.
+
+    Where the pose is unsure, one point alone may be any of several landmarks; the way from one to
+    the other does not depend on the pose.
+    """
+    limit, found = float(chdtri(2, TAIL_PROBABILITY)), []
+    for place, point in enumerate(points):
+        for row in near_rows(state, point, parameters.map.neighbourhood_m).tolist():
+            rows = point_rows(state, row, point)
+            if row not in others and rows.mahalanobis_sq <= limit:
+                found.append((place, row, rows))
+    density = parameters.points.unmapped_per_m2
+    joint = [
+        identity(
+            ((-1 - one, row), (-1 - other, second)),
+            np.concatenate([mine.residual, theirs.residual]),
+            _joint_covariance(state, mine, theirs),
+            density,
+        )
+        for (one, row, mine), (other, second, theirs) in combinations(found, 2)
+        if one != other and row != second
+    ]
+    best = certain(joint)
+    return () if best is None else tuple((-1 - key, row) for key, row in best.pairs)
+
+
+def _joint_covariance(state: State, one: FeatureRows, other: FeatureRows) -> Array:
+    """Return the covariance of two residuals, shape (4, 4)."""
+    at = np.concatenate([one.at, other.at])
+    H = np.zeros((4, len(at)))
+    H[:2, : len(one.at)], H[2:, len(one.at) :] = one.H, other.H
+    S = H @ state.P.block(at) @ H.T
+    S[:2, :2], S[2:, 2:] = one.S, other.S
+    return np.asarray((S + S.T) / 2)
+
+
 def update_with_point(state: State, row: int, point: BodyPoint) -> float:
     """Correct the state with a point that is the landmark in ``row``; return the NIS."""
     rows = point_rows(state, row, point)
@@ -825,11 +867,21 @@ class TentativePoints:
         """Take back what may be a landmark that is in the map."""
         self._points.append(one)
 
-    def take(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> list[TentativePoint]:
-        """Take in the detections of a scan, with their points; return new landmarks.
+    def take_out(self) -> list[TentativePoint]:
+        """Return those that are landmarks, of the map or new; they are no tentative ones any more."""
+        found = [one for one in self._points if self._is_landmark(one)]
+        labels = {one.label for one in found if one.label is not None}
+        kept = [one for one in self._points if one not in found and one.label not in labels]
+        self._points = kept
+        # Of one label there is one landmark.
+        return [
+            one
+            for k, one in enumerate(found)
+            if one.label is None or one.label not in {other.label for other in found[:k]}
+        ]
 
-        They are no tentative ones any more.
-        """
+    def take(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> None:
+        """Take in the detections of a scan, with their points."""
         rule, waiting = self._parameters.points, self._points
         chosen = self._assigned(seen, points)
         hit = set(chosen.values())
@@ -843,14 +895,7 @@ class TentativePoints:
             for k, (detection, point) in enumerate(zip(seen, points, strict=True))
             if k not in chosen
         ]
-        found = [one for one in waiting if self._is_landmark(one)]
-        labels = {one.label for one in found if one.label is not None}
-        self._points = [
-            one
-            for one in [*waiting, *new]
-            if one not in found and one.misses <= rule.most_misses and one.label not in labels
-        ]
-        return found
+        self._points = [one for one in [*waiting, *new] if one.misses <= rule.most_misses]
 
     def _is_landmark(self, one: TentativePoint) -> bool:
         hits, excess = len(one.seen), self._parameters.tracklets.excess_sigmas
