@@ -42,31 +42,33 @@ _BARCODES = "Barcodes.dat"
 _LANDMARKS = "Landmark_Groundtruth.dat"
 _MOST_GAP_S = 0.25
 """Longest motion of a step."""
-_RANGE_SIGMA_M, _BEARING_SIGMA_RAD = 0.15, 0.03
+_RANGE_SIGMA_M, _BEARING_SIGMA_RAD = 0.15, 0.02
 
 SENSOR = Sensor(
     wheels=WheelNoise(
-        along_m_per_sqrt_m=0.03,
-        across_m_per_sqrt_m=0.01,
-        heading_rad_per_sqrt_m=0.05,
+        along_m_per_sqrt_m=0.05,
+        across_m_per_sqrt_m=0.02,
+        heading_rad_per_sqrt_m=0.1,
         heading_rad_per_rad=0.1,
-        scale_sigma=0.1,
-        turn_scale_sigma=0.1,
+        scale_sigma=0.05,
+        turn_scale_sigma=0.05,
         curvature_sigma_rad_per_m=0.05,
-        floor_m=1e-4,
-        floor_rad=1e-4,
+        floor_m=1e-3,
+        floor_rad=1e-3,
     ),
     min_range_m=0.5,
     max_range_m=8.0,
     field_of_view_rad=math.radians(60.0),
-    detection_probability=0.3,
-    clutter=0.05,
+    detection_probability=0.4,
+    clutter=0.24,
     least_move_m=0.02,
     least_turn_rad=0.03,
     shift_m=0.1,
-    neighbourhood_m=1.5,
-    source="velocities are commands, not counts of the wheels: a tenth; the range is from the "
-    "height of a barcode in a picture: 15 cm; a bearing, with the mount of the camera: 0.03 rad",
+    common_share=0.95,
+    neighbourhood_m=3.0,
+    source="velocities are commands, not counts of the wheels: a tenth of a turn; the range is from the "
+    "height of a barcode in a picture: 15 cm; a bearing, with the mount of the camera: 0.02 rad; most of both is the same as long as a cylinder "
+    "is in view",
 )
 
 
