@@ -51,8 +51,11 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
     back_end = RobustBackEnd(
         Rig(mounts=(Mount(name="sensor", x_m=0.0, y_m=0.0, yaw_rad=0.0),)), parameters_of(sensor)
     )
-    causal, moved = [], np.zeros(3)  # since the last scan that was used
-    scan_of, moves, stamps_ns = [], [], []
+    causal: list[Array] = []
+    moved = np.zeros(3)  # since the last scan that was used
+    scan_of: list[int] = []
+    moves: list[Array] = []
+    stamps_ns: list[int] = []
     for step in run.steps:
         stop.check()
         moved = compose(moved, step.increment)

@@ -190,7 +190,9 @@ def nanoseconds(seconds: Array) -> NDArray[np.int64]:
     decimals = np.clip(-1 - np.ceil(np.log10(np.spacing(np.maximum(np.abs(seconds), 1.0)))), 0, 9)
     unit = 10.0**decimals
     ticks = np.round((seconds - whole) * unit).astype(np.int64)
-    return whole.astype(np.int64) * 10**9 + ticks * (10**9 / unit).astype(np.int64)
+    stamps: NDArray[np.int64] = whole.astype(np.int64) * 10**9
+    stamps += ticks * (10**9 / unit).astype(np.int64)
+    return stamps
 
 
 def step_times(times_s: Array, first_s: float, last_s: float, most_gap_s: float) -> Array:

@@ -69,8 +69,8 @@ SENSOR = Sensor(
     shift_m=0.5,
     neighbourhood_m=10.0,
     source="ranges as the file says, about 0.5 m; wheel encoders and a fibre-optic gyro: two "
-    "hundredths in distance and turn. The covariances of EDGE_SE2 are the same for every step, also "
-    "where the robot stands, and are not used",
+    "hundredths in distance and turn. Covariances of EDGE_SE2 are not used: they are the same for "
+    "every step, also where the robot stands",
 )
 
 
@@ -195,12 +195,11 @@ def matrix_of(triangle: Sequence[float]) -> Array:
 
 def write_pyfg(path: FilePath, graph: FactorGraph) -> None:
     """Write a graph; reading it again gives the same numbers to the last bit."""
-    lines = []
-    for pose in graph.poses:
-        at = _words((pose.x_m, pose.y_m, pose.heading_rad))
-        lines.append(f"VERTEX_SE2 {_stamp(pose.t_ns)} {pose.name} {at}")
-    for landmark in graph.landmarks:
-        lines.append(f"VERTEX_XY {landmark.name} {_words((landmark.x_m, landmark.y_m))}")
+    lines = [
+        f"VERTEX_SE2 {_stamp(one.t_ns)} {one.name} {_words((one.x_m, one.y_m, one.heading_rad))}"
+        for one in graph.poses
+    ]
+    lines += [f"VERTEX_XY {one.name} {_words((one.x_m, one.y_m))}" for one in graph.landmarks]
     for kind, edges in graph.edges.items():
         lines += [
             f"{kind} {_stamp(edge.t_ns)} {edge.first} {edge.second} "

@@ -21,7 +21,7 @@ BEACONS_M = np.array([[4.0, 4.0], [-4.0, 4.0], [-4.0, -4.0], [4.0, -4.5]])
 
 
 def times_s(duration_s: float) -> Array:
-    return np.arange(round(duration_s / PERIOD_S) + 1) * PERIOD_S
+    return np.arange(round(duration_s / PERIOD_S) + 1, dtype=np.float64) * PERIOD_S
 
 
 def true_poses(t_s: Array, *, scale: float = 1.0) -> Array:
