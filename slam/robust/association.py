@@ -422,11 +422,12 @@ def find_points(
     state: State,
     seen: View,
     scan: RangeScan,
-    free: Sequence[int],
-    row_of_label: Mapping[int, int],
+    waiting: tuple[Sequence[int], Collection[int], Mapping[int, int]],
     parameters: BackEndParameters,
 ) -> PointMatches:
-    """Return which landmarks detections of a scan with bearings are of; ``free`` are their indices.
+    """Return which landmarks the detections of a scan with bearings are of.
+
+    ``waiting`` are the indices to be assigned, the rows that have a detection, and rows by label.
 
     Labels decide where there are any; each of those is judged by itself. Of the others, the
     likeliest one-to-one assignment is looked for, with the costs of ranges. A pair is taken if the
@@ -436,12 +437,14 @@ def find_points(
     """
     assert scan.bearings_rad is not None
     noise, rule, radar = parameters.ranges, parameters.continuation, scan.radar
+    free, hit, row_of_label = waiting
     inside = seen.inside(noise, rule.view_margin_rad, rule.view_sigmas * noise.sigma_m)[radar]
     inside[len(state.landmark_ids) :] = False
+    inside[list(hit)] = False
     named = {
         index: row_of_label[label]
         for index, label in scan.labelled
-        if index in free and label in row_of_label
+        if index in free and label in row_of_label and row_of_label[label] not in hit
     }
     others = [index for index in free if scan.labels is None or scan.labels[index] is None]
     rows = np.unique(np.concatenate([np.flatnonzero(inside), list(named.values())])).astype(np.intp)

@@ -247,7 +247,7 @@ class RobustBackEnd:
             likelihoods = [*likelihoods, *evidence]
         dof = len(continued)
         for scan in with_bearings:
-            points, nis_of_points, evidence = self._take_points(scan, added_m, antennas)
+            points, nis_of_points, evidence = self._take_points(scan, added_m)
             continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
             likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
@@ -276,8 +276,8 @@ class RobustBackEnd:
         """
         if not relinearise(self._log, self.state, self.parameters):
             return False
-        beacons = self._beacon_rows()
-        split = find_split(self._log, self.state, self.parameters, beacons)
+        labelled = self._labelled_rows()
+        split = find_split(self._log, self.state, self.parameters, labelled)
         if split is not None:
             state = self.state
             size = state.layout.landmark_size
@@ -370,6 +370,11 @@ class RobustBackEnd:
         beacons = {id_ for label, id_ in self._landmark_of_label.items() if label in self._heard}
         return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in beacons]
 
+    def _labelled_rows(self) -> list[int]:
+        """Return the rows of landmarks that have labels."""
+        labelled = set(self._landmark_of_label.values())
+        return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in labelled]
+
     def _take_labelled(
         self, scans: Sequence[RangeScan], added_m: float
     ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
@@ -438,7 +443,7 @@ class RobustBackEnd:
                 self._existence.hit(landmark_id, waiting.n_ranges)
 
     def _take_points(
-        self, scan: RangeScan, added_m: float, antennas: Antennas
+        self, scan: RangeScan, added_m: float
     ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
         """Correct the state with a scan with bearings; log it; make landmarks of what is new.
 
@@ -447,6 +452,7 @@ class RobustBackEnd:
         """
         assert scan.bearings_rad is not None
         state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
+        antennas = antennas_of(self.rig, [scan], state.calibration, state.mounts_m)
         wide = scan.with_added_sigma(added_m)
         free = [
             index
@@ -458,20 +464,23 @@ class RobustBackEnd:
             label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
         }
         miss = math.log(1.0 - noise.detection_probability)
-        continued: list[tuple[int, int, int]] = []
         evidence: list[tuple[int, float]] = []
+        pairs: list[tuple[int, int]] = []
         nis = 0.0
         for _ in range(self.parameters.points.rounds):
             seen = view(state, antennas)
-            found = find_points(state, seen, wide, free, row_of_label, self.parameters)
+            hit = {row for _, row in pairs}
+            found = find_points(state, seen, wide, (free, hit, row_of_label), self.parameters)
             if not found.pairs:
                 break
+            pairs += found.pairs
             nis_of_pairs, likelihoods = self._correct_points(scan, seen, found.pairs, antennas)
             nis, evidence = nis + nis_of_pairs, evidence + likelihoods
             used = {index for index, _ in found.pairs}
             free = [index for index in free if index not in used]
-            continued += [(scan.radar, index, ids[row]) for index, row in found.pairs]
-        for _, _, landmark_id in continued:
+        continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
+        hit_ids = {landmark_id for _, _, landmark_id in continued}
+        for landmark_id in sorted(hit_ids):
             self._existence.hit(landmark_id)
         refused = [(index, ids[row]) for index, row in found.refused]
         for index, landmark_id in refused:
@@ -480,9 +489,8 @@ class RobustBackEnd:
             )
         # Those that are seen rarely are missed often.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
-        hit = {landmark_id for _, _, landmark_id in continued}
         missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
-        for landmark_id in sorted(missed - hit):
+        for landmark_id in sorted(missed - hit_ids):
             self._existence.miss(landmark_id, self.parameters.points.decay * odds)
             evidence.append((landmark_id, miss))
         far = {index for index, _ in refused}
@@ -492,8 +500,8 @@ class RobustBackEnd:
         points = [body_point(state, antennas, one, own_share) for one in detections]
         self._tentative.take(detections, points)
         if detections:
-            self._place_points(antennas, hit | missed)
-        return tuple(continued), nis, evidence
+            self._place_points(antennas, hit_ids | missed)
+        return continued, nis, evidence
 
     def _correct_points(
         self,
@@ -562,6 +570,7 @@ class RobustBackEnd:
                 ids = enumerate(state.landmark_ids)
                 barred = {row for row, id_ in ids if id_ in others or id_ in beacons}
                 row, is_new = match_or_new(state, point, barred, parameters)
+                is_new = is_new and len(tentative.seen) >= parameters.points.new_hits
             if row is None and not is_new:
                 unclear.append((tentative, point))
             else:
@@ -696,7 +705,7 @@ class RobustBackEnd:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
-        merge = find_merge(self.state, rule, self._refused, self._beacon_rows())
+        merge = find_merge(self.state, rule, self._refused, self._labelled_rows())
         if merge is not None:
             self.merge_if_possible(merge.pairs)
 

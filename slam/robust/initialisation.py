@@ -350,7 +350,7 @@ def match_two(
     others: Collection[int],
     parameters: BackEndParameters,
 ) -> tuple[tuple[int, int], ...]:
-    """Return which two of some points certainly are which landmarks, (place, row) each, or nothing.
+    """Return which two of some points are certainly which landmarks, place and row each, if any.
 
     Where the pose is unsure, one point alone may be any of several landmarks; the way from one to
     the other does not depend on the pose.
@@ -753,7 +753,7 @@ def _radar_part(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Detection:
-    """A detection with range and bearing, as measured; for the log, and for a tentative landmark."""
+    """A detection with range and bearing, as measured."""
 
     radar: int
     label: int | None
@@ -868,7 +868,7 @@ class TentativePoints:
         self._points.append(one)
 
     def take_out(self) -> list[TentativePoint]:
-        """Return those that are landmarks, of the map or new; they are no tentative ones any more."""
+        """Return those that are landmarks, of the map or new, and forget them."""
         found = [one for one in self._points if self._is_landmark(one)]
         labels = {one.label for one in found if one.label is not None}
         kept = [one for one in self._points if one not in found and one.label not in labels]

@@ -334,14 +334,16 @@ class PointRule:
     """When detections with range and bearing that continue nothing are evidence of a landmark."""
 
     min_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
-    """Fewest scans that must hold it: clutter has no past, and what moves leaves the gate."""
+    """Fewest scans that must hold it: clutter has no past."""
+    new_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
+    """The same of one without a label that is not in the map: what moves leaves the gate in time."""
     most_misses: Annotated[int, Origin.BUDGET, "scans"] = 15
     """After so many scans without it, what has not become a landmark is forgotten."""
     unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 0.02
-    """How many landmarks per square metre may not be in the map yet: what a match competes with."""
+    """How many landmarks per square metre may not be in the map yet: a match must beat them."""
     sure_sigmas: Annotated[float, Origin.CHOSEN] = 2.0
-    """How surely a landmark must be predicted for its likeliest detection to be taken for it, in the
-    sensor's standard deviations. A new landmark has the error of its own detections."""
+    """How surely a landmark must be predicted for its likeliest detection to be taken for it, in
+    the sensor's standard deviations. A new landmark has the error of its own detections."""
     decay: Annotated[float, Origin.CHOSEN] = 0.5
     """Share of its expected hits that a landmark's score loses in misses: a sensor that detects a
     landmark rarely says little where it does not. A miss never counts more than `MapRule.miss`."""

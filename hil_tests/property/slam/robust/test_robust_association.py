@@ -236,7 +236,7 @@ def camera_sees(
     )
     seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
     parameters = BackEndParameters(ranges=noise)
-    found = find_points(state, seen, scan, range(len(points)), {}, parameters)
+    found = find_points(state, seen, scan, (range(len(points)), (), {}), parameters)
     return sorted(found.pairs)
 
 

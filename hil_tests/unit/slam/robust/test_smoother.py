@@ -61,11 +61,6 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
     places = poses[keys][at, :2] + arm
     z = np.linalg.norm(marks[np.minimum(seen, 2)] - places, axis=1)
     z[seen == 3] = 2.0 - places[seen == 3, 1]
-    turns = 0.1 * rng.standard_normal(len(at))
-    away = marks[np.minimum(seen, 2)] - places
-    bearings = np.arctan2(away[:, 1], away[:, 0]) - poses[keys][at, 2] - turns
-    bearings += 2e-3 * rng.standard_normal(len(at))
-    bearings[(seen == 3) | (radars > 0)] = np.nan
     sigmas = np.full(layout.size, 0.5)
     sigmas[:3], sigmas[3:6], sigmas[layout.offsets] = 1e-2, (0.02, 0.02, 0.01), 0.005
     sigmas[layout.mounts] = 0.004
@@ -91,9 +86,19 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
         range_landmarks=seen,
         range_antennas=m,
         range_rows=np.arange(len(at)),
-        range_turns=turns,
+        range_turns=0.1 * rng.standard_normal(len(at)),
         ranges_m=z + 2e-3 * rng.standard_normal(len(z)),
         range_sigmas_m=np.full(len(z), 5e-3),
+        range_bearings_rad=np.full(len(at), np.nan),
+        range_bearing_sigmas_rad=np.full(len(at), np.nan),
+    )
+    # The first radar measures bearings, too.
+    away = marks[np.minimum(seen, 2)] - places
+    bearings = np.arctan2(away[:, 1], away[:, 0]) - poses[keys][at, 2] - problem.range_turns
+    bearings += 2e-3 * rng.standard_normal(len(at))
+    bearings[(seen == 3) | (radars > 0)] = np.nan
+    problem = replace(
+        problem,
         range_bearings_rad=bearings,
         range_bearing_sigmas_rad=np.where(np.isnan(bearings), np.nan, 0.05),
     )
