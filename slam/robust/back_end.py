@@ -220,7 +220,7 @@ class RobustBackEnd:
 
         Without ``solve`` merges and the solution over all poses wait for a later time.
         """
-        looks = [scan for scan in scans if scan.looks or scan.bearings_rad is not None]
+        looks = [scan for scan in scans if scan.looks]
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m

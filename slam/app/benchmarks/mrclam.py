@@ -66,9 +66,9 @@ SENSOR = Sensor(
     shift_m=0.1,
     common_share=0.95,
     neighbourhood_m=3.0,
-    source="velocities are commands, not counts of the wheels: a tenth of a turn; the range is from "
-    "the height of a barcode in a picture: 15 cm; a bearing, with the mount of the camera: 0.02 rad; "
-    "most of both errors stays the same as long as a cylinder is in view",
+    source="velocities are commands, not counts of the wheels: a tenth of a turn; the range is "
+    "from the height of a barcode in a picture: 15 cm; a bearing, with the mount of the camera: "
+    "0.02 rad; most of both errors stays as it is while a cylinder is in view",
 )
 
 
