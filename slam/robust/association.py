@@ -44,7 +44,6 @@ from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 LONGEST_M = 1e6
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
-_NEVER = 1e9  # cost of an assignment that is ruled out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -469,18 +468,18 @@ def find_points(
     odds = noise.detection_probability / (1.0 - noise.detection_probability)
     clutter = noise.clutter_per_m / noise.field_of_view_rad
     is_free = inside[rows] & ~np.isin(rows, list(row_of_label.values()))
-    own, most = np.flatnonzero(is_free), parameters.points.sure_sigmas**2
+    own, most = np.flatnonzero(is_free), parameters.tracklets.gate_sigmas**2
     if len(own) and others:
         log_n = -0.5 * (distance + np.linalg.slogdet(math.tau * S)[1])[k:, own]
         evidence = np.where(is_near[k:, own], log_n + math.log(odds / clutter), -math.inf)
         cost = np.hstack(
-            [np.where(evidence > 0.0, -evidence, _NEVER), np.zeros((len(others),) * 2)]
+            [np.where(evidence > 0.0, -evidence, math.inf), np.zeros((len(others),) * 2)]
         )
         chosen = linear_sum_assignment(cost)[1]
         white = prior[own][None] / np.sqrt(variances[k:, None, :, None] * variances[k:, None, None])
         is_sure = np.linalg.eigvalsh(white)[..., -1] <= most
         # A square metre is the more radians wide, the nearer it is.
-        beta = parameters.points.unmapped_per_m2 * measured[k:, 0]
+        beta = noise.unmapped_per_m2 * measured[k:, 0]
         new = np.log(np.maximum(1.0, beta * odds / clutter))
         for one, at in enumerate(chosen.tolist()):
             if at >= len(own):

@@ -467,7 +467,7 @@ class RobustBackEnd:
         evidence: list[tuple[int, float]] = []
         pairs: list[tuple[int, int]] = []
         nis = 0.0
-        for _ in range(self.parameters.points.rounds):
+        while True:
             seen = view(state, antennas)
             hit = {row for _, row in pairs}
             found = find_points(state, seen, wide, (free, hit, row_of_label), self.parameters)
@@ -487,11 +487,11 @@ class RobustBackEnd:
             self._log_detections(
                 landmark_id, detections_of(scan, [index], self._log.n_poses - 1, antennas, noise)
             )
-        # Those that are seen rarely are missed often.
+        # Those that are seen rarely are missed often: half of the expected hits, at most.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
         missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
         for landmark_id in sorted(missed - hit_ids):
-            self._existence.miss(landmark_id, self.parameters.points.decay * odds)
+            self._existence.miss(landmark_id, 0.5 * odds)
             evidence.append((landmark_id, miss))
         far = {index for index, _ in refused}
         free = [index for index in free if index not in far]
@@ -562,7 +562,7 @@ class RobustBackEnd:
         The landmarks with the ids ``others`` are none of them: this scan says where they are.
         """
         state, parameters = self.state, self.parameters
-        labelled, apart = set(self._labelled_rows()), parameters.points.apart
+        labelled, apart = set(self._labelled_rows()), parameters.tracklets.min_hits_per_radar
         unclear: list[tuple[TentativePoint, BodyPoint, set[int]]] = []
         for tentative in self._tentative.take_out():
             point, row, is_new = self._common(tentative, antennas), None, True
@@ -573,7 +573,7 @@ class RobustBackEnd:
                 barred = {row for row, id_ in ids if id_ in others or beside[id_] >= apart}
                 barred |= labelled
                 row, is_new = match_or_new(state, point, barred, parameters)
-                is_new = is_new and len(tentative.seen) >= parameters.points.new_hits
+                is_new = is_new and len(tentative.seen) >= parameters.tracklets.min_frames
             if row is None and not is_new:
                 unclear.append((tentative, point, barred))
             else:
@@ -717,7 +717,7 @@ class RobustBackEnd:
         ids = self.state.landmark_ids
         return any(
             self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]]
-            >= self.parameters.points.apart
+            >= self.parameters.tracklets.min_hits_per_radar
             for kept, gone in pairs
         )
 

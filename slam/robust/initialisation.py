@@ -341,7 +341,7 @@ def match_or_new(
     found = {row: point_rows(state, row, point) for row in near if row not in others}
     limit = float(chdtri(2, TAIL_PROBABILITY))
     is_new = all(rows.mahalanobis_sq > limit for rows in found.values())
-    return certain_row(found, parameters.points.unmapped_per_m2), is_new
+    return certain_row(found, parameters.ranges.unmapped_per_m2), is_new
 
 
 def match_two(
@@ -360,7 +360,7 @@ def match_two(
             rows = point_rows(state, row, point)
             if row not in others and rows.mahalanobis_sq <= limit:
                 found.append((place, row, rows))
-    density = parameters.points.unmapped_per_m2
+    density = parameters.ranges.unmapped_per_m2
     # Neighbours come in groups that look alike, and say little of the heading.
     least_m = 0.5 * parameters.map.neighbourhood_m
     joint = [
@@ -885,7 +885,7 @@ class TentativePoints:
 
     def take(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> None:
         """Take in the detections of a scan, with their points."""
-        rule, waiting = self._parameters.points, self._points
+        rule, waiting = self._parameters.tracklets, self._points
         chosen = self._assigned(seen, points)
         hit = set(chosen.values())
         for k, (detection, point) in enumerate(zip(seen, points, strict=True)):
@@ -898,12 +898,12 @@ class TentativePoints:
             for k, (detection, point) in enumerate(zip(seen, points, strict=True))
             if k not in chosen
         ]
-        self._points = [one for one in [*waiting, *new] if one.misses <= rule.most_misses]
+        self._points = [one for one in [*waiting, *new] if one.misses <= rule.window]
 
     def _is_landmark(self, one: TentativePoint) -> bool:
         hits, excess = len(one.seen), self._parameters.tracklets.excess_sigmas
         is_at_rest = one.chi_square <= chi_square_limit(2 * (hits - 1), excess)
-        return hits >= self._parameters.points.min_hits and is_at_rest
+        return hits >= self._parameters.tracklets.min_hits_per_radar and is_at_rest
 
     def _assigned(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> dict[int, int]:
         """Return which tentative point each detection is of, by index."""

@@ -31,9 +31,7 @@ TAIL_PROBABILITY: Annotated[float, Origin.QUANTILE] = 1e-3
 """Probability with which a test rejects what is true."""
 MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
 """Logarithm of how many times likelier than any other an explanation must be: twenty times."""
-NEIGHBOURHOOD_M: Annotated[float, Origin.CHOSEN] = 1.5
-"""Distance within which landmarks are neighbours: those that may be one, and those that count for
-the density of a map."""
+NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 
 
 def chi_square_limit(dof: int, excess_sigmas: float) -> float:
@@ -50,6 +48,9 @@ class RangeNoise:
     # Share of the variance of range and bearing that is one error in all detections of a passage,
     # of a sensor that measures both: what is left is how well it repeats itself
     common_share: float = 0.0
+    # How many landmarks per square metre may not be in the map yet, where such a sensor looks: what
+    # a match competes with
+    unmapped_per_m2: float = 0.02
     # Added in squares to the front end's sigma of each range, wherever ranges are assigned: a
     # neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
     association_sigma_m: float = 0.0
@@ -164,7 +165,8 @@ class MapRule:
     most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
     """How many of the likeliest merges are combined in twos."""
     neighbourhood_m: Annotated[float, Origin.CHOSEN] = NEIGHBOURHOOD_M
-    """Distance within which landmarks are neighbours, in a world of another size than a room."""
+    """Distance within which landmarks are neighbours: those that may be one, and those that count
+    for the density of a map."""
     refused_updates: Annotated[int, Origin.BUDGET, "scans"] = 200
     """After how many scans a merge that the run did not allow is tried again."""
     miss: Annotated[float, Origin.CHOSEN, "hits"] = 1.5
@@ -330,30 +332,6 @@ class BranchRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PointRule:
-    """When detections with range and bearing that continue nothing are evidence of a landmark."""
-
-    min_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
-    """Fewest scans that must hold it: clutter has no past."""
-    new_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
-    """The same of one without a label that is not in the map: in time, what moves is elsewhere."""
-    most_misses: Annotated[int, Origin.BUDGET, "scans"] = 15
-    """After so many scans without it, what has not become a landmark is forgotten."""
-    unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 0.02
-    """How many landmarks per square metre may not be in the map yet: a match must beat them."""
-    sure_sigmas: Annotated[float, Origin.CHOSEN] = 2.0
-    """How surely a landmark must be predicted for its likeliest detection to be taken for it, in
-    the sensor's standard deviations. A new landmark has the error of its own detections."""
-    decay: Annotated[float, Origin.CHOSEN] = 0.5
-    """Share of its expected hits that a landmark's score loses in misses: a sensor that detects a
-    landmark rarely says little where it does not. A miss never counts more than `MapRule.miss`."""
-    apart: Annotated[int, Origin.CHOSEN, "scans"] = 2
-    """Two that so many scans hold both are two."""
-    rounds: Annotated[int, Origin.BUDGET] = 3
-    """How often a scan is assigned: what is certain corrects the pose, and makes more certain."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndParameters:
     """All parameters of the back end."""
 
@@ -361,7 +339,6 @@ class BackEndParameters:
     ranges: RangeNoise = field(default_factory=RangeNoise)
     continuation: ContinuationRule = field(default_factory=ContinuationRule)
     tracklets: TrackletRule = field(default_factory=TrackletRule)
-    points: PointRule = field(default_factory=PointRule)
     map: MapRule = field(default_factory=MapRule)
     walls: WallRule = field(default_factory=WallRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)

@@ -159,7 +159,14 @@ def test_a_point_is_a_landmark_when_enough_scans_hold_it(label: int | None) -> N
     rig = Rig(mounts=(Mount(name="camera", x_m=0.1, y_m=0.05, yaw_rad=0.3),))
     parameters = BackEndParameters(ranges=RangeNoise(max_range_m=5.0))
     back_end = RobustBackEnd(rig, parameters)
-    target, min_hits = np.array([2.0, 0.5]), parameters.points.min_hits
+    target, min_hits = (
+        np.array([2.0, 0.5]),
+        (
+            parameters.tracklets.min_frames
+            if label is None
+            else parameters.tracklets.min_hits_per_radar
+        ),
+    )
     for k in range(min_hits + 3):
         back_end.predict(np.array([0.1, 0.0, 0.0]))
         x, y = target - np.array([0.1 * (k + 1) + 0.1, 0.05])
