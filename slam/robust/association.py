@@ -414,7 +414,7 @@ class PointMatches:
 
     pairs: tuple[tuple[int, int], ...]  # index in the scan and row of its landmark
     refused: tuple[tuple[int, int], ...]  # the same of labelled ones too far off
-    missed: tuple[int, ...]  # rows surely in view of which nothing was seen
+    missed: tuple[int, ...]  # rows without labels surely in view, of which nothing was seen
 
 
 def find_points(
@@ -497,7 +497,7 @@ def find_points(
         )[:, -1]
         <= most
     )
-    missed = rows[well & is_known & ~is_near.any(axis=0)]
+    missed = rows[well & is_known & is_free & ~is_near.any(axis=0)]
     return PointMatches(pairs=tuple(pairs), refused=tuple(refused), missed=tuple(missed.tolist()))
 
 
