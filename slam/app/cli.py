@@ -13,10 +13,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from slam.app.benchmarks import BENCHMARKS
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
 from slam.app.experiments import add_experiments
+from slam.app.experiments.benchmarks import BENCHMARKS
 from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
 from xethru_protocol.extras import what_is_missing
