@@ -468,7 +468,7 @@ _COMMANDS = (
     ),
     _Command(
         "benchmark",
-        "slam.app.commands.benchmark:run_benchmark",
+        "slam.app.experiments.benchmarks.command:run_benchmark",
         "run the back end of preset robust on a public data set, beside its truth",
         _add_benchmark,
         "Runs the back end of preset robust on all drives of a public data set that you have "
