@@ -406,7 +406,7 @@ def point_variances(scan: RangeScan, indices: Sequence[int], noise: RangeNoise) 
         )
         for index in indices
     ]
-    return np.square(np.array(sigmas).reshape(-1, 2))
+    return np.asarray(np.square(np.array(sigmas, dtype=np.float64).reshape(-1, 2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -461,7 +461,8 @@ def find_points(
     distance = np.einsum("kni,knij,knj->kn", nu, np.linalg.inv(S), nu)
     is_near = distance <= float(chdtri(2, TAIL_PROBABILITY))
     place = {row: at for at, row in enumerate(rows.tolist())}
-    pairs, refused = [], []
+    pairs: list[tuple[int, int]] = []
+    refused: list[tuple[int, int]] = []
     for k, (index, row) in enumerate(named.items()):
         (pairs if is_near[k, place[row]] else refused).append((index, row))
     k = len(named)

@@ -562,26 +562,27 @@ class RobustBackEnd:
         The landmarks with the ids ``others`` are none of them: this scan says where they are.
         """
         state, parameters = self.state, self.parameters
-        waiting, beacons = self._tentative.take_out(), set(self._landmark_of_label.values())
-        unclear: list[tuple[TentativePoint, BodyPoint]] = []
-        for tentative in waiting:
+        labelled, apart = set(self._labelled_rows()), parameters.points.apart
+        unclear: list[tuple[TentativePoint, BodyPoint, set[int]]] = []
+        for tentative in self._tentative.take_out():
             point, row, is_new = self._common(tentative, antennas), None, True
+            barred: set[int] = set()
             if tentative.label is None:
+                beside = self._log.seen_from({one.pose for one in tentative.seen})
                 ids = enumerate(state.landmark_ids)
-                barred = {row for row, id_ in ids if id_ in others or id_ in beacons}
+                barred = {row for row, id_ in ids if id_ in others or beside[id_] >= apart}
+                barred |= labelled
                 row, is_new = match_or_new(state, point, barred, parameters)
                 is_new = is_new and len(tentative.seen) >= parameters.points.new_hits
             if row is None and not is_new:
-                unclear.append((tentative, point))
+                unclear.append((tentative, point, barred))
             else:
                 self._place_point(tentative, point, row)
-        ids = enumerate(state.landmark_ids)
-        barred = {row for row, id_ in ids if id_ in others or id_ in beacons}
-        points = [point for _, point in unclear]
-        placed = dict(match_two(state, points, barred, parameters))
+        points = [(point, barred) for _, point, barred in unclear]
+        placed = dict(match_two(state, points, parameters))
         for place, row in placed.items():
-            self._place_point(*unclear[place], row)
-        for place, (tentative, _) in enumerate(unclear):
+            self._place_point(*unclear[place][:2], row)
+        for place, (tentative, _, _) in enumerate(unclear):
             if place not in placed:
                 self._tentative.keep(tentative)
 
@@ -706,8 +707,19 @@ class RobustBackEnd:
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
         merge = find_merge(self.state, rule, self._refused, self._labelled_rows())
-        if merge is not None:
+        if merge is not None and self._are_seen_together(merge.pairs):
+            self._refused[named_pairs(self.state, merge.pairs)] = now
+        elif merge is not None:
             self.merge_if_possible(merge.pairs)
+
+    def _are_seen_together(self, pairs: Sequence[tuple[int, int]]) -> bool:
+        """Return whether scans with bearings hold both landmarks of a pair, by row."""
+        ids = self.state.landmark_ids
+        return any(
+            self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]]
+            >= self.parameters.points.apart
+            for kept, gone in pairs
+        )
 
     def merge_if_possible(self, pairs: Sequence[tuple[int, int]]) -> bool:
         """Merge landmarks, rows of the older first, if the whole run allows it; return whether.

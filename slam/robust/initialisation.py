@@ -346,22 +346,23 @@ def match_or_new(
 
 def match_two(
     state: State,
-    points: Sequence[BodyPoint],
-    others: Collection[int],
+    points: Sequence[tuple[BodyPoint, Collection[int]]],
     parameters: BackEndParameters,
 ) -> tuple[tuple[int, int], ...]:
     """Return which two of some points are certainly which landmarks, place and row each, if any.
 
     Where the pose is unsure, one point alone may be any of several landmarks; the way from one to
-    the other does not depend on the pose.
+    the other does not depend on the pose. Each point comes with the rows that it is not.
     """
     limit, found = float(chdtri(2, TAIL_PROBABILITY)), []
-    for place, point in enumerate(points):
+    for place, (point, others) in enumerate(points):
         for row in near_rows(state, point, parameters.map.neighbourhood_m).tolist():
             rows = point_rows(state, row, point)
             if row not in others and rows.mahalanobis_sq <= limit:
                 found.append((place, row, rows))
     density = parameters.points.unmapped_per_m2
+    # Neighbours come in groups that look alike, and say little of the heading.
+    least_m = 0.5 * parameters.map.neighbourhood_m
     joint = [
         identity(
             ((-1 - one, row), (-1 - other, second)),
@@ -370,7 +371,9 @@ def match_two(
             density,
         )
         for (one, row, mine), (other, second, theirs) in combinations(found, 2)
-        if one != other and row != second
+        if one != other
+        and row != second
+        and math.dist(points[one][0].point_m, points[other][0].point_m) >= least_m
     ]
     best = certain(joint)
     return () if best is None else tuple((-1 - key, row) for key, row in best.pairs)

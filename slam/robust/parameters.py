@@ -336,7 +336,7 @@ class PointRule:
     min_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
     """Fewest scans that must hold it: clutter has no past."""
     new_hits: Annotated[int, Origin.CHOSEN, "scans"] = 4
-    """The same of one without a label that is not in the map: what moves leaves the gate in time."""
+    """The same of one without a label that is not in the map: in time, what moves is elsewhere."""
     most_misses: Annotated[int, Origin.BUDGET, "scans"] = 15
     """After so many scans without it, what has not become a landmark is forgotten."""
     unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 0.02
@@ -347,6 +347,8 @@ class PointRule:
     decay: Annotated[float, Origin.CHOSEN] = 0.5
     """Share of its expected hits that a landmark's score loses in misses: a sensor that detects a
     landmark rarely says little where it does not. A miss never counts more than `MapRule.miss`."""
+    apart: Annotated[int, Origin.CHOSEN, "scans"] = 2
+    """Two that so many scans hold both are two."""
     rounds: Annotated[int, Origin.BUDGET] = 3
     """How often a scan is assigned: what is certain corrects the pose, and makes more certain."""
 

@@ -14,7 +14,8 @@ q_i the place after the step: a step's turn moves what comes after it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -288,6 +289,33 @@ class RunLog:
     def drop(self, landmark_id: int) -> None:
         """Leave out all of a landmark's measurements."""
         self._names[landmark_id] = None
+
+    def seen_from(self, poses: Collection[int]) -> Counter[int]:
+        """Return from how many of some poses each landmark was seen with a bearing, by its id."""
+        ranges = self._ranges.rows
+        first = np.isin(ranges["pose"], list(poses)) & ~np.isnan(ranges["bearing_rad"])
+        found: set[tuple[int, int]] = set()
+        for landmark, pose in zip(
+            ranges["landmark"][first].tolist(), ranges["pose"][first].tolist(), strict=True
+        ):
+            name: int | None = landmark
+            while name is not None and name in self._names:
+                name = self._names[name]
+            if name is not None:
+                found.add((name, pose))
+        return Counter(name for name, _ in found)
+
+    def poses_of(self, landmark_id: int) -> list[int]:
+        """Return the poses from which a landmark was seen with a bearing."""
+        ranges = self._ranges.rows
+        names = {landmark_id}
+        while True:
+            more = {gone for gone, kept in self._names.items() if kept in names} - names
+            if not more:
+                break
+            names |= more
+        mine = np.isin(ranges["landmark"], list(names)) & ~np.isnan(ranges["bearing_rad"])
+        return sorted(set(ranges["pose"][mine].tolist()))
 
     def edges(self, rows: Indices) -> tuple[Indices, Indices]:
         """Return what ranges, by row of the log, were taken for: first landmark and passage."""

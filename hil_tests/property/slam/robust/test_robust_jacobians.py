@@ -140,7 +140,7 @@ def test_range_and_bearing_rows_are_derivatives(seed: int, heading: float, radar
         full = np.zeros((2, len(mean)))
         full[:, found.at] = found.H[place]
         assert np.abs(full - wanted).max() <= 1e-10 * max(1.0, np.abs(wanted).max())
-        range_m, angle = measured(np.zeros(len(mean))).real.tolist()
+        range_m, angle = measured(np.zeros(len(mean), dtype=np.complex128)).real.tolist()
         assert found.predicted[place, 0] == pytest.approx(range_m, abs=1e-12)
         apart = math.remainder(float(found.predicted[place, 1]) - angle, math.pi)
         assert apart == pytest.approx(0.0, abs=1e-9)
