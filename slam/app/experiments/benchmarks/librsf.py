@@ -19,7 +19,8 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from slam.app.benchmarks.data_set import (
+from slam.app.errors import AppError
+from slam.app.experiments.benchmarks.data_set import (
     DataSet,
     Observation,
     Path,
@@ -30,8 +31,7 @@ from slam.app.benchmarks.data_set import (
     nanoseconds,
     positions_of,
 )
-from slam.app.benchmarks.tables import REMEDY, bad_line, found, number_of, rows_of
-from slam.app.errors import AppError
+from slam.app.experiments.benchmarks.tables import REMEDY, bad_line, found, number_of, rows_of
 from slam.config import WheelNoise
 
 _INPUT, _TRUTH = "_Input.txt", "_GT.txt"

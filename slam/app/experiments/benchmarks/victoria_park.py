@@ -23,7 +23,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from slam.app.benchmarks.data_set import (
+from slam.app.experiments.benchmarks.data_set import (
     DataSet,
     Observation,
     Path,
@@ -35,7 +35,7 @@ from slam.app.benchmarks.data_set import (
     positions_of,
     step_times,
 )
-from slam.app.benchmarks.tables import bad_line, folder_at, read_table, rows_of
+from slam.app.experiments.benchmarks.tables import bad_line, folder_at, read_table, rows_of
 from slam.config import WheelNoise
 
 _L_M, _H_M, _A_M, _B_M = 2.83, 0.76, 3.78, 0.50

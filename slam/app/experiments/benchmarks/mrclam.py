@@ -22,7 +22,8 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from slam.app.benchmarks.data_set import (
+from slam.app.errors import AppError
+from slam.app.experiments.benchmarks.data_set import (
     DataSet,
     Observation,
     Path,
@@ -34,8 +35,7 @@ from slam.app.benchmarks.data_set import (
     positions_of,
     step_times,
 )
-from slam.app.benchmarks.tables import REMEDY, folder_at, read_table
-from slam.app.errors import AppError
+from slam.app.experiments.benchmarks.tables import REMEDY, folder_at, read_table
 from slam.config import WheelNoise
 
 _BARCODES = "Barcodes.dat"

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.unit.slam.app.benchmarks import worlds
-from slam.app.benchmarks import librsf, mrclam, pyfg, victoria_park
-from slam.app.benchmarks.data_set import (
+from hil_tests.unit.slam.app.experiments.benchmarks import worlds
+from slam.app.errors import AppError
+from slam.app.experiments.benchmarks import librsf, mrclam, pyfg, victoria_park
+from slam.app.experiments.benchmarks.data_set import (
     DataSet,
     Run,
     increments_of,
@@ -18,8 +19,7 @@ from slam.app.benchmarks.data_set import (
     positions_of,
     step_times,
 )
-from slam.app.benchmarks.data_set import Path as Places
-from slam.app.errors import AppError
+from slam.app.experiments.benchmarks.data_set import Path as Places
 from slam.evaluation import ate_rmse_m
 from slam.geometry import between, compose
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hil_tests.unit.slam.app.benchmarks import worlds
-from slam.app.benchmarks import BENCHMARKS, pyfg
-from slam.app.benchmarks.data_set import Path as Places
-from slam.app.benchmarks.data_set import Run
-from slam.app.benchmarks.evaluation import associated
+from hil_tests.unit.slam.app.experiments.benchmarks import worlds
 from slam.app.cli import main
+from slam.app.experiments.benchmarks import BENCHMARKS, pyfg
+from slam.app.experiments.benchmarks.data_set import Path as Places
+from slam.app.experiments.benchmarks.data_set import Run
+from slam.app.experiments.benchmarks.evaluation import associated
 from slam.app.odometry.track import Trajectory, read_tum
 
 

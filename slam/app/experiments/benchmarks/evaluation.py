@@ -9,10 +9,10 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.benchmarks.back_end import Solution, solve
-from slam.app.benchmarks.data_set import Array, DataSet, Path, Run
-from slam.app.benchmarks.pyfg import graph_of, write_pyfg
 from slam.app.errors import AppError, naming
+from slam.app.experiments.benchmarks.back_end import Solution, solve
+from slam.app.experiments.benchmarks.data_set import Array, DataSet, Path, Run
+from slam.app.experiments.benchmarks.pyfg import graph_of, write_pyfg
 from slam.app.odometry.track import NS_PER_S, Trajectory, write_tum
 from slam.evaluation import ate_rmse_m
 from slam.geometry import align_se2, transform

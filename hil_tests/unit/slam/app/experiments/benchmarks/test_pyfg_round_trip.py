@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil_tests.unit.slam.app.benchmarks import worlds
-from slam.app.benchmarks import mrclam, pyfg
-from slam.app.benchmarks.pyfg import Edge, FactorGraph, Landmark, Pose
+from hil_tests.unit.slam.app.experiments.benchmarks import worlds
+from slam.app.experiments.benchmarks import mrclam, pyfg
+from slam.app.experiments.benchmarks.pyfg import Edge, FactorGraph, Landmark, Pose
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False, width=64)
 STAMPS = st.integers(-(2**62), 2**62)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from slam.app.benchmarks.data_set import Array, Observation, Run, Sensor
+from slam.app.experiments.benchmarks.data_set import Array, Observation, Run, Sensor
 from slam.geometry import Mount, Rig, compose, has_moved
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd

@@ -26,7 +26,8 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from slam.app.benchmarks.data_set import (
+from slam.app.errors import AppError, naming
+from slam.app.experiments.benchmarks.data_set import (
     Array,
     DataSet,
     Observation,
@@ -35,8 +36,7 @@ from slam.app.benchmarks.data_set import (
     Sensor,
     Step,
 )
-from slam.app.benchmarks.tables import bad_line, found, number_of, rows_of
-from slam.app.errors import AppError, naming
+from slam.app.experiments.benchmarks.tables import bad_line, found, number_of, rows_of
 from slam.config import WheelNoise
 from xethru_protocol.system import written_whole
 
