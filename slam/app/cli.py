@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
 from slam.app.experiments import add_experiments
+from slam.app.experiments.benchmarks import BENCHMARKS
 from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
 from xethru_protocol.extras import what_is_missing
@@ -363,6 +364,22 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
+    benchmark.add_argument(
+        "name",
+        choices=tuple(BENCHMARKS),
+        metavar="NAME",
+        help="; ".join(f"{name}: {row.help}" for name, row in BENCHMARKS.items()),
+    )
+    benchmark.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="folder with the files"
+    )
+    benchmark.add_argument(
+        "--out", type=folder, default=Path("out/benchmarks"), help="folder for the results"
+    )
+    _add_json(benchmark)
+
+
 def _setting(text: str) -> tuple[str, tuple[str, ...]]:
     key, _, values = text.partition("=")
     named = tuple(value.strip() for value in values.split(","))
@@ -448,6 +465,16 @@ _COMMANDS = (
         "Estimates every radar's range offset, mount position, relative gain and pulse from a "
         "session of `uwb-slam run` or `demo` past reflectors, and says what the drive cannot tell "
         "apart.",
+    ),
+    _Command(
+        "benchmark",
+        "slam.app.experiments.benchmarks.command:run_benchmark",
+        "run the back end of preset robust on a public data set, beside its truth",
+        _add_benchmark,
+        "Runs the back end of preset robust on all drives of a public data set that you have "
+        "fetched, with and without the ids of landmarks where the data allow, and prints each "
+        "path's error against the truth, beside dead reckoning. Writes paths as TUM text, a "
+        "picture NAME.png and NAME.json. docs/benchmarks.md says where the data are from.",
     ),
     _Command(
         "sweep",

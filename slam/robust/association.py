@@ -25,11 +25,12 @@ least sum is found by branch and bound, as joint compatibility is (Neira and Tar
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
@@ -59,6 +60,37 @@ class RangeScan:
     # Ranges of echoes that several targets may share: no evidence of where anything is, nor that
     # nothing is there
     blurred_m: tuple[float, ...] = ()
+    # Of each range the id of the beacon that it is of, None where that is not known
+    labels: tuple[int | None, ...] | None = None
+    # Bearing of each range from the boresight, counter-clockwise, where the sensor measures it, and
+    # its standard deviation, where that is known better than `RangeNoise.bearing_sigma_rad`
+    bearings_rad: tuple[float, ...] | None = None
+    bearing_sigmas_rad: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("bearings_rad", "bearing_sigmas_rad"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.ranges_m):
+                raise ValueError(
+                    f"{len(values)} {name} of {len(self.ranges_m)} ranges; there must be one for "
+                    "each range"
+                )
+        if self.labels is not None and len(self.labels) != len(self.ranges_m):
+            raise ValueError(
+                f"{len(self.labels)} labels of {len(self.ranges_m)} ranges; there must be one, or "
+                "None, for each range"
+            )
+
+    @property
+    def labelled(self) -> tuple[tuple[int, int], ...]:
+        """Return index and label of each range that has a label."""
+        labels = enumerate(self.labels or ())
+        return tuple((index, label) for index, label in labels if label is not None)
+
+    @property
+    def looks(self) -> bool:
+        """Return whether the radar looked for whatever is there, and did not ask beacons only."""
+        return self.labels is None or None in self.labels
 
     def sigma(self, index: int, otherwise_m: float) -> float:
         """Return the standard deviation [m] of one range; ``otherwise_m`` if there is none."""
@@ -205,11 +237,14 @@ def find_known(
     scans: Sequence[RangeScan],
     side_of: Indices,
     parameters: BackEndParameters,
+    *,
+    beacons: Sequence[int] = (),
 ) -> Known:
-    """Return the likeliest one-to-one assignment of ranges to landmarks.
+    """Return the likeliest one-to-one assignment of ranges without labels to landmarks.
 
     ``side_of`` (r,) is the side of each radar. Those whose ranges the prior predicts less surely
-    than the radars' ``sigma_m`` take no part.
+    than the radars' ``sigma_m`` take no part, nor do the rows ``beacons``, whose ranges have labels
+    and which do not answer every time.
     """
     noise, rule, tracklets = parameters.ranges, parameters.continuation, parameters.tracklets
     ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
@@ -217,6 +252,7 @@ def find_known(
     has_frame[[scan.radar for scan in scans]] = True
     margin_m = rule.view_sigmas * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
+    inside[:, list(beacons)] = False
     rows = np.flatnonzero(inside.any(axis=0))
     layout, of_radars = state.layout, state.radar_columns
     at = np.concatenate([np.array([1, 2]), of_radars, layout.columns(rows)])
@@ -272,6 +308,199 @@ def find_known(
     )
 
 
+def find_labelled(
+    state: State,
+    seen: View,
+    scans: Sequence[RangeScan],
+    row_of_label: Mapping[int, int],
+    parameters: BackEndParameters,
+) -> tuple[Known, list[tuple[int, int, int]]]:
+    """Return the ranges whose labels say which landmark they are of, and those too far off for it.
+
+    Each is judged by itself, whatever the field of view: radar, index and row of those further off
+    than the quantile of chi-square are returned apart. ``row_of_label`` has the labels in the map.
+    """
+    layout, noise = state.layout, parameters.ranges
+    found = [
+        (scan.radar, index, row_of_label[label], scan.sigma(index, noise.sigma_m))
+        for scan in scans
+        for index, label in scan.labelled
+        if label in row_of_label and 0.0 < scan.ranges_m[index] < LONGEST_M
+    ]
+    rows = np.array(sorted({row for _, _, row, _ in found}), dtype=np.intp)
+    at = np.concatenate([np.array([1, 2]), state.radar_columns, layout.columns(rows)])
+    block, added_m = state.P.block(at), state.feature_added_sigmas_m
+    n_radars, k = len(state.offsets_m), layout.landmark_size
+    of_radar = {scan.radar: scan for scan in scans}
+    assigned, of_assigned, refused = [], [], []
+    for radar, index, row, sigma_m in found:
+        place = int(np.searchsorted(rows, row))
+        first = 2 + len(state.radar_columns) + k * place
+        h = np.zeros(len(at))
+        h[:2], h[2 + radar] = -seen.directions[radar, row], 1.0
+        if layout.has_mounts:
+            mount = 2 + n_radars + 2 * radar
+            h[mount : mount + 2] = -seen.directions[radar, row] @ seen.turned[radar]
+        h[first : first + 2] = seen.by_feature[radar, row]
+        if layout.has_radii:
+            h[first + 2] = -1.0
+        innovation_m = of_radar[radar].ranges_m[index] - float(seen.ranges_m[radar, row])
+        variance = float(h @ block @ h) + sigma_m**2 + float(added_m[row]) ** 2
+        if innovation_m**2 <= float(chdtri(1, TAIL_PROBABILITY)) * variance:
+            assigned.append((radar, index, place))
+            of_assigned.append(h)
+        else:
+            refused.append((radar, index, row))
+    known = Known(
+        rows=rows,
+        prior=np.zeros((len(rows), n_radars, n_radars)),
+        assigned=np.array(assigned, dtype=np.intp).reshape(-1, 3),
+        of_side=np.zeros((0, len(rows), 2), dtype=np.bool_),
+        unheard=np.zeros((len(rows), n_radars), dtype=np.bool_),
+        at=at,
+        H=np.array(of_assigned).reshape(-1, len(at)),
+    )
+    return known, refused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointView:
+    """Range and bearing of n landmarks as one radar should measure them."""
+
+    predicted: Array  # shape (n, 2): range [m], offsets included, and bearing [rad] from boresight
+    at: Indices  # shape (c,): columns of the error that H has entries for
+    H: Array  # shape (n, 2, c)
+
+
+def point_view(state: State, seen: View, radar: int, rows: Indices) -> PointView:
+    """Return what a radar should measure of landmarks in some rows, and its derivatives."""
+    layout, n = state.layout, len(rows)
+    at = np.concatenate([np.array([1, 2]), state.radar_columns, layout.columns(rows)])
+    u, ranges_m = seen.directions[radar, rows], seen.ranges_m[radar, rows]
+    distances_m = ranges_m - state.offsets_m[radar] + state.feature_radii_m[rows]
+    across = quarter_turn(u) / np.maximum(distances_m, _LEAST_RANGE_M)[:, None]
+    by_place = np.stack([u, across], axis=1)
+    H = np.zeros((n, 2, len(at)))
+    H[:, :, :2], H[:, 0, 2 + radar] = -by_place, 1.0
+    if layout.has_mounts:
+        mount = 2 + layout.n_radars + 2 * radar
+        H[:, :, mount : mount + 2] = -by_place @ seen.turned[radar]
+    first = 2 + len(state.radar_columns) + layout.landmark_size * np.arange(n)
+    for axis in range(2):
+        H[np.arange(n), :, first + axis] = by_place[:, :, axis]
+    if layout.has_radii:
+        H[np.arange(n), 0, first + 2] = -1.0
+    bearings_rad = seen.off_boresight_rad[radar, rows]
+    return PointView(predicted=np.column_stack([ranges_m, bearings_rad]), at=at, H=H)
+
+
+def point_variances(scan: RangeScan, indices: Sequence[int], noise: RangeNoise) -> Array:
+    """Return the variances of range [m^2] and bearing [rad^2] of some detections, (k, 2)."""
+    sigmas = [
+        (
+            scan.sigma(index, noise.sigma_m),
+            noise.bearing_sigma_rad
+            if scan.bearing_sigmas_rad is None
+            else scan.bearing_sigmas_rad[index],
+        )
+        for index in indices
+    ]
+    return np.asarray(np.square(np.array(sigmas, dtype=np.float64).reshape(-1, 2)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointMatches:
+    """What detections with bearings are against the map."""
+
+    pairs: tuple[tuple[int, int], ...]  # index in the scan and row of its landmark
+    refused: tuple[tuple[int, int], ...]  # the same of labelled ones too far off
+    missed: tuple[int, ...]  # rows without labels surely in view, of which nothing was seen
+
+
+def find_points(
+    state: State,
+    seen: View,
+    scan: RangeScan,
+    waiting: tuple[Sequence[int], Collection[int], Mapping[int, int]],
+    parameters: BackEndParameters,
+) -> PointMatches:
+    """Return which landmarks the detections of a scan with bearings are of.
+
+    ``waiting`` are the indices to be assigned, the rows that have a detection, and rows by label.
+
+    Labels decide where there are any; each of those is judged by itself. Of the others, the
+    likeliest one-to-one assignment is looked for, with the costs of ranges. A pair is taken if the
+    prior predicts the landmark more surely than the sensor measures it, or if it is certain: more
+    likely by `MARGIN_NATS` than that the detection is new, than any other landmark for it, and than
+    any other detection for the landmark.
+    """
+    assert scan.bearings_rad is not None
+    noise, rule, radar = parameters.ranges, parameters.continuation, scan.radar
+    free, hit, row_of_label = waiting
+    inside = seen.inside(noise, rule.view_margin_rad, rule.view_sigmas * noise.sigma_m)[radar]
+    inside[len(state.landmark_ids) :] = False
+    inside[list(hit)] = False
+    named = {
+        index: row_of_label[label]
+        for index, label in scan.labelled
+        if index in free and label in row_of_label and row_of_label[label] not in hit
+    }
+    others = [index for index in free if scan.labels is None or scan.labels[index] is None]
+    rows = np.unique(np.concatenate([np.flatnonzero(inside), list(named.values())])).astype(np.intp)
+    if not len(rows):
+        return PointMatches(pairs=(), refused=(), missed=())
+    points, indices = point_view(state, seen, radar, rows), [*named, *others]
+    prior = points.H @ state.P.block(points.at) @ points.H.transpose(0, 2, 1)
+    prior[:, 0, 0] += np.square(state.feature_added_sigmas_m[rows])
+    measured = np.array([(scan.ranges_m[k], scan.bearings_rad[k]) for k in indices]).reshape(-1, 2)
+    variances = point_variances(scan, indices, noise)
+    nu = measured[:, None] - points.predicted
+    nu[..., 1] = wrap_angles(nu[..., 1])
+    S = prior + variances[:, None, :, None] * np.eye(2)
+    distance = np.einsum("kni,knij,knj->kn", nu, np.linalg.inv(S), nu)
+    is_near = distance <= float(chdtri(2, TAIL_PROBABILITY))
+    place = {row: at for at, row in enumerate(rows.tolist())}
+    pairs: list[tuple[int, int]] = []
+    refused: list[tuple[int, int]] = []
+    for k, (index, row) in enumerate(named.items()):
+        (pairs if is_near[k, place[row]] else refused).append((index, row))
+    k = len(named)
+    odds = noise.detection_probability / (1.0 - noise.detection_probability)
+    clutter = noise.clutter_per_m / noise.field_of_view_rad
+    is_free = inside[rows] & ~np.isin(rows, list(row_of_label.values()))
+    own, most = np.flatnonzero(is_free), parameters.tracklets.gate_sigmas**2
+    if len(own) and others:
+        log_n = -0.5 * (distance + np.linalg.slogdet(math.tau * S)[1])[k:, own]
+        evidence = np.where(is_near[k:, own], log_n + math.log(odds / clutter), -math.inf)
+        cost = np.hstack(
+            [np.where(evidence > 0.0, -evidence, math.inf), np.zeros((len(others),) * 2)]
+        )
+        chosen = linear_sum_assignment(cost)[1]
+        white = prior[own][None] / np.sqrt(variances[k:, None, :, None] * variances[k:, None, None])
+        is_sure = np.linalg.eigvalsh(white)[..., -1] <= most
+        # A square metre is the more radians wide, the nearer it is.
+        beta = noise.unmapped_per_m2 * measured[k:, 0]
+        new = np.log(np.maximum(1.0, beta * odds / clutter))
+        for one, at in enumerate(chosen.tolist()):
+            if at >= len(own):
+                continue
+            rivals = [new[one], *np.delete(evidence[one], at), *np.delete(evidence[:, at], one)]
+            if is_sure[one, at] or evidence[one, at] - max(rivals) > MARGIN_NATS:
+                pairs.append((others[one], int(rows[own[at]])))
+    inset, edge = parameters.map.view_inset_m, parameters.tracklets.edge_rad
+    well = seen.inside(noise, -edge, -inset)[radar, rows]
+    is_known = (
+        np.linalg.eigvalsh(
+            prior
+            / np.array([noise.sigma_m, noise.bearing_sigma_rad])
+            / np.array([[noise.sigma_m], [noise.bearing_sigma_rad]])
+        )[:, -1]
+        <= most
+    )
+    missed = rows[well & is_known & is_free & ~is_near.any(axis=0)]
+    return PointMatches(pairs=tuple(pairs), refused=tuple(refused), missed=tuple(missed.tolist()))
+
+
 def _padded(
     scans: Sequence[RangeScan], n_radars: int, noise: RangeNoise
 ) -> tuple[Array, Array, Array]:
@@ -285,6 +514,7 @@ def _padded(
         ranges_m[scan.radar, :k] = scan.ranges_m
         sigmas_m = noise.sigma_m if scan.sigmas_m is None else np.array(scan.sigmas_m)
         variances[scan.radar, :k] = np.square(sigmas_m)
+        ranges_m[scan.radar, [index for index, _ in scan.labelled]] = np.nan
         blurred_m[scan.radar, : len(scan.blurred_m)] = scan.blurred_m
     return ranges_m, variances, blurred_m
 

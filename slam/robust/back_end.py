@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry import Rig
+from slam.geometry import Rig, wrap_angles
 from slam.results import SmoothedRun, UpdateReport
 from slam.robust import kernels
 from slam.robust.association import (
+    LONGEST_M,
     Antennas,
     Known,
     Pairs,
@@ -21,26 +22,34 @@ from slam.robust.association import (
     View,
     antennas_of,
     find_known,
+    find_labelled,
+    find_points,
+    point_variances,
+    point_view,
     predicted_ranges,
     view,
 )
 from slam.robust.initialisation import (
     BodyPoint,
-    RangeBearing,
+    Detection,
     Search,
     Sightings,
+    TentativePoint,
+    TentativePoints,
     Tracklet,
     UnassignedRanges,
-    assign,
+    body_point,
+    detections_of,
     initialise_landmark,
     match,
-    named_rows,
+    match_or_new,
+    match_two,
     point_guesses,
-    range_bearing_rows,
     update_with_point,
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
-from slam.robust.parameters import BackEndParameters, PointRule
+from slam.robust.parameters import BackEndParameters
+from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     find_split,
     is_due,
@@ -101,11 +110,15 @@ class RobustBackEnd:
             scale,
             scale * parameters.wheels.walk_lever_m,
         )
+        self._tentative = TentativePoints(parameters)
         self._existence = Existence(parameters.map, rule.min_frames)
         self._log = RunLog(parameters.wheels, parameters.splits.gap_poses)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
+        # Beacons, whose ranges have labels: all labels heard, and by label those without a place
+        self._heard: set[int] = set()
+        self._waiting: dict[int, Waiting] = {}
         self._n_updates = 0
         # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[Pairs, int] = {}
@@ -118,6 +131,11 @@ class RobustBackEnd:
     @property
     def pose_covariance(self) -> Array:
         return self.state.pose_covariance()
+
+    @property
+    def landmark_of_label(self) -> Mapping[int, int]:
+        """Return the ids of the landmarks that have labels, by label."""
+        return self._landmark_of_label
 
     def copy(self) -> RobustBackEnd:
         """Return a back end that goes on from here by itself; what never changes is shared."""
@@ -175,6 +193,7 @@ class RobustBackEnd:
         self._log.add_motion(increment, motion, is_loose=covariance is not None)
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
+        self._tentative.move(motion)
 
     def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
         """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
@@ -187,6 +206,7 @@ class RobustBackEnd:
         motion = Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=free, walk_variance=0.0)
         self._log.add_motion(increment, motion, is_loose=True)
         self._unassigned.clear()
+        self._tentative.clear()
         state = self.state
         state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
         for landmark_id, point_m, covariance in points:
@@ -200,23 +220,42 @@ class RobustBackEnd:
 
         Without ``solve`` merges and the solution over all poses wait for a later time.
         """
-        antennas = antennas_of(self.rig, scans, self.state.calibration, self.state.mounts_m)
+        looks = [scan for scan in scans if scan.looks]
+        antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
-        widened = [scan.with_added_sigma(added_m) for scan in scans]
+        with_bearings = [scan for scan in scans if scan.bearings_rad is not None]
+        if with_bearings:
+            scans = [scan for scan in scans if scan.bearings_rad is None]
+            looks = [scan for scan in looks if scan.bearings_rad is None]
+        widened = [scan.with_added_sigma(added_m) for scan in looks]
         seen = self._walls.look(view(self.state, antennas), antennas)
-        known = find_known(self.state, seen, widened, self._side_of, self.parameters)
+        beacons = self._beacon_rows()
+        known = find_known(
+            self.state, seen, widened, self._side_of, self.parameters, beacons=beacons
+        )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
-        continued, nis, likelihoods = self._correct(known, seen, scans, antennas)
+        continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
+        if any(scan.labelled for scan in scans):
+            used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
+            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, added_m)
+            continued, nis = continued + of_beacons, nis + nis_of_beacons
+            likelihoods = [*likelihoods, *evidence]
+        dof = len(continued)
+        for scan in with_bearings:
+            points, nis_of_points, evidence = self._take_points(scan, added_m)
+            continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
+            likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         self._initialise_landmarks()
-        self._delete_vanished()
+        self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:
+            self._initialise_beacons()
             self._merge()
             if is_due(self._log, self.state, self.parameters):
                 self.relinearise()
@@ -224,46 +263,10 @@ class RobustBackEnd:
         return UpdateReport(
             continued=continued,
             nis=nis,
-            dof=len(continued),
+            dof=dof,
             predicted=tuple(predicted),
             evidence=(*likelihoods, *((id_, miss) for id_ in missed)),
         )
-
-    def update_points(
-        self, points: Sequence[RangeBearing], rule: PointRule
-    ) -> tuple[int | None, ...]:
-        """Take in ranges and bearings of points seen from the newest pose.
-
-        If all points have labels, each is of the landmark with its label, or new; else they are
-        assigned by distance. Returns one landmark id per point, None for an ambiguous one left out.
-        """
-        state = self.state
-        rows = named_rows(state, points, self._landmark_of_label)
-        if rows is None:
-            rows = assign(state, points, rule)
-        found = [
-            None if row is None else self._see_point(point, row)
-            for point, row in zip(points, rows, strict=True)
-        ]
-        if is_due(self._log, self.state, self.parameters):
-            self.relinearise()
-        self._log.set_causal(state.pose)
-        return tuple(found)
-
-    def _see_point(self, point: RangeBearing, row: int) -> int:
-        """Update the landmark in a row with a point, or add one (row -1)."""
-        state = self.state
-        if row < 0:
-            landmark_id = initialise_landmark(state, point.body_point(state.n_fixed - HEAD_SIZE))
-            if point.label is not None:
-                self._landmark_of_label[point.label] = landmark_id
-        else:
-            landmark_id = state.landmark_ids[row]
-            rows = range_bearing_rows(state, row, point)
-            state.update(rows.at, rows.H, rows.residual, point.covariance)
-        self._existence.hit(landmark_id)
-        self._log.add_point(landmark_id, point.values, point.covariance)
-        return landmark_id
 
     def relinearise(self) -> bool:
         """Solve for all poses and replace the belief; return whether that worked.
@@ -273,7 +276,8 @@ class RobustBackEnd:
         """
         if not relinearise(self._log, self.state, self.parameters):
             return False
-        split = find_split(self._log, self.state, self.parameters)
+        labelled = self._labelled_rows()
+        split = find_split(self._log, self.state, self.parameters, labelled)
         if split is not None:
             state = self.state
             size = state.layout.landmark_size
@@ -361,6 +365,247 @@ class RobustBackEnd:
         state.apply(gain, weighted)
         return continued, float(white @ white), likelihoods
 
+    def _beacon_rows(self) -> list[int]:
+        """Return the rows of landmarks whose ranges have labels."""
+        beacons = {id_ for label, id_ in self._landmark_of_label.items() if label in self._heard}
+        return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in beacons]
+
+    def _labelled_rows(self) -> list[int]:
+        """Return the rows of landmarks that have labels."""
+        labelled = set(self._landmark_of_label.values())
+        return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in labelled]
+
+    def _take_labelled(
+        self, scans: Sequence[RangeScan], added_m: float
+    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
+        """Correct the state with the ranges that have labels, and log them all.
+
+        Returns what `_correct` does. A range beyond the gate corrects nothing now; it is logged,
+        too: which are outliers, the solution over the whole run decides. ``added_m`` is added in
+        squares to the noise of ranges in the gate.
+        """
+        state = self.state
+        antennas = antennas_of(self.rig, scans, state.calibration, state.mounts_m)
+        widened = [scan.with_added_sigma(added_m) for scan in scans]
+        rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+        row_of_label = {
+            label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
+        }
+        seen = view(state, antennas)
+        known, refused = find_labelled(state, seen, widened, row_of_label, self.parameters)
+        ids = state.landmark_ids.copy()
+        miss = math.log(1.0 - self.parameters.ranges.detection_probability)
+        for row in known.rows[known.assigned[:, 2]].tolist():
+            self._existence.hit(ids[row])
+        for _, _, row in refused:
+            self._existence.miss(ids[row])
+        of_radar = {scan.radar: scan for scan in scans}
+        for radar, index, row in refused:
+            self._log_range(of_radar[radar], index, ids[row], antennas)
+        continued, nis, evidence = self._correct(known, seen, scans, antennas)
+        evidence += [(ids[row], miss) for _, _, row in refused]
+        for scan in scans:
+            for index, label in scan.labelled:
+                self._heard.add(label)
+                if label not in self._landmark_of_label and 0.0 < scan.ranges_m[index] < LONGEST_M:
+                    if label not in self._waiting:
+                        self._waiting[label] = Waiting(state.next_id)
+                        state.next_id += 1
+                    waiting = self._waiting[label]
+                    waiting.n_ranges += 1
+                    self._log_range(scan, index, waiting.log_id, antennas)
+        return continued, nis, evidence
+
+    def _log_range(self, scan: RangeScan, index: int, id_: int, antennas: Antennas) -> None:
+        x_m, y_m = antennas.nominal_m[scan.radar].tolist()
+        self._log.add_range(
+            self._log.n_poses - 1,
+            scan.radar,
+            id_,
+            antenna=(x_m, y_m),
+            turn_rad=float(antennas.turns_rad[scan.radar]),
+            range_m=scan.ranges_m[index],
+            sigma_m=scan.sigma(index, self.parameters.ranges.sigma_m),
+        )
+
+    def _initialise_beacons(self) -> None:
+        """Bring the beacons into the map whose ranges have one place."""
+        fewest = self.parameters.tracklets.min_frames
+        share = 1.0 + self.parameters.relinearisation.run_share
+        for label, waiting in list(self._waiting.items()):
+            if waiting.n_ranges < max(fewest, waiting.try_at):
+                continue
+            waiting.try_at = math.ceil(share * waiting.n_ranges)
+            landmark_id = initialise_beacon(self._log, self.state, waiting.log_id, self.parameters)
+            if landmark_id is not None:
+                del self._waiting[label]
+                self._landmark_of_label[label] = landmark_id
+                self._existence.hit(landmark_id, waiting.n_ranges)
+
+    def _take_points(
+        self, scan: RangeScan, added_m: float
+    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
+        """Correct the state with a scan with bearings; log it; make landmarks of what is new.
+
+        Returns what `_correct` does. What is certain corrects the pose first, and is followed by
+        what is certain then. A labelled detection that is too far off is logged all the same.
+        """
+        assert scan.bearings_rad is not None
+        state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
+        antennas = antennas_of(self.rig, [scan], state.calibration, state.mounts_m)
+        wide = scan.with_added_sigma(added_m)
+        free = [
+            index
+            for index, pair in enumerate(zip(scan.ranges_m, scan.bearings_rad, strict=True))
+            if 0.0 < pair[0] < LONGEST_M and math.isfinite(pair[1])
+        ]
+        rows = {id_: row for row, id_ in enumerate(ids)}
+        row_of_label = {
+            label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
+        }
+        miss = math.log(1.0 - noise.detection_probability)
+        evidence: list[tuple[int, float]] = []
+        pairs: list[tuple[int, int]] = []
+        nis = 0.0
+        while True:
+            seen = view(state, antennas)
+            hit = {row for _, row in pairs}
+            found = find_points(state, seen, wide, (free, hit, row_of_label), self.parameters)
+            if not found.pairs:
+                break
+            pairs += found.pairs
+            nis_of_pairs, likelihoods = self._correct_points(scan, seen, found.pairs, antennas)
+            nis, evidence = nis + nis_of_pairs, evidence + likelihoods
+            used = {index for index, _ in found.pairs}
+            free = [index for index in free if index not in used]
+        continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
+        hit_ids = {landmark_id for _, _, landmark_id in continued}
+        for landmark_id in sorted(hit_ids):
+            self._existence.hit(landmark_id)
+        refused = [(index, ids[row]) for index, row in found.refused]
+        for index, landmark_id in refused:
+            self._log_detections(
+                landmark_id, detections_of(scan, [index], self._log.n_poses - 1, antennas, noise)
+            )
+        # Those that are seen rarely are missed often: half of the expected hits, at most.
+        odds = noise.detection_probability / (1.0 - noise.detection_probability)
+        missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
+        for landmark_id in sorted(missed - hit_ids):
+            self._existence.miss(landmark_id, 0.5 * odds)
+            evidence.append((landmark_id, miss))
+        far = {index for index, _ in refused}
+        free = [index for index in free if index not in far]
+        detections = detections_of(scan, free, self._log.n_poses - 1, antennas, noise)
+        own_share = 1.0 - noise.common_share
+        points = [body_point(state, antennas, one, own_share) for one in detections]
+        self._tentative.take(detections, points)
+        if detections:
+            self._place_points(antennas, hit_ids | missed)
+        return continued, nis, evidence
+
+    def _correct_points(
+        self,
+        scan: RangeScan,
+        seen: View,
+        pairs: Sequence[tuple[int, int]],
+        antennas: Antennas,
+    ) -> tuple[float, list[tuple[int, float]]]:
+        """Correct the state with detections of landmarks, index and row each; log them."""
+        assert scan.bearings_rad is not None
+        state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
+        indices, rows = [index for index, _ in pairs], [row for _, row in pairs]
+        view_of = point_view(state, seen, scan.radar, np.array(rows, dtype=np.intp))
+        measured = [(scan.ranges_m[index], scan.bearings_rad[index]) for index in indices]
+        innovations = np.array(measured) - view_of.predicted
+        innovations[:, 1] = wrap_angles(innovations[:, 1])
+        variances = point_variances(scan, indices, noise)
+        variances[:, 0] += np.square(state.feature_added_sigmas_m[rows])
+        gain, weighted, white, scales = kernels.weigh(
+            state.P.columns(view_of.at),
+            view_of.at,
+            np.ascontiguousarray(view_of.H.reshape(2 * len(pairs), -1)),
+            innovations.ravel(),
+            variances.ravel(),
+            noise.huber_sigmas,
+            state.range_errors.variance_share,
+        )
+        area = (noise.max_range_m - noise.min_range_m) * noise.field_of_view_rad
+        clutter = max(noise.clutter_per_m / noise.field_of_view_rad, len(scan.ranges_m) / area)
+        log_n = -0.5 * np.square(white) - 0.5 * math.log(math.tau) - np.log(scales)
+        log_n = log_n.reshape(-1, 2).sum(axis=1) + math.log(noise.detection_probability / clutter)
+        likelihoods = [(ids[row], value) for row, value in zip(rows, log_n.tolist(), strict=True)]
+        pose = self._log.n_poses - 1
+        for row, detection in zip(
+            rows, detections_of(scan, indices, pose, antennas, noise), strict=True
+        ):
+            self._log_detections(ids[row], [detection])
+        state.apply(gain, weighted)
+        return float(white @ white), likelihoods
+
+    def _log_detections(self, landmark_id: int, seen: Sequence[Detection]) -> None:
+        for one in seen:
+            self._log.add_range(
+                one.pose,
+                one.radar,
+                landmark_id,
+                antenna=one.nominal_m,
+                turn_rad=one.turn_rad,
+                range_m=one.range_m,
+                sigma_m=one.sigma_m,
+                bearing_rad=one.bearing_rad,
+                bearing_sigma_rad=one.bearing_sigma_rad,
+            )
+
+    def _place_points(self, antennas: Antennas, others: Collection[int]) -> None:
+        """Let tentative landmarks be ones of the map, or new ones, where either is certain.
+
+        The landmarks with the ids ``others`` are none of them: this scan says where they are.
+        """
+        state, parameters = self.state, self.parameters
+        labelled, apart = set(self._labelled_rows()), parameters.tracklets.min_hits_per_radar
+        unclear: list[tuple[TentativePoint, BodyPoint, set[int]]] = []
+        for tentative in self._tentative.take_out():
+            point, row, is_new = self._common(tentative, antennas), None, True
+            barred: set[int] = set()
+            if tentative.label is None:
+                beside = self._log.seen_from({one.pose for one in tentative.seen})
+                ids = enumerate(state.landmark_ids)
+                barred = {row for row, id_ in ids if id_ in others or beside[id_] >= apart}
+                barred |= labelled
+                row, is_new = match_or_new(state, point, barred, parameters)
+                is_new = is_new and len(tentative.seen) >= parameters.tracklets.min_frames
+            if row is None and not is_new:
+                unclear.append((tentative, point, barred))
+            else:
+                self._place_point(tentative, point, row)
+        points = [(point, barred) for _, point, barred in unclear]
+        placed = dict(match_two(state, points, parameters))
+        for place, row in placed.items():
+            self._place_point(*unclear[place][:2], row)
+        for place, (tentative, _, _) in enumerate(unclear):
+            if place not in placed:
+                self._tentative.keep(tentative)
+
+    def _common(self, tentative: TentativePoint, antennas: Antennas) -> BodyPoint:
+        """Return a tentative point with the errors that all its detections have in common."""
+        share = max(self.state.range_errors.variance_share, 1.0)
+        common_share = self.parameters.ranges.common_share
+        common = body_point(self.state, antennas, tentative.seen[-1], common_share).covariance
+        return replace(tentative.point, covariance=share * tentative.point.covariance + common)
+
+    def _place_point(self, tentative: TentativePoint, point: BodyPoint, row: int | None) -> None:
+        """Update the landmark in a row with a tentative one, or add it to the map."""
+        state = self.state
+        if row is None:
+            landmark_id = initialise_landmark(state, point)
+            if tentative.label is not None:
+                self._landmark_of_label[tentative.label] = landmark_id
+        else:
+            landmark_id = state.landmark_ids[row]
+            update_with_point(state, row, point)
+        self._existence.hit(landmark_id, len(tentative.seen))
+        self._log_detections(landmark_id, tentative.seen)
+
     def _initialise_landmarks(self) -> None:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""
         rule = self.parameters.tracklets
@@ -425,8 +670,14 @@ class RobustBackEnd:
                 sigma_m=sigma_m,
             )
 
-    def _delete_vanished(self) -> None:
-        vanished = self._existence.lost()
+    def _delete_vanished(self, *, solve: bool) -> None:
+        """Delete landmarks that are not there any more; without ``solve``, no beacons."""
+        lost, beacons = self._existence.lost(), set()
+        if lost and self._heard:
+            beacons = {self.state.landmark_ids[row] for row in self._beacon_rows()}
+        vanished = [
+            id_ for id_ in lost if id_ not in beacons or (solve and not self._is_where_it_was(id_))
+        ]
         for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
             self.state.remove(self.state.feature_ids.index(landmark_id))
@@ -436,6 +687,18 @@ class RobustBackEnd:
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
 
+    def _is_where_it_was(self, landmark_id: int) -> bool:
+        """Return whether ranges beyond the gate are a beacon's after all, as the whole run has it.
+
+        A pose that was wrong is then corrected, and the beacon begins anew with its score.
+        """
+        self.relinearise()
+        row = self.state.landmark_ids.index(landmark_id)
+        if not is_heard_where_it_is(self._log, self.state, row, self.parameters):
+            return False
+        self._existence.renew(landmark_id)
+        return True
+
     def _merge(self) -> None:
         """Merge landmarks where that is certain, and the whole run allows it."""
         rule, now = self.parameters.map, self._n_updates
@@ -443,9 +706,20 @@ class RobustBackEnd:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
-        merge = find_merge(self.state, rule, self._refused)
-        if merge is not None:
+        merge = find_merge(self.state, rule, self._refused, self._labelled_rows())
+        if merge is not None and self._are_seen_together(merge.pairs):
+            self._refused[named_pairs(self.state, merge.pairs)] = now
+        elif merge is not None:
             self.merge_if_possible(merge.pairs)
+
+    def _are_seen_together(self, pairs: Sequence[tuple[int, int]]) -> bool:
+        """Return whether scans with bearings hold both landmarks of a pair, by row."""
+        ids = self.state.landmark_ids
+        return any(
+            self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]]
+            >= self.parameters.tracklets.min_hits_per_radar
+            for kept, gone in pairs
+        )
 
     def merge_if_possible(self, pairs: Sequence[tuple[int, int]]) -> bool:
         """Merge landmarks, rows of the older first, if the whole run allows it; return whether.
@@ -462,5 +736,8 @@ class RobustBackEnd:
         for kept, gone in ids:
             self._existence.merge(kept, gone)
             self._log.rename(gone, kept)
+        merged = {gone: kept for kept, gone in ids}
+        labels = self._landmark_of_label.items()
+        self._landmark_of_label = {label: merged.get(id_, id_) for label, id_ in labels}
         self.relinearise()
         return True

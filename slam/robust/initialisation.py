@@ -26,15 +26,14 @@ pose is correlated with. (In right-invariant errors the heading enters neither.)
 frames end at the surface: with o the direction away from where they were taken, the axis of a
 landmark of radius rho is seen at b + rho o, and H has e_rho: -o.
 
-Points measured with range and bearing, b = R^T (l - p) in the body frame, z = (|b|, atan2(b_y,
-b_x)) and G = dz / db, have ``H = [e_p: -G R^T, e_l: G R^T]``. They are matched to the landmarks of
-least Mahalanobis distance, all points of one time together and no landmark twice, or by label.
+Where a bearing is measured with the range, one detection has a place. As clutter has one, too, it
+waits as a tentative landmark, and becomes one when enough scans hold it and they agree.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import TypeAlias
@@ -42,8 +41,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.special import chdtri
 
-from slam.geometry import compose, wrap_angle
+from slam.geometry import compose
 from slam.robust import kernels
 from slam.robust.association import (
     LONGEST_M,
@@ -53,16 +53,26 @@ from slam.robust.association import (
     crossings,
     density_per_m2,
     identity,
+    point_variances,
 )
 from slam.robust.parameters import (
     NEIGHBOURHOOD_M,
+    TAIL_PROBABILITY,
     BackEndParameters,
-    PointRule,
     RangeNoise,
     TrackletRule,
     chi_square_limit,
 )
-from slam.robust.state import HEAD_SIZE, POSITION, Array, Indices, Motion, State, rotation
+from slam.robust.state import (
+    HEAD_SIZE,
+    POSITION,
+    Array,
+    Indices,
+    Motion,
+    State,
+    quarter_turn,
+    rotation,
+)
 
 _FORBIDDEN = 1e9
 _LEAST_WAY_M = 1e-6
@@ -317,6 +327,66 @@ def certain_row(found: Mapping[int, FeatureRows], density: float) -> int | None:
         [identity(((SEEN, row),), rows.residual, rows.S, density) for row, rows in found.items()]
     )
     return None if best is None else best.pairs[0][1]
+
+
+def match_or_new(
+    state: State, point: BodyPoint, others: Collection[int], parameters: BackEndParameters
+) -> tuple[int | None, bool]:
+    """Return the row of the landmark that a point certainly is, or None, and whether it is new.
+
+    It is new if it passes the gate of no landmark; the rows ``others`` are not it. If both are
+    possible, it is neither.
+    """
+    near = near_rows(state, point, parameters.map.neighbourhood_m).tolist()
+    found = {row: point_rows(state, row, point) for row in near if row not in others}
+    limit = float(chdtri(2, TAIL_PROBABILITY))
+    is_new = all(rows.mahalanobis_sq > limit for rows in found.values())
+    return certain_row(found, parameters.ranges.unmapped_per_m2), is_new
+
+
+def match_two(
+    state: State,
+    points: Sequence[tuple[BodyPoint, Collection[int]]],
+    parameters: BackEndParameters,
+) -> tuple[tuple[int, int], ...]:
+    """Return which two of some points are certainly which landmarks, place and row each, if any.
+
+    Where the pose is unsure, one point alone may be any of several landmarks; the way from one to
+    the other does not depend on the pose. Each point comes with the rows that it is not.
+    """
+    limit, found = float(chdtri(2, TAIL_PROBABILITY)), []
+    for place, (point, others) in enumerate(points):
+        for row in near_rows(state, point, parameters.map.neighbourhood_m).tolist():
+            rows = point_rows(state, row, point)
+            if row not in others and rows.mahalanobis_sq <= limit:
+                found.append((place, row, rows))
+    density = parameters.ranges.unmapped_per_m2
+    # Neighbours come in groups that look alike, and say little of the heading.
+    least_m = 0.5 * parameters.map.neighbourhood_m
+    joint = [
+        identity(
+            ((-1 - one, row), (-1 - other, second)),
+            np.concatenate([mine.residual, theirs.residual]),
+            _joint_covariance(state, mine, theirs),
+            density,
+        )
+        for (one, row, mine), (other, second, theirs) in combinations(found, 2)
+        if one != other
+        and row != second
+        and math.dist(points[one][0].point_m, points[other][0].point_m) >= least_m
+    ]
+    best = certain(joint)
+    return () if best is None else tuple((-1 - key, row) for key, row in best.pairs)
+
+
+def _joint_covariance(state: State, one: FeatureRows, other: FeatureRows) -> Array:
+    """Return the covariance of two residuals, shape (4, 4)."""
+    at = np.concatenate([one.at, other.at])
+    H = np.zeros((4, len(at)))
+    H[:2, : len(one.at)], H[2:, len(one.at) :] = one.H, other.H
+    S = H @ state.P.block(at) @ H.T
+    S[:2, :2], S[2:, 2:] = one.S, other.S
+    return np.asarray((S + S.T) / 2)
 
 
 def update_with_point(state: State, row: int, point: BodyPoint) -> float:
@@ -685,71 +755,192 @@ def _radar_part(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RangeBearing:
-    """One point: range and bearing in the body frame, covariance (2, 2)."""
+class Detection:
+    """A detection with range and bearing, as measured."""
 
+    radar: int
+    label: int | None
+    pose: int  # index in the log
+    nominal_m: tuple[
+        float, float
+    ]  # antenna in the body frame, its mount being where the rig has it
+    turn_rad: float  # of the robot from the pose to the sample
     range_m: float
-    bearing_rad: float
-    covariance: Array
-    label: int | None = None  # of the target, where known
+    sigma_m: float
+    bearing_rad: float  # in the body frame of the sample
+    bearing_sigma_rad: float
+
+
+def detections_of(
+    scan: RangeScan, indices: Sequence[int], pose: int, antennas: Antennas, noise: RangeNoise
+) -> list[Detection]:
+    """Return some detections of a scan with bearings."""
+    assert scan.bearings_rad is not None
+    radar, variances = scan.radar, point_variances(scan, indices, noise)
+    x_m, y_m = antennas.nominal_m[radar].tolist()
+    turn_rad = float(antennas.turns_rad[radar])
+    yaw_rad = float(antennas.yaw_rad[radar]) - turn_rad
+    return [
+        Detection(
+            radar=radar,
+            label=None if scan.labels is None else scan.labels[index],
+            pose=pose,
+            nominal_m=(x_m, y_m),
+            turn_rad=turn_rad,
+            range_m=scan.ranges_m[index],
+            sigma_m=sigma_m,
+            bearing_rad=yaw_rad + scan.bearings_rad[index],
+            bearing_sigma_rad=bearing_sigma_rad,
+        )
+        for index, (sigma_m, bearing_sigma_rad) in zip(
+            indices, np.sqrt(variances).tolist(), strict=True
+        )
+    ]
+
+
+def body_point(
+    state: State, antennas: Antennas, detection: Detection, share: float = 1.0
+) -> BodyPoint:
+    """Return where a detection lies: at its range and bearing, the offset of the radar removed.
+
+    Of its variance a share is taken.
+    """
+    radar, layout = detection.radar, state.layout
+    angle = detection.bearing_rad + detection.turn_rad
+    distance_m = detection.range_m - float(state.offsets_m[radar])
+    turn = rotation(angle)
+    spread = np.diag([detection.sigma_m**2, (distance_m * detection.bearing_sigma_rad) ** 2])
+    by_radar = np.zeros((2, state.n_fixed - HEAD_SIZE))
+    by_radar[:, radar] = -turn[:, 0]
+    if layout.has_mounts:
+        mount = layout.n_radars + 2 * radar
+        by_radar[:, mount : mount + 2] = rotation(detection.turn_rad)
+    return BodyPoint(
+        point_m=antennas.position_m[radar] + distance_m * turn[:, 0],
+        covariance=share * turn @ spread @ turn.T,
+        by_offsets=by_radar,
+        outward=turn[:, 0],
+    )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class TentativePoint:
+    """What may be a landmark: a point in the newest body frame, and the detections of it."""
+
+    point: BodyPoint
+    seen: list[Detection]
+    chi_square: float = 0.0
+    misses: int = 0  # scans since the last one that held it
 
     @property
-    def values(self) -> Array:
-        return np.array([self.range_m, self.bearing_rad])
-
-    def body_point(self, n_unknowns: int) -> BodyPoint:
-        """Return the point; none of the unknowns of the radars matter."""
-        c, s = math.cos(self.bearing_rad), math.sin(self.bearing_rad)
-        G = np.array([[c, -self.range_m * s], [s, self.range_m * c]])
-        return BodyPoint(
-            point_m=self.range_m * np.array([c, s]),
-            covariance=G @ self.covariance @ G.T,
-            by_offsets=np.zeros((2, n_unknowns)),
-        )
+    def label(self) -> int | None:
+        return self.seen[0].label
 
 
-def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> FeatureRows:
-    R = rotation(state.heading_rad)
-    b = R.T @ (state.landmarks_m[row] - state.position_m)
-    q = float(b @ b)
-    r = math.sqrt(q)
-    G = np.array([[b[0] / r, b[1] / r], [-b[1] / q, b[0] / q]]) @ R.T
-    at = np.concatenate([np.array([1, 2]), state.landmark_columns(np.array([row]))])
-    H = np.hstack([-G, G])
-    S = H @ state.P.block(at) @ H.T + seen.covariance
-    residual = seen.values - np.array([r, math.atan2(b[1], b[0])])
-    residual[1] = wrap_angle(float(residual[1]))
-    return FeatureRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
+class TentativePoints:
+    """Detections with bearings that are of nothing known, as points at rest.
 
-
-def named_rows(
-    state: State, points: Sequence[RangeBearing], landmark_of_label: Mapping[int, int]
-) -> list[int | None] | None:
-    """Return the rows of labelled points, -1 for new ones; None if a point has no label."""
-    labels = [point.label for point in points if point.label is not None]
-    if len(labels) < len(points):
-        return None
-    known = {id_: row for row, id_ in enumerate(state.landmark_ids)}
-    return [known.get(landmark_of_label.get(label, -1), -1) for label in labels]
-
-
-def assign(state: State, points: Sequence[RangeBearing], rule: PointRule) -> list[int | None]:
-    """Return for each point the row of its landmark, -1 for a new one, None if ambiguous.
-
-    A point nearer than the rule's ``new_gate`` but not assigned is ambiguous.
+    Each is followed along odometry by a Kalman filter on its two coordinates in the newest body
+    frame. Detections are assigned to them as to landmarks, those with labels to those of the label.
     """
-    if not points:
-        return []
-    n = len(state.landmark_ids)
-    cost = np.full((len(points), n + len(points)), _FORBIDDEN)
-    nearest = np.full(len(points), math.inf)
-    for i, point in enumerate(points):
-        cost[i, n + i] = rule.gate
-        for row in near_rows(state, point.body_point(0), rule.reach_m):
-            distance = range_bearing_rows(state, int(row), point).mahalanobis_sq
-            nearest[i] = min(nearest[i], distance)
-            if distance < rule.gate:
-                cost[i, row] = distance
-    new = [-1 if distance > rule.new_gate else None for distance in nearest.tolist()]
-    columns = linear_sum_assignment(cost)[1].tolist()
-    return [column if column < n else new[i] for i, column in enumerate(columns)]
+
+    def __init__(self, parameters: BackEndParameters) -> None:
+        self._parameters = parameters
+        self._points: list[TentativePoint] = []
+
+    def move(self, motion: Motion) -> None:
+        """Move the body frame: b' = R^T (b - d), and the noise of (d, a) turns and shifts it."""
+        R = rotation(motion.turn_rad)
+        for one in self._points:
+            moved = R.T @ (one.point.point_m - motion.step_m)
+            by_motion = np.column_stack([-R.T, -quarter_turn(moved)])
+            noise = by_motion @ motion.covariance @ by_motion.T
+            one.point = replace(
+                one.point,
+                point_m=moved,
+                covariance=R.T @ one.point.covariance @ R + noise,
+                by_offsets=R.T @ one.point.by_offsets,
+                outward=None if one.point.outward is None else R.T @ one.point.outward,
+            )
+
+    def clear(self) -> None:
+        self._points = []
+
+    def keep(self, one: TentativePoint) -> None:
+        """Take back what may be a landmark that is in the map."""
+        self._points.append(one)
+
+    def take_out(self) -> list[TentativePoint]:
+        """Return those that are landmarks, of the map or new, and forget them."""
+        found = [one for one in self._points if self._is_landmark(one)]
+        labels = {one.label for one in found if one.label is not None}
+        kept = [one for one in self._points if one not in found and one.label not in labels]
+        self._points = kept
+        # Of one label there is one landmark.
+        return [
+            one
+            for k, one in enumerate(found)
+            if one.label is None or one.label not in {other.label for other in found[:k]}
+        ]
+
+    def take(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> None:
+        """Take in the detections of a scan, with their points."""
+        rule, waiting = self._parameters.tracklets, self._points
+        chosen = self._assigned(seen, points)
+        hit = set(chosen.values())
+        for k, (detection, point) in enumerate(zip(seen, points, strict=True)):
+            if k in chosen:
+                self._fuse(waiting[chosen[k]], detection, point)
+        for at, one in enumerate(waiting):
+            one.misses = 0 if at in hit else one.misses + 1
+        new = [
+            TentativePoint(point=point, seen=[detection])
+            for k, (detection, point) in enumerate(zip(seen, points, strict=True))
+            if k not in chosen
+        ]
+        self._points = [one for one in [*waiting, *new] if one.misses <= rule.window]
+
+    def _is_landmark(self, one: TentativePoint) -> bool:
+        hits, excess = len(one.seen), self._parameters.tracklets.excess_sigmas
+        is_at_rest = one.chi_square <= chi_square_limit(2 * (hits - 1), excess)
+        return hits >= self._parameters.tracklets.min_hits_per_radar and is_at_rest
+
+    def _assigned(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> dict[int, int]:
+        """Return which tentative point each detection is of, by index."""
+        noise, n = self._parameters.ranges, len(self._points)
+        if not n or not seen:
+            return {}
+        odds = noise.detection_probability / (1.0 - noise.detection_probability)
+        clutter = noise.clutter_per_m / noise.field_of_view_rad
+        limit = float(chdtri(2, TAIL_PROBABILITY))
+        cost = np.zeros((len(seen), n + len(seen)))
+        for k, (detection, point) in enumerate(zip(seen, points, strict=True)):
+            for at, one in enumerate(self._points):
+                S = one.point.covariance + point.covariance
+                nu = point.point_m - one.point.point_m
+                distance = float(nu @ np.linalg.solve(S, nu))
+                # Per square metre, clutter is the denser the nearer.
+                log_n = -0.5 * (distance + float(np.linalg.slogdet(math.tau * S)[1]))
+                evidence = log_n + math.log(odds * detection.range_m / clutter)
+                is_named = detection.label is not None or evidence > 0.0
+                is_same = detection.label == one.label and distance <= limit and is_named
+                cost[k, at] = (
+                    -evidence - 1e3 * (detection.label is not None) if is_same else _FORBIDDEN
+                )
+        columns = linear_sum_assignment(cost)[1].tolist()
+        return {k: at for k, at in enumerate(columns) if at < n}
+
+    def _fuse(self, one: TentativePoint, detection: Detection, point: BodyPoint) -> None:
+        before = one.point
+        S = before.covariance + point.covariance
+        nu = point.point_m - before.point_m
+        K = np.linalg.solve(S, before.covariance).T
+        covariance = before.covariance - K @ before.covariance
+        one.point = BodyPoint(
+            point_m=before.point_m + K @ nu,
+            covariance=(covariance + covariance.T) / 2,
+            by_offsets=before.by_offsets + K @ (point.by_offsets - before.by_offsets),
+            outward=point.outward,
+        )
+        one.chi_square += float(nu @ np.linalg.solve(S, nu))
+        one.seen.append(detection)

@@ -8,6 +8,7 @@ made, the solution over the whole run decides (`slam.robust.solver.revision.is_o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -17,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from slam.robust.association import Identity, Pairs, certain, density_per_m2, identity
-from slam.robust.parameters import MARGIN_NATS, NEIGHBOURHOOD_M, TAIL_PROBABILITY, MapRule
+from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
 from slam.robust.state import Array, Indices, State
 
 # Noise [m] of the statement that two landmarks are one: it is exact.
@@ -44,9 +45,13 @@ class Existence:
         record.score = min(record.score + frames, self._rule.most)
         record.hits += frames
 
-    def miss(self, landmark_id: int) -> None:
-        """Count a frame that should have hit a landmark and did not."""
-        self._records[landmark_id].score -= self._rule.miss
+    def miss(self, landmark_id: int, most: float = math.inf) -> None:
+        """Count a frame that should have hit a landmark and did not, by no more than ``most``."""
+        self._records[landmark_id].score -= min(self._rule.miss, most)
+
+    def renew(self, landmark_id: int) -> None:
+        """Let the score begin anew; the hits remain."""
+        self._records[landmark_id].score = 0.0
 
     def lost(self) -> list[int]:
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
@@ -105,13 +110,23 @@ def named_pairs(state: State, pairs: Pairs) -> Pairs:
     return tuple(sorted((ids[kept], ids[gone]) for kept, gone in pairs))
 
 
-def find_merge(state: State, rule: MapRule, refused: Collection[Pairs] = ()) -> Identity | None:
+def find_merge(
+    state: State,
+    rule: MapRule,
+    refused: Collection[Pairs] = (),
+    distinct: Collection[int] = (),
+) -> Identity | None:
     """Return the merge to be tried now, of one pair or two, or None.
 
-    ``refused`` are those not to be tried, as ``named_pairs`` returns them.
+    ``refused`` are those not to be tried, as ``named_pairs`` returns them; of the rows ``distinct``
+    no two are one.
     """
-    density = density_per_m2(state.landmarks_m, NEIGHBOURHOOD_M)
-    single = _candidates(state, density)
+    density = density_per_m2(state.landmarks_m, rule.neighbourhood_m)
+    single = [
+        one
+        for one in _candidates(state, density, rule.neighbourhood_m)
+        if not all(row in distinct for row in one.pairs[0])
+    ]
     best = _certain(state, single, refused)
     if best is not None:
         return best
@@ -131,11 +146,11 @@ def _certain(
     return certain(merges, [rows for rows in pairs if named_pairs(state, rows) in refused])
 
 
-def _candidates(state: State, density: float) -> list[Identity]:
+def _candidates(state: State, density: float, neighbourhood_m: float) -> list[Identity]:
     """Return all merges of two landmarks within reach, those far from passing the test left out."""
     if len(state.landmark_ids) < 2:
         return []
-    near = cKDTree(state.landmarks_m).query_pairs(NEIGHBOURHOOD_M, output_type="ndarray")
+    near = cKDTree(state.landmarks_m).query_pairs(neighbourhood_m, output_type="ndarray")
     near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.intp)
     distances = _distances_sq(state, near, MERGE_SIGMA_M)
     # What contradicts a possible one and comes within the margin of it is kept, too.

@@ -31,9 +31,7 @@ TAIL_PROBABILITY: Annotated[float, Origin.QUANTILE] = 1e-3
 """Probability with which a test rejects what is true."""
 MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
 """Logarithm of how many times likelier than any other an explanation must be: twenty times."""
-NEIGHBOURHOOD_M: Annotated[float, Origin.CHOSEN] = 1.5
-"""Distance within which landmarks are neighbours: those that may be one, and those that count for
-the density of a map."""
+NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 
 
 def chi_square_limit(dof: int, excess_sigmas: float) -> float:
@@ -46,6 +44,13 @@ class RangeNoise:
     """How one radar of the rig measures."""
 
     sigma_m: float = 7.4e-3  # standard deviation of a range
+    bearing_sigma_rad: float = 0.03  # standard deviation of a bearing, of a sensor that measures it
+    # Share of the variance of range and bearing that is one error in all detections of a passage,
+    # of a sensor that measures both: what is left is how well it repeats itself
+    common_share: float = 0.0
+    # How many landmarks per square metre may not be in the map yet, where such a sensor looks: what
+    # a match competes with
+    unmapped_per_m2: float = 0.02
     # Added in squares to the front end's sigma of each range, wherever ranges are assigned: a
     # neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
     association_sigma_m: float = 0.0
@@ -159,6 +164,9 @@ class MapRule:
     """Scans between two looks for landmarks that may be one, and for evidence of a carry."""
     most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
     """How many of the likeliest merges are combined in twos."""
+    neighbourhood_m: Annotated[float, Origin.CHOSEN] = NEIGHBOURHOOD_M
+    """Distance within which landmarks are neighbours: those that may be one, and those that count
+    for the density of a map."""
     refused_updates: Annotated[int, Origin.BUDGET, "scans"] = 200
     """After how many scans a merge that the run did not allow is tried again."""
     miss: Annotated[float, Origin.CHOSEN, "hits"] = 1.5
@@ -321,18 +329,6 @@ class BranchRule:
     used once more."""
     lost_position_m: Annotated[float, Origin.CHOSEN] = 5.0
     """Standard deviation that is reported for the position while the robot is lost."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PointRule:
-    """How points with range and bearing find their landmarks.
-
-    No radar measures such points; who has a sensor that does gives the rule with them.
-    """
-
-    gate: float  # squared Mahalanobis distance below which a point may be a landmark
-    new_gate: float  # squared distance to every landmark above which a point is new
-    reach_m: float  # distance up to which landmarks are compared with a point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -106,6 +106,18 @@ TABLES: dict[str, dict[str, object]] = {
     "words": AUTHORS | {"odom": "text"},
 }
 
+# Files of data sets: damaged, but for those in `good`
+DATA_SETS = {
+    "mrclam/Barcodes.dat": "# Subject Barcode\n6 72\n",
+    "mrclam/Landmark_Groundtruth.dat": "6 1 1 0 0\n",
+    "mrclam/Robot1_Odometry.dat": "# Time v w\n2 0.1 0\n1 0.1 0\n",
+    "victoria-park/inputs.dat": "1 2 0\n2 2\n",
+    "plaza/drive.pyfg": "VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 L0 1 1\n",
+    "uwb-indoor/drive_Input.txt": "range2 0 1 0.01 0 0 105 0\nodom3 1 2 3\n",
+    "good/drive_Input.txt": "odom2diff 0 0 0 0 1 1 1 1\nodom2diff 1 0 0 0 1 1 1 1\n",
+    "good/drive_GT.txt": "point2 0 0 0 0 0 0 0\n",
+}
+
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -142,6 +154,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "link.rrd").symlink_to("session.mcap")
     (place / "loop.mcap").symlink_to("loop.mcap")
     (place / "empty").mkdir()
+    for name, text in DATA_SETS.items():
+        (place / name).parent.mkdir(exist_ok=True)
+        (place / name).write_text(text, encoding="ascii")
     os.mkfifo(place / "pipe")
     return place
 

@@ -193,17 +193,4 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         module="sweep_results",
         options=(_sweep_of("`uwb-slam sweep --scene ...`", "out/scenes.json"),),
     ),
-    "victoria-park": Experiment(
-        help="the robust back end on real data, a car among trees, against GTSAM's batch solution",
-        module="victoria_park",
-        options=(
-            (
-                "--steps",
-                {
-                    "type": count,
-                    "help": "take the first steps of the drive only (default: all 6968)",
-                },
-            ),
-        ),
-    ),
 }

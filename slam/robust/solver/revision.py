@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -49,10 +49,17 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     solution = _solved(log, state, problem, parameters)
     if solution is None or not is_determined(solution.information):
         return False
+    adopt(log, state, problem, solution, parameters)
+    return True
+
+
+def adopt(
+    log: RunLog, state: State, problem: Problem, solution: Solution, parameters: BackEndParameters
+) -> None:
+    """Replace the belief by a solution, and let it choose the noise of ranges."""
     _replace(state, solution)
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state, parameters)
-    return True
 
 
 def _solved(
@@ -112,28 +119,35 @@ class Split:
     point_m: Array  # shape (2,): where they lie, map frame
 
 
-def find_split(log: RunLog, state: State, parameters: BackEndParameters) -> Split | None:
+def find_split(
+    log: RunLog, state: State, parameters: BackEndParameters, whole: Collection[int] = ()
+) -> Split | None:
     """Return the passage, or the landmark merged into another, that disagrees most with the rest.
 
-    To be called after a solution, whose poses are taken for true: of a group of ranges of one
-    landmark, the smaller part, the cost must fall by more than chance and `BranchRule.price_nats`
-    explain where the group has a place of its own.
+    The ranges of the rows ``whole`` are surely of their landmarks. To be called after a solution,
+    whose poses are taken for true: of a group of ranges of one landmark, the smaller part, the cost
+    must fall by more than chance and `BranchRule.price_nats` explain where the group has a place of
+    its own.
     """
     problem = log.problem(state, parameters)
     estimate, n = log.starts(state, problem)[0], len(problem.ranges_m)
-    residual = measurement_residuals(problem, estimate).residual[:n]
+    residual = measurement_residuals(problem, estimate).residual
     limit, layout = parameters.relinearisation.outlier_sigmas, problem.layout
     rule, price = parameters.splits, parameters.branches.price_nats
-    costs = np.minimum(residual**2, limit**2)
+    of_rows, dof = np.minimum(residual**2, limit**2), np.ones(n)
+    costs = of_rows[:n]
+    costs[problem.with_bearing] += of_rows[n:]
+    dof[problem.with_bearing] += 1.0
     found: list[tuple[float, Split]] = []
     for edges in log.edges(problem.range_rows):
         order = np.lexsort((edges, problem.range_landmarks))
         keys = np.column_stack([problem.range_landmarks, edges])[order]
         starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1))
         sizes = np.diff(np.append(starts, n))
-        means = np.add.reduceat(costs[order], starts) / sizes
+        means = np.add.reduceat(costs[order], starts) / np.add.reduceat(dof[order], starts)
         wholes = np.bincount(problem.range_landmarks)[keys[starts, 0]]
         suspects = (means > rule.suspect_mean) & (sizes >= rule.fewest) & (2 * sizes <= wholes)
+        suspects &= ~np.isin(keys[starts, 0], list(whole))
         for k in np.flatnonzero(suspects & (keys[starts, 0] < layout.n_landmarks)).tolist():
             at = order[starts[k] : starts[k] + sizes[k]]
             point_m, apart = _place_apart(problem, estimate, at, limit, rule.tried_m)
@@ -154,10 +168,6 @@ def _place_apart(
             for column in fields(Problem)
             if column.name.startswith("range")
         },
-        point_poses=problem.point_poses[:0],
-        point_landmarks=problem.point_landmarks[:0],
-        points=problem.points[:0],
-        point_roots=problem.point_roots[:0],
     )
     first = int(problem.layout.first_columns(problem.range_landmarks[at[:1]])[0]) - HEAD_SIZE
     best_m, least = estimate.fixed[first : first + 2], math.inf

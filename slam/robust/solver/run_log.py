@@ -1,6 +1,6 @@
 """The log of one run, and the problem of solving for all of it.
 
-Every step, range and point of the run is kept. The problem is stated in *keyframes*, every few
+Every step and every detection of the run is kept. The problem is stated in *keyframes*, every few
 centimetres or degrees: ranges from the poses between two of them are referred to the nearer one,
 through odometry as the calibration corrects it. With steps (d_i, a_i) and headings h_i within a
 segment of several steps, and e_i = Rot(h_i) d_i, odometry measures the segment's end in the frame
@@ -14,7 +14,8 @@ q_i the place after the step: a step's turn moves what comes after it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,18 +70,21 @@ class Problem:
     range_turns: Array
     ranges_m: Array
     range_sigmas_m: Array  # shape (m,), noise of single ranges
-    # shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin, and a
-    # matrix that makes their noise white
-    point_poses: Indices
-    point_landmarks: Indices
-    points: Array
-    point_roots: Array
+    # shape (m,) each, NaN for a range without one: bearing in the body frame of the sample, and its
+    # noise
+    range_bearings_rad: Array
+    range_bearing_sigmas_rad: Array
     huber_sigmas: float = math.inf  # residuals beyond it weigh less
     variance_share: float = 1.0  # see `RangeErrors`
 
     @property
     def is_walking(self) -> bool:
         return bool(np.any(self.walks > 0.0))
+
+    @property
+    def with_bearing(self) -> Indices:
+        """Return which ranges have a bearing."""
+        return np.flatnonzero(~np.isnan(self.range_bearings_rad))
 
 
 def prior_sigmas(layout: Layout, parameters: BackEndParameters) -> Array:
@@ -187,7 +191,7 @@ def motion_covariances(chain: Chain, step_covariances: Array) -> Array:
 
 
 class RunLog:
-    """Steps, used ranges and points of a whole run, with the trajectory last solved for.
+    """Steps and used detections of a whole run, with the trajectory last solved for.
 
     Landmarks are named by id; merges rename, deletions drop what belonged to the landmark. One that
     has not been seen for more than ``gap_poses`` is in another passage when it is seen again.
@@ -205,9 +209,8 @@ class RunLog:
         whose = [("pose", np.int32), ("landmark", np.int32), ("passage", np.int32)]
         where = [("radar", np.int16), ("antenna", np.float64, 2), ("turn_rad", np.float32)]
         measured = [("range_m", np.float64), ("sigma_m", np.float32)]
-        self._ranges = PackedRows(np.dtype([*whose, *where, *measured]))
-        seen = [("point", np.float64, 2), ("root", np.float64, (2, 2))]
-        self._points = PackedRows(np.dtype([("pose", np.int32), ("landmark", np.int32), *seen]))
+        bearing = [("bearing_rad", np.float64), ("bearing_sigma_rad", np.float32)]
+        self._ranges = PackedRows(np.dtype([*whose, *where, *measured, *bearing]))
         self._names: dict[int, int | None] = {}
         # By landmark: its newest passage, and the last pose of that
         self._passages: dict[int, tuple[int, int]] = {}
@@ -259,8 +262,10 @@ class RunLog:
         range_m: float,
         sigma_m: float,
         turn_rad: float = 0.0,
+        bearing_rad: float = math.nan,
+        bearing_sigma_rad: float = math.nan,
     ) -> None:
-        """Append a range used.
+        """Append a range used, with its bearing in the body frame of the sample if it has one.
 
         ``antenna`` is in the body frame of the pose, its mount being where the rig has it, and
         ``turn_rad`` the robot's from the pose to the sample.
@@ -271,12 +276,8 @@ class RunLog:
             self._n_passages += 1
         self._passages[landmark_id] = passage, max(pose, last)
         whose = (pose, landmark_id, passage, radar)
-        self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m))
-
-    def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
-        self._mark_key()
-        self._points.append((self.n_poses - 1, landmark_id, point.tolist(), root.tolist()))
+        bearing = bearing_rad, bearing_sigma_rad
+        self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m, *bearing))
 
     def _mark_key(self) -> None:
         """Let the newest pose be a keyframe."""
@@ -289,10 +290,47 @@ class RunLog:
         """Leave out all of a landmark's measurements."""
         self._names[landmark_id] = None
 
+    def seen_from(self, poses: Collection[int]) -> Counter[int]:
+        """Return from how many of some poses each landmark was seen with a bearing, by its id."""
+        ranges = self._ranges.rows
+        first = np.isin(ranges["pose"], list(poses)) & ~np.isnan(ranges["bearing_rad"])
+        found: set[tuple[int, int]] = set()
+        for landmark, pose in zip(
+            ranges["landmark"][first].tolist(), ranges["pose"][first].tolist(), strict=True
+        ):
+            name: int | None = landmark
+            while name is not None and name in self._names:
+                name = self._names[name]
+            if name is not None:
+                found.add((name, pose))
+        return Counter(name for name, _ in found)
+
+    def poses_of(self, landmark_id: int) -> list[int]:
+        """Return the poses from which a landmark was seen with a bearing."""
+        ranges = self._ranges.rows
+        names = {landmark_id}
+        while True:
+            more = {gone for gone, kept in self._names.items() if kept in names} - names
+            if not more:
+                break
+            names |= more
+        mine = np.isin(ranges["landmark"], list(names)) & ~np.isnan(ranges["bearing_rad"])
+        return sorted(set(ranges["pose"][mine].tolist()))
+
     def edges(self, rows: Indices) -> tuple[Indices, Indices]:
         """Return what ranges, by row of the log, were taken for: first landmark and passage."""
         ranges = self._ranges.rows[rows]
         return ranges["landmark"].astype(np.intp), ranges["passage"].astype(np.intp)
+
+    def ranges_of(self, landmark_id: int) -> tuple[Array, Array, Array]:
+        """Return ranges (k,) by the id they were added with, noise (k,) and antennas (k, 2).
+
+        The antennas are on the trajectory last solved for, and that of the filter since, map frame.
+        """
+        ranges = self._ranges.rows[self._ranges.rows["landmark"] == landmark_id]
+        poses = self._causal.rows[ranges["pose"]]
+        antennas = poses[:, :2] + _turned(ranges["antenna"], poses[:, 2])
+        return ranges["range_m"].copy(), ranges["sigma_m"].astype(np.float64), antennas
 
     def split_off(self, rows: Indices, landmark_id: int) -> int:
         """Take ranges from their landmark and give them to a new one; return of how many poses."""
@@ -318,12 +356,10 @@ class RunLog:
         """
         rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
         names = self._names | dict(same or {})
-        ranges, points = self._ranges.rows, self._points.rows
+        ranges = self._ranges.rows
         of_range = _rows_of(ranges["landmark"], names, rows)
-        of_point = _rows_of(points["landmark"], names, rows)
         range_rows = np.flatnonzero(of_range >= 0)
         ranges, of_range = ranges[range_rows], of_range[range_rows]
-        points, of_point = points[of_point >= 0], of_point[of_point >= 0]
         sigmas_m = ranges["sigma_m"].astype(np.float64)
         if state.added_sigmas_m:
             sigmas_m = np.hypot(sigmas_m, state.feature_added_sigmas_m[of_range])
@@ -353,10 +389,8 @@ class RunLog:
             range_turns=turn[pose] + ranges["turn_rad"],
             ranges_m=ranges["range_m"].copy(),
             range_sigmas_m=sigmas_m,
-            point_poses=np.searchsorted(keys, points["pose"]),
-            point_landmarks=of_point,
-            points=points["point"].copy(),
-            point_roots=points["root"].copy(),
+            range_bearings_rad=ranges["bearing_rad"].copy(),
+            range_bearing_sigmas_rad=ranges["bearing_sigma_rad"].astype(np.float64),
             huber_sigmas=parameters.ranges.huber_sigmas,
             variance_share=state.range_errors.variance_share,
         )

@@ -31,7 +31,7 @@ from slam.robust.solver.run_log import (
     motion_covariances,
     motions_by_calibration,
 )
-from slam.robust.state import HEAD_SIZE, Array, Indices
+from slam.robust.state import HEAD_SIZE, Array, Indices, quarter_turn
 
 # Columns of the border
 POSE, CALIBRATION = slice(0, 3), slice(3, HEAD_SIZE)
@@ -102,14 +102,15 @@ def motion_residuals(problem: Problem, estimate: Estimate) -> Steps:
 
 
 def measurement_residuals(problem: Problem, estimate: Estimate) -> Rows:
-    """Return the white residuals of all ranges, then of all points."""
+    """Return the white residuals of all ranges, then of those bearings that there are."""
     ranges = _range_rows(problem, estimate)
-    if not len(problem.points):
+    at = problem.with_bearing
+    if not len(at):
         return ranges
-    points = _point_rows(problem, estimate, ranges.columns.shape[1])
+    bearings = _bearing_rows(problem, estimate, at)
     names = [column.name for column in fields(Rows)]
     return Rows(
-        **{name: np.concatenate([getattr(ranges, name), getattr(points, name)]) for name in names}
+        **{name: np.concatenate([getattr(ranges, name), getattr(bearings, name)]) for name in names}
     )
 
 
@@ -168,33 +169,41 @@ def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
     )
 
 
-def _point_rows(problem: Problem, estimate: Estimate, n_columns: int) -> Rows:
-    first = problem.layout.first_columns(problem.point_landmarks)
-    pose = estimate.poses[problem.point_poses]
-    landmarks = estimate.fixed[np.column_stack([first, first + 1]) - HEAD_SIZE]
-    away = landmarks - pose[:, :2]
-    q = np.maximum(np.sum(away**2, axis=1), _LEAST_RANGE_M2)
-    distance = np.sqrt(q)
-    residual = np.column_stack([distance, np.arctan2(away[:, 1], away[:, 0]) - pose[:, 2]])
-    residual -= problem.points
-    residual[:, 1] = wrap_angles(residual[:, 1])
-    by_landmark = np.empty((len(q), 2, 2))
-    by_landmark[:, 0] = away / distance[:, None]
-    by_landmark[:, 1, 0], by_landmark[:, 1, 1] = -away[:, 1] / q, away[:, 0] / q
-    by_pose = np.zeros((len(q), 2, 3))
-    by_pose[:, :, :2] = -by_landmark
-    by_pose[:, 1, 2] = -1.0
-    roots = problem.point_roots
-    columns = np.repeat(first, n_columns).reshape(-1, n_columns)
-    columns[:, 1] += 1
-    by_border = np.zeros((2 * len(q), n_columns))
-    by_border[:, :2] = (roots @ by_landmark).reshape(-1, 2)
+def _bearing_rows(problem: Problem, estimate: Estimate, at: Indices) -> Rows:
+    """Return the rows of the bearings of some ranges; columns in the order of `_range_rows`."""
+    layout, radars = problem.layout, problem.range_radars[at]
+    values = np.concatenate([np.zeros(HEAD_SIZE), estimate.fixed])
+    first = layout.first_columns(problem.range_landmarks[at])
+    pose, turns = estimate.poses[problem.range_poses[at]], problem.range_turns[at]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    cm, sm = np.cos(turns), np.sin(turns)
+    mx, my = problem.range_antennas[at].T
+    if layout.has_mounts:
+        of_mount = layout.mounts.start + 2 * radars
+        ex, ey = values[of_mount], values[of_mount + 1]
+        mx, my = mx + cm * ex - sm * ey, my + sm * ex + cm * ey
+    arm = np.column_stack([c * mx - s * my, s * mx + c * my])
+    away = np.column_stack([values[first], values[first + 1]]) - pose[:, :2] - arm
+    square = np.maximum(np.sum(away**2, axis=1), _LEAST_RANGE_M2)
+    sigmas = problem.range_bearing_sigmas_rad[at]
+    residual = np.arctan2(away[:, 1], away[:, 0]) - pose[:, 2] - turns
+    residual = wrap_angles(residual - problem.range_bearings_rad[at])
+    g = quarter_turn(away) / (square * sigmas)[:, None]
+    by_heading = g[:, 0] * arm[:, 1] - g[:, 1] * arm[:, 0] - 1.0 / sigmas
+    of_offset, none = layout.offsets.start + radars, np.zeros(len(at))
+    columns, by_border = [of_offset, first, first + 1], [none, *g.T]
+    if layout.has_mounts:
+        ct, st = c * cm - s * sm, s * cm + c * sm
+        by_mount = [-(g[:, 0] * ct + g[:, 1] * st), g[:, 0] * st - g[:, 1] * ct]
+        columns, by_border = [*columns, of_mount, of_mount + 1], [*by_border, *by_mount]
+    if layout.has_radii:
+        columns, by_border = [*columns, first + 2], [*by_border, none]
     return Rows(
-        poses=np.repeat(problem.point_poses, 2),
-        residual=np.einsum("kij,kj->ki", roots, residual).ravel(),
-        by_pose=(roots @ by_pose).reshape(-1, 3),
-        columns=np.repeat(columns, 2, axis=0),
-        by_border=by_border,
+        poses=problem.range_poses[at],
+        residual=residual / sigmas,
+        by_pose=np.column_stack([-g, by_heading]),
+        columns=np.column_stack(columns),
+        by_border=np.column_stack(by_border),
     )
 
 

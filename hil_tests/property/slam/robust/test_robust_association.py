@@ -12,11 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 
 from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, values
 from hil_tests.property.trilateration_oracles import NO_RANGES
-from slam.app.experiments.victoria_park import PARK_POINTS
 from slam.app.sweep.bound import fix_of_pair
 from slam.geometry import paper_rig
 from slam.robust.association import (
@@ -24,16 +23,15 @@ from slam.robust.association import (
     RangeScan,
     antennas_of,
     find_known,
+    find_points,
+    point_view,
     view,
 )
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
     BodyPoint,
-    RangeBearing,
-    assign,
     match,
     point_rows,
-    range_bearing_rows,
 )
 from slam.robust.parameters import (
     MARGIN_NATS,
@@ -186,10 +184,6 @@ def test_the_brute_force_has_work_to_do() -> None:
 # --- gates ----------------------------------------------------------------------------------------
 
 
-def test_the_gate_of_points_is_a_quantile_of_chi_square() -> None:
-    assert chi2.cdf(PARK_POINTS.gate, 2) == pytest.approx(0.99, abs=1e-4)
-
-
 def one_landmark(prior: Array) -> State:
     """Return a landmark 1 m ahead whose ranges of the left radars have a covariance (2, 2)."""
     state = random_state(0, 1, 0.3)
@@ -231,57 +225,87 @@ def test_a_gate_ends_where_it_says(sigmas: float, n_used: int) -> None:
     assert len(known_of(state, scans, noise).assigned) == n_used
 
 
-def test_true_points_pass_the_gate_of_99_percent_as_often_as_it_says() -> None:
+def camera_sees(
+    state: State, points: Sequence[tuple[float, float]], noise: RangeNoise
+) -> list[tuple[int, int]]:
+    """Return index and row of what a scan of radar 0 sees, by range and bearing."""
+    scan = RangeScan(
+        radar=0,
+        ranges_m=tuple(range_m for range_m, _ in points),
+        bearings_rad=tuple(bearing for _, bearing in points),
+    )
+    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+    parameters = BackEndParameters(ranges=noise)
+    found = find_points(state, seen, scan, (range(len(points)), (), {}), parameters)
+    return sorted(found.pairs)
+
+
+def test_true_points_pass_their_gate_as_often_as_it_says() -> None:
     """Drawn from the distribution of the state's own errors, by its own formulas."""
     rng = np.random.default_rng(12)
-    state = random_state(1, 1, 0.4)
-    state.P = SymmetricMatrix(1e-4 * state.P.full())
-    C = np.diag([1e-3, 2e-3]) ** 2
-    seen = RangeBearing(range_m=1.0, bearing_rad=0.0, covariance=C)
-    rows = range_bearing_rows(state, 0, seen)
-    expected = seen.values - rows.residual
-    noisy = expected + rng.standard_normal((TRIALS // 4, 2)) @ np.linalg.cholesky(rows.S).T
-    rule = PARK_POINTS
-    passed = 0
-    for range_m, bearing in noisy.tolist():
-        point = RangeBearing(range_m=range_m, bearing_rad=bearing, covariance=C)
-        passed += assign(state, [point], rule) == [0]
-    assert passed / len(noisy) == pytest.approx(0.99, abs=0.006)
+    noise = replace(NOISE, clutter_per_m=1e-12, bearing_sigma_rad=0.02)
+    state = one_landmark(1e-6 * np.array([[2.0, 1.0], [1.0, 3.0]]))
+    of = point_view(state, view(state, antennas_of(paper_rig(), (), np.zeros(3))), 0, np.array([0]))
+    S = of.H[0] @ state.P.block(of.at) @ of.H[0].T
+    S += np.diag([noise.sigma_m**2, noise.bearing_sigma_rad**2])
+    noisy = of.predicted[0] + rng.standard_normal((TRIALS // 4, 2)) @ np.linalg.cholesky(S).T
+    passed = sum(camera_sees(state, [(z[0], z[1])], noise) == [(0, 0)] for z in noisy.tolist())
+    assert passed / len(noisy) == pytest.approx(1.0 - TAIL_PROBABILITY, abs=0.002)
 
 
 @few
-@given(seeds, st.integers(1, 5), st.integers(1, 5))
-def test_points_are_assigned_as_the_best_of_all_assignments(
+@given(seeds, st.integers(1, 4), st.integers(1, 4))
+def test_sure_points_are_assigned_as_the_best_of_all_assignments(
     seed: int, n: int, n_points: int
 ) -> None:
+    """By the likelihood with its determinant, written out, against clutter."""
     rng = np.random.default_rng(seed)
     state = ahead_of_the_left_radars(seed, n)
-    points = [
-        RangeBearing(
-            range_m=float(rng.uniform(0.8, 1.2)),
-            bearing_rad=float(math.pi / 2 + rng.uniform(-0.2, 0.2)),
-            covariance=np.diag([4e-4, 9e-4]),
-        )
-        for _ in range(n_points)
-    ]
-    rule = PARK_POINTS
-    table = np.array(
-        [[range_bearing_rows(state, k, point).mahalanobis_sq for k in range(n)] for point in points]
-    )
+    state.P = SymmetricMatrix(1e-4 * state.P.full())  # far surer than the sensor
+    noise = replace(NOISE, sigma_m=0.05, bearing_sigma_rad=0.05)
+    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+    of = point_view(state, seen, 0, np.arange(n))
+    points = of.predicted[rng.integers(0, n, n_points)] + rng.normal(0.0, 0.05, (n_points, 2))
+    R = np.diag([noise.sigma_m**2, noise.bearing_sigma_rad**2])
+    Pd, clutter = noise.detection_probability, noise.clutter_per_m / noise.field_of_view_rad
+    gain = np.full((n_points, n), -math.inf)
+    for k in range(n):
+        S = of.H[k] @ state.P.block(of.at) @ of.H[k].T + R
+        for i, z in enumerate(points):
+            if (z - of.predicted[k]) @ np.linalg.solve(S, z - of.predicted[k]) <= chi2.isf(1e-3, 2):
+                density = multivariate_normal.pdf(z, of.predicted[k], S)
+                gain[i, k] = math.log(Pd / (1.0 - Pd) * density / clutter)
 
-    def cost(choice: Sequence[int | None]) -> float:
-        return sum(rule.gate if k is None else table[i, k] for i, k in enumerate(choice))
+    def total(choice: Sequence[int | None]) -> float:
+        return sum(0.0 if k is None else gain[i, k] for i, k in enumerate(choice))
 
-    best = min(
-        cost(choice)
+    best = max(
+        total(choice)
         for choice in product([None, *range(n)], repeat=n_points)
         if len(used := [k for k in choice if k is not None]) == len(set(used))
-        and all(k is None or table[i, k] < rule.gate for i, k in enumerate(choice))
     )
-    found = assign(state, points, rule)
-    assert cost([None if k in (None, -1) else k for k in found]) == pytest.approx(best, abs=1e-9)
-    for i, k in enumerate(found):
-        assert (k == -1) <= (table[i].min() > rule.new_gate)
+    found = dict(camera_sees(state, [(z[0], z[1]) for z in points.tolist()], noise))
+    assert total([found.get(i) for i in range(n_points)]) == pytest.approx(best, abs=1e-9)
+
+
+def test_a_point_of_an_unsure_landmark_is_taken_only_where_it_is_certain() -> None:
+    """The wider the prediction, the likelier is another landmark at the same place."""
+    noise = replace(NOISE, sigma_m=0.01, bearing_sigma_rad=0.01)
+    for sigma_m, is_taken in ((0.005, True), (0.05, True), (0.5, False)):
+        state = one_landmark(sigma_m**2 * np.eye(2))
+        seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+        z = float(seen.ranges_m[0, 0]), float(seen.off_boresight_rad[0, 0])
+        assert (camera_sees(state, [z], noise) == [(0, 0)]) == is_taken
+
+
+def test_an_unsure_landmark_is_neither_of_two_points() -> None:
+    noise = replace(NOISE, sigma_m=0.01, bearing_sigma_rad=0.01)
+    state = one_landmark(0.05**2 * np.eye(2))
+    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+    range_m, bearing = float(seen.ranges_m[0, 0]), float(seen.off_boresight_rad[0, 0])
+    one, other = (range_m - 0.02, bearing), (range_m + 0.02, bearing)
+    assert camera_sees(state, [one], noise) == [(0, 0)]
+    assert camera_sees(state, [one, other], noise) == []
 
 
 @few

@@ -28,13 +28,11 @@ from hil_tests.property.robust_oracles import (
 )
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.association import RangeScan, antennas_of, view
+from slam.robust.association import RangeScan, antennas_of, point_view, view
 from slam.robust.initialisation import (
     BodyPoint,
-    RangeBearing,
     initialise_landmark,
     point_rows,
-    range_bearing_rows,
     update_with_point,
 )
 from slam.robust.solver.run_log import Estimate, Problem
@@ -123,24 +121,30 @@ def test_point_rows_are_derivatives(seed: int, heading: float) -> None:
 
 
 @few
-@given(seeds, near_a_half_turn())
-def test_range_and_bearing_rows_are_derivatives(seed: int, heading: float) -> None:
+@given(seeds, near_a_half_turn(), st.integers(0, N_RADARS - 1))
+def test_range_and_bearing_rows_are_derivatives(seed: int, heading: float, radar: int) -> None:
     state = random_state(seed, 2, heading)
-    seen = RangeBearing(range_m=1.0, bearing_rad=0.3, covariance=1e-4 * np.eye(2))
-    rows = range_bearing_rows(state, 0, seen)
-    mean = values(state).astype(np.complex128)
+    antennas = antennas_of(paper_rig(), (), np.zeros(3))
+    found = point_view(state, view(state, antennas), radar, np.array([1, 0]))
+    mean, mount = values(state).astype(np.complex128), paper_rig().mounts[radar]
+    for place, landmark in enumerate((1, 0)):
 
-    def measured(e: Complex) -> Complex:
-        b = body_point(plus(mean, e), 0)
-        # atan2 of complex numbers, up to a constant: Im log.
-        angle = np.arctan(b[1] / b[0])
-        return np.array([np.sqrt(b @ b), angle])
+        def measured(e: Complex, landmark: int = landmark) -> Complex:
+            b = body_point(plus(mean, e), landmark) - antennas.position_m[radar]
+            # arctan2 of complex numbers, up to a half turn
+            angle = np.arctan(b[1] / b[0]) - mount.yaw_rad
+            offset = plus(mean, e)[state.layout.offsets][radar]
+            return np.array([np.sqrt(b @ b) + offset, angle])
 
-    wanted = complex_step(measured, np.zeros(len(mean)))
-    full = np.zeros((2, len(mean)))
-    full[:, rows.at] = rows.H
-    assert np.abs(full - wanted).max() <= 1e-10 * max(1.0, np.abs(wanted).max())
-    assert -math.pi <= rows.residual[1] < math.pi
+        wanted = complex_step(measured, np.zeros(len(mean)))
+        full = np.zeros((2, len(mean)))
+        full[:, found.at] = found.H[place]
+        assert np.abs(full - wanted).max() <= 1e-10 * max(1.0, np.abs(wanted).max())
+        range_m, angle = measured(np.zeros(len(mean), dtype=np.complex128)).real.tolist()
+        assert found.predicted[place, 0] == pytest.approx(range_m, abs=1e-12)
+        apart = math.remainder(float(found.predicted[place, 1]) - angle, math.pi)
+        assert apart == pytest.approx(0.0, abs=1e-9)
+        assert -math.pi <= found.predicted[place, 1] < math.pi
 
 
 @few
@@ -214,13 +218,11 @@ def small_problem(seed: int) -> tuple[Problem, Estimate]:
         range_landmarks=np.array([0, 1, 0, 1]),
         range_antennas=rng.uniform(-0.2, 0.2, (4, 2)),
         range_rows=np.arange(4),
-        range_turns=np.zeros(4),
+        range_turns=0.3 * rng.standard_normal(4),
         ranges_m=rng.uniform(0.5, 1.5, 4),
         range_sigmas_m=np.full(4, 0.01),
-        point_poses=np.array([3, 4]),
-        point_landmarks=np.array([1, 0]),
-        points=np.array([[1.0, 0.2], [1.2, -0.4]]),
-        point_roots=np.tile(np.array([[20.0, 0.0], [3.0, 30.0]]), (2, 1, 1)),
+        range_bearings_rad=np.array([np.nan, 0.2, np.nan, -0.4]),
+        range_bearing_sigmas_rad=np.array([np.nan, 0.03, np.nan, 0.05]),
     )
     estimate = Estimate(
         poses=rng.uniform(-2, 2, (5, 3)),
@@ -271,21 +273,21 @@ def test_derivatives_of_the_smoother_are_those_of_its_residuals(seed: int) -> No
         found = np.concatenate([rows.by_pose[i], own[1:3], own[:1]])
         assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()
         assert rows.residual[i] == pytest.approx(white_range(x.astype(complex))[0].real, abs=1e-9)
-    for i in range(2):
+    for number, i in enumerate((1, 3)):
 
-        def white_point(x: Complex, i: int = i) -> Complex:
-            away = x[3:5] - x[:2]
-            q = np.sqrt(away @ away)
+        def white_bearing(x: Complex, i: int = i) -> Complex:
+            away = x[3:5] - x[:2] - turn(x[2]) @ problem.range_antennas[i]
             angle = np.arctan(away[1] / away[0]) - x[2]
-            result: Complex = problem.point_roots[i] @ np.array([q, angle])
-            return result
+            return np.array([angle / problem.range_bearing_sigmas_rad[i]])
 
         x = np.concatenate(
             [
-                estimate.poses[problem.point_poses[i]],
-                landmarks_m[problem.point_landmarks[i]],
+                estimate.poses[problem.range_poses[i]],
+                landmarks_m[problem.range_landmarks[i]],
             ]
         )
-        wanted = complex_step(white_point, x)
-        found = np.hstack([rows.by_pose[4 + 2 * i :][:2], rows.by_border[4 + 2 * i :][:2, :2]])
+        wanted = complex_step(white_bearing, x)[0]
+        own = rows.by_border[4 + number]
+        found = np.concatenate([rows.by_pose[4 + number], own[1:3]])
+        assert own[0] == 0.0
         assert np.abs(found - wanted).max() <= 1e-9 * np.abs(wanted).max()

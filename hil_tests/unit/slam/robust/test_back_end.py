@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,14 +17,14 @@ from hil_tests.unit.slam.robust.range_world import (
     parameters_for,
     simulate,
 )
-from slam.app.experiments.victoria_park import PARK_POINTS
 from slam.evaluation import ate_rmse_m, landmark_metrics, observable_landmarks
 from slam.geometry import PAPERS_FIELD, Mount, Rig, align_se2, paper_rig, transform
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import BackEndParameters
+from slam.robust.initialisation import BodyPoint, initialise_landmark
+from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.pipeline import belief_of
+from slam.robust.state import quarter_turn
 
 SIGMA_M = 7.4e-3
 
@@ -139,21 +140,57 @@ def test_a_range_of_uncertain_association_is_used_and_weighs_less() -> None:
     assert not after(association_sigma_m=0.0)[0]
 
 
-def test_points_with_names_make_a_map() -> None:
-    back_end = RobustBackEnd(paper_rig(), BackEndParameters())
-    C = np.diag([1e-4, 1e-4])
-    for k in range(5):
-        back_end.predict(np.array([0.1, 0.0, 0.0]))
-        seen = np.array([2.0, 1.0]) - np.array([0.1 * (k + 1), 0.0])
-        range_m, bearing = float(np.hypot(*seen)), float(np.arctan2(seen[1], seen[0]))
-        point = RangeBearing(range_m=range_m, bearing_rad=bearing, covariance=C, label=7)
-        assert back_end.update_points([point], PARK_POINTS) == (0,)
-    assert back_end.state.landmarks_m[0] == pytest.approx([2.0, 1.0], abs=1e-3)
-    unnamed = replace(point, label=None)
-    assert back_end.update_points([unnamed], PARK_POINTS) == (0,)
-    assert back_end.update_points([replace(unnamed, bearing_rad=bearing + 1.0)], PARK_POINTS) == (
-        1,
+def camera_scan(
+    points: Sequence[tuple[float, float]], labels: tuple[int | None, ...] | None = None
+) -> RangeScan:
+    """Return what radar 0 sees, with range and bearing, each known to a centimetre."""
+    return RangeScan(
+        radar=0,
+        ranges_m=tuple(range_m for range_m, _ in points),
+        sigmas_m=(0.01,) * len(points),
+        bearings_rad=tuple(bearing for _, bearing in points),
+        bearing_sigmas_rad=(0.01,) * len(points),
+        labels=labels,
     )
+
+
+@pytest.mark.parametrize("label", [None, 7])
+def test_a_point_is_a_landmark_when_enough_scans_hold_it(label: int | None) -> None:
+    rig = Rig(mounts=(Mount(name="camera", x_m=0.1, y_m=0.05, yaw_rad=0.3),))
+    parameters = BackEndParameters(ranges=RangeNoise(max_range_m=5.0))
+    back_end = RobustBackEnd(rig, parameters)
+    target, min_hits = (
+        np.array([2.0, 0.5]),
+        (
+            parameters.tracklets.min_frames
+            if label is None
+            else parameters.tracklets.min_hits_per_radar
+        ),
+    )
+    for k in range(min_hits + 3):
+        back_end.predict(np.array([0.1, 0.0, 0.0]))
+        x, y = target - np.array([0.1 * (k + 1) + 0.1, 0.05])
+        seen = math.hypot(x, y), math.atan2(y, x) - 0.3
+        report = back_end.update([camera_scan([seen], (label,))])
+        assert len(back_end.state.landmark_ids) == (k + 1 >= min_hits)
+        assert report.continued == (((0, 0, 0),) if k >= min_hits else ())
+        assert report.dof == 2 * len(report.continued)
+    assert back_end.state.landmarks_m[0] == pytest.approx(target, abs=1e-3)
+    assert back_end.landmark_of_label == ({} if label is None else {7: 0})
+
+
+def test_clutter_with_bearings_is_no_landmark() -> None:
+    rng = np.random.default_rng(3)
+    back_end = RobustBackEnd(paper_rig(), BackEndParameters(ranges=RangeNoise(max_range_m=5.0)))
+    for _ in range(60):
+        back_end.predict(np.array([0.05, 0.0, 0.01]))
+        back_end.update([camera_scan([(rng.uniform(0.5, 5.0), rng.uniform(-0.5, 0.5))])])
+    assert not back_end.state.landmark_ids
+
+
+def test_a_scan_with_bearings_needs_one_for_each_range() -> None:
+    with pytest.raises(ValueError, match="1 bearings_rad of 2 ranges"):
+        RangeScan(radar=0, ranges_m=(1.0, 2.0), bearings_rad=(0.1,))
 
 
 def test_an_empty_scan_and_no_scan_change_nothing() -> None:
@@ -180,13 +217,16 @@ def test_a_landmark_known_to_two_centimetres_is_given_up_where_nothing_answers(
 ) -> None:
     back_end = RobustBackEnd(paper_rig(), BackEndParameters())
     # 0.4 m straight in front of both left radars' middle; too unsure for single ranges
-    point = RangeBearing(range_m=0.6, bearing_rad=np.pi / 2, covariance=np.diag([4e-4, 4e-4]))
     # others answer on the right, so the pose of the robot is certain
-    known = [
-        RangeBearing(range_m=0.6, bearing_rad=bearing, covariance=np.diag([1e-6, 1e-6]))
-        for bearing in (-1.5, -1.7)
-    ]
-    assert back_end.update_points([point, *known], PARK_POINTS) == (0, 1, 2)
+    for bearing, sigma_m in ((np.pi / 2, 0.02), (-1.5, 1e-3), (-1.7, 1e-3)):
+        u = np.array([math.cos(bearing), math.sin(bearing)])
+        turn = np.column_stack([u, quarter_turn(u)])
+        point = BodyPoint(
+            point_m=0.6 * u,
+            covariance=turn @ np.diag([sigma_m**2, (0.6 * sigma_m) ** 2]) @ turn.T,
+            by_offsets=np.zeros((2, 4)),
+        )
+        back_end._existence.hit(initialise_landmark(back_end.state, point))
     ranges_m = [
         tuple(math.hypot(0.6 * math.cos(b) - x_m, 0.6 * math.sin(b) + 0.2) for b in (-1.5, -1.7))
         for x_m in (0.1, -0.1)

@@ -15,12 +15,10 @@ from scipy.special import chdtri
 
 from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.unit.slam.robust.range_world import LAB, follow, parameters_for, simulate, step_of
-from slam.app.experiments.victoria_park import PARK_POINTS
 from slam.config import WheelNoise
 from slam.geometry import between, compose, paper_rig
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters, RelinearisationRule, SplitRule
 from slam.robust.solver.revision import is_determined, relinearise
 from slam.robust.solver.run_log import (
@@ -41,11 +39,6 @@ Complex = NDArray[np.complex128]
 N_RADARS, N_MARKS, N_STEPS = 4, 3, 12
 ANTENNAS = np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]])
 RULE = RelinearisationRule(iterations=40, outlier_sigmas=50.0, steps_per_slip=math.inf)
-
-
-def point_seen(pose: Array, mark: Array) -> Array:
-    x, y = mark - pose[:2]
-    return np.array([math.hypot(x, y) + 0.02, math.atan2(y, x) - pose[2] - 0.03])
 
 
 def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Problem, Estimate]:
@@ -96,12 +89,18 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
         range_turns=0.1 * rng.standard_normal(len(at)),
         ranges_m=z + 2e-3 * rng.standard_normal(len(z)),
         range_sigmas_m=np.full(len(z), 5e-3),
-        point_poses=np.array([1, 4], dtype=np.intp),
-        point_landmarks=np.array([0, 2], dtype=np.intp),
-        points=np.array(
-            [point_seen(poses[keys[1]], marks[0]), point_seen(poses[keys[4]], marks[2])]
-        ),
-        point_roots=np.tile(np.diag([50.0, 20.0]), (2, 1, 1)),
+        range_bearings_rad=np.full(len(at), np.nan),
+        range_bearing_sigmas_rad=np.full(len(at), np.nan),
+    )
+    # The first radar measures bearings, too.
+    away = marks[np.minimum(seen, 2)] - places
+    bearings = np.arctan2(away[:, 1], away[:, 0]) - poses[keys][at, 2] - problem.range_turns
+    bearings += 2e-3 * rng.standard_normal(len(at))
+    bearings[(seen == 3) | (radars > 0)] = np.nan
+    problem = replace(
+        problem,
+        range_bearings_rad=bearings,
+        range_bearing_sigmas_rad=np.where(np.isnan(bearings), np.nan, 0.05),
     )
     return problem, Estimate(
         poses=poses[keys] + 0.02 * rng.standard_normal((k, 3)),
@@ -180,6 +179,7 @@ def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool 
         if n_cal > 1:
             walks = problem.walks[own].sum(axis=0)
             result.append((calibration[k + 1] - calibration[k]) / np.sqrt(walks))
+    bearings = []
     for i, (k, radar, row) in enumerate(
         zip(problem.range_poses, problem.range_radars, problem.range_landmarks, strict=True)
     ):
@@ -197,19 +197,13 @@ def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool 
             expected = d - np.cos(phi) * place[0] - np.sin(phi) * place[1]
         miss = expected + v[layout.offsets.start + radar] - problem.ranges_m[i]
         result.append(np.atleast_1d(miss / problem.range_sigmas_m[i]))
-    for k, row, point, root in zip(
-        problem.point_poses,
-        problem.point_landmarks,
-        problem.points,
-        problem.point_roots,
-        strict=True,
-    ):
-        first = layout.landmarks.start + layout.landmark_size * row
-        b = turn(poses[k, 2]).T @ (v[first : first + 2] - poses[k, :2])
-        # atan of a ratio: complex steps do not pass arctan2; the point lies ahead and left.
-        bearing = math.pi / 2 - np.arctan(b[0] / b[1])
-        result.append(root @ (np.array([np.sqrt(b @ b), bearing]) - point))
-    return np.concatenate(result)
+        if not np.isnan(problem.range_bearings_rad[i]):
+            # Turned by what was measured, the landmark lies ahead: complex steps do not pass
+            # arctan2.
+            measured = problem.range_turns[i] + problem.range_bearings_rad[i]
+            b = turn(poses[k, 2] + measured).T @ away
+            bearings.append(np.arctan(b[1] / b[0]) / problem.range_bearing_sigmas_rad[i])
+    return np.concatenate([*result, np.array(bearings)])
 
 
 def newest(n_poses: int, n_cal: int, size: int) -> NDArray[np.intp]:
@@ -289,7 +283,7 @@ def test_huber_weights_are_those_of_the_solution_itself() -> None:
     problem = replace(problem, ranges_m=ranges_m, huber_sigmas=2.0)
     solution = Smoother(problem, RULE).solve(start, tolerance=1e-13)
     assert solution is not None
-    n_rows = len(ranges_m) + 2 * len(problem.points)
+    n_rows = len(ranges_m) + len(problem.with_bearing)
 
     def real(x: Array) -> Array:
         white = white_residuals(problem, 1, x.astype(np.complex128), is_exact=True).real
@@ -303,14 +297,14 @@ def test_huber_weights_are_those_of_the_solution_itself() -> None:
 
 
 def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
-    """Of 60 ranges the eleventh is off by 40 standard deviations; by default the limit is four."""
+    """Of 60 ranges the twelfth is off by 40 standard deviations; by default the limit is four."""
     problem, start = short_run(3, 0.0)
     rule = RelinearisationRule(iterations=40, steps_per_slip=math.inf)
     ranges_m = problem.ranges_m.copy()
-    ranges_m[10] += 0.2
+    ranges_m[11] += 0.2
     spoilt = Smoother(replace(problem, ranges_m=ranges_m), rule)
     names = [name for name in Problem.__dataclass_fields__ if name.startswith("range")]
-    rows = {name: np.delete(getattr(problem, name), 10, axis=0) for name in names}
+    rows = {name: np.delete(getattr(problem, name), 11, axis=0) for name in names}
     without = Smoother(replace(problem, **rows), rule)
     wanted = without.solve(start, tolerance=1e-14)
     assert wanted is not None
@@ -450,19 +444,30 @@ def test_each_calibration_error_walks_in_proportion_to_its_own_deviation() -> No
     assert state.P.full().diagonal()[3:6] == pytest.approx(1.25 * np.square(sigmas))
 
 
-def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
-    """A target that comes back is a new landmark, not one that the map lacks."""
-    parameters = parameters_for(LAB, 7.4e-3)
-    back_end = RobustBackEnd(paper_rig(), parameters)
-    seen = RangeBearing(range_m=1.0, bearing_rad=1.5, covariance=1e-6 * np.eye(2), label=3)
-    far = RangeBearing(range_m=5.0, bearing_rad=0.0, covariance=1e-6 * np.eye(2), label=4)
-    first, _ = back_end.update_points([seen, far], PARK_POINTS)
-    silent = [RangeScan(radar=radar, ranges_m=()) for radar in range(N_RADARS)]
+def test_the_label_of_a_target_that_was_moved_is_where_it_is_now() -> None:
+    """That nothing is seen of it is no evidence; that it is seen elsewhere, is."""
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, 7.4e-3))
+    seen = RangeScan(
+        radar=0,
+        ranges_m=(1.0,),
+        sigmas_m=(1e-3,),
+        bearings_rad=(0.1,),
+        bearing_sigmas_rad=(1e-3,),
+        labels=(3,),
+    )
+    for _ in range(5):
+        back_end.update([seen])
     for _ in range(40):
-        back_end.update(silent)
-    assert first not in back_end.state.landmark_ids
-    assert back_end.update_points([seen], PARK_POINTS) != (first,)
-    assert len(back_end.state.landmark_ids) == 2
+        back_end.update([RangeScan(radar=0, ranges_m=(), bearings_rad=())])
+    (first,) = back_end.state.landmark_ids
+    assert back_end.landmark_of_label == {3: first}
+    for _ in range(40):
+        back_end.update([replace(seen, bearings_rad=(-0.4,))])
+    row = back_end.state.landmark_ids.index(back_end.landmark_of_label[3])
+    mount = paper_rig().mounts[0]
+    angle = mount.yaw_rad - 0.4
+    place = np.array([mount.x_m + math.cos(angle), mount.y_m + math.sin(angle)])
+    assert back_end.state.landmarks_m[row] == pytest.approx(place, abs=5e-3)
 
 
 def drive_along(

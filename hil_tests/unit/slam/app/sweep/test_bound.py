@@ -150,10 +150,8 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
         range_turns=np.zeros(len(used)),
         ranges_m=np.array([known.range_m for _, known in used]),
         range_sigmas_m=np.full(len(used), SIGMA_M),
-        point_poses=np.zeros(0, dtype=np.intp),
-        point_landmarks=np.zeros(0, dtype=np.intp),
-        points=np.zeros((0, 2)),
-        point_roots=np.zeros((0, 2, 2)),
+        range_bearings_rad=np.full(len(used), np.nan),
+        range_bearing_sigmas_rad=np.full(len(used), np.nan),
     )
     rule = RelinearisationRule(iterations=20, outlier_sigmas=math.inf, steps_per_slip=math.inf)
     begin = Estimate(

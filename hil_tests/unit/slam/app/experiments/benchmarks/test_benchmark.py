@@ -1,0 +1,121 @@
+"""`uwb-slam benchmark` on a look-alike of each data set, from files to numbers and pictures."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hil_tests.unit.slam.app.experiments.benchmarks import worlds
+from slam.app.cli import main
+from slam.app.experiments.benchmarks import BENCHMARKS, pyfg
+from slam.app.experiments.benchmarks.data_set import Path as Places
+from slam.app.experiments.benchmarks.data_set import Run
+from slam.app.experiments.benchmarks.evaluation import associated
+from slam.app.odometry.track import Trajectory, read_tum
+
+
+def write(name: str, folder: Path) -> Path:
+    match name:
+        case "mrclam":
+            return worlds.write_mrclam(folder, robots=2)
+        case "victoria-park":
+            return worlds.write_victoria_park(folder, duration_s=60.0)
+        case "plaza":
+            return worlds.write_pyfg_file(folder / "small.pyfg").parent
+    return worlds.write_librsf(folder)
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_a_benchmark_is_better_than_dead_reckoning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    data, out = write(name, tmp_path / "data"), tmp_path / "out"
+    assert main(["benchmark", name, "--data", str(data), "--out", str(out), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((out / f"{name}.json").read_text(encoding="ascii"))
+    assert len(printed["runs"]) == (2 if name == "mrclam" else 1)
+    for run in printed["runs"]:
+        ate = run["ate_rmse_m"]
+        ways = {
+            "mrclam": {"with_ids", "without_ids"},
+            "victoria-park": {"without_ids"},
+        }.get(name, {"with_ids"})
+        assert set(run["landmarks"]) == ways
+        assert set(ate) == {"odometry", *ways, *(f"{way}_smoothed" for way in ways)}
+        for way in ways:
+            # wheels that err by 3 % are off by half a metre; what is seen is sure to centimetres
+            assert ate[way] < 0.7 * ate["odometry"]
+            assert ate[f"{way}_smoothed"] < 0.5 * ate["odometry"]
+        folder = out / name / run["run"]
+        files = {f"{path}.tum" for path in ate} | {"truth.tum"}
+        files |= {"graph.pyfg"} if "with_ids" in ways else set()
+        assert {path.name for path in folder.iterdir()} == files
+        truth = read_tum(folder / "truth.tum")
+        for path, expected in ate.items():
+            estimate = read_tum(folder / f"{path}.tum")
+            assert len(estimate.stamps_ns) == run["steps"]
+            assert _ate_m(estimate, truth) == pytest.approx(expected, rel=1e-6)
+    means = printed["mean_ate_rmse_m"]
+    assert means["odometry"] == pytest.approx(
+        np.mean([run["ate_rmse_m"]["odometry"] for run in printed["runs"]])
+    )
+    with Image.open(out / f"{name}.png") as image:
+        assert min(image.size) > 400
+
+
+def _ate_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """Return the ATE with complex numbers: the best turn has a closed form there."""
+    inside = (truth.stamps_ns >= estimate.stamps_ns[0]) & (
+        truth.stamps_ns <= estimate.stamps_ns[-1]
+    )
+    stamps = truth.stamps_ns[inside] - estimate.stamps_ns[0]
+    since = estimate.stamps_ns - estimate.stamps_ns[0]
+    x, y = (np.interp(stamps, since, estimate.poses[:, axis]) for axis in (0, 1))
+    a, b = x + 1j * y, truth.poses[inside, 0] + 1j * truth.poses[inside, 1]
+    a, b = a - a.mean(), b - b.mean()
+    turn = np.vdot(a, b)
+    return float(np.sqrt(np.mean(np.abs(a * turn / abs(turn) - b) ** 2)))
+
+
+def test_the_table_has_a_row_per_run_and_their_mean(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = tmp_path / "data"
+    worlds.write_librsf(data, duration_s=10.0)
+    for kind in ("Input", "GT"):
+        text = (data / f"Small_{kind}.txt").read_text(encoding="ascii")
+        (data / f"Other_{kind}.txt").write_text(text, encoding="ascii")
+    code = main(["benchmark", "uwb-indoor", "--data", str(data), "--out", str(tmp_path / "out")])
+    assert code == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    first = {row[0]: row for row in rows if row}
+    assert first["Other"][1:5] == first["Small"][1:5]
+    # dead reckoning, causal, smoothed
+    assert first["mean"][1:] == first["Other"][2:5]
+
+
+def test_truth_of_another_drive_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = worlds.write_librsf(tmp_path / "data", duration_s=2.0)
+    (data / "Small_GT.txt").write_text("point2 99 0 0 0 0 0 0\npoint2 100 0 0 0 0 0 0\n")
+    code = main(["benchmark", "uwb-indoor", "--data", str(data), "--out", str(tmp_path / "out")])
+    assert code == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error == (
+        "uwb-slam: Small: 0 positions of its truth lie in the time of its odometry; both must be "
+        "of the same drive"
+    )
+
+
+def test_how_densely_a_path_is_sampled_does_not_count(tmp_path: Path) -> None:
+    worlds.write_pyfg_file(tmp_path / "small.pyfg", duration_s=5.0)
+    (run,) = pyfg.read_data_set(tmp_path).runs
+    half = Run(name="half", steps=run.steps[::2], truth=run.truth)
+    straight = np.column_stack([np.arange(len(run.steps)), *np.zeros((2, len(run.steps)))])
+    dense, _ = associated(run, straight)
+    sparse, _ = associated(half, straight[::2])
+    np.testing.assert_allclose(sparse, dense, atol=1e-9)
+    assert isinstance(run.truth, Places)

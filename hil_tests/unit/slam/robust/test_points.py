@@ -1,0 +1,135 @@
+"""Scans with ranges and bearings in a small simulated world: the map is found and consistent."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from slam.config import WheelNoise
+from slam.evaluation import ate_rmse_m
+from slam.geometry import Mount, Rig, compose, wrap_angle
+from slam.robust.association import RangeScan
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.parameters import (
+    BackEndParameters,
+    MapRule,
+    RangeNoise,
+    RelinearisationRule,
+)
+
+Array = NDArray[np.float64]
+
+MOUNT = Mount(name="camera", x_m=0.2, y_m=-0.1, yaw_rad=0.4)
+WHEELS = WheelNoise(
+    along_m_per_sqrt_m=0.02,
+    across_m_per_sqrt_m=0.01,
+    heading_rad_per_sqrt_m=0.02,
+    heading_rad_per_rad=0.02,
+    scale_sigma=0.02,
+    turn_scale_sigma=0.02,
+    curvature_sigma_rad_per_m=0.01,
+)
+NOISE = RangeNoise(
+    sigma_m=0.1,
+    bearing_sigma_rad=0.02,
+    huber_sigmas=2.0,
+    detection_probability=0.8,
+    clutter_per_m=0.05,
+    field_of_view_rad=2.0,
+    min_range_m=0.5,
+    max_range_m=8.0,
+    unmapped_per_m2=0.05,
+)
+PARAMETERS = BackEndParameters(
+    wheels=WHEELS,
+    ranges=NOISE,
+    map=MapRule(neighbourhood_m=3.0, view_inset_m=0.3),
+    relinearisation=RelinearisationRule(key_m=0.2, shift_m=0.2, steps_per_slip=math.inf),
+)
+LAPS, STEPS = 2, 120
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    pose: Array
+    increment: Array
+    scan: RangeScan
+
+
+def world(seed: int, *, labelled: bool) -> tuple[Array, Iterator[Step]]:
+    """Return landmarks (n, 2) and a drive in circles of 4 m among them."""
+    rng = np.random.default_rng(seed)
+    angles = np.linspace(0.0, math.tau, 14, endpoint=False)
+    radii = np.where(np.arange(14) % 2, 6.0, 2.2)
+    marks = np.column_stack([radii * np.cos(angles), radii * np.sin(angles) + 4.0])
+    marks += rng.uniform(-0.3, 0.3, marks.shape)
+    s, w = 0.02 * rng.standard_normal(2)
+    kappa = 0.01 * rng.standard_normal()
+
+    def drive() -> Iterator[Step]:
+        pose, turn = np.zeros(3), math.tau / STEPS
+        step = np.array([4.0 * math.sin(turn), 4.0 * (1.0 - math.cos(turn)), turn])
+        length = math.hypot(step[0], step[1])
+        for _ in range(LAPS * STEPS):
+            pose = compose(pose, step)
+            noise = rng.standard_normal(3) * np.sqrt(WHEELS.step_variances(length, turn))
+            reported = np.append((1.0 + s) * step[:2], (1.0 + w) * turn + kappa * length) + noise
+            at = compose(pose, np.array([MOUNT.x_m, MOUNT.y_m, MOUNT.yaw_rad]))
+            seen: list[tuple[float, float, int | None]] = []
+            for label, mark in enumerate(marks):
+                x, y = mark - at[:2]
+                r, bearing = math.hypot(x, y), wrap_angle(math.atan2(y, x) - at[2])
+                if abs(bearing) < 1.0 and 0.5 < r < 8.0 and rng.random() < 0.8:
+                    r, bearing = r + rng.normal(0.0, 0.1), bearing + rng.normal(0.0, 0.02)
+                    seen.append((r, bearing, label if labelled else None))
+            seen += [
+                (rng.uniform(0.5, 8.0), rng.uniform(-1.0, 1.0), None)
+                for _ in range(rng.poisson(0.05 * 7.5))
+            ]
+            yield Step(
+                pose,
+                reported,
+                RangeScan(
+                    radar=0,
+                    ranges_m=tuple(r for r, _, _ in seen),
+                    bearings_rad=tuple(bearing for _, bearing, _ in seen),
+                    labels=tuple(label for _, _, label in seen) if labelled else None,
+                ),
+            )
+
+    return marks, drive()
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_the_map_is_found_and_the_pose_is_as_sure_as_it_says(*, labelled: bool) -> None:
+    """Of the mean NEES of several runs, the band holds 99.9 %."""
+    nees: list[float] = []
+    for seed in range(4):
+        marks, steps = world(seed, labelled=labelled)
+        back_end = RobustBackEnd(Rig(mounts=(MOUNT,)), PARAMETERS)
+        path, truth, wheels = [], [], [np.zeros(3)]
+        for step in steps:
+            back_end.predict(step.increment)
+            back_end.update([step.scan])
+            path.append(back_end.pose)
+            truth.append(step.pose)
+            wheels.append(compose(wheels[-1], step.increment))
+        true = np.array(truth)
+        apart = back_end.pose - true[-1]
+        apart[2] = wrap_angle(float(apart[2]))
+        nees.append(float(apart @ np.linalg.solve(back_end.pose_covariance, apart)))
+        error_m = ate_rmse_m(np.array(path)[:, :2], true[:, :2])
+        assert error_m < 0.15
+        smoothed = back_end.smoothed(np.arange(len(true), dtype=np.int64))
+        assert smoothed is not None
+        assert ate_rmse_m(smoothed.poses[:, :2], true[:, :2]) < 0.1
+        found = smoothed.landmarks_m
+        gaps = np.linalg.norm(found[:, None] - marks[None], axis=2)
+        assert len(found) == len(marks)
+        assert gaps.min(axis=0).max() < 0.4
+    total = sum(nees)
+    assert chi2.ppf(0.0005, 3 * len(nees)) < total < chi2.ppf(0.9995, 3 * len(nees))

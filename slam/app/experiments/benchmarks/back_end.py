@@ -1,0 +1,122 @@
+"""The robust back end on a data set: all that these benchmarks know of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from slam.app.experiments.benchmarks.data_set import Array, Observation, Run, Sensor
+from slam.geometry import Mount, Rig, compose, has_moved
+from slam.robust.association import RangeScan
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.parameters import (
+    BackEndParameters,
+    MapRule,
+    RangeNoise,
+    RelinearisationRule,
+)
+from xethru_protocol.system import StopFlag
+
+_SIGMA_M = 0.1  # of ranges without one; all have one here
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solution:
+    """What came out of a run."""
+
+    causal: Array  # (n, 3): the pose of each step as it was known then
+    smoothed: Array | None  # (n, 3): all poses solved for at once at the end
+    n_scans: int  # that were used
+    landmarks_m: Array  # (k, 2), map frame
+    seconds: float  # processor time
+
+
+def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Solution:
+    """Run all steps through the back end; without labels it must find out what is what itself.
+
+    A scan from where the last one was taken has the same errors once more and is not used; between
+    two scans that are used the path follows the odometry.
+    """
+    with threadpool_limits(limits=1):  # the same numbers on every machine, and faster
+        return _solve(run, sensor, stop, with_labels=with_labels)
+
+
+def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Solution:
+    began = time.process_time()
+    back_end = RobustBackEnd(
+        Rig(mounts=(Mount(name="sensor", x_m=0.0, y_m=0.0, yaw_rad=0.0),)), parameters_of(sensor)
+    )
+    causal: list[Array] = []
+    moved = np.zeros(3)  # since the last scan that was used
+    scan_of: list[int] = []
+    moves: list[Array] = []
+    stamps_ns: list[int] = []
+    for step in run.steps:
+        stop.check()
+        moved = compose(moved, step.increment)
+        is_first = not stamps_ns
+        if step.observations and (
+            is_first or has_moved(np.zeros(3), moved, sensor.least_move_m, sensor.least_turn_rad)
+        ):
+            back_end.predict(moved)
+            back_end.update([_scan(step.observations, with_labels=with_labels)])
+            moved = np.zeros(3)
+            stamps_ns.append(step.t_ns)
+        causal.append(compose(back_end.pose, moved))
+        scan_of.append(len(stamps_ns))
+        moves.append(moved)
+    stop.check()
+    solved = back_end.smoothed(np.array(stamps_ns, dtype=np.int64))
+    smoothed = None
+    if solved is not None:
+        poses = np.vstack([np.zeros(3), solved.poses])
+        smoothed = np.array([compose(poses[i], by) for i, by in zip(scan_of, moves, strict=True)])
+    return Solution(
+        causal=np.array(causal),
+        smoothed=smoothed,
+        n_scans=len(stamps_ns),
+        landmarks_m=back_end.state.landmarks_m[back_end.reported_rows()].copy(),
+        seconds=time.process_time() - began,
+    )
+
+
+def parameters_of(sensor: Sensor) -> BackEndParameters:
+    """Return the rules of the project for a room, with noise and size of this sensor's world."""
+    return BackEndParameters(
+        wheels=sensor.wheels,
+        ranges=RangeNoise(
+            sigma_m=_SIGMA_M,
+            common_share=sensor.common_share,
+            huber_sigmas=2.0,
+            offset_sigma_m=sensor.range_offset_sigma_m,
+            detection_probability=sensor.detection_probability,
+            clutter_per_m=sensor.clutter / sensor.max_range_m,
+            field_of_view_rad=sensor.field_of_view_rad,
+            min_range_m=sensor.min_range_m,
+            max_range_m=sensor.max_range_m,
+        ),
+        map=MapRule(neighbourhood_m=sensor.neighbourhood_m),
+        relinearisation=RelinearisationRule(
+            key_m=sensor.shift_m, shift_m=sensor.shift_m, steps_per_slip=math.inf
+        ),
+    )
+
+
+def _scan(seen: Sequence[Observation], *, with_labels: bool) -> RangeScan:
+    """Return a scan whose observations all have bearings, or none has."""
+    has_bearings = any(one.bearing_rad is not None for one in seen)
+    bearings = tuple([one.bearing_rad or 0.0 for one in seen])
+    bearing_sigmas = tuple([one.bearing_sigma_rad or 0.0 for one in seen])
+    return RangeScan(
+        radar=0,
+        ranges_m=tuple([one.range_m for one in seen]),
+        sigmas_m=tuple([one.range_sigma_m for one in seen]),
+        bearings_rad=bearings if has_bearings else None,
+        bearing_sigmas_rad=bearing_sigmas if has_bearings else None,
+        labels=tuple([one.label for one in seen]) if with_labels else None,
+    )

@@ -1,0 +1,127 @@
+"""How well the paths of a run fit its truth, and the files that say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.errors import AppError, naming
+from slam.app.experiments.benchmarks.back_end import Solution, solve
+from slam.app.experiments.benchmarks.data_set import Array, DataSet, Path, Run
+from slam.app.experiments.benchmarks.pyfg import graph_of, write_pyfg
+from slam.app.odometry.track import NS_PER_S, Trajectory, write_tum
+from slam.evaluation import ate_rmse_m
+from slam.geometry import align_se2, transform
+from xethru_protocol.system import StopFlag, written_whole
+
+ODOMETRY = "odometry"
+WITH_IDS, WITHOUT_IDS = "with_ids", "without_ids"
+_FEWEST = 3
+"""Positions that an alignment is not exact for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScoredRun:
+    """A run, the poses of each of its paths by name, (n, 3), and their ATE."""
+
+    run: Run
+    paths: Mapping[str, Array]  # odometry, with_ids, with_ids_smoothed and so on
+    ate_rmse_m: Mapping[str, float]
+    solutions: Mapping[str, Solution]  # with_ids, without_ids
+    n_positions: int  # of the truth, that were compared
+
+    def aligned_m(self, name: str) -> Array:
+        """Return the positions of a path, (n, 2), in the frame of the truth."""
+        xy, truth = associated(self.run, self.paths[name])
+        return transform(align_se2(xy, truth), self.paths[name][:, :2])
+
+    def numbers(self) -> dict[str, object]:
+        run, solutions = self.run, self.solutions
+        return {
+            "run": run.name,
+            "steps": len(run.steps),
+            "duration_s": float(run.t_ns[-1] - run.t_ns[0]) / NS_PER_S,
+            "observations": run.n_observations,
+            "left_out": run.left_out,
+            "compared_positions": self.n_positions,
+            "ate_rmse_m": dict(self.ate_rmse_m),
+            "landmarks": {name: len(each.landmarks_m) for name, each in solutions.items()},
+            "seconds": {name: each.seconds for name, each in solutions.items()},
+        }
+
+
+def associated(run: Run, poses: Array) -> tuple[Array, Array]:
+    """Return the positions of a path at the stamps of the truth, and the truth, (k, 2) each.
+
+    The path is interpolated between its steps, so that how densely it is sampled does not count.
+    """
+    path = Path(t_ns=run.t_ns, xy_m=poses[:, :2])
+    xy, known = path.at(run.truth.t_ns)
+    return xy[known], run.truth.xy_m[known]
+
+
+def score_run(
+    data: DataSet, run: Run, stop: StopFlag, progress: Callable[[str], None]
+) -> ScoredRun:
+    """Run the back end with the ids of landmarks and without them, where there are such data.
+
+    A range alone is only used with its id: what measures such ranges knows whom it asked. Raises
+    AppError if truth and odometry do not share some time.
+    """
+    paths = {ODOMETRY: run.dead_reckoning()}
+    n_positions = len(associated(run, paths[ODOMETRY])[0])
+    if n_positions < _FEWEST:
+        raise AppError(
+            f"{run.name}: {n_positions} positions of its truth lie in the time of its odometry; "
+            "both must be of the same drive"
+        )
+    solutions = {}
+    for name, with_labels in ((WITH_IDS, True), (WITHOUT_IDS, False)):
+        if not (run.has_labels if with_labels else run.has_bearings):
+            continue
+        progress(f"{run.name}, {name.replace('_', ' ')}: {len(run.steps)} steps")
+        solution = solve(run, data.sensor, stop, with_labels=with_labels)
+        solutions[name] = solution
+        paths[name] = solution.causal
+        if solution.smoothed is not None:
+            paths[f"{name}_smoothed"] = solution.smoothed
+    return ScoredRun(
+        run=run,
+        paths=paths,
+        ate_rmse_m={name: ate_rmse_m(*associated(run, poses)) for name, poses in paths.items()},
+        solutions=solutions,
+        n_positions=n_positions,
+    )
+
+
+def mean_ate_m(runs: Sequence[ScoredRun]) -> dict[str, float]:
+    """Return the mean ATE of each path that all runs have."""
+    names = [name for name in runs[0].ate_rmse_m if all(name in one.ate_rmse_m for one in runs)]
+    return {name: float(np.mean([one.ate_rmse_m[name] for one in runs])) for name in names}
+
+
+def write_run(folder: FilePath, data: DataSet, scored: ScoredRun) -> None:
+    """Write the paths of a run as TUM files, and its observations with ids as a factor graph.
+
+    The truth has no heading: its orientation is the identity.
+    """
+    run = scored.run
+    with naming(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, poses in scored.paths.items():
+        _write_tum(folder / f"{name}.tum", run.t_ns, poses)
+    truth = run.truth
+    _, rows = np.unique(truth.t_ns, return_index=True)
+    places = np.column_stack([truth.xy_m[rows], np.zeros(len(rows))])
+    _write_tum(folder / "truth.tum", truth.t_ns[rows], places)
+    if run.has_labels:
+        write_pyfg(folder / "graph.pyfg", graph_of(run, data.sensor))
+
+
+def _write_tum(path: FilePath, t_ns: NDArray[np.int64], poses: Array) -> None:
+    with naming(path), written_whole(path) as fresh:
+        write_tum(fresh, Trajectory(stamps_ns=t_ns, poses=poses))
