@@ -146,6 +146,7 @@ def _draw_map(axes: Axes, scored: ScoredRun, *, small: bool) -> None:
     best = min(scored.ate_rmse_m.items(), key=lambda pair: pair[1])
     reckoned = scored.ate_rmse_m[ODOMETRY]
     separator = "\n" if small else ": "
-    text = f"{_STYLES[best[0]][0]} {best[1]:.2f} m, dead reckoning {reckoned:.2f} m"
+    comma = "\n" if small else ", "
+    text = f"{_STYLES[best[0]][0]} {best[1]:.2f} m{comma}dead reckoning {reckoned:.2f} m"
     title = f"{scored.run.name}{separator}{text}"
     label(axes, title, "x [m]", "y [m]", fontsize=8 if small else 10)
