@@ -922,11 +922,13 @@ class TentativePoints:
                 # Per square metre, clutter is the denser the nearer.
                 log_n = -0.5 * (distance + float(np.linalg.slogdet(math.tau * S)[1]))
                 evidence = log_n + math.log(odds * detection.range_m / clutter)
-                is_named = detection.label is not None or evidence > 0.0
-                is_same = detection.label == one.label and distance <= limit and is_named
-                cost[k, at] = (
-                    -evidence - 1e3 * (detection.label is not None) if is_same else _FORBIDDEN
-                )
+                is_named = detection.label is not None
+                is_same = detection.label == one.label and distance <= limit
+                if is_same and (is_named or evidence > 0.0):
+                    # A label is better than to begin anew, which costs 0.
+                    cost[k, at] = min(-evidence, -1.0) if is_named else -evidence
+                else:
+                    cost[k, at] = _FORBIDDEN
         columns = linear_sum_assignment(cost)[1].tolist()
         return {k: at for k, at in enumerate(columns) if at < n}
 
