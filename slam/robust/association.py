@@ -413,6 +413,8 @@ class PointMatches:
     """What detections with bearings are against the map."""
 
     pairs: tuple[tuple[int, int], ...]  # index in the scan and row of its landmark
+    # Of each pair, in nats: how much likelier it is than a new landmark; 0 of those with labels
+    evidence: tuple[float, ...]
     refused: tuple[tuple[int, int], ...]  # the same of labelled ones too far off
     missed: tuple[int, ...]  # rows without labels surely in view, of which nothing was seen
 
@@ -448,7 +450,7 @@ def find_points(
     others = [index for index in free if scan.labels is None or scan.labels[index] is None]
     rows = np.unique(np.concatenate([np.flatnonzero(inside), list(named.values())])).astype(np.intp)
     if not len(rows):
-        return PointMatches(pairs=(), refused=(), missed=())
+        return PointMatches(pairs=(), evidence=(), refused=(), missed=())
     points, indices = point_view(state, seen, radar, rows), [*named, *others]
     prior = points.H @ state.P.block(points.at) @ points.H.transpose(0, 2, 1)
     prior[:, 0, 0] += np.square(state.feature_added_sigmas_m[rows])
@@ -464,6 +466,7 @@ def find_points(
     refused: list[tuple[int, int]] = []
     for k, (index, row) in enumerate(named.items()):
         (pairs if is_near[k, place[row]] else refused).append((index, row))
+    against_new = [0.0] * len(pairs)
     k = len(named)
     odds = noise.detection_probability / (1.0 - noise.detection_probability)
     clutter = noise.clutter_per_m / noise.field_of_view_rad
@@ -479,13 +482,14 @@ def find_points(
         white = prior[own][None] / np.sqrt(variances[k:, None, :, None] * variances[k:, None, None])
         is_sure = np.linalg.eigvalsh(white)[..., -1] <= most
         # A square metre is the more radians wide, the nearer it is.
-        beta = noise.unmapped_per_m2 * measured[k:, 0]
-        new = np.log(np.maximum(1.0, beta * odds / clutter))
+        unmapped = np.log(noise.unmapped_per_m2 * measured[k:, 0] * odds / clutter)
+        new = np.maximum(0.0, unmapped)
         for one, at in enumerate(chosen.tolist()):
             if at >= len(own):
                 continue
             rivals = [new[one], *np.delete(evidence[one], at), *np.delete(evidence[:, at], one)]
             if is_sure[one, at] or evidence[one, at] - max(rivals) > MARGIN_NATS:
+                against_new.append(float(evidence[one, at] - unmapped[one]))
                 pairs.append((others[one], int(rows[own[at]])))
     inset, edge = parameters.map.view_inset_m, parameters.tracklets.edge_rad
     well = seen.inside(noise, -edge, -inset)[radar, rows]
@@ -498,7 +502,12 @@ def find_points(
         <= most
     )
     missed = rows[well & is_known & is_free & ~is_near.any(axis=0)]
-    return PointMatches(pairs=tuple(pairs), refused=tuple(refused), missed=tuple(missed.tolist()))
+    return PointMatches(
+        pairs=tuple(pairs),
+        evidence=tuple(against_new),
+        refused=tuple(refused),
+        missed=tuple(missed.tolist()),
+    )
 
 
 def _padded(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -32,6 +32,9 @@ from slam.robust.association import (
 from slam.robust.initialisation import (
     BodyPoint,
     Detection,
+    FeatureRows,
+    Option,
+    Question,
     Search,
     Sightings,
     TentativePoint,
@@ -39,12 +42,13 @@ from slam.robust.initialisation import (
     Tracklet,
     UnassignedRanges,
     body_point,
+    certain_row,
     detections_of,
     initialise_landmark,
     match,
-    match_or_new,
-    match_two,
+    options_of,
     point_guesses,
+    possible_rows,
     update_with_point,
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
@@ -120,6 +124,13 @@ class RobustBackEnd:
         self._heard: set[int] = set()
         self._waiting: dict[int, Waiting] = {}
         self._n_updates = 0
+        self.evidence = 0.0
+        """Nats by which what detections with bearings were taken for, once a passage, and merges of
+        landmarks are likelier than that all is new."""
+        # Of the newest scan with bearings: the antennas, and the ids that it held or should have
+        self._antennas = antennas_of(rig, (), np.zeros(3))
+        self._settled: set[int] = set()
+        self._jumped = -parameters.splits.gap_poses - 1  # the pose that a jump led to
         # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[Pairs, int] = {}
 
@@ -215,10 +226,13 @@ class RobustBackEnd:
             update_with_point(state, state.landmark_ids.index(landmark_id), point)
         self._log.set_causal(state.pose)
 
-    def update(self, scans: Sequence[RangeScan], *, solve: bool = True) -> UpdateReport:
+    def update(
+        self, scans: Sequence[RangeScan], *, solve: bool = True, decide: bool = True
+    ) -> UpdateReport:
         """Take in the scans of one time; a radar without a frame is absent, not empty.
 
-        Without ``solve`` merges and the solution over all poses wait for a later time.
+        Without ``solve`` merges and the solution over all poses wait for a later time. With
+        ``decide`` what is unclear is taken for the likeliest; without it, questions stay open.
         """
         looks = [scan for scan in scans if scan.looks]
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
@@ -259,6 +273,8 @@ class RobustBackEnd:
             self._merge()
             if is_due(self._log, self.state, self.parameters):
                 self.relinearise()
+        while decide and (question := self.question()) is not None:
+            self.answer(question, question.options[0])
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
@@ -474,6 +490,9 @@ class RobustBackEnd:
             if not found.pairs:
                 break
             pairs += found.pairs
+            for (_, row), nats in zip(found.pairs, found.evidence, strict=True):
+                if self._log.is_new_passage(ids[row]):
+                    self.evidence += nats
             nis_of_pairs, likelihoods = self._correct_points(scan, seen, found.pairs, antennas)
             nis, evidence = nis + nis_of_pairs, evidence + likelihoods
             used = {index for index, _ in found.pairs}
@@ -490,6 +509,8 @@ class RobustBackEnd:
         # Those that are seen rarely are missed often: half of the expected hits, at most.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
         missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
+        # What one scan misses, the next ones miss likely, too: those of a window count as one.
+        self.evidence += miss * len(missed - hit_ids) / self.parameters.tracklets.window
         for landmark_id in sorted(missed - hit_ids):
             self._existence.miss(landmark_id, 0.5 * odds)
             evidence.append((landmark_id, miss))
@@ -499,8 +520,9 @@ class RobustBackEnd:
         own_share = 1.0 - noise.common_share
         points = [body_point(state, antennas, one, own_share) for one in detections]
         self._tentative.take(detections, points)
+        self._antennas, self._settled = antennas, hit_ids | missed
         if detections:
-            self._place_points(antennas, hit_ids | missed)
+            self._place_points()
         return continued, nis, evidence
 
     def _correct_points(
@@ -556,41 +578,83 @@ class RobustBackEnd:
                 bearing_sigma_rad=one.bearing_sigma_rad,
             )
 
-    def _place_points(self, antennas: Antennas, others: Collection[int]) -> None:
-        """Let tentative landmarks be ones of the map, or new ones, where either is certain.
+    def _place_points(self) -> None:
+        """Let tentative landmarks be those of the map that they certainly are, or have labels of.
 
-        The landmarks with the ids ``others`` are none of them: this scan says where they are.
+        Of the others it is asked which they are.
         """
-        state, parameters = self.state, self.parameters
-        labelled, apart = set(self._labelled_rows()), parameters.tracklets.min_hits_per_radar
-        unclear: list[tuple[TentativePoint, BodyPoint, set[int]]] = []
+        density = self.parameters.ranges.unmapped_per_m2
         for tentative in self._tentative.take_out():
-            point, row, is_new = self._common(tentative, antennas), None, True
-            barred: set[int] = set()
+            point, row = self._common(tentative), None
             if tentative.label is None:
-                beside = self._log.seen_from({one.pose for one in tentative.seen})
-                ids = enumerate(state.landmark_ids)
-                barred = {row for row, id_ in ids if id_ in others or beside[id_] >= apart}
-                barred |= labelled
-                row, is_new = match_or_new(state, point, barred, parameters)
-                is_new = is_new and len(tentative.seen) >= parameters.tracklets.min_frames
-            if row is None and not is_new:
-                unclear.append((tentative, point, barred))
-            else:
-                self._place_point(tentative, point, row)
-        points = [(point, barred) for _, point, barred in unclear]
-        placed = dict(match_two(state, points, parameters))
-        for place, row in placed.items():
-            self._place_point(*unclear[place][:2], row)
-        for place, (tentative, _, _) in enumerate(unclear):
-            if place not in placed:
-                self._tentative.keep(tentative)
+                found = self._possible(tentative, point)
+                row = certain_row(found, density)
+                if row is None:
+                    self._tentative.keep(tentative)
+                    continue
+                certain = {row: found[row]}
+                self.evidence += options_of(self.state, point, certain, density)[0].evidence
+            self._place_point(tentative, point, row)
 
-    def _common(self, tentative: TentativePoint, antennas: Antennas) -> BodyPoint:
+    def _possible(self, tentative: TentativePoint, point: BodyPoint) -> dict[int, FeatureRows]:
+        """Return the landmarks that a tentative one without a label may be, by row.
+
+        Those with labels, and those of which a scan says where they are, are not it.
+        """
+        beside = self._log.seen_from({one.pose for one in tentative.seen})
+        apart = self.parameters.tracklets.min_hits_per_radar
+        barred = {
+            row
+            for row, id_ in enumerate(self.state.landmark_ids)
+            if id_ in self._settled or beside[id_] >= apart
+        }
+        barred.update(self._labelled_rows())
+        return possible_rows(self.state, point, barred, self.parameters)
+
+    def question(self) -> Question | None:
+        """Return which of several options the first tentative landmark is that is unclear."""
+        parameters, rule = self.parameters, self.parameters.tracklets
+        for tentative in self._tentative.unclear():
+            if len(tentative.seen) < rule.min_frames:
+                continue
+            point = self._common(tentative)
+            found = self._possible(tentative, point)
+            options = options_of(self.state, point, found, parameters.ranges.unmapped_per_m2)
+            options.append(Option(evidence=0.0))
+            if self._may_have_jumped(tentative):
+                rarity = math.log(parameters.relinearisation.steps_per_slip)
+                options.append(Option(evidence=-rarity, is_jump=True))
+            options.sort(key=lambda one: -one.evidence)
+            return Question(tentative=tentative, point=point, options=tuple(options))
+        return None
+
+    def answer(self, question: Question, option: Option) -> bool:
+        """Believe one option of a question of this back end; return False if that is impossible."""
+        self.evidence += option.evidence
+        if not option.is_jump:
+            self._tentative.remove(question.tentative)
+            self._place_point(question.tentative, question.point, option.row)
+            return True
+        parameters, self._jumped = self.parameters, question.tentative.seen[0].pose
+        sigmas = [parameters.jump_sigma_m, parameters.jump_sigma_m, parameters.jump_sigma_rad]
+        self._log.loosen(self._jumped, np.diag(np.square(sigmas)))
+        return self.relinearise()
+
+    def _may_have_jumped(self, tentative: TentativePoint) -> bool:
+        """Return whether the robot may have moved unnoticed before a landmark was first seen."""
+        since = tentative.seen[0].pose - self._jumped
+        n_known = len(self.state.landmark_ids)
+        return (
+            self.parameters.jump_sigma_rad > 0.0
+            and since > self.parameters.splits.gap_poses
+            and n_known >= self.parameters.branches.least_landmarks
+        )
+
+    def _common(self, tentative: TentativePoint) -> BodyPoint:
         """Return a tentative point with the errors that all its detections have in common."""
         share = max(self.state.range_errors.variance_share, 1.0)
         common_share = self.parameters.ranges.common_share
-        common = body_point(self.state, antennas, tentative.seen[-1], common_share).covariance
+        common = body_point(self.state, self._antennas, tentative.seen[-1], common_share).covariance
         return replace(tentative.point, covariance=share * tentative.point.covariance + common)
 
     def _place_point(self, tentative: TentativePoint, point: BodyPoint, row: int | None) -> None:
@@ -709,8 +773,8 @@ class RobustBackEnd:
         merge = find_merge(self.state, rule, self._refused, self._labelled_rows())
         if merge is not None and self._are_seen_together(merge.pairs):
             self._refused[named_pairs(self.state, merge.pairs)] = now
-        elif merge is not None:
-            self.merge_if_possible(merge.pairs)
+        elif merge is not None and self.merge_if_possible(merge.pairs):
+            self.evidence += merge.evidence
 
     def _are_seen_together(self, pairs: Sequence[tuple[int, int]]) -> bool:
         """Return whether scans with bearings hold both landmarks of a pair, by row."""

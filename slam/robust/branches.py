@@ -25,6 +25,10 @@ Decision
     trial.
 
 While nothing is suspicious that costs a copy of the back end now and then.
+
+``Hypotheses`` are for detections with bearings: where it is unclear which landmark a tentative one
+is, every option is followed by a back end of its own (D. B. Reid, "An Algorithm for Tracking
+Multiple Targets", IEEE Transactions on Automatic Control 24(6), 1979).
 """
 
 from __future__ import annotations
@@ -35,11 +39,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.geometry import Rig, compose
+from slam.geometry import Rig, compose, has_moved
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.constellation import constellation_of, find_placement
+from slam.robust.initialisation import Question
 from slam.robust.parameters import BackEndParameters, BranchRule
 from slam.robust.state import Array
 
@@ -55,6 +60,82 @@ class Step:
     scans: Sequence[RangeScan]
     next_id: int  # landmarks known before it have smaller ids
     evidence: Array  # shape (k, 2): ids and nats
+
+
+class Hypotheses:
+    """Back ends that took unclear detections for different landmarks; the likeliest is believed.
+
+    Each is judged by the evidence that it has gathered (`RobustBackEnd.evidence`). One is dropped
+    if it is less likely than the best by `BranchRule.price_nats`, if its pose is nearer to that of
+    a likelier one than two keyframes are, or if there are more than `MapRule.most_likely`.
+    """
+
+    def __init__(self, rig: Rig, parameters: BackEndParameters) -> None:
+        self._parameters = parameters
+        self._back_ends = [RobustBackEnd(rig, parameters)]
+
+    @property
+    def best(self) -> RobustBackEnd:
+        return self._back_ends[0]
+
+    def predict(self, increment: Array) -> None:
+        """Move all by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
+        for back_end in self._back_ends:
+            back_end.predict(increment)
+
+    def update(self, scans: Sequence[RangeScan]) -> None:
+        """Take in the scans of one time, and follow the options of each question that is open."""
+        decided: list[RobustBackEnd] = []
+        for back_end in self._back_ends:
+            back_end.update(scans, decide=False)
+            decided += self._decided(back_end)
+        rule, kept = self._parameters.relinearisation, list[RobustBackEnd]()
+        for one in self._likely(decided):
+            is_like = any(
+                not has_moved(one.pose, other.pose, rule.key_m, rule.key_rad) for other in kept
+            )
+            if not is_like:
+                kept.append(one)
+        self._back_ends = kept[: self._parameters.map.most_likely]
+
+    def _decided(self, back_end: RobustBackEnd) -> list[RobustBackEnd]:
+        """Return what a back end becomes by the answers to its questions: the likeliest of them."""
+        asking, decided, price_nats = [back_end], list[RobustBackEnd](), self._price_nats
+        while asking:
+            answered: list[RobustBackEnd] = []
+            for one in asking:
+                question = one.question()
+                if question is None:
+                    decided.append(one)
+                else:
+                    answered += _answered(one, question, price_nats)
+            asking = self._likely(answered)[: self._parameters.map.most_likely]
+        return decided
+
+    def _likely(self, back_ends: Sequence[RobustBackEnd]) -> list[RobustBackEnd]:
+        """Return the likeliest, and those that are less likely by no more than the price."""
+        ranked = sorted(back_ends, key=lambda one: -one.evidence)
+        return [one for one in ranked if ranked[0].evidence - one.evidence <= self._price_nats]
+
+    @property
+    def _price_nats(self) -> float:
+        return self._parameters.branches.price_nats
+
+
+def _answered(
+    back_end: RobustBackEnd, question: Question, price_nats: float
+) -> list[RobustBackEnd]:
+    """Return a back end for each option of a question that is not too unlikely."""
+    found = []
+    for k, option in enumerate(question.options):
+        if question.options[0].evidence - option.evidence > price_nats:
+            break
+        child = back_end.copy()
+        asked = child.question()
+        assert asked is not None
+        if child.answer(asked, asked.options[k]):
+            found.append(child)
+    return found
 
 
 def evidence_table(report: UpdateReport) -> Array:

@@ -329,64 +329,58 @@ def certain_row(found: Mapping[int, FeatureRows], density: float) -> int | None:
     return None if best is None else best.pairs[0][1]
 
 
-def match_or_new(
+def possible_rows(
     state: State, point: BodyPoint, others: Collection[int], parameters: BackEndParameters
-) -> tuple[int | None, bool]:
-    """Return the row of the landmark that a point certainly is, or None, and whether it is new.
-
-    It is new if it passes the gate of no landmark; the rows ``others`` are not it. If both are
-    possible, it is neither.
-    """
+) -> dict[int, FeatureRows]:
+    """Return the landmarks whose gate a point passes, by row; the rows ``others`` are not it."""
+    limit = float(chdtri(2, TAIL_PROBABILITY))
     near = near_rows(state, point, parameters.map.neighbourhood_m).tolist()
     found = {row: point_rows(state, row, point) for row in near if row not in others}
-    limit = float(chdtri(2, TAIL_PROBABILITY))
-    is_new = all(rows.mahalanobis_sq > limit for rows in found.values())
-    return certain_row(found, parameters.ranges.unmapped_per_m2), is_new
+    return {row: rows for row, rows in found.items() if rows.mahalanobis_sq <= limit}
 
 
-def match_two(
-    state: State,
-    points: Sequence[tuple[BodyPoint, Collection[int]]],
-    parameters: BackEndParameters,
-) -> tuple[tuple[int, int], ...]:
-    """Return which two of some points are certainly which landmarks, place and row each, if any.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Option:
+    """What a tentative landmark may be."""
 
-    Where the pose is unsure, one point alone may be any of several landmarks; the way from one to
-    the other does not depend on the pose. Each point comes with the rows that it is not.
+    evidence: float  # nats, against that it is new
+    row: int | None = None  # the landmark of the map that it is; None: a new one
+    # The robot moved before the landmark was first seen, and the wheels did not report it; the
+    # question is asked again after that
+    is_jump: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Question:
+    """Which of several options a tentative landmark is."""
+
+    tentative: TentativePoint
+    point: BodyPoint
+    options: tuple[Option, ...]  # likeliest first
+
+
+def options_of(
+    state: State, point: BodyPoint, found: Mapping[int, FeatureRows], density: float
+) -> list[Option]:
+    """Return which of the landmarks ``found`` a point may be, likeliest first.
+
+    Of those that the sensor cannot tell apart from where it is, only the likeliest is returned: a
+    wrong one among them costs little, and the run may still choose another. ``density`` is that of
+    landmarks that are not in the map [1/m^2].
     """
-    limit, found = float(chdtri(2, TAIL_PROBABILITY)), []
-    for place, (point, others) in enumerate(points):
-        for row in near_rows(state, point, parameters.map.neighbourhood_m).tolist():
-            rows = point_rows(state, row, point)
-            if row not in others and rows.mahalanobis_sq <= limit:
-                found.append((place, row, rows))
-    density = parameters.ranges.unmapped_per_m2
-    # Neighbours come in groups that look alike, and say little of the heading.
-    least_m = 0.5 * parameters.map.neighbourhood_m
-    joint = [
-        identity(
-            ((-1 - one, row), (-1 - other, second)),
-            np.concatenate([mine.residual, theirs.residual]),
-            _joint_covariance(state, mine, theirs),
-            density,
-        )
-        for (one, row, mine), (other, second, theirs) in combinations(found, 2)
-        if one != other
-        and row != second
-        and math.dist(points[one][0].point_m, points[other][0].point_m) >= least_m
-    ]
-    best = certain(joint)
-    return () if best is None else tuple((-1 - key, row) for key, row in best.pairs)
-
-
-def _joint_covariance(state: State, one: FeatureRows, other: FeatureRows) -> Array:
-    """Return the covariance of two residuals, shape (4, 4)."""
-    at = np.concatenate([one.at, other.at])
-    H = np.zeros((4, len(at)))
-    H[:2, : len(one.at)], H[2:, len(one.at) :] = one.H, other.H
-    S = H @ state.P.block(at) @ H.T
-    S[:2, :2], S[2:, 2:] = one.S, other.S
-    return np.asarray((S + S.T) / 2)
+    judged = {
+        row: identity(((SEEN, row),), rows.residual, rows.S, density).evidence
+        for row, rows in found.items()
+    }
+    limit = float(chdtri(2, TAIL_PROBABILITY))
+    R = rotation(state.heading_rad)
+    information = R @ np.linalg.inv(point.covariance) @ R.T
+    distinct: dict[int, Option] = {}
+    for row in sorted(judged, key=lambda row: -judged[row]):
+        away = state.landmarks_m[list(distinct)] - state.landmarks_m[row]
+        if np.all(np.einsum("ki,ij,kj->k", away, information, away) > limit):
+            distinct[row] = Option(row=row, evidence=judged[row])
+    return list(distinct.values())
 
 
 def update_with_point(state: State, row: int, point: BodyPoint) -> float:
@@ -869,6 +863,14 @@ class TentativePoints:
     def keep(self, one: TentativePoint) -> None:
         """Take back what may be a landmark that is in the map."""
         self._points.append(one)
+
+    def remove(self, one: TentativePoint) -> None:
+        self._points = [other for other in self._points if other is not one]
+
+    def unclear(self) -> list[TentativePoint]:
+        """Return those that the newest scan held and that are landmarks, but not yet which."""
+        held = [one for one in self._points if one.label is None and not one.misses]
+        return [one for one in held if self._is_landmark(one)]
 
     def take_out(self) -> list[TentativePoint]:
         """Return those that are landmarks, of the map or new, and forget them."""

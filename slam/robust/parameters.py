@@ -162,8 +162,8 @@ class MapRule:
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
     """Scans between two looks for landmarks that may be one, and for evidence of a carry."""
-    most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
-    """How many of the likeliest merges are combined in twos."""
+    most_likely: Annotated[int, Origin.BUDGET] = 12
+    """How many of the likeliest are kept: of merges, to be combined in twos, and of hypotheses."""
     neighbourhood_m: Annotated[float, Origin.CHOSEN] = NEIGHBOURHOOD_M
     """Distance within which landmarks are neighbours: those that may be one, and those that count
     for the density of a map."""
@@ -345,3 +345,7 @@ class BackEndParameters:
     noise: NoiseRule = field(default_factory=NoiseRule)
     splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)
+    # Standard deviations of a motion that the wheels do not report, as when somebody bumps into the
+    # robot; zero: there is none
+    jump_sigma_m: float = 0.0
+    jump_sigma_rad: float = 0.0

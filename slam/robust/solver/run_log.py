@@ -279,6 +279,16 @@ class RunLog:
         bearing = bearing_rad, bearing_sigma_rad
         self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m, *bearing))
 
+    def is_new_passage(self, landmark_id: int) -> bool:
+        """Return whether a range of a landmark now would begin a passage."""
+        last = self._passages.get(landmark_id, (0, -self._gap_poses - 1))[1]
+        return self.n_poses - 1 - last > self._gap_poses
+
+    def loosen(self, pose: int, covariance: Array) -> None:
+        """Let the step that leads to a pose have so much more noise, (3, 3), from now on."""
+        self._covariances.rows_to_write(pose - 1)[0] += covariance
+        self._is_key.rows_to_write(pose - 1)[:2] = True
+
     def _mark_key(self) -> None:
         """Let the newest pose be a keyframe."""
         self._is_key.rows_to_write(self.n_poses - 1)[0] = True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,12 +12,13 @@ from threadpoolctl import threadpool_limits
 from slam.app.experiments.benchmarks.data_set import Array, Observation, Run, Sensor
 from slam.geometry import Mount, Rig, compose, has_moved
 from slam.robust.association import RangeScan
-from slam.robust.back_end import RobustBackEnd
+from slam.robust.branches import Hypotheses
 from slam.robust.parameters import (
     BackEndParameters,
     MapRule,
     RangeNoise,
     RelinearisationRule,
+    TrackletRule,
 )
 from xethru_protocol.system import StopFlag
 
@@ -48,9 +48,8 @@ def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Sol
 
 def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Solution:
     began = time.process_time()
-    back_end = RobustBackEnd(
-        Rig(mounts=(Mount(name="sensor", x_m=0.0, y_m=0.0, yaw_rad=0.0),)), parameters_of(sensor)
-    )
+    rig = Rig(mounts=(Mount(name="sensor", x_m=0.0, y_m=0.0, yaw_rad=0.0),))
+    hypotheses = Hypotheses(rig, parameters_of(sensor))
     causal: list[Array] = []
     moved = np.zeros(3)  # since the last scan that was used
     scan_of: list[int] = []
@@ -63,14 +62,15 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
         if step.observations and (
             is_first or has_moved(np.zeros(3), moved, sensor.least_move_m, sensor.least_turn_rad)
         ):
-            back_end.predict(moved)
-            back_end.update([_scan(step.observations, with_labels=with_labels)])
+            hypotheses.predict(moved)
+            hypotheses.update([_scan(step.observations, with_labels=with_labels)])
             moved = np.zeros(3)
             stamps_ns.append(step.t_ns)
-        causal.append(compose(back_end.pose, moved))
+        causal.append(compose(hypotheses.best.pose, moved))
         scan_of.append(len(stamps_ns))
         moves.append(moved)
     stop.check()
+    back_end = hypotheses.best
     solved = back_end.smoothed(np.array(stamps_ns, dtype=np.int64))
     smoothed = None
     if solved is not None:
@@ -92,6 +92,7 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
         ranges=RangeNoise(
             sigma_m=_SIGMA_M,
             common_share=sensor.common_share,
+            unmapped_per_m2=sensor.unmapped_per_m2,
             huber_sigmas=2.0,
             offset_sigma_m=sensor.range_offset_sigma_m,
             detection_probability=sensor.detection_probability,
@@ -100,10 +101,14 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
             min_range_m=sensor.min_range_m,
             max_range_m=sensor.max_range_m,
         ),
+        tracklets=TrackletRule(min_share=sensor.new_share),
         map=MapRule(neighbourhood_m=sensor.neighbourhood_m),
+        # Slips of the size that the radars' robots have are none
         relinearisation=RelinearisationRule(
-            key_m=sensor.shift_m, shift_m=sensor.shift_m, steps_per_slip=math.inf
+            key_m=sensor.shift_m, shift_m=sensor.shift_m, slip_m=0.0, slip_rad=0.0
         ),
+        jump_sigma_m=sensor.jump_sigma_m,
+        jump_sigma_rad=sensor.jump_sigma_rad,
     )
 
 

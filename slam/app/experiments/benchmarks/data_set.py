@@ -118,6 +118,12 @@ class Sensor:
     # Distance within which landmarks are neighbours: they may be one, or be taken for each other
     neighbourhood_m: float
     source: str
+    unmapped_per_m2: float = 0.02  # how many landmarks may not be in the map yet
+    # Share of 15 scans that must hold what is to be a new landmark: small, if nothing else is seen
+    new_share: float = 0.6
+    # Standard deviations of a motion that the wheels do not report: by a bump
+    jump_sigma_m: float = 0.0
+    jump_sigma_rad: float = 0.0
     range_offset_sigma_m: float = 0.0  # of the unknown constant error of all ranges
     # Share of the variance of range and bearing that is one error as long as a landmark is in view
     common_share: float = 0.0
