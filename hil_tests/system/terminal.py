@@ -56,7 +56,6 @@ class Command:
     def _shows_one(self) -> bool:
         return b"Traceback" in self.printed
 
-    @property
     def echoes(self) -> bool:
         """Whether the terminal shows what is typed."""
         assert self._master is not None

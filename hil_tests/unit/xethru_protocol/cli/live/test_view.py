@@ -196,16 +196,16 @@ def test_a_key_takes_the_next_clutter_filter(at_rest: Path, tmp_path: Path) -> N
     with in_terminal(
         "xethru_protocol.cli", arguments, tmp_path / "crashes", environment=size
     ) as command:
-        assert command.echoes
+        assert command.echoes()
         command.read_until(lambda: b"clutter mean" in command.printed)
-        assert not command.echoes
+        assert not command.echoes()
         command.press(b"c")
         command.read_until(lambda: b"clutter exponential" in command.printed)
         command.press(b"xcc")
         command.read_until(lambda: b"clutter none" in command.printed)
         command.process.send_signal(signal.SIGINT)
         command.read_until(lambda: command.process.poll() is not None)
-        assert command.echoes
+        assert command.echoes()
         assert command.tracebacks == ""
 
 
