@@ -279,7 +279,7 @@ def measure(rest: int, nobody: int, first: int, processes: int) -> list[dict[str
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rest", type=int, default=20, help="windows per range and posture")
+    parser.add_argument("--rest", type=int, default=40, help="windows per range and posture")
     parser.add_argument("--nobody", type=int, default=300, help="windows of each kind")
     parser.add_argument("--first", type=int, default=FIRST_MEASURED, help="number of the first")
     parser.add_argument("--jobs", type=int, default=2, help="processes")

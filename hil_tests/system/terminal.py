@@ -56,6 +56,11 @@ class Command:
     def _shows_one(self) -> bool:
         return b"Traceback" in self.printed
 
+    def echoes(self) -> bool:
+        """Whether the terminal shows what is typed."""
+        assert self._master is not None
+        return bool(termios.tcgetattr(self._master)[3] & termios.ECHO)
+
     def read_until(self, condition: Callable[[], object]) -> None:
         """Show what the command prints until the condition is true; AssertionError if it ends."""
 

@@ -330,7 +330,8 @@ def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
         choices=("none", "mean", "exponential", "svd"),
         default="mean",
         help="how what stands still is removed: not at all, by a running mean of 64 frames "
-        "(default), by a high-pass with a time constant of 50 frames, or by singular values",
+        "(default), by a high-pass with a time constant of 50 frames, or by singular values; "
+        "the key c takes the next one",
     )
     one.add_argument(
         "--memory",

@@ -13,6 +13,7 @@ from types import CodeType, ModuleType, TracebackType
 
 import xethru_protocol
 from xethru_protocol import legacy as pymoduleconnector
+from xethru_protocol.system import StopRequestedError
 from xethru_protocol.wire.errors import XeThruError
 
 _OURS = str(Path(xethru_protocol.__file__).parent)
@@ -53,7 +54,8 @@ def legacy(arguments: argparse.Namespace) -> int:
         _join_threads(running)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except (SystemExit, BrokenPipeError):  # of a script's output, whose reader has ended
+    # BrokenPipeError: of a script's output, whose reader has ended
+    except (SystemExit, BrokenPipeError, StopRequestedError):
         raise
     except BaseException as error:
         shown = error.with_traceback(_of_script(error.__traceback__))

@@ -32,6 +32,13 @@ Rate
 Confidence
     Share of ``|V(f)|**2 / f`` below 2 Hz that lies at the rate and its next two harmonics; below
     `LEAST_CONFIDENCE` nothing is answered.
+Faint echoes
+    Where no candidate has an answer and none is strong, one spectral line is looked for: power at
+    +-f over its median over range, whose own spectrum is that of noise and slow clutter (a constant
+    false alarm rate over range, as in `detection`). Bins are added as above, but by what moves
+    within 3 cycles per minute of that line, and taken along their largest component; the spectrum
+    of the noise in one component is subtracted before the confidence is computed. A line of which
+    anything else at that range, up to half of the frame rate, reaches a third is not answered.
 
 The numbers were chosen with emulated people; `docs/breathing.md` has what comes of them.
 """
@@ -67,6 +74,13 @@ _FASTER_THAN_USUAL = 4.0  # in the upper quartile of the speed
 _AROUND_S = 0.75  # before and after a movement, which begins and ends slowly
 _LEAST_REST = 2 / 3  # of the window
 _BLOCK_S, _LEAST_DUTY, _PASSING = 4.0, 0.4, 0.3
+# of faint echoes
+_FEWEST_BINS = 8  # of fewer the median over range is not that of noise
+_LEAST_LINE = 15.0  # power over its median over range; of noise alone less than 11 in 95 %
+_LINE_HZ = 0.05  # on either side of a line
+_OTHER_LINES = 0.3  # of a line
+_SLOWEST_HZ = 0.015  # of other lines: slower ones are drift
+_MEDIAN_OF_MEAN = 0.839  # of the sum of two exponential variables
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,12 +215,36 @@ def breathing_rates(
         raise ValueError(
             f"{len(frames)} frames at {frame_rate_hz:g} frames/s: breathing needs {SHORTEST_S:g} s"
         )
+    unsmoothed = frames
     frames = _smoothed(frames, round(frame_rate_hz / (2 * _HIGHEST_HZ)))
     wavelength_m = SPEED_OF_LIGHT_MPS / carrier_hz
     power, frequency = _spectrum(frames, frame_rate_hz)
     if _passing_share(frames, round(_BLOCK_S * frame_rate_hz)) > _PASSING:
         return
-    for bin_index, weak in _candidates(power, frequency):
+    candidates = _candidates(power, frequency)
+    nobody = True
+    for bin_index, rate_hz, confidence in _of_candidates(
+        frames, candidates, frame_rate_hz, wavelength_m
+    ):
+        nobody = False
+        if not _is_alias(unsmoothed[:, bin_index : bin_index + 1], rate_hz, frame_rate_hz):
+            yield Breathing(
+                rate_bpm=60 * rate_hz, confidence=confidence, range_m=float(ranges[bin_index])
+            )
+    if nobody and all(weak for _, weak in candidates):
+        faint = _of_line(frames, unsmoothed, ranges, frame_rate_hz)
+        if faint is not None:
+            yield faint
+
+
+def _of_candidates(
+    frames: NDArray[np.complex128],
+    candidates: list[tuple[int, bool]],
+    frame_rate_hz: float,
+    wavelength_m: float,
+) -> Iterator[tuple[int, float, float]]:
+    """Yield bin, rate [Hz] and confidence of candidates, to the first whose body moves."""
+    for bin_index, weak in candidates:
         echo = _echo_near(frames, bin_index)
         velocity_mps, rests = _velocity(echo, frame_rate_hz, wavelength_m)
         if weak and rests.mean() < _LEAST_REST:
@@ -216,10 +254,14 @@ def breathing_rates(
             return
         found = _periodicity(velocity_mps, frame_rate_hz)
         if found is not None and found[1] >= LEAST_CONFIDENCE:
-            rate_hz, confidence = found
-            yield Breathing(
-                rate_bpm=60 * rate_hz, confidence=confidence, range_m=float(ranges[bin_index])
-            )
+            yield bin_index, *found
+
+
+def _is_alias(of_bin: NDArray[np.complex128], rate_hz: float, frame_rate_hz: float) -> bool:
+    """Return whether frames of a bin, shape (n_frames, 1), hold a stronger line above 2 Hz."""
+    power, frequency = _spectrum(of_bin, frame_rate_hz)
+    own = power[np.abs(frequency - rate_hz) <= _LINE_HZ]
+    return bool(power[frequency > _HIGHEST_HZ].max(initial=0.0) > own.max(initial=0.0))
 
 
 def _smoothed(frames: NDArray[np.complex128], width: int) -> NDArray[np.complex128]:
@@ -324,12 +366,124 @@ def _periodicity(
     if half is not None and abs(half / peak - 0.5) < 0.05 and 2 * power[half] > power[peak]:
         peak = half
     rate_hz = _mean_rate_hz(velocity_mps, float(frequency[peak]), frame_rate_hz)
-    lobe_hz = 2 * frame_rate_hz / len(velocity_mps) + 0.1 * rate_hz
     heard = (frequency > 0.5 * SLOWEST_BPM / 60) & (frequency < _HIGHEST_HZ)
+    near = _near_harmonics(frequency, rate_hz, len(velocity_mps) / frame_rate_hz)
+    return rate_hz, float(power[heard & near].sum() / power[heard].sum())
+
+
+def _of_line(
+    frames: NDArray[np.complex128],
+    unsmoothed: NDArray[np.complex128],
+    ranges: NDArray[np.float64],
+    frame_rate_hz: float,
+) -> Breathing | None:
+    """Return who breathes behind an echo that is seen as a spectral line only, or None."""
+    if frames.shape[1] < _FEWEST_BINS:
+        return None
+    lines, line_hz = _over_median(*_spectrum(frames, frame_rate_hz))
+    in_band = (line_hz >= SLOWEST_BPM / 60) & (line_hz <= FASTEST_BPM / 60)
+    # the window and the pulse reach over two cells at least
+    wide = (lines[:-1, :-1] + lines[:-1, 1:] + lines[1:, :-1] + lines[1:, 1:]) / 4
+    wide[~in_band[:-1]] = 0.0
+    row, column = np.unravel_index(int(np.argmax(wide)), wide.shape)
+    if wide[row, column] < _LEAST_LINE:
+        return None
+    bin_index = int(column + (lines[row, column + 1] > lines[row, column]))
+    velocity = _along_line(frames, bin_index, float(line_hz[row]), frame_rate_hz)
+    found = _periodicity_in_noise(
+        velocity, _noise_of_component(np.diff(frames, axis=0)), frame_rate_hz
+    )
+    if found is None or found[1] < LEAST_CONFIDENCE:
+        return None
+    rate_hz, confidence = found
+    if not SLOWEST_BPM <= 60 * rate_hz <= FASTEST_BPM:
+        return None
+    # a fan's fundamental, or a curtain's, of which the line is an alias or a harmonic
+    lines, line_hz = _over_median(*_spectrum(unsmoothed, frame_rate_hz))
+    here = lines[:, max(bin_index - 1, 0) : bin_index + 2].mean(axis=1)
+    here, line_hz = (here[:-1] + here[1:]) / 2, line_hz[:-1]
+    own = _near_harmonics(line_hz, rate_hz, len(unsmoothed) / frame_rate_hz)
+    others = here[~own & (line_hz > _SLOWEST_HZ)].max(initial=0.0)
+    if others > _OTHER_LINES * here[own].max(initial=0.0):
+        return None
+    return Breathing(rate_bpm=60 * rate_hz, confidence=confidence, range_m=float(ranges[bin_index]))
+
+
+def _over_median(
+    power: NDArray[np.float64], frequency: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return power at +-f over its median over range, shape (n, n_bins), and f > 0, rising."""
+    zero = int(np.argmin(frequency))
+    count = min(zero, len(power) - 1 - zero)
+    both = power[zero + 1 : zero + 1 + count] + power[zero - count : zero][::-1]
+    median = np.median(both, axis=1, keepdims=True)
+    rising = frequency[zero + 1 : zero + 1 + count]
+    return both / np.maximum(median, np.finfo(np.float64).tiny), rising
+
+
+def _along_line(
+    frames: NDArray[np.complex128], bin_index: int, line_hz: float, frame_rate_hz: float
+) -> NDArray[np.float64]:
+    """Return the steps of the largest component of what moves at a frequency, about a bin."""
+    block = frames[:, max(bin_index - _NEIGHBOURS, 0) : bin_index + _NEIGHBOURS + 1]
+    window = hann(len(block))[:, np.newaxis]
+    spectrum = np.fft.fft((block - block.mean(axis=0)) * window, axis=0)
+    offset_hz = np.abs(np.abs(np.fft.fftfreq(len(block), 1 / frame_rate_hz)) - line_hz)
+    at_line = np.where((offset_hz <= _LINE_HZ)[:, np.newaxis], spectrum, 0.0)
+    _, vectors = np.linalg.eigh(at_line.conj().T @ at_line)
+    weights = vectors[:, -1]
+    narrow = np.fft.ifft(at_line @ weights)
+    turn = np.exp(-0.5j * np.angle((narrow**2).mean()))
+    return np.asarray(np.diff((block @ weights * turn).real))
+
+
+def _noise_of_component(steps: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return the spectrum of noise in one component of a bin, by the median over bins.
+
+    Of the same window and length as in `_periodicity_in_noise`, the mean of 25 neighbours.
+    """
+    length = 8 * len(steps)
+    spectrum = np.fft.fft((steps - steps.mean(axis=0)) * hann(len(steps))[:, None], length, axis=0)
+    power = spectrum.real**2 + spectrum.imag**2
+    both = power[: length // 2 + 1] + power[-np.arange(length // 2 + 1)]
+    median = np.median(both, axis=1) / (4 * _MEDIAN_OF_MEAN)
+    return np.convolve(median, np.ones(25) / 25, mode="same")
+
+
+def _periodicity_in_noise(
+    steps: NDArray[np.float64], noise: NDArray[np.float64], frame_rate_hz: float
+) -> tuple[float, float] | None:
+    """Return the same as `_periodicity`, of a component with noise of this spectrum."""
+    length = 8 * len(steps)
+    frequency = np.asarray(np.fft.rfftfreq(length, 1 / frame_rate_hz), dtype=np.float64)
+    weighted = (steps - steps.mean()) * hann(len(steps))
+    power = np.abs(np.fft.rfft(weighted, length)) ** 2
+    ratio = power / np.maximum(noise, np.finfo(np.float64).tiny)
+    heard = (frequency > 0.5 * SLOWEST_BPM / 60) & (frequency < _HIGHEST_HZ)
+    peak = _highest(ratio, frequency)
+    if peak is None or ratio[peak] < ratio[heard].max():
+        return None
+    half = round(0.45 * peak) + int(np.argmax(ratio[round(0.45 * peak) : round(0.55 * peak) + 1]))
+    slow_enough = frequency[half] >= SLOWEST_BPM / 60
+    # of the displacement: power over frequency squared
+    if slow_enough and ratio[half] > _LEAST_LINE and 4 * power[half] > power[peak]:
+        peak = half
+    if ratio[peak] < _LEAST_LINE:
+        return None
+    rate_hz = _mean_rate_hz(steps, float(frequency[peak]), frame_rate_hz)
+    near = heard & _near_harmonics(frequency, rate_hz, len(steps) / frame_rate_hz)
+    without_noise = (power - noise) / np.maximum(frequency, frequency[1])
+    moving = max(float(without_noise[heard].sum()), np.finfo(np.float64).tiny)
+    return rate_hz, min(float(without_noise[near].sum()) / moving, 1.0)
+
+
+def _near_harmonics(
+    frequency: NDArray[np.float64], rate_hz: float, window_s: float
+) -> NDArray[np.bool_]:
     near = np.zeros(len(frequency), dtype=np.bool_)
     for harmonic in range(1, _HARMONICS + 1):
-        near |= np.abs(frequency - harmonic * rate_hz) < lobe_hz
-    return rate_hz, float(power[heard & near].sum() / power[heard].sum())
+        near |= np.abs(frequency - harmonic * rate_hz) < 2 / window_s + 0.1 * rate_hz
+    return near
 
 
 def _mean_rate_hz(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from xethru_protocol.cli.live.sources import FrameSource, TimedFrame
 from xethru_protocol.cli.output import CommandFailed
-from xethru_protocol.processing.clutter import ClutterFilter, Method
+from xethru_protocol.processing.clutter import METHODS, ClutterFilter, Method
 from xethru_protocol.processing.doppler import SPEED_OF_LIGHT_MPS, RangeDoppler, range_doppler
 from xethru_protocol.processing.downconversion import downconvert, line_bins
 from xethru_protocol.processing.presence import Presence, PresenceMonitor
@@ -32,6 +32,7 @@ _LEAST_RF_BINS = 160
 """16 lines of baseband, every 8th bin, and the filter's length."""
 
 Clutter = Method | Literal["none"]
+CLUTTERS: tuple[Clutter, ...] = ("none", *METHODS)
 Floats = NDArray[np.float32] | NDArray[np.float64]
 
 
@@ -206,7 +207,7 @@ class LiveAnalysis:
     def __init__(self, source: FrameSource, *, clutter: Clutter, window_s: float) -> None:
         self._source, self._clutter = source, clutter
         self.vital = VitalSigns(source, window_s)
-        self._filter = None if clutter == "none" else ClutterFilter(clutter)
+        self._filter = _filter_of(clutter)
         rate_hz, n_bins = source.frame_rate_hz, len(self.vital.ranges_m)
         self._n_rows = max(round(WATERFALL_S * rate_hz), 2)
         # twice, so that the newest rows are always one piece
@@ -225,6 +226,16 @@ class LiveAnalysis:
             ring[place] = ring[place + self._n_rows] = row
         self._n_frames += 1
         self._newest = frame
+
+    def switch_clutter(self) -> None:
+        """Take the next of `CLUTTERS`, for the frames that are shown, too."""
+        self._clutter = CLUTTERS[(CLUTTERS.index(self._clutter) + 1) % len(CLUTTERS)]
+        self._filter = _filter_of(self._clutter)
+        for number in range(max(self._n_frames - self._n_rows, 0), self._n_frames):
+            place = number % self._n_rows
+            iq = self._raw[place]
+            filtered = iq if self._filter is None else self._filter.update(iq)
+            self._filtered[place] = self._filtered[place + self._n_rows] = filtered
 
     def update(self) -> LiveUpdate:
         """Return what there is to show; a frame must have come."""
@@ -276,3 +287,7 @@ class LiveAnalysis:
             since_s = (np.arange(len(rows)) - len(rows) + 1) / self._source.frame_rate_hz
             self._chest = since_s, millimetres - millimetres.mean()
         return self._chest
+
+
+def _filter_of(clutter: Clutter) -> ClutterFilter | None:
+    return None if clutter == "none" else ClutterFilter(clutter)

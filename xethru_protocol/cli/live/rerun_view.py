@@ -46,10 +46,9 @@ _GRID_RGB: Rgb = (45, 47, 52)
 _ABOUT = """\
 # What you see
 
-* **Range** (left): the newest frame above, grey as it came and yellow without clutter; below it the
-  amplitudes without clutter of the last {seconds:.0f} s, the newest on top. Bright is strong, dark
-  the median of all. What stands still vanishes (clutter filter: {clutter}). A blue line: where
-  somebody breathes.
+* **Range** (left): the newest frame above, grey as it came and yellow behind the clutter filter;
+  below it the last {seconds:.0f} s, the newest on top. Bright is strong, dark the median of all.
+  The filter ({clutter}) removes what stands still. A blue line: where somebody breathes.
 * **Range-Doppler**: what moves, by range and radial velocity, approaching above.
 * **Chest**: displacement towards the radar where somebody breathes.
 * **Breathing rate**: of the last minutes. An estimate for experiments; this is no medical device.
@@ -188,7 +187,7 @@ class RerunPicture:
         peak = self._peak("profile", update.profile)
         heights = box.y(np.clip(update.profile / peak, 0, 1))
         self._line("range/frame/profile", box.x(update.ranges_m), heights, _PROFILE_RGB, 1.2)
-        texts.append(f"without clutter, to {peak:.2g}")
+        texts.append(f"clutter filter {update.clutter}, to {peak:.2g}")
         places.append([720, box.top_y + 50])
         colours.append(_PROFILE_RGB)
         self._labels("range/frame/legend", places, texts, colours)

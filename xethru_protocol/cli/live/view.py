@@ -1,20 +1,24 @@
 """``xethru view``: a live picture in Rerun, in a browser or as text.
 
-Every frame is taken; a picture is drawn as often as the display takes one.
+Every frame is taken; a picture is drawn as often as the display takes one. On a terminal, the key c
+takes the next clutter filter.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import shutil
+import sys
+import termios
 import time
 from argparse import Namespace
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from threading import Event, Thread
-from typing import Protocol
+from typing import Any, Protocol
 
-from xethru_protocol.cli.live.analysis import Clutter, LiveAnalysis, LiveUpdate
+from xethru_protocol.cli.live.analysis import LiveAnalysis, LiveUpdate
 from xethru_protocol.cli.live.picture import Style, picture
 from xethru_protocol.cli.live.sources import FrameSource, open_source
 from xethru_protocol.cli.live.viewer import ViewerError, ViewerKind, ViewerProcess
@@ -27,6 +31,7 @@ _TERMINAL_PERIOD_S = 0.2
 _SNAPSHOT_S = 10.0
 _CLOSE_LIMIT_S = 3.0
 _POLL_S = 0.1
+_NEXT_CLUTTER = b"c"
 
 
 class Display(Protocol):
@@ -48,18 +53,20 @@ class Display(Protocol):
 
 def view(arguments: Namespace) -> int:
     """Show frames until they end, the viewer is closed, or a signal comes."""
-    with open_source(arguments) as source, _display(arguments) as display:
-        show(source, display, clutter=arguments.clutter, window_s=arguments.window)
+    with open_source(arguments) as source, _display(arguments) as display, _Keys() as keys:
+        analysis = LiveAnalysis(source, clutter=arguments.clutter, window_s=arguments.window)
+        show(source, display, analysis, keys)
     return 1 if source.faults else 0
 
 
-def show(source: FrameSource, display: Display, *, clutter: Clutter, window_s: float) -> None:
+def show(source: FrameSource, display: Display, analysis: LiveAnalysis, keys: _Keys) -> None:
     """Take every frame of a source; draw when the display is ready for it."""
-    analysis = LiveAnalysis(source, clutter=clutter, window_s=window_s)
     t_s = None
     for frame in source.frames:
         analysis.take(frame)
         t_s = frame.t_s
+        for _ in range(keys.pressed().count(_NEXT_CLUTTER)):
+            analysis.switch_clutter()
         if not display.is_open:
             return
         if display.is_due(t_s):
@@ -86,6 +93,49 @@ def _display(arguments: Namespace) -> Iterator[Display]:
             if arguments.web:
                 warn(f"xethru view: watch at {process.web_url}")
             yield viewer
+
+
+class _Keys:
+    """Keys pressed on the terminal of standard input, without Enter; none if it is no terminal.
+
+    A terminal is read while this process is in its foreground only, and gets its mode back.
+    """
+
+    def __init__(self) -> None:
+        try:
+            self._terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
+        except (AttributeError, OSError, ValueError):  # closed, or none
+            self._terminal = None
+        self._mode: list[Any] | None = None
+
+    def __enter__(self) -> _Keys:
+        if self._terminal is not None and self._is_in_foreground():
+            with suppress(termios.error):
+                self._mode = termios.tcgetattr(self._terminal)
+                at_once = list(self._mode)
+                at_once[3] &= ~(termios.ICANON | termios.ECHO)
+                termios.tcsetattr(self._terminal, termios.TCSADRAIN, at_once)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._terminal is not None and self._mode is not None and self._is_in_foreground():
+            with suppress(termios.error):
+                termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._mode)
+
+    def pressed(self) -> bytes:
+        """Return what was pressed since the last call, without waiting."""
+        if self._terminal is None or self._mode is None or not self._is_in_foreground():
+            return b""
+        with suppress(OSError):  # the terminal was closed
+            if select.select([self._terminal], [], [], 0.0)[0]:
+                return os.read(self._terminal, 64)
+        return b""
+
+    def _is_in_foreground(self) -> bool:
+        assert self._terminal is not None
+        with suppress(OSError):
+            return os.tcgetpgrp(self._terminal) == os.getpgrp()
+        return False
 
 
 def style_of_output() -> Style:

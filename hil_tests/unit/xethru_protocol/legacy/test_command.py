@@ -96,6 +96,14 @@ def test_interrupt_ends_with_130_unless_the_script_catches_it(
     assert capsys.readouterr() == ("caught\n", "")
 
 
+def test_sigterm_ends_with_143_and_nothing_else(
+    script: Script, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\nwhile True: pass"
+    assert script(text) == 143
+    assert capsys.readouterr() == ("", "")
+
+
 def test_a_traceback_shows_the_script_alone(
     script: Script, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,7 @@
 """Breathing: closed forms of a chest's echo, and emulated people with known truth."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,7 +16,9 @@ from hil_tests.bench.breathing import (
     baseband_of,
     nobody_at_rest,
 )
+from xethru_protocol.processing import vital
 from xethru_protocol.processing.vital import (
+    LEAST_CONFIDENCE,
     BreathingMonitor,
     breathing_rate,
     breathing_rates,
@@ -102,6 +106,46 @@ def test_noise_is_no_breathing() -> None:
     for _ in range(30):
         iq = rng.normal(size=(1020, 60)) + 1j * rng.normal(size=(1020, 60))
         assert breathing_rate(iq, RANGES, RATE_HZ) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_echo_fainter_than_the_noise_has_a_rate(seed: int) -> None:
+    """1 mm of amplitude turns this echo by 0.3 rad: 1e-4, as much as the noise of a component."""
+    found = breathing_rate(
+        echo_of(breath(13.3, 0.001), 2.0, amplitude=3e-4, seed=seed), RANGES, RATE_HZ
+    )
+    assert found is not None
+    assert found.rate_bpm == pytest.approx(13.3, abs=0.2)
+    assert found.range_m == pytest.approx(2.0, abs=0.11)
+    assert LEAST_CONFIDENCE <= found.confidence <= 1.0
+
+
+@pytest.mark.parametrize("amplitude", [3e-4, 0.01])
+@pytest.mark.parametrize("frequency_hz", [5.9, 8.3])
+def test_an_alias_of_a_fan_is_no_breathing(frequency_hz: float, amplitude: float) -> None:
+    """Twice 8.3 Hz and three times 5.9 Hz look like 24 and 42 a minute."""
+    chest = breath(60 * frequency_hz, 0.006)
+    for seed in range(4):
+        iq = echo_of(chest, 2.0, amplitude=amplitude, seed=seed)
+        assert breathing_rate(iq, RANGES, RATE_HZ) is None
+
+
+def test_a_harmonic_of_a_faint_curtain_is_no_breathing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice 4 a minute; without the rule about other lines it would be answered."""
+    iq = [echo_of(breath(4, 0.006), 2.0, amplitude=3e-4, seed=seed) for seed in range(4)]
+    assert [breathing_rate(frames, RANGES, RATE_HZ) for frames in iq] == [None] * 4
+    monkeypatch.setattr(vital, "_OTHER_LINES", np.inf)
+    assert any(breathing_rate(frames, RANGES, RATE_HZ) for frames in iq)
+
+
+def test_slow_noise_is_no_breathing() -> None:
+    """Of a time constant of 2 s, as a receiver's drift."""
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        noise = rng.normal(size=(1020, 60)) + 1j * rng.normal(size=(1020, 60))
+        for before, after in pairwise(noise):
+            after += 0.97 * before
+        assert breathing_rate(noise, RANGES, RATE_HZ) is None
 
 
 def test_two_people_have_a_rate_each() -> None:

@@ -19,6 +19,7 @@ import pytest
 from emulator import emulated_port
 from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds, wait_until
+from hil_tests.system.terminal import in_terminal
 from hil_tests.unit.xethru_protocol.cli.live.chest import (
     RANGES_M,
     breathing,
@@ -31,7 +32,7 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said
 from hil_tests.unit.xethru_protocol.scripted import PlainModule
 from xethru_protocol.cli import main
 from xethru_protocol.cli.arguments import parse
-from xethru_protocol.cli.live.analysis import LiveAnalysis
+from xethru_protocol.cli.live.analysis import Clutter, LiveAnalysis
 from xethru_protocol.cli.live.sources import open_source
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
@@ -162,6 +163,50 @@ def test_clutter_goes_and_the_chest_stays(clutter: str, tmp_path: Path) -> None:
     assert update.chest_mm is not None
     # 8 mm from end to end
     assert np.ptp(update.chest_mm) == pytest.approx(8.0, rel=0.1)
+
+
+def test_a_switched_filter_is_that_of_all_frames_shown(tmp_path: Path) -> None:
+    """Behind 25 s of frames a switch from one gives the picture of the other."""
+    iq = target(breathing(25))
+    iq[:, 60:63] += np.complex64(0.05)
+    path = recording(tmp_path / "wall.npz", iq)
+    arguments = parse(["view", str(path), "--rate", "0"])
+
+    def analysis_of(clutter: Clutter) -> LiveAnalysis:
+        with open_source(arguments) as source:
+            analysis = LiveAnalysis(source, clutter=clutter, window_s=20.0)
+            for frame in source.frames:
+                analysis.take(frame)
+            return analysis
+
+    switched = analysis_of("none")
+    after_none: tuple[Clutter, ...] = ("mean", "exponential", "svd", "none")
+    for clutter in after_none:
+        switched.switch_clutter()
+        shown, expected = switched.update(), analysis_of(clutter).update()
+        assert shown.clutter == expected.clutter
+        np.testing.assert_array_equal(shown.waterfall, expected.waterfall)
+        np.testing.assert_array_equal(shown.profile, expected.profile)
+
+
+def test_a_key_takes_the_next_clutter_filter(at_rest: Path, tmp_path: Path) -> None:
+    """And the terminal shows what is typed again when the command has ended."""
+    size = {"TERM": "xterm-256color", "LC_ALL": "C.UTF-8", "LINES": "24", "COLUMNS": "80"}
+    arguments = ["view", at_rest, "--terminal", "--rate", "0.5"]
+    with in_terminal(
+        "xethru_protocol.cli", arguments, tmp_path / "crashes", environment=size
+    ) as command:
+        assert command.echoes()
+        command.read_until(lambda: b"clutter mean" in command.printed)
+        assert not command.echoes()
+        command.press(b"c")
+        command.read_until(lambda: b"clutter exponential" in command.printed)
+        command.press(b"xcc")
+        command.read_until(lambda: b"clutter none" in command.printed)
+        command.process.send_signal(signal.SIGINT)
+        command.read_until(lambda: command.process.poll() is not None)
+        assert command.echoes()
+        assert command.tracebacks == ""
 
 
 @pytest.mark.parametrize("tx_center_frequency", [3, 4])
