@@ -630,13 +630,14 @@ class RobustBackEnd:
 
     def answer(self, question: Question, option: Option) -> bool:
         """Believe one option of a question of this back end; return False if that is impossible."""
-        self.evidence += option.evidence
+        self.evidence, parameters = self.evidence + option.evidence, self.parameters
         if not option.is_jump:
             self._tentative.remove(question.tentative)
             self._place_point(question.tentative, question.point, option.row)
             return True
-        parameters, self._jumped = self.parameters, question.tentative.seen[0].pose
-        sigmas = [parameters.jump_sigma_m, parameters.jump_sigma_m, parameters.jump_sigma_rad]
+        self._jumped = question.tentative.seen[0].pose
+        self._settled = set()  # what was in view then was so from another pose
+        sigmas = [parameters.jumps.sigma_m, parameters.jumps.sigma_m, parameters.jumps.sigma_rad]
         self._log.loosen(self._jumped, np.diag(np.square(sigmas)))
         return self.relinearise()
 
@@ -645,7 +646,7 @@ class RobustBackEnd:
         since = tentative.seen[0].pose - self._jumped
         n_known = len(self.state.landmark_ids)
         return (
-            self.parameters.jump_sigma_rad > 0.0
+            self.parameters.jumps.sigma_rad > 0.0
             and since > self.parameters.splits.gap_poses
             and n_known >= self.parameters.branches.least_landmarks
         )

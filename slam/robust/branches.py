@@ -67,7 +67,7 @@ class Hypotheses:
 
     Each is judged by the evidence that it has gathered (`RobustBackEnd.evidence`). One is dropped
     if it is less likely than the best by `BranchRule.price_nats`, if its pose is nearer to that of
-    a likelier one than two keyframes are, or if there are more than `MapRule.most_likely`.
+    a likelier one than two keyframes are, or if there are more than `BranchRule.snapshots`.
     """
 
     def __init__(self, rig: Rig, parameters: BackEndParameters) -> None:
@@ -96,7 +96,7 @@ class Hypotheses:
             )
             if not is_like:
                 kept.append(one)
-        self._back_ends = kept[: self._parameters.map.most_likely]
+        self._back_ends = kept[: self._parameters.branches.snapshots]
 
     def _decided(self, back_end: RobustBackEnd) -> list[RobustBackEnd]:
         """Return what a back end becomes by the answers to its questions: the likeliest of them."""
@@ -109,7 +109,7 @@ class Hypotheses:
                     decided.append(one)
                 else:
                     answered += _answered(one, question, price_nats)
-            asking = self._likely(answered)[: self._parameters.map.most_likely]
+            asking = self._likely(answered)[: self._parameters.branches.snapshots]
         return decided
 
     def _likely(self, back_ends: Sequence[RobustBackEnd]) -> list[RobustBackEnd]:

@@ -14,8 +14,8 @@ constants, and beside the code that uses them, are
 - numbers of mathematics, such as a half, or the median of normal noise;
 - sizes of buffers, and what marks a value as missing.
 
-Fields of ``RangeNoise`` and ``WheelNoise`` have the values of the settings and of the robot; their
-defaults are for tests.
+Fields of ``RangeNoise``, ``JumpNoise`` and ``WheelNoise`` have the values of the settings and of
+the robot; their defaults are for tests.
 """
 
 from __future__ import annotations
@@ -78,6 +78,15 @@ class RangeNoise:
             min_range_m=self.min_range_m,
             max_range_m=self.max_range_m,
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JumpNoise:
+    """A motion that the wheels do not report at all, as when somebody bumps into the robot."""
+
+    # Standard deviations along each axis, and of the turn; zero: there is no such motion
+    sigma_m: float = 0.0
+    sigma_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,8 +171,8 @@ class MapRule:
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
     """Scans between two looks for landmarks that may be one, and for evidence of a carry."""
-    most_likely: Annotated[int, Origin.BUDGET] = 12
-    """How many of the likeliest are kept: of merges, to be combined in twos, and of hypotheses."""
+    most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
+    """How many of the likeliest merges are combined in twos."""
     neighbourhood_m: Annotated[float, Origin.CHOSEN] = NEIGHBOURHOOD_M
     """Distance within which landmarks are neighbours: those that may be one, and those that count
     for the density of a map."""
@@ -310,8 +319,9 @@ class BranchRule:
     """After how many times `TrackletRule.window` a place on trial is dropped."""
     snapshot_every: Annotated[int, Origin.BUDGET, "scans"] = 50
     """Scans between two snapshots of the back end."""
-    snapshots: Annotated[int, Origin.BUDGET, "snapshots"] = 9
-    """How many snapshots are kept: a carry that is noticed later is dated to the oldest."""
+    snapshots: Annotated[int, Origin.BUDGET, "copies"] = 9
+    """How many copies of the back end are kept: snapshots, to the oldest of which a carry is dated
+    that is noticed later, or hypotheses."""
     catch_up: Annotated[int, Origin.BUDGET, "scans"] = 10
     """How many scans an alternative that lags behind takes at a time."""
     newest: Annotated[int, Origin.BUDGET, "landmarks"] = 8
@@ -345,7 +355,4 @@ class BackEndParameters:
     noise: NoiseRule = field(default_factory=NoiseRule)
     splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)
-    # Standard deviations of a motion that the wheels do not report, as when somebody bumps into the
-    # robot; zero: there is none
-    jump_sigma_m: float = 0.0
-    jump_sigma_rad: float = 0.0
+    jumps: JumpNoise = field(default_factory=JumpNoise)

@@ -70,7 +70,12 @@ def groups() -> list[Group]:
     of_rules = [
         group_of(type(rule), {field.name: getattr(rule, field.name) for field in fields(rule)})
         for rule in (getattr(rules, field.name) for field in fields(rules))
-        if rule not in (rules.wheels, rules.ranges)  # they come with the robot and the settings
+        if rule
+        not in (
+            rules.wheels,
+            rules.ranges,
+            rules.jumps,
+        )  # they come with the robot and the settings
     ]
     return [
         group_of(parameters, vars(parameters), "Shared", "What several rules use."),

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,8 +14,10 @@ from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount, Rig, compose, wrap_angle
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
+from slam.robust.branches import Hypotheses
 from slam.robust.parameters import (
     BackEndParameters,
+    JumpNoise,
     MapRule,
     RangeNoise,
     RelinearisationRule,
@@ -133,3 +135,55 @@ def test_the_map_is_found_and_the_pose_is_as_sure_as_it_says(*, labelled: bool) 
         assert gaps.min(axis=0).max() < 0.4
     total = sum(nees)
     assert chi2.ppf(0.0005, 3 * len(nees)) < total < chi2.ppf(0.9995, 3 * len(nees))
+
+
+def drive(
+    hypotheses: Hypotheses, seed: int, *, jump_at: int | None = None, jump_rad: float = 0.0
+) -> tuple[Array, Array]:
+    """Return the path and the true one; in one step the wheels miss a part of the turn."""
+    _, steps = world(seed, labelled=False)
+    path, truth = [], []
+    for number, step in enumerate(steps):
+        increment = step.increment
+        if number == jump_at:
+            increment = increment - np.array([0.0, 0.0, jump_rad])
+        hypotheses.predict(increment)
+        hypotheses.update([step.scan])
+        path.append(hypotheses.best.pose)
+        truth.append(step.pose)
+    return np.array(path), np.array(truth)
+
+
+def test_hypotheses_find_the_map_too() -> None:
+    path, truth = drive(Hypotheses(Rig(mounts=(MOUNT,)), PARAMETERS), seed=1)
+    assert ate_rmse_m(path[:, :2], truth[:, :2]) < 0.15
+
+
+def test_a_motion_that_the_wheels_do_not_report_is_found() -> None:
+    """A turn of half a radian in the second lap: the next steps find it, or it stays.
+
+    With hypotheses of a jump the end is where the truth is; without them it is not.
+    """
+    rig, end_m = Rig(mounts=(MOUNT,)), []
+    rule = RelinearisationRule(key_m=0.2, shift_m=0.2, slip_m=0.0, slip_rad=0.0)
+    for jumps in (JumpNoise(sigma_m=0.1, sigma_rad=0.7), JumpNoise()):
+        hypotheses = Hypotheses(rig, replace(PARAMETERS, jumps=jumps, relinearisation=rule))
+        path, truth = drive(hypotheses, seed=1, jump_at=LAPS * STEPS * 2 // 3, jump_rad=0.5)
+        end_m.append(float(np.hypot(*(path[-1, :2] - truth[-1, :2]))))
+    assert end_m[0] < 0.3
+    assert end_m[1] > 1.0
+
+
+def test_the_answers_to_a_question_are_back_ends_of_their_own() -> None:
+    """Without a decision the likeliest answers live on; the best one has the most evidence."""
+    hypotheses = Hypotheses(Rig(mounts=(MOUNT,)), PARAMETERS)
+    _, steps = world(3, labelled=False)
+    alone = RobustBackEnd(Rig(mounts=(MOUNT,)), PARAMETERS)
+    for step in steps:
+        hypotheses.predict(step.increment)
+        hypotheses.update([step.scan])
+        assert hypotheses.best.question() is None
+        alone.predict(step.increment)
+        alone.update([step.scan])
+        assert alone.question() is None
+    assert hypotheses.best.evidence >= alone.evidence - 1e-9

@@ -15,6 +15,7 @@ from slam.robust.association import RangeScan
 from slam.robust.branches import Hypotheses
 from slam.robust.parameters import (
     BackEndParameters,
+    JumpNoise,
     MapRule,
     RangeNoise,
     RelinearisationRule,
@@ -107,8 +108,7 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
         relinearisation=RelinearisationRule(
             key_m=sensor.shift_m, shift_m=sensor.shift_m, slip_m=0.0, slip_rad=0.0
         ),
-        jump_sigma_m=sensor.jump_sigma_m,
-        jump_sigma_rad=sensor.jump_sigma_rad,
+        jumps=JumpNoise(sigma_m=sensor.jump_sigma_m, sigma_rad=sensor.jump_sigma_rad),
     )
 
 

@@ -64,7 +64,7 @@ SENSOR = Sensor(
     clutter=0.24,
     least_move_m=0.02,
     least_turn_rad=0.03,
-    shift_m=0.1,
+    shift_m=0.15,
     common_share=0.95,
     unmapped_per_m2=0.05,
     new_share=0.25,
@@ -74,8 +74,8 @@ SENSOR = Sensor(
     source="velocities are commands, not counts of the wheels: a tenth of a way or turn; the "
     "range is from the height of a barcode in a picture: 4 %; a bearing, with the mount of the "
     "camera: 0.02 rad; most of both errors stays as it is while a cylinder is in view; 15 "
-    "cylinders on 15 m by 8 m, a part of them not seen yet; no barcode is read where there is none; robots "
-    "bump into each other: 10 cm and 0.7 rad",
+    "cylinders on 15 m by 8 m, a part of them not seen yet; no barcode is read where there is "
+    "none; robots bump into each other: 10 cm and 0.7 rad",
 )
 
 
