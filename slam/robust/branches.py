@@ -78,6 +78,19 @@ class Hypotheses:
     def best(self) -> RobustBackEnd:
         return self._back_ends[0]
 
+    @property
+    def pose(self) -> Array:
+        """Return the mean of all poses by likelihood, [x m, y m, heading rad], map frame.
+
+        If the evidence is right, no other position has a smaller mean square error.
+        """
+        poses = np.array([one.pose for one in self._back_ends])
+        weights = np.exp([one.evidence - self.best.evidence for one in self._back_ends])
+        weights /= weights.sum()
+        x, y = weights @ poses[:, :2]
+        c, s = weights @ np.cos(poses[:, 2]), weights @ np.sin(poses[:, 2])
+        return np.array([x, y, math.atan2(s, c)])
+
     def predict(self, increment: Array) -> None:
         """Move all by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
         for back_end in self._back_ends:

@@ -67,7 +67,7 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
             hypotheses.update([_scan(step.observations, with_labels=with_labels)])
             moved = np.zeros(3)
             stamps_ns.append(step.t_ns)
-        causal.append(compose(hypotheses.best.pose, moved))
+        causal.append(compose(hypotheses.pose, moved))
         scan_of.append(len(stamps_ns))
         moves.append(moved)
     stop.check()

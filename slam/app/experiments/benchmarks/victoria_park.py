@@ -63,10 +63,12 @@ SENSOR = Sensor(
     clutter=1.0,
     least_move_m=1.0,
     least_turn_rad=0.05,
-    shift_m=0.5,
+    shift_m=1.0,
+    unmapped_per_m2=0.005,
     neighbourhood_m=5.0,
     source="a tenth in distance and turn, a degree per square root of a metre; the centre of a "
-    "trunk is uncertain by its width: half a metre; two beams of the laser: a degree",
+    "trunk is uncertain by its width: half a metre; two beams of the laser: a degree; a tree that is "
+    "not in the map on 14 m by 14 m",
 )
 
 
