@@ -126,7 +126,8 @@ class RobustBackEnd:
         self._n_updates = 0
         self.evidence = 0.0
         """Nats by which what detections with bearings were taken for, once a passage, and merges of
-        landmarks are likelier than that all is new."""
+        landmarks are likelier than that all is new, less what was missed. It is not revised when
+        the run is solved for, nor when a landmark is split or deleted."""
         # Of the newest scan with bearings: the antennas, and the ids that it held or should have
         self._antennas = antennas_of(rig, (), np.zeros(3))
         self._settled: set[int] = set()
@@ -585,6 +586,9 @@ class RobustBackEnd:
         """
         density = self.parameters.ranges.unmapped_per_m2
         for tentative in self._tentative.take_out():
+            if tentative.label is None and tentative.misses:
+                self._tentative.keep(tentative)  # the newest scan does not hold it
+                continue
             point, row = self._common(tentative), None
             if tentative.label is None:
                 found = self._possible(tentative, point)
@@ -593,7 +597,8 @@ class RobustBackEnd:
                     self._tentative.keep(tentative)
                     continue
                 certain = {row: found[row]}
-                self.evidence += options_of(self.state, point, certain, density)[0].evidence
+                (option,) = options_of(self.state, point, certain, density)
+                self._count_evidence(option)
             self._place_point(tentative, point, row)
 
     def _possible(self, tentative: TentativePoint, point: BodyPoint) -> dict[int, FeatureRows]:
@@ -630,16 +635,25 @@ class RobustBackEnd:
 
     def answer(self, question: Question, option: Option) -> bool:
         """Believe one option of a question of this back end; return False if that is impossible."""
-        self.evidence, parameters = self.evidence + option.evidence, self.parameters
+        parameters = self.parameters
+        self._count_evidence(option)
         if not option.is_jump:
             self._tentative.remove(question.tentative)
             self._place_point(question.tentative, question.point, option.row)
+            self._log.set_causal(self.state.pose)
             return True
         self._jumped = question.tentative.seen[0].pose
+        self._tentative.forget_before(self._jumped)
         self._settled = set()  # what was in view then was so from another pose
         sigmas = [parameters.jumps.sigma_m, parameters.jumps.sigma_m, parameters.jumps.sigma_rad]
         self._log.loosen(self._jumped, np.diag(np.square(sigmas)))
         return self.relinearise()
+
+    def _count_evidence(self, option: Option) -> None:
+        """Add the evidence of an option, that of a landmark once a passage."""
+        ids = self.state.landmark_ids
+        if option.row is None or self._log.is_new_passage(ids[option.row]):
+            self.evidence += option.evidence
 
     def _may_have_jumped(self, tentative: TentativePoint) -> bool:
         """Return whether the robot may have moved unnoticed before a landmark was first seen."""
@@ -802,6 +816,7 @@ class RobustBackEnd:
             self._existence.merge(kept, gone)
             self._log.rename(gone, kept)
         merged = {gone: kept for kept, gone in ids}
+        self._settled = {merged.get(id_, id_) for id_ in self._settled}
         labels = self._landmark_of_label.items()
         self._landmark_of_label = {label: merged.get(id_, id_) for label, id_ in labels}
         self.relinearise()

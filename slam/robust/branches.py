@@ -139,16 +139,17 @@ def _answered(
     back_end: RobustBackEnd, question: Question, price_nats: float
 ) -> list[RobustBackEnd]:
     """Return a back end for each option of a question that is not too unlikely."""
+    first = question.options[0]
     found = []
-    for k, option in enumerate(question.options):
-        if question.options[0].evidence - option.evidence > price_nats:
+    for k, option in enumerate(question.options[1:], start=1):
+        if first.evidence - option.evidence > price_nats:
             break
         child = back_end.copy()
         asked = child.question()
         assert asked is not None
         if child.answer(asked, asked.options[k]):
             found.append(child)
-    return found
+    return [back_end, *found] if back_end.answer(question, first) else found
 
 
 def evidence_table(report: UpdateReport) -> Array:

@@ -867,6 +867,10 @@ class TentativePoints:
     def remove(self, one: TentativePoint) -> None:
         self._points = [other for other in self._points if other is not one]
 
+    def forget_before(self, pose: int) -> None:
+        """Forget those that were seen before a pose, by index in the log."""
+        self._points = [one for one in self._points if one.seen[0].pose >= pose]
+
     def unclear(self) -> list[TentativePoint]:
         """Return those that the newest scan held and that are landmarks, but not yet which."""
         held = [one for one in self._points if one.label is None and not one.misses]

@@ -242,7 +242,8 @@ class RelinearisationRule:
     slip_rad: Annotated[float, Origin.CHOSEN] = math.radians(2.0)
     """Standard deviation of a slip's turn; that of the stress `slip`."""
     steps_per_slip: Annotated[float, Origin.CHOSEN, "steps"] = 100.0
-    """How many steps of the robot there are to one slip; as in the stress `slip`."""
+    """How many steps of the robot there are to one slip, as in the stress `slip`, or to one motion
+    that the wheels do not report."""
     slips_from: Annotated[int, Origin.CHOSEN, "steps"] = 2
     """Step of a solution from which on there are slips; from the next one on, outliers."""
     first_share: Annotated[float, Origin.CHOSEN] = 0.25
@@ -307,7 +308,7 @@ class BranchRule:
     """Most evidence that one landmark gives for a place, for others may lie near its prediction."""
     price_nats: Annotated[float, Origin.CHOSEN] = 20.0
     """By how much something rare must be likelier than that it did not happen: that the robot was
-    carried, or that a passage's ranges are of another landmark."""
+    carried, that a passage's ranges are of another landmark, or that a hypothesis is right."""
     least_landmarks: Annotated[int, Origin.CHOSEN, "landmarks"] = 3
     """Fewest landmarks that place a map on another, that are against a pose, and that can pay the
     price together."""

@@ -281,7 +281,8 @@ class RunLog:
 
     def is_new_passage(self, landmark_id: int) -> bool:
         """Return whether a range of a landmark now would begin a passage."""
-        last = self._passages.get(landmark_id, (0, -self._gap_poses - 1))[1]
+        names = self._all_names(landmark_id)
+        last = max((self._passages[name][1] for name in names if name in self._passages), default=0)
         return self.n_poses - 1 - last > self._gap_poses
 
     def loosen(self, pose: int, covariance: Array) -> None:
@@ -315,15 +316,19 @@ class RunLog:
                 found.add((name, pose))
         return Counter(name for name, _ in found)
 
-    def poses_of(self, landmark_id: int) -> list[int]:
-        """Return the poses from which a landmark was seen with a bearing."""
-        ranges = self._ranges.rows
+    def _all_names(self, landmark_id: int) -> set[int]:
+        """Return the id of a landmark with those of all that were merged into it."""
         names = {landmark_id}
         while True:
             more = {gone for gone, kept in self._names.items() if kept in names} - names
             if not more:
-                break
+                return names
             names |= more
+
+    def poses_of(self, landmark_id: int) -> list[int]:
+        """Return the poses from which a landmark was seen with a bearing."""
+        ranges = self._ranges.rows
+        names = self._all_names(landmark_id)
         mine = np.isin(ranges["landmark"], list(names)) & ~np.isnan(ranges["bearing_rad"])
         return sorted(set(ranges["pose"][mine].tolist()))
 

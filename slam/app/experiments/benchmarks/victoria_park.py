@@ -40,7 +40,7 @@ from slam.config import WheelNoise
 
 _L_M, _H_M, _A_M, _B_M = 2.83, 0.76, 3.78, 0.50
 _MOST_GAP_S = 0.5
-_RANGE_SIGMA_M, _BEARING_SIGMA_RAD = 0.5, math.radians(1.0)
+_RANGE_SIGMA_M, _BEARING_SIGMA_RAD = 0.2, math.radians(0.5)
 _MOST_STEERING_RAD = 1.2
 """At `atan(L / H)`, 1.31 rad, the left wheel would be the centre of the turn."""
 
@@ -67,8 +67,8 @@ SENSOR = Sensor(
     unmapped_per_m2=0.005,
     neighbourhood_m=5.0,
     source="a tenth in distance and turn, a degree per square root of a metre; the centre of a "
-    "trunk is uncertain by its width: half a metre; two beams of the laser: a degree; a tree that is "
-    "not in the map on 14 m by 14 m",
+    "trunk is uncertain by a part of its width: 20 cm; a step of the laser: half a degree; a tree that "
+    "is not in the map on 14 m by 14 m",
 )
 
 
