@@ -324,7 +324,8 @@ def eliminate(equations: NormalEquations) -> Eliminated:
     factor, info = dpbtrf(band, lower=1)
     if info != 0:
         raise np.linalg.LinAlgError("the chain of poses is not positive definite")
-    right = np.asfortranarray(np.column_stack([B, g]))
+    right = np.empty((len(B), B.shape[1] + 1), order="F")
+    right[:, :-1], right[:, -1] = B, g
     solved, info = dtbtrs(factor, right, uplo="L", overwrite_b=1)
     if info != 0:
         raise np.linalg.LinAlgError("the chain of poses is singular")

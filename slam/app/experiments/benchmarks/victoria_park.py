@@ -67,8 +67,8 @@ SENSOR = Sensor(
     unmapped_per_m2=0.005,
     neighbourhood_m=5.0,
     source="a tenth in distance and turn, a degree per square root of a metre; the centre of a "
-    "trunk is uncertain by a part of its width: 20 cm; a step of the laser: half a degree; a tree that "
-    "is not in the map on 14 m by 14 m",
+    "trunk is uncertain by a part of its width: 20 cm; a step of the laser: half a degree; a tree "
+    "that is not in the map on 14 m by 14 m",
 )
 
 
