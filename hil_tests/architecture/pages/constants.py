@@ -67,15 +67,11 @@ class Group:
 def groups() -> list[Group]:
     """Return all constants; settings have the values of preset robust."""
     rules = BackEndParameters()
+    given = rules.wheels, rules.ranges, rules.jumps  # they come with the robot and the settings
     of_rules = [
         group_of(type(rule), {field.name: getattr(rule, field.name) for field in fields(rule)})
         for rule in (getattr(rules, field.name) for field in fields(rules))
-        if rule
-        not in (
-            rules.wheels,
-            rules.ranges,
-            rules.jumps,
-        )  # they come with the robot and the settings
+        if rule not in given
     ]
     return [
         group_of(parameters, vars(parameters), "Shared", "What several rules use."),

@@ -281,9 +281,9 @@ class RunLog:
 
     def is_new_passage(self, landmark_id: int) -> bool:
         """Return whether a range of a landmark now would begin a passage."""
-        names = self._all_names(landmark_id)
-        last = max((self._passages[name][1] for name in names if name in self._passages), default=0)
-        return self.n_poses - 1 - last > self._gap_poses
+        known = [name for name in self._all_names(landmark_id) if name in self._passages]
+        newest = self.n_poses - 1
+        return all(newest - self._passages[name][1] > self._gap_poses for name in known)
 
     def loosen(self, pose: int, covariance: Array) -> None:
         """Let the step that leads to a pose have so much more noise, (3, 3), from now on."""
