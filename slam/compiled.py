@@ -20,9 +20,10 @@ _KERNELS: list[_Kernel] = []
 class _Kernel:
     """A function that is compiled once, for one signature."""
 
-    def __init__(self, function: FunctionType, signature: str) -> None:
+    def __init__(self, function: FunctionType, signature: str, *, has_long_loops: bool) -> None:
         self._function = function
         self._signature = signature
+        self._has_long_loops = has_long_loops
         self.compiled = cache(self._compiled)
         update_wrapper(self, function)
         _KERNELS.append(self)
@@ -40,9 +41,9 @@ class _Kernel:
                 known[name] = called.compiled()
         bound = FunctionType(function.__code__, known, function.__name__)
         bound.__module__, bound.__qualname__ = function.__module__, function.__qualname__
-        # Loops are short: their vectorised variants would take a third of the compilation.
+        # Where loops are short, their vectorised variants would take a third of the compilation.
         vectorise = numba.config.LOOP_VECTORIZE
-        numba.config.LOOP_VECTORIZE = 0
+        numba.config.LOOP_VECTORIZE = vectorise if self._has_long_loops else 0
         try:
             kept = numba.njit(cache=True, error_model="numpy")(bound)
         except RuntimeError:  # no folder can be written
@@ -56,8 +57,10 @@ class _Kernel:
         return compiled
 
 
-def kernel(signature: str) -> Callable[[_Function], _Function]:
+def kernel(signature: str, *, has_long_loops: bool = False) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles a function for a signature when it is first called.
+
+    Only ``has_long_loops`` makes vectorised loops, which give the same bits.
 
     A kernel may call kernels and read constants of its own module only: what is kept on disk is
     renewed when that file changes. Arrays are C-contiguous.
@@ -65,7 +68,8 @@ def kernel(signature: str) -> Callable[[_Function], _Function]:
 
     def decorate(function: _Function) -> _Function:
         assert isinstance(function, FunctionType)
-        return _Kernel(function, signature)  # type: ignore[return-value]  # the same function, faster
+        kept = _Kernel(function, signature, has_long_loops=has_long_loops)
+        return kept  # type: ignore[return-value]  # the same function, faster
 
     return decorate
 

@@ -487,3 +487,26 @@ def weigh(
                 value -= gain[row, b] * L[i, b]
             gain[row, i] = value / L[i, i]
     return gain, weighted, white, scale
+
+
+@kernel("f8[:,::1](f8[:,::1], f8[:,::1])", has_long_loops=True)
+def substitute(columns: Array, right: Array) -> Array:
+    """Return W (n, m) with L W = ``right`` (n, m), for a lower triangle L with a narrow band.
+
+    Row j of ``columns`` (n, b) has the entries of column j of L from the diagonal down. Entries of
+    W less than 1e-60 become zero: products of two of them are denormal, a hundred times slower.
+    """
+    n, width = columns.shape
+    found = np.empty_like(right)
+    left = np.empty(right.shape[1])
+    for row in range(n):
+        for k in range(len(left)):
+            left[k] = right[row, k]
+        for back in range(1, min(width, row + 1)):
+            entry, above = columns[row - back, back], found[row - back]
+            for k in range(len(left)):
+                left[k] -= entry * above[k]
+        for k in range(len(left)):
+            entry = left[k] / columns[row, 0]
+            found[row, k] = entry if abs(entry) > 1e-60 else 0.0
+    return found

@@ -20,9 +20,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpbtrf, dtbtrs
 
 from slam.geometry import wrap_angles
+from slam.robust import kernels
 from slam.robust.parameters import RelinearisationRule
 from slam.robust.solver.run_log import (
     Estimate,
@@ -39,6 +41,7 @@ _LEAST_WALK_SHARE = 1e-5
 # The decrease of the cost that ends a search, what rounding may add to it, and how often a step is
 # halved
 _TOLERANCE, _ROUNDING, _HALVINGS = 1e-2, 1e-12, 8
+_GROUPS = 8  # of columns of the border whose rows begin together
 _SETTLED_SHARE = 0.01  # decrease of the cost, as a share, from which on outliers are left out
 # What keeps a direction finite where a landmark stands at an antenna, or at the robot, and a root
 # where nothing walks
@@ -324,13 +327,17 @@ def eliminate(equations: NormalEquations) -> Eliminated:
     factor, info = dpbtrf(band, lower=1)
     if info != 0:
         raise np.linalg.LinAlgError("the chain of poses is not positive definite")
-    right = np.empty((len(B), B.shape[1] + 1), order="F")
-    right[:, :-1], right[:, -1] = B, g
-    solved, info = dtbtrs(factor, right, uplo="L", overwrite_b=1)
-    if info != 0:
-        raise np.linalg.LinAlgError("the chain of poses is singular")
-    W, y = solved[:, :-1], solved[:, -1]
-    information = C - W.T @ W
+    W = kernels.substitute(factor.T, B)
+    y = kernels.substitute(factor.T, g[:, None])[:, 0]
+    # A column is zero until the first pose that it has an entry of, and landmarks are in the order
+    # in which they were first seen: the rows of early poses have entries in the first columns only.
+    first = np.minimum.accumulate(np.argmax(B != 0.0, axis=0)[::-1])[::-1]
+    information = C.copy()
+    for columns in np.array_split(np.arange(len(first)), _GROUPS):
+        if len(columns):
+            end = int(columns[-1]) + 1
+            rows = W[first[columns[0]] : (first[end] if end < len(first) else len(W)), :end]
+            information[:end, :end] -= rows.T @ rows
     return Eliminated(
         information=(information + information.T) / 2,
         gradient=h - W.T @ y,
@@ -345,7 +352,7 @@ def solve(equations: NormalEquations) -> tuple[Array, Array]:
     """Return the change of the chain (k, size) and of the border."""
     left = eliminate(equations)
     L = np.linalg.cholesky(left.information)
-    border = -np.asarray(np.linalg.solve(L.T, np.linalg.solve(L, left.gradient)))
+    border = -np.asarray(cho_solve((L, True), left.gradient, check_finite=False))
     chain, _ = dtbtrs(left.factor, -(left.y + left.W @ border)[:, None], uplo="L", trans="T")
     if not (np.isfinite(chain).all() and np.isfinite(border).all()):
         raise np.linalg.LinAlgError("the normal equations are singular")

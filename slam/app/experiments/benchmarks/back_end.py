@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.cluster.hierarchy import fclusterdata
 from threadpoolctl import threadpool_limits
 
 from slam.app.experiments.benchmarks.data_set import Array, Observation, Run, Sensor
@@ -64,7 +66,7 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
             is_first or has_moved(np.zeros(3), moved, sensor.least_move_m, sensor.least_turn_rad)
         ):
             hypotheses.predict(moved)
-            hypotheses.update([_scan(step.observations, with_labels=with_labels)])
+            hypotheses.update([_scan(step.observations, sensor, with_labels=with_labels)])
             moved = np.zeros(3)
             stamps_ns.append(step.t_ns)
         causal.append(compose(hypotheses.pose, moved))
@@ -112,9 +114,11 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
     )
 
 
-def _scan(seen: Sequence[Observation], *, with_labels: bool) -> RangeScan:
+def _scan(seen: Sequence[Observation], sensor: Sensor, *, with_labels: bool) -> RangeScan:
     """Return a scan whose observations all have bearings, or none has."""
     has_bearings = any(one.bearing_rad is not None for one in seen)
+    if has_bearings and not with_labels and sensor.extent_m:
+        seen = grouped(seen, sensor.extent_m)
     bearings = tuple([one.bearing_rad or 0.0 for one in seen])
     bearing_sigmas = tuple([one.bearing_sigma_rad or 0.0 for one in seen])
     return RangeScan(
@@ -125,3 +129,32 @@ def _scan(seen: Sequence[Observation], *, with_labels: bool) -> RangeScan:
         bearing_sigmas_rad=bearing_sigmas if has_bearings else None,
         labels=tuple([one.label for one in seen]) if with_labels else None,
     )
+
+
+def grouped(seen: Sequence[Observation], extent_m: float) -> list[Observation]:
+    """Return one observation, without a label, of each group of those with range and bearing.
+
+    Those nearer to each other than the extent of a landmark are one group; it is at their mean. As
+    any part of the landmark may have been seen, the noise of a point in a disc of that diameter,
+    D / 4 along each axis, is added in squares.
+    """
+    ranges_m = np.array([one.range_m for one in seen])
+    bearings = np.array([one.bearing_rad for one in seen], dtype=np.float64)
+    points = np.column_stack([ranges_m * np.cos(bearings), ranges_m * np.sin(bearings)])
+    group_of = np.ones(1)
+    if len(seen) > 1:
+        group_of = np.asarray(fclusterdata(points, extent_m, "distance", method="single"))
+    spread_m, groups = extent_m / 4.0, list[Observation]()
+    for group in np.unique(group_of).tolist():
+        members = np.flatnonzero(group_of == group)
+        x_m, y_m = points[members].mean(axis=0).tolist()
+        first, range_m = seen[int(members[0])], math.hypot(x_m, y_m)
+        groups.append(
+            Observation(
+                range_m=range_m,
+                range_sigma_m=math.hypot(first.range_sigma_m, spread_m),
+                bearing_rad=math.atan2(y_m, x_m),
+                bearing_sigma_rad=math.hypot(first.bearing_sigma_rad or 0.0, spread_m / range_m),
+            )
+        )
+    return groups

@@ -71,6 +71,8 @@ class Run:
     truth: Path
     beacons_m: dict[int, tuple[float, float]] = field(default_factory=dict)  # true, by label
     left_out: int = 0  # observations that the reader left out, such as those of other robots
+    # Whether it is worth a try without ids: not if its author has left most observations out
+    is_dense: bool = True
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
@@ -119,6 +121,9 @@ class Sensor:
     neighbourhood_m: float
     source: str
     unmapped_per_m2: float = 0.02  # how many landmarks may not be in the map yet
+    # Diameter of what is one landmark where there are no ids: the sensor sees any part of it, and
+    # cannot tell the parts apart
+    extent_m: float = 0.0
     # Share of 15 scans that must hold what is to be a new landmark: small, if nothing else is seen
     new_share: float = 0.6
     # Standard deviations of a motion that the wheels do not report: by a bump

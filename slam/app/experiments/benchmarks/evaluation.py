@@ -81,7 +81,7 @@ def score_run(
         )
     solutions = {}
     for name, with_labels in ((WITH_IDS, True), (WITHOUT_IDS, False)):
-        if not (run.has_labels if with_labels else run.has_bearings):
+        if not (run.has_labels if with_labels else run.has_bearings and run.is_dense):
             continue
         progress(f"{run.name}, {name.replace('_', ' ')}: {len(run.steps)} steps")
         solution = solve(run, data.sensor, stop, with_labels=with_labels)
@@ -105,7 +105,7 @@ def mean_ate_m(runs: Sequence[ScoredRun]) -> dict[str, float]:
 
 
 def write_run(folder: FilePath, data: DataSet, scored: ScoredRun) -> None:
-    """Write the paths of a run as TUM files, and its observations with ids as a factor graph.
+    """Write the paths of a run as TUM files, and as a factor graph if true landmarks are known.
 
     The truth has no heading: its orientation is the identity.
     """
@@ -118,7 +118,7 @@ def write_run(folder: FilePath, data: DataSet, scored: ScoredRun) -> None:
     _, rows = np.unique(truth.t_ns, return_index=True)
     places = np.column_stack([truth.xy_m[rows], np.zeros(len(rows))])
     _write_tum(folder / "truth.tum", truth.t_ns[rows], places)
-    if run.has_labels:
+    if run.beacons_m:
         write_pyfg(folder / "graph.pyfg", graph_of(run, data.sensor))
 
 

@@ -73,6 +73,50 @@ def test_the_laser_of_the_car_goes_where_its_axle_and_its_place_say(tmp_path: Pa
         assert np.linalg.norm(10.0 * worlds.LANDMARKS_M - place, axis=1).min() < 2.5
 
 
+def test_a_fix_that_no_car_can_reach_is_left_out(tmp_path: Path) -> None:
+    folder = worlds.write_victoria_park(tmp_path, duration_s=2.0)
+    lines = (folder / "gps.dat").read_text(encoding="ascii").splitlines()
+    time_s, x_m, y_m = lines[7].split()
+    _damage(folder / "gps.dat", 8, f"{time_s} {float(x_m) + 3.0} {y_m}")  # 3 m in 0.1 s
+    # with nothing behind it, a fix cannot be told from a fast car
+    _damage(folder / "gps.dat", len(lines), f"{lines[-1].split()[0]} 500 500")
+    (run,) = victoria_park.read_data_set(folder).runs
+    kept = [float(line.split()[0]) for line in lines]
+    del kept[7]
+    np.testing.assert_allclose(run.truth.t_ns / 1e9, kept)
+
+
+def test_the_graph_of_the_car_has_the_times_of_its_way(tmp_path: Path) -> None:
+    folder = worlds.write_victoria_park(tmp_path, with_graph=True)
+    plain, run = victoria_park.read_data_set(folder).runs
+    assert (plain.has_labels, run.has_labels, run.is_dense) == (False, True, False)
+    # every fifth of the inputs, which are 0.1 s apart
+    np.testing.assert_allclose(run.t_ns / 1e9, 0.5 * np.arange(61), atol=0.01)
+    assert dead_reckoning_error_m(run) < 0.05
+    labels = set()
+    for step in run.steps:
+        heading = math.pi / 2 + 0.25 * step.t_ns / 1e9
+        at, known = run.truth.at(np.array([step.t_ns]))
+        for one in step.observations:
+            assert one.label is not None
+            assert one.bearing_rad is not None
+            angle = heading + one.bearing_rad
+            place = at[0] + one.range_m * np.array([math.cos(angle), math.sin(angle)])
+            assert known[0]
+            assert np.linalg.norm(10.0 * worlds.LANDMARKS_M[one.label] - place) < 2.5
+            labels.add(one.label)
+    assert labels == {0, 1, 2, 3, 4}
+
+
+def test_a_graph_of_another_drive_is_named(tmp_path: Path) -> None:
+    folder = worlds.write_victoria_park(tmp_path, duration_s=10.0, with_graph=True)
+    lines = (folder / "victoria_park.txt").read_text(encoding="ascii").splitlines()
+    half = "\n".join(lines[: len(lines) // 2])
+    (folder / "victoria_park.txt").write_text(half + "\n", encoding="ascii")
+    with pytest.raises(AppError, match=r"victoria_park.txt: its way is \d+ m, that of inputs.dat"):
+        victoria_park.read_data_set(folder)
+
+
 def test_pyfg_gives_a_chain_of_poses_with_labelled_ranges(tmp_path: Path) -> None:
     worlds.write_pyfg_file(tmp_path / "small.pyfg")
     (run,) = pyfg.read_data_set(tmp_path).runs
@@ -98,7 +142,10 @@ def _damage(path: Path, line: int, text: str) -> None:
 
 WRITERS: dict[str, tuple[Callable[..., Path], Callable[[Path], DataSet]]] = {
     "mrclam": (worlds.write_mrclam, mrclam.read_data_set),
-    "victoria-park": (worlds.write_victoria_park, victoria_park.read_data_set),
+    "victoria-park": (
+        lambda folder, **more: worlds.write_victoria_park(folder, with_graph=True, **more),
+        victoria_park.read_data_set,
+    ),
     "plaza": (
         lambda folder, **more: worlds.write_pyfg_file(folder / "a.pyfg", **more).parent,
         pyfg.read_data_set,
@@ -120,6 +167,17 @@ SET = "MRCLAM_Dataset1"
         ("victoria-park", ("inputs.dat", 3), "0.2 5 1.3", "no car steers"),
         ("victoria-park", ("measurements.dat", 1), "inf 1 1 1", '"inf" is no finite'),
         ("victoria-park", ("gps.dat", 4), "a b c", '"a" is no finite'),
+        ("victoria-park", ("victoria_park.txt", 1), "POSE 1 2", "is not one of ODOMETRY, LANDMARK"),
+        ("victoria-park", ("victoria_park.txt", 1), "ODOMETRY 1", '"" is no id'),
+        ("victoria-park", ("victoria_park.txt", 1), "ODOMETRY 1 2 3", "1 numbers behind the ids"),
+        ("victoria-park", ("victoria_park.txt", 1), f"LANDMARK 7 1 {'1 ' * 5}", "to pose 7"),
+        ("victoria-park", ("victoria_park.txt", 1), f"ODOMETRY 1 2 nan {'1 ' * 8}", '"nan" is no'),
+        (
+            "victoria-park",
+            ("victoria_park.txt", 1),
+            f"ODOMETRY 1 1 {'1 ' * 9}",
+            "been there before",
+        ),
         ("plaza", ("a.pyfg", 2), "VERTEX_SE3:QUAT 1 A1 0 0 0 0 0 0 1", "is not one of"),
         ("plaza", ("a.pyfg", 2), "VERTEX_SE2 1 A0 0 0 0", "A0 is defined twice"),
         ("plaza", ("a.pyfg", 2), "VERTEX_SE2 1 A1 0 0", "2 numbers behind the names"),

@@ -86,10 +86,14 @@ def write_mrclam(folder: Path, *, duration_s: float = 40.0, robots: int = 1) -> 
     return folder
 
 
-def write_victoria_park(folder: Path, *, duration_s: float = 30.0) -> Path:
+def write_victoria_park(
+    folder: Path, *, duration_s: float = 30.0, with_graph: bool = False
+) -> Path:
     """Write a car whose rear axle drives a circle of 20 m, among trees ten times as far apart.
 
     Axle and laser are placed by hand, so the reader's model of the car has something to agree with.
+    ``with_graph`` adds the drive as GTSAM has it: every fifth scan, poses of the axle, ids that
+    poses and trees share, no times.
     """
     wheelbase_m, h_m, a_m, b_m = 2.83, 0.76, 3.78, 0.50
     axle_radius_m, axle_mps = 20.0, 5.0
@@ -112,11 +116,27 @@ def write_victoria_park(folder: Path, *, duration_s: float = 30.0) -> Path:
         folder / "gps.dat",
         [[f"{t:.3f}", f"{x:.3f}", f"{y:.3f}"] for t, (x, y) in zip(t_s, laser, strict=True)],
     )
-    rows = []
-    for t, pose in zip(t_s[::2].tolist(), poses[::2], strict=True):
-        for _, range_m, bearing in seen_from(pose, LANDMARKS_M, rng, scale=10.0):
+    rows, graph = [], []
+    turn = SCALE * axle_mps / axle_radius_m * PERIOD_S
+    chord_m = 2.0 * axle_radius_m * math.sin(5.0 * turn / 2)
+    step = [chord_m * math.cos(5.0 * turn / 2), chord_m * math.sin(5.0 * turn / 2), 5.0 * turn]
+    for n, (t, pose) in enumerate(zip(t_s.tolist(), poses, strict=True)):
+        here = 100 + n
+        if n % 5 == 0 and n:
+            graph.append(["ODOMETRY", str(here - 5), str(here), *map(repr, step), *["1"] * 6])
+        if n % 2:
+            continue
+        for tree, range_m, bearing in seen_from(pose, LANDMARKS_M, rng, scale=10.0):
             rows.append([f"{t:.3f}", f"{range_m:.4f}", f"{bearing + math.pi / 2:.5f}", "0.4"])
+            if n % 5 == 0 and n:
+                x_m = a_m + range_m * math.cos(bearing)
+                y_m = b_m + range_m * math.sin(bearing)
+                graph.append(
+                    ["LANDMARK", str(here), str(tree), repr(x_m), repr(y_m), "1", "0", "1"]
+                )
     write_rows(folder / "measurements.dat", rows)
+    if with_graph:
+        write_rows(folder / "victoria_park.txt", graph)
     return folder
 
 
