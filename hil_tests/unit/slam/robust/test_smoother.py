@@ -9,6 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import chdtri
@@ -17,6 +19,7 @@ from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.unit.slam.robust.range_world import LAB, follow, parameters_for, simulate, step_of
 from slam.config import WheelNoise
 from slam.geometry import between, compose, paper_rig
+from slam.robust import kernels
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters, RelinearisationRule, SplitRule
@@ -30,7 +33,14 @@ from slam.robust.solver.run_log import (
     motion_covariances,
     motions_by_calibration,
 )
-from slam.robust.solver.smoother import Smoother, measurement_residuals
+from slam.robust.solver.smoother import (
+    NormalEquations,
+    Rows,
+    Smoother,
+    Steps,
+    eliminate,
+    measurement_residuals,
+)
 from slam.robust.state import Layout, State, calibrated_motion, predict
 
 Array = NDArray[np.float64]
@@ -552,3 +562,68 @@ def test_information_of_rounding_alone_is_none() -> None:
 def _is_sane(state: State) -> bool:
     P = state.P.full()
     return bool(P.diagonal().max() < 1e4 and np.linalg.eigvalsh(P)[0] > -1e-9)
+
+
+@given(n=st.integers(1, 12), width=st.integers(1, 4), m=st.integers(1, 9), seed=st.integers(0, 99))
+def test_substitution_solves_a_banded_triangle(n: int, width: int, m: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    columns, L = np.zeros((n, width)), np.zeros((n, n))
+    for j in range(n):
+        for below in range(min(width, n - j)):
+            columns[j, below] = L[j + below, j] = rng.normal() + (4.0 if below == 0 else 0.0)
+    right = rng.normal(size=(n, m))
+    np.testing.assert_allclose(kernels.substitute(columns, right), np.linalg.solve(L, right))
+
+
+def test_what_fades_along_the_chain_ends_as_zero() -> None:
+    # W_k = 0.5^k: its squares would be denormal from k = 511 on
+    columns = np.tile([1.0, -0.5], (1200, 1))
+    right = np.zeros((1200, 1))
+    right[0] = 1.0
+    faded = kernels.substitute(columns, right)[:, 0]
+    expected = 0.5 ** np.arange(1200)
+    np.testing.assert_array_equal(faded, np.where(expected > 1e-60, expected, 0.0))
+
+
+def test_elimination_is_the_schur_complement() -> None:
+    rng = np.random.default_rng(5)
+    n_chain, size, n_border = 30, 3, 21
+    n = n_chain * size
+    equations = NormalEquations(n_chain, size, n_border)
+    # A column of the border begins at a later pose than those before it; the first are of all poses
+    pose = np.repeat(np.arange(n_chain + 1), 8)
+    newest = 6 + 3 * ((n_border - 9) * pose // (3 * n_chain))
+    columns = np.column_stack([np.full(len(pose), 3), np.minimum(newest, n_border - 1)])
+    rows = Rows(
+        poses=pose,
+        residual=rng.normal(size=len(pose)),
+        by_pose=rng.normal(size=(len(pose), 3)),
+        columns=columns,
+        by_border=rng.normal(size=(len(pose), 2)),
+    )
+    steps = Steps(
+        residual=rng.normal(size=(n_chain, 3)),
+        by_before=rng.normal(size=(n_chain, 3, 3)),
+        by_after=rng.normal(size=(n_chain, 3, 3)),
+        by_calibration=rng.normal(size=(n_chain, 3, 3)),
+    )
+    equations.add_steps(steps)
+    equations.add_rows(rows, np.ones(len(pose)))
+    equations.add_prior(np.zeros(n_border), np.ones(n_border))
+    J = np.zeros((len(pose) + 3 * n_chain, n + n_border))
+    for k, at in enumerate(pose.tolist()):
+        # the last pose is the first in the border
+        J[k, size * at : size * at + 3] += rows.by_pose[k]
+        np.add.at(J[k], n + columns[k], rows.by_border[k])
+    for k in range(n_chain):
+        mine = slice(len(pose) + 3 * k, len(pose) + 3 * k + 3)
+        J[mine, size * k : size * k + 3] = steps.by_before[k]
+        J[mine, size * k + 3 : size * k + 6] = steps.by_after[k]
+        J[mine, n + 3 : n + 6] = steps.by_calibration[k]
+    prior = np.concatenate([np.ones(3), np.zeros(n - 3), np.zeros(3), np.ones(n_border - 3)])
+    A = J.T @ J + np.diag(prior)
+    g = J.T @ np.concatenate([rows.residual, steps.residual.ravel()])
+    gained = A[n:, :n] @ np.linalg.inv(A[:n, :n])
+    left = eliminate(equations)
+    np.testing.assert_allclose(left.information, A[n:, n:] - gained @ A[:n, n:], atol=1e-8)
+    np.testing.assert_allclose(left.gradient, g[n:] - gained @ g[:n], atol=1e-8)

@@ -99,7 +99,7 @@ def _table(data: DataSet, runs: Sequence[ScoredRun]) -> tuple[str, Sequence[str]
         for one in runs
     ]
     mean = mean_ate_m(runs)
-    if len(runs) > 1:
+    if len(runs) > 1 and len(mean) > 1:  # more than dead reckoning
         rows.append(["mean", "", *(_metres(mean.get(name)) for name in names), ""])
     title = f"{data.title}: ATE [m], time-associated, SE(2)-aligned (real data)"
     header = ["run", "observations", *(_COLUMNS[name] for name in names), "CPU time"]
@@ -122,7 +122,7 @@ def _draw(figure: Figure, title: str, runs: Sequence[ScoredRun]) -> None:
     columns = min(len(runs), _PANELS)
     rows = math.ceil(len(runs) / columns)
     for number, scored in enumerate(runs, start=1):
-        _draw_map(figure.add_subplot(rows, columns, number), scored, small=len(runs) > 2)
+        _draw_map(figure.add_subplot(rows, columns, number), scored, small=len(runs) > 1)
     figure.suptitle(title, fontsize=11, color=INK, x=0.01, ha="left")
     used = [name for name in _STYLES if any(name in one.paths for one in runs)]
     handles = [Line2D([], [], color=TRUTH, linewidth=3.0, alpha=0.6)]
