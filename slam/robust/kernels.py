@@ -16,6 +16,9 @@ from slam.compiled import kernel
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+# Of what a substitution gives: products of two smaller entries are denormal, a hundred times slower.
+_LEAST_ENTRY = 1e-60
+
 
 @kernel(
     "Tuple((f8[::1], f8[:,::1], i8[:,::1], i8[::1]))"
@@ -494,7 +497,7 @@ def substitute(columns: Array, right: Array) -> Array:
     """Return W (n, m) with L W = ``right`` (n, m), for a lower triangle L with a narrow band.
 
     Row j of ``columns`` (n, b) has the entries of column j of L from the diagonal down. Entries of
-    W less than 1e-60 become zero: products of two of them are denormal, a hundred times slower.
+    W less than `_LEAST_ENTRY` become zero.
     """
     n, width = columns.shape
     found = np.empty_like(right)
@@ -508,5 +511,5 @@ def substitute(columns: Array, right: Array) -> Array:
                 left[k] -= entry * above[k]
         for k in range(len(left)):
             entry = left[k] / columns[row, 0]
-            found[row, k] = entry if abs(entry) > 1e-60 else 0.0
+            found[row, k] = entry if abs(entry) > _LEAST_ENTRY else 0.0
     return found
