@@ -16,7 +16,7 @@ from slam.compiled import kernel
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# Of what a substitution gives: products of two smaller entries are denormal, a hundred times slower.
+# Products of two smaller entries of a substitution are denormal, a hundred times slower.
 _LEAST_ENTRY = 1e-60
 
 
