@@ -511,5 +511,6 @@ def substitute(columns: Array, right: Array) -> Array:
                 left[k] -= entry * above[k]
         for k in range(len(left)):
             entry = left[k] / columns[row, 0]
-            found[row, k] = entry if abs(entry) > _LEAST_ENTRY else 0.0
+            # so written that what is no number stays none
+            found[row, k] = 0.0 if abs(entry) < _LEAST_ENTRY else entry
     return found

@@ -583,6 +583,8 @@ def test_what_fades_along_the_chain_ends_as_zero() -> None:
     faded = kernels.substitute(columns, right)[:, 0]
     expected = 0.5 ** np.arange(1200)
     np.testing.assert_array_equal(faded, np.where(expected > 1e-60, expected, 0.0))
+    right[0] = np.nan
+    assert np.isnan(kernels.substitute(columns, right)).all()
 
 
 def test_elimination_is_the_schur_complement() -> None:
