@@ -44,7 +44,11 @@ class Drive:
 
 
 def read_gtsam(path: FilePath) -> Drive:
-    """Read a drive; AppError names a line that is none of it, or that does not go on."""
+    """Read a drive.
+
+    Raises AppError that names a line of another form, or one that does not continue the chain of
+    poses.
+    """
     increments: list[tuple[float, ...]] = []
     sightings: list[Sighting] = []
     place_of: dict[int, int] = {}
