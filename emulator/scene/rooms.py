@@ -4,9 +4,12 @@
 method does in rooms that it was not tuned for, so nothing about SLAM may be chosen by looking at
 single ones. The same name gives the same room as long as NumPy keeps the streams of its generators.
 
+The last six families deceive: things that look alike, bodies wider than a landmark, or next to
+nothing. Rig, speed and, where it is free, the shape of the course are drawn, too.
+
 A room is the tables of a scene file as plain values; `emulator.scene.scene` checks them. Lengths
 are metres, angles degrees; the robot drives its closed course twice, with the lab's noise and, but
-for ``sparse``, the lab's wheels.
+for ``sparse`` and ``yard``, the lab's wheels.
 """
 
 from __future__ import annotations
@@ -43,6 +46,9 @@ _WHEELS = {
 """The lab's."""
 _RIG = ((-0.1, 0.2, 90.0), (0.1, 0.2, 90.0), (-0.1, -0.2, -90.0), (0.1, -0.2, -90.0))
 """The paper's: place and yaw of each radar."""
+_RIGS = (((0.0, 0.2, 90.0), (0.0, -0.2, -90.0)), (*_RIG[:2], (0.0, -0.2, -90.0)), _RIG)
+"""Two, three and four radars: a side with one radar has no pair of ranges of one time."""
+_SPEEDS_MPS = (0.05, 0.3)
 _SENSORS: Row = {
     "noise": {"rf_sigma": 5e-4, "iterations": 16, "pulses_per_step": 300},
     "clutter": {"sigma": 2.25e-4, "correlation_s": 4.8},
@@ -63,6 +69,7 @@ class Room:
     people: list[Row] = field(default_factory=list)
     rig: Sequence[tuple[float, float, float]] = _RIG
     wheels_factor: float = 1.0  # on every standard deviation of the wheels
+    speed_mps: float = 0.05
 
 
 def _off_course_m(point: NDArray[np.float64], way: Way) -> float:
@@ -206,9 +213,139 @@ def rig(rng: np.random.Generator) -> Room:
     return Room(way=way, targets=rods, rig=mounts)
 
 
+def _square(rng: np.random.Generator) -> Way:
+    return _rectangle(rng, 2.4, 3.6)
+
+
+def _circle(rng: np.random.Generator) -> Way:
+    """Return 24 corners of a circle that begins along x."""
+    step_m = rng.uniform(1.2, 1.8) * math.tau / 24
+    way = [(0.0, 0.0)]
+    for corner in range(23):
+        (x, y), heading = way[-1], corner * math.tau / 24
+        way.append((x + step_m * math.cos(heading), y + step_m * math.sin(heading)))
+    return way
+
+
+def _eight(rng: np.random.Generator) -> Way:
+    """Return two squares that touch at the start, each driven round once, in opposite senses."""
+    a = rng.uniform(1.8, 2.4)
+    return [(0.0, 0.0), (a, 0.0), (a, a), (0.0, a), (0.0, -a), (-a, -a), (-a, 0.0)]
+
+
+def _corridor(rng: np.random.Generator) -> Way:
+    """Return a straight way, there and back."""
+    return [(0.0, 0.0), (rng.uniform(4.0, 6.0), 0.0)]
+
+
+def _course(rng: np.random.Generator) -> Way:
+    shapes = (_square, _circle, _eight, _corridor)
+    return shapes[int(rng.integers(len(shapes)))](rng)
+
+
+def _drawn(rng: np.random.Generator) -> Row:
+    """Return the rig and the speed of a room that leaves them free."""
+    rig = _RIGS[int(rng.integers(len(_RIGS)))]
+    return {"rig": rig, "speed_mps": float(rng.choice(_SPEEDS_MPS))}
+
+
+def rack(rng: np.random.Generator) -> Room:
+    """One to four aisles between rows of uprights at one pitch."""
+    n_aisles, pitch = int(rng.integers(1, 5)), rng.uniform(0.5, 0.8)
+    length, width, depth = rng.uniform(3.0, 5.0), rng.uniform(1.4, 2.0), rng.uniform(0.3, 0.6)
+    way: Way = []
+    for aisle in range(n_aisles):
+        y = aisle * (width + depth)
+        way += [(0.0, y), (length, y)] if aisle % 2 == 0 else [(length, y), (0.0, y)]
+    if n_aisles % 2 and n_aisles > 1:  # back along the last aisle, not across the racks
+        way.append((0.0, way[-1][1]))
+    uprights = [
+        (0.4 + number * pitch + rng.normal(0, 0.003), row + rng.normal(0, 0.003))
+        for aisle in range(n_aisles)
+        for row in (aisle * (width + depth) - width / 2, aisle * (width + depth) + width / 2)
+        for number in range(int((length - 0.8) / pitch) + 1)
+    ]
+    return Room(way=way, targets=_rods(uprights), **_drawn(rng))
+
+
+def doors(rng: np.random.Generator) -> Room:
+    """Corridor with eight door frames, four to each side, there and back."""
+    gap, pitch, opening = rng.uniform(0.8, 1.1), rng.uniform(1.6, 2.2), 0.9
+    length = 4 * pitch
+    frames, walls = [], []
+    for y in (-gap, gap):
+        ends = [-0.5]
+        for number in range(4):
+            middle = (number + 0.5) * pitch
+            ends += [middle - opening / 2, middle + opening / 2]
+            frames += [(middle - opening / 2, y), (middle + opening / 2, y)]
+        ends.append(length + 0.5)
+        walls += [
+            {"from_m": (start, y), "to_m": (end, y), "amplitude_1m": 0.035}
+            for start, end in zip(ends[::2], ends[1::2], strict=True)
+        ]
+    way = [(0.0, 0.0), (length, 0.0)]
+    return Room(way=way, targets=_rods(frames), walls=walls, **_drawn(rng))
+
+
+def legs(rng: np.random.Generator) -> Room:
+    """Equal desks or chairs of four legs, in a row on either side of the course."""
+    way = _rectangle(rng, 2.4, 3.6)
+    width, depth = way[2]
+    long, short = (1.2, 0.6) if rng.integers(2) else (0.4, 0.4)
+    pitch, off = long + rng.uniform(0.3, 0.6), rng.uniform(0.5, 0.7)
+    count = int(width / pitch) + 1
+    places = [
+        (number * pitch + along * long, y)
+        for near, far in ((-off, -off - short), (depth + off, depth + off + short))
+        for number in range(count)
+        for along in (0, 1)
+        for y in (near, far)
+    ]
+    return Room(way=way, targets=[_rod(place, 0.01) for place in places], **_drawn(rng))
+
+
+def columns(rng: np.random.Generator) -> Room:
+    """Up to nine columns of 5 to 40 cm radius."""
+    way = _course(rng)
+    targets = [
+        _rod(place, rng.uniform(0.01, 0.03))
+        | {"kind": "cylinder", "radius_m": rng.uniform(0.05, 0.4)}
+        for place in _beside(rng, 9, way, off=(0.8, 1.3), apart=0.9)
+    ]
+    return Room(way=way, targets=targets, **_drawn(rng))
+
+
+def yard(rng: np.random.Generator) -> Room:
+    """No more than three rods in range, the lab's wheels or three times as bad ones."""
+    way = [(3 * x, 3 * y) for x, y in _course(rng)]
+    rods = _rods(_beside(rng, int(rng.integers(4)), way, off=(0.5, 1.4), apart=2.0))
+    wheels_factor = float(rng.choice([1.0, 3.0]))
+    drawn = _drawn(rng) | {"speed_mps": 0.3}  # the way is three times as long
+    return Room(way=way, targets=rods, wheels_factor=wheels_factor, **drawn)
+
+
+def twins(rng: np.random.Generator) -> Room:
+    """Two equal rooms of eight rods, on one drive."""
+    first = _rectangle(rng, 2.0, 2.8)
+    apart = first[1][0] + rng.uniform(3.0, 4.0)
+    second = [(x + apart, y) for x, y in first]
+    way = [*first, (0.0, 0.0), *second, (apart, 0.0)]
+    free = [
+        place
+        for place in _beside(rng, 30, first, off=(0.5, 1.0), apart=0.5)
+        if min(_off_course_m(place + shift, way) for shift in ((0, 0), (apart, 0))) >= 0.5
+    ]
+    rods = [place + shift for shift in ((0, 0), (apart, 0)) for place in free[:8]]
+    return Room(way=way, targets=_rods(rods), **_drawn(rng))
+
+
+_FAMILIES = (pillars, office, dense, loop, sparse, people, rig)
+_DECEIVING = (rack, doors, legs, columns, yard, twins)
 FAMILIES: dict[str, Callable[[np.random.Generator], Room]] = {
-    family.__name__: family for family in (pillars, office, dense, loop, sparse, people, rig)
+    family.__name__: family for family in (*_FAMILIES, *_DECEIVING)
 }
+"""A family keeps its place: the random numbers of a room depend on it."""
 
 
 def room_of(name: str) -> tuple[str, int] | None:
@@ -240,7 +377,7 @@ def room_tables(family: str, number: int) -> Row:
         "path": {
             "waypoints_m": room.way,
             "laps": ["forward", "forward"],
-            "speed_mps": 0.05,
+            "speed_mps": room.speed_mps,
             "turn_rate_deg_per_s": 28.125,
         },
         "odometry": {"rate_hz": 5.0, **wheels},

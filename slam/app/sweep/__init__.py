@@ -11,7 +11,10 @@ from dataclasses import dataclass, field
 
 CLEAN = "clean"
 
-FAMILIES = ("pillars", "office", "dense", "loop", "sparse", "people", "rig")
+FAMILIES = (
+    *("pillars", "office", "dense", "loop", "sparse", "people", "rig"),
+    *("rack", "doors", "legs", "columns", "yard", "twins"),
+)
 """Families of random rooms; `emulator.scene.rooms` would load NumPy."""
 
 Table = Mapping[str, object]
@@ -23,11 +26,13 @@ class Stress:
     """The stress of a run; random choices depend on the run's seed alone.
 
     SLAM does not get these values. Frames have their true times, but for the errors of stamps in
-    ``radars``. Only outliers enter behind the front end: no reflector gives such echoes.
+    ``radars``. Outliers and the noise of ranges enter behind the front end: no reflector gives
+    such echoes.
     """
 
     help: str
     outlier_share: float = 0.0  # of the detections: uniform between the front end's limits
+    range_noise: float = 1.0  # standard deviation of ranges, over that which preset robust states
     dropped_share: float = 0.0  # of the frames, each lost by itself
     start_skews_ms: tuple[float, ...] = ()  # how late each radar samples
     # random walk of the wheels' errors over the run, in their own standard deviations
@@ -57,6 +62,7 @@ _BURSTS: Table = {"bursts": {"echo_share": 0.15, "noise_share": 0.05}}
 _STAMPS: Table = {"stamp_sigma_ms": 20.0}
 _ROD_ROD: Table = {"target_pairs": 0.25}
 _SLIP: Table = {"slips_per_s": 1 / 20, "slip_sigma_m": 0.015, "slip_sigma_deg": 2.0}
+_LARGE_SLIP: Table = {"slips_per_s": 1 / 60, "slip_sigma_m": 0.06, "slip_sigma_deg": 8.0}
 
 
 def _wander(range_m: float) -> Table:
@@ -108,6 +114,12 @@ STRESSES: Mapping[str, Stress] = {
         help="pulses and noise of other modules in a fifth of the frames", radars=_BURSTS
     ),
     "slip": Stress(help="wheels slip by 15 mm and 2 degrees, every 20 s", odometry=_SLIP),
+    "slip_large": Stress(
+        help="wheels slip by 6 cm and 8 degrees, once a minute", odometry=_LARGE_SLIP
+    ),
+    "noise_stated_low": Stress(
+        help="ranges err four times as much as preset robust states", range_noise=4.0
+    ),
     "mounts": Stress(
         help="each radar 5 mm per axis and 1 degree off its mount (standard deviations)",
         mount_sigma_m=_MOUNT_SIGMA_M,

@@ -1,4 +1,4 @@
-"""For how many states a robot was lost, and when its pose was right again after a carry."""
+"""What a run did to its robot: lost, confidently wrong, and when its pose was right after a carry."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import SessionInfo, SessionObserver, Snapshot
@@ -20,6 +21,9 @@ FOUND_M, FOUND_RAD = 0.3, 0.2
 """Largest errors of a right pose [m, rad]; a carry is longer."""
 FOUND_FOR_S = 5.0
 """How long a pose must stay right [s], so that chance does not count."""
+WRONG_M, WRONG_TAIL = 0.15, 1e-3
+"""A position is confidently wrong when it is further off than this [m], and than all but this share
+of errors under its own covariance."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +92,34 @@ def carry_of(
         & (np.abs(wrap_angles(errors[:, 2])) <= FOUND_RAD)
     )
     return Carry(three_seen_s=three_seen_s, found_s=_begin_s(since_s, right))
+
+
+def confidently_wrong(
+    record: RunRecord,
+    lost: NDArray[np.bool_],
+    carried_ns: tuple[int, int] | None,
+    carry: Carry | None,
+) -> float:
+    """Return for which share of the states the position was confidently wrong and not lost.
+
+    States from a carry on do not count until `FOUND_WITHIN_S` after a third landmark has come into
+    view.
+    """
+    states = record.states
+    truth = np.array([between(record.world_from_map, pose) for pose in states.truth])
+    errors = states.estimate[:, :2] - truth[:, :2]
+    covariances = states.pose_covariances[:, :2, :2]
+    # A pose of no uncertainty, as before the first motion, is right or infinitely far off.
+    information = np.linalg.pinv(covariances, hermitian=True)
+    squares = np.einsum("ni,nij,nj->n", errors, information, errors)
+    counted = np.ones(len(states), dtype=np.bool_)
+    if carried_ns is not None:
+        begin_ns, down_ns = carried_ns
+        seen_s = None if carry is None else carry.three_seen_s
+        from_ns = np.inf if seen_s is None else down_ns + (seen_s + FOUND_WITHIN_S) * NS_PER_S
+        counted = (states.t_ns < begin_ns) | (states.t_ns >= from_ns)
+    is_wrong = (np.hypot(errors[:, 0], errors[:, 1]) > WRONG_M) & (squares > chdtri(2, WRONG_TAIL))
+    return float((is_wrong & ~lost & counted).mean())
 
 
 def _begin_s(since_s: NDArray[np.float64], right: NDArray[np.bool_]) -> float | None:

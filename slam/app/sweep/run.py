@@ -43,7 +43,7 @@ from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.session.messages import settings_text
 from slam.app.sweep import CLEAN, STRESSES, Stress, Table
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
-from slam.app.sweep.places import Carry, LostStates, carry_of
+from slam.app.sweep.places import Carry, LostStates, carry_of, confidently_wrong
 from slam.config import ConfigError, SlamConfig, override
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
@@ -56,7 +56,9 @@ from xethru_protocol.wire.x4 import FIRST_COUNTER
 # Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the
 # odometry's, 2**63.
 _STREAM = 1 << 62
-_OFFSETS, _SILENCE, _DROPPED, _OUTLIERS, _MOUNTS = (_STREAM + (part << 32) for part in range(5))
+_OFFSETS, _SILENCE, _DROPPED, _OUTLIERS, _MOUNTS, _RANGE_NOISE = (
+    _STREAM + (part << 32) for part in range(6)
+)
 
 _SILENCE_FROM, _SILENCE_TO = 0.15, 0.75
 """When a silence may begin, in parts of the run."""
@@ -160,16 +162,15 @@ def stressed_scans(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OutlierDetector:
-    """A front end that gives random ranges now and then, with the looks of the true detection.
+class DisturbedDetector:
+    """A front end whose ranges err, or that gives random ones with the looks of the true detection.
 
-    Ranges are uniform between the limits, the carrier phase, if there is one, on the circle.
+    Random ranges are uniform between the limits, the carrier phase, if there is one, on the circle.
     """
 
     detector: Detector  # the true front end
-    share: float  # of the detections, replaced
-    min_range_m: float
-    max_range_m: float
+    stress: Stress
+    config: SlamConfig
     seed: int  # of the run
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
@@ -181,29 +182,51 @@ class OutlierDetector:
     ) -> list[tuple[Detection, ...]]:
         """Return what ``detect`` returns, for each frame with its range offset."""
         found = self.detector.detect_many(frames, offsets_m)
-        return [self._mixed(*pair) for pair in zip(frames, found, strict=True)]
+        if self.stress.range_noise > 1.0:
+            found = [self._noisy(*pair) for pair in zip(frames, found, strict=True)]
+        if self.stress.outlier_share:
+            found = [self._mixed(*pair) for pair in zip(frames, found, strict=True)]
+        return [tuple(sorted(each, key=lambda detection: detection.range_m)) for each in found]
+
+    def _noisy(self, frame: RadarFrame, detections: Sequence[Detection]) -> tuple[Detection, ...]:
+        robust, first = self.config.robust, (frame.counter - FIRST_COUNTER) * _BLOCKS_PER_FRAME
+        normals = counter_normals(
+            first + np.arange(len(detections)), seed=self.seed, stream=_RANGE_NOISE + frame.radar
+        )
+        added = math.sqrt(self.stress.range_noise**2 - 1.0)
+        stated_m = [
+            robust.range_sigma_m
+            if math.isnan(detection.sigma_m)
+            else math.hypot(robust.range_floor_m, detection.sigma_m)
+            for detection in detections
+        ]
+        return tuple(
+            replace(detection, range_m=max(detection.range_m + added * sigma_m * normal, 0.0))
+            for detection, sigma_m, normal in zip(
+                detections, stated_m, normals.tolist(), strict=True
+            )
+        )
 
     def _mixed(self, frame: RadarFrame, detections: Sequence[Detection]) -> tuple[Detection, ...]:
-        block = (frame.counter - FIRST_COUNTER) * _BLOCKS_PER_FRAME
+        limits, block = self.config.detection, (frame.counter - FIRST_COUNTER) * _BLOCKS_PER_FRAME
         words = uniforms(
             3 * len(detections), seed=self.seed, stream=_OUTLIERS + frame.radar, block=block
         )
-        span_m = self.max_range_m - self.min_range_m
-        mixed = [
+        span_m = limits.max_range_m - limits.min_range_m
+        return tuple(
             replace(
                 detection,
-                range_m=self.min_range_m + span_m * where,
+                range_m=limits.min_range_m + span_m * where,
                 phase_rad=math.nan
                 if math.isnan(detection.phase_rad)
                 else math.pi * (2 * phase - 1),
             )
-            if chance < self.share
+            if chance < self.stress.outlier_share
             else detection
             for detection, (chance, where, phase) in zip(
                 detections, words.reshape(-1, 3).tolist(), strict=True
             )
-        ]
-        return tuple(sorted(mixed, key=lambda detection: detection.range_m))
+        )
 
 
 def false_landmarks(last: Snapshot, scene: Scene) -> tuple[int, int]:
@@ -273,8 +296,9 @@ class SweepRun(Summary):
     ``settings`` are those of the preset that were replaced, dotted keys; ``false`` and
     ``confident_false`` count the landmarks of the map where nothing stands, and those of them that
     claim to be known to 5 cm; ``bound`` is on the same data, where it was asked for; ``family`` is
-    that of a random room; ``lost_share`` is the share of states reported as lost, and ``carry``
-    whether a robot that was carried was found again.
+    that of a random room; ``lost_share`` is the share of states reported as lost,
+    ``confidently_wrong_share`` that of states as `slam.app.sweep.places.confidently_wrong` counts
+    them, and ``carry`` whether a robot that was carried was found again.
     """
 
     settings: dict[str, str] = field(default_factory=dict)
@@ -285,6 +309,7 @@ class SweepRun(Summary):
     family: str = ""
     lost_share: float = 0.0
     lost_at_end: bool = False
+    confidently_wrong_share: float = 0.0
     carry: Carry | None = None
 
     @property
@@ -386,12 +411,11 @@ class Steps(SessionObserver):
 def source_of(case: Case, stop: StopFlag = NO_STOP) -> RunSource:
     """Return the source of a case; SLAM gets the scene's own rig and wheels, no stress."""
     stress, front_end = STRESSES[case.stress], None
-    if stress.outlier_share:
-        front_end = OutlierDetector(
+    if stress.outlier_share or stress.range_noise > 1.0:
+        front_end = DisturbedDetector(
             detector=make_detector(case.config, rig_of(case.scene)),
-            share=stress.outlier_share,
-            min_range_m=case.config.detection.min_range_m,
-            max_range_m=case.config.detection.max_range_m,
+            stress=stress,
+            config=case.config,
             seed=case.seed,
         )
     slam = make_slam(case.config, rig_of(case.scene), wheels_of(case.scene), front_end)
@@ -423,6 +447,9 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
     carried_ns = (
         stressed_scene(case.scene, STRESSES[case.stress], case.seed).trajectory().carried_ns
     )
+    carry = None
+    if carried_ns is not None:
+        carry = carry_of(record, lost, carried_ns[1], source.info, source.rig)
     run = SweepRun(
         **{row.name: getattr(summary, row.name) for row in fields(summary)},
         settings=dict(case.settings),
@@ -430,9 +457,8 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
         family="" if case.room is None else case.room[0],
         lost_share=float(lost.mean()),
         lost_at_end=bool(lost[-1]),
-        carry=None
-        if carried_ns is None
-        else carry_of(record, lost, carried_ns[1], source.info, source.rig),
+        confidently_wrong_share=confidently_wrong(record, lost, carried_ns, carry),
+        carry=carry,
         false=false,
         confident_false=confident,
         bound=bound_of(record, ranges, case.scene, case.config) if case.bound else None,

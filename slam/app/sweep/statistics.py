@@ -16,6 +16,8 @@ from slam.app.sweep.places import FOUND_WITHIN_S
 from slam.app.sweep.run import LARGEST, SweepRun
 
 _POSE_DOF = 3
+HARMED = 1.2
+"""Ratio to the error of the wheels from which on a run is harmed."""
 
 
 def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
@@ -87,10 +89,13 @@ def outcomes_text(counts: Mapping[str, Any]) -> str:
         f"{counts[key]} of {n_runs} runs {what}"
         for key, what in (
             ("runs_above_odometry", "worse than their wheels"),
+            ("runs_harmed", f"worse than {HARMED:g} x their wheels"),
             ("runs_lost", "lost without a carry"),
             ("runs_lost_at_end", "lost at the end"),
+            ("runs_confidently_wrong", "confidently wrong"),
         )
     ]
+    parts[-1] += f" ({counts['confidently_wrong_share']:.2%} of the time)"
     if counts["carries"]:
         parts.append(
             f"{counts['carries_in_time']} of {counts['carries']} carries found within "
@@ -148,20 +153,25 @@ def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
     }
 
 
-def outcomes(runs: Sequence[SweepRun]) -> dict[str, int]:
+def outcomes(runs: Sequence[SweepRun]) -> dict[str, Any]:
     """Return the number of runs, and how many failed in each way.
 
-    ``runs_lost`` counts runs without a carry in which SLAM reported the robot as lost; ``carries``
-    those with a carry and three landmarks in view after it, ``carries_in_time`` those of them that
-    were found in time.
+    ``runs_harmed`` counts those whose causal path is worse than `HARMED` times the wheels, and
+    ``runs_lost`` runs without a carry in which SLAM reported the robot as lost; ``carries`` those
+    with a carry and three landmarks in view after it, ``carries_in_time`` those of them that were
+    found in time. ``confidently_wrong_share`` is that of all states, ``runs_confidently_wrong``
+    counts runs with any such state.
     """
     carries = [run.carry.in_time for run in runs if run.carry and run.carry.in_time is not None]
     return {
         "runs": len(runs),
         "runs_below_odometry": sum(run.ate_ratio < 1.0 for run in runs),
         "runs_above_odometry": sum(run.ate_ratio > 1.0 for run in runs),
+        "runs_harmed": sum(run.ate_ratio > HARMED for run in runs),
         "runs_lost": sum(run.carry is None and run.lost_share > 0.0 for run in runs),
         "runs_lost_at_end": sum(run.lost_at_end for run in runs),
+        "runs_confidently_wrong": sum(run.confidently_wrong_share > 0.0 for run in runs),
+        "confidently_wrong_share": statistics.fmean(run.confidently_wrong_share for run in runs),
         "carries": len(carries),
         "carries_in_time": sum(carries),
     }
@@ -296,6 +306,7 @@ def stress_table(
         ],
         "worse": [str(row["runs_above_odometry"]) for row in rows],
         "lost": [str(row["runs_lost"]) for row in rows],
+        "confidently wrong": [str(row["runs_confidently_wrong"]) for row in rows],
         "carries found": [carries_text(row) for row in rows],
         "mean NEES": [f"{row['anees_mean']:.2f}" for row in rows],
         "ANEES in band": [in_band_text(row) for row in rows],

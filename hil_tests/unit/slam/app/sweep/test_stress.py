@@ -16,7 +16,8 @@ from slam.app.odometry.track import OdometryTrack
 from slam.app.records import Scan
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
 from slam.app.sweep import CLEAN, FAMILIES, STRESSES, Stress
-from slam.app.sweep.run import OutlierDetector, stressed_scans, stressed_scene
+from slam.app.sweep.run import DisturbedDetector, stressed_scans, stressed_scene
+from slam.config import RobustConfig, SlamConfig
 from slam.frames import Detection, RadarFrame
 
 PERIOD_NS = 200_000_000
@@ -217,6 +218,7 @@ class ThreeEchoes:
     """A front end that sees the same everywhere."""
 
     phase_rad: float = 0.5
+    sigma_m: float = math.nan
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         return self.detect_many([frame], [range_offset_m])[0]
@@ -232,6 +234,7 @@ class ThreeEchoes:
                     range_m=range_m,
                     amplitude=range_m,
                     phase_rad=self.phase_rad,
+                    sigma_m=self.sigma_m,
                 )
                 for range_m in (0.5, 0.7, 0.9)
             )
@@ -239,8 +242,26 @@ class ThreeEchoes:
         ]
 
 
-def outliers(true: ThreeEchoes, seed: int = 0) -> OutlierDetector:
-    return OutlierDetector(detector=true, share=0.2, min_range_m=0.2, max_range_m=1.5, seed=seed)
+def disturbed(name: str, true: ThreeEchoes, seed: int = 0) -> DisturbedDetector:
+    config = SlamConfig(robust=RobustConfig(range_floor_m=3e-3, range_sigma_m=5e-3))
+    return DisturbedDetector(detector=true, stress=STRESSES[name], config=config, seed=seed)
+
+
+def outliers(true: ThreeEchoes, seed: int = 0) -> DisturbedDetector:
+    return disturbed("outliers", true, seed)
+
+
+@pytest.mark.parametrize(("sigma_m", "stated_m"), [(4e-3, 5e-3), (math.nan, 5e-3)])
+def test_ranges_err_four_times_as_much_as_stated(sigma_m: float, stated_m: float) -> None:
+    frames = [frame(radar, tick) for tick in range(N_TICKS) for radar in range(N_RADARS)]
+    true = ThreeEchoes(sigma_m=sigma_m)
+    noisy = disturbed("noise_stated_low", true).detect_many(frames, [0.0] * len(frames))
+    errors = np.array([d.range_m - d.amplitude for of_one in noisy for d in of_one])
+    # what the front end's own error, of the stated size, would make four times as much
+    assert errors.std() == pytest.approx(math.sqrt(15) * stated_m, rel=0.02)
+    assert abs(errors.mean()) < 1e-3
+    assert abs(np.corrcoef(errors[1:], errors[:-1])[0, 1]) < 0.05
+    assert noisy[7] == disturbed("noise_stated_low", true).detect(frames[7])
 
 
 def test_a_fifth_of_the_detections_gets_a_random_range_and_looks_as_before() -> None:
