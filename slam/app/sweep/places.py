@@ -1,4 +1,4 @@
-"""What a run did to its robot: lost, confidently wrong, and when its pose was right after a carry."""
+"""What became of a robot: lost, confidently wrong, or found again after a carry."""
 
 from __future__ import annotations
 
