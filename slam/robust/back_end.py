@@ -115,7 +115,9 @@ class RobustBackEnd:
             scale * parameters.wheels.walk_lever_m,
         )
         self._tentative = TentativePoints(parameters)
-        self._existence = Existence(parameters.map, rule.min_frames)
+        self._existence = Existence(
+            parameters.map, rule.min_frames, parameters.ranges.detection_probability
+        )
         self._log = RunLog(parameters.wheels, parameters.splits.gap_poses)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
@@ -165,6 +167,28 @@ class RobustBackEnd:
         """Return the rows of landmarks hit often enough."""
         ids = self.state.landmark_ids
         return [row for row, id_ in enumerate(ids) if self._existence.is_reported(id_)]
+
+    def n_reported_since(self, first_id: int) -> int:
+        """Return how many reported landmarks and walls have an id from one on."""
+        ids = [id_ for id_ in self.state.feature_ids if id_ >= first_id]
+        return sum(map(self._existence.is_reported, ids))
+
+    def merged_ids(self, ids: Array) -> Array:
+        """Return the ids that landmarks have after all merges, (k,); those dropped keep theirs."""
+        names = {id_: self._log.name_of(int(id_)) for id_ in np.unique(ids).tolist()}
+        kept = [names[id_] for id_ in ids.tolist()]
+        return np.array(
+            [id_ if name is None else name for id_, name in zip(ids, kept, strict=True)]
+        )
+
+    def most_against(self, ids: Array) -> Array:
+        """Return the most nats that landmarks give against a pose, (k,), ids of shape (k,).
+
+        By Laplace's rule of succession, a landmark that n frames have hit is none, or gone, with a
+        probability of 1 / (n + 1).
+        """
+        hits = np.array([self._existence.hits(int(id_)) for id_ in ids], dtype=np.float64)
+        return np.minimum(np.log1p(hits), self.parameters.branches.most_against)
 
     def wall_spans_m(self) -> Array:
         """Return the ends of the reported stretches of wall, (k, 2, 2) [m], map frame."""
@@ -253,8 +277,10 @@ class RobustBackEnd:
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
         continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
-        miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         used = {(radar, index) for radar, index, _ in continued}
+        evidence_of_misses = [(id_, self._existence.unheard(id_)) for id_ in missed]
+        for _, _, id_ in continued:
+            self._existence.heard(id_)
         if any(scan.labelled for scan in scans):
             used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
             of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, added_m)
@@ -266,7 +292,7 @@ class RobustBackEnd:
             continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
             likelihoods = [*likelihoods, *evidence]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
-        self._initialise_landmarks()
+        of_tracklets = self._initialise_landmarks()
         self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:
@@ -282,7 +308,7 @@ class RobustBackEnd:
             nis=nis,
             dof=dof,
             predicted=tuple(predicted),
-            evidence=(*likelihoods, *((id_, miss) for id_ in missed)),
+            evidence=(*likelihoods, *evidence_of_misses, *of_tracklets),
         )
 
     def relinearise(self) -> bool:
@@ -685,9 +711,12 @@ class RobustBackEnd:
         self._existence.hit(landmark_id, len(tentative.seen))
         self._log_detections(landmark_id, tentative.seen)
 
-    def _initialise_landmarks(self) -> None:
-        """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""
-        rule = self.parameters.tracklets
+    def _initialise_landmarks(self) -> list[tuple[int, float]]:
+        """Make tracklets of unassigned ranges; each becomes a landmark or updates one.
+
+        Returns of each the landmark, and how much likelier its ranges are than as false ones.
+        """
+        rule, evidence = self.parameters.tracklets, list[tuple[int, float]]()
         for side in self._sides:
             # A radar without frames for long takes no part.
             radars = [radar for radar in side if self._silent[radar] <= rule.single_min_frames]
@@ -712,9 +741,23 @@ class RobustBackEnd:
             tracker = self._walls.tracker(is_wall=False)
             is_point = None if is_single else self._walls.is_point
             for tracklet in tracker.find(guesses, self._unassigned, search, is_point):
-                self._place(tracklet)
+                evidence.append((self._place(tracklet), self._evidence_of(tracklet)))
+        return evidence
 
-    def _place(self, tracklet: Tracklet) -> None:
+    def _evidence_of(self, tracklet: Tracklet) -> float:
+        """Return the nats of the ranges of a tracklet, as `_correct` returns those of single ones.
+
+        Each radar is taken to have one range in every frame.
+        """
+        noise = self.parameters.ranges
+        density = max(noise.clutter_per_m, 1.0 / (noise.max_range_m - noise.min_range_m))
+        log_n = -0.5 * (
+            tracklet.chi_square + float(np.sum(np.log(math.tau * tracklet.seen.variances)))
+        )
+        return log_n + len(tracklet.members) * math.log(noise.detection_probability / density)
+
+    def _place(self, tracklet: Tracklet) -> int:
+        """Let a tracklet be a landmark, new or of the map; return its id."""
         state = self.state
         point = tracklet.body_point()
         share = max(state.range_errors.variance_share, 1.0)
@@ -726,6 +769,7 @@ class RobustBackEnd:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
         self._use(landmark_id, tracklet.seen)
+        return landmark_id
 
     def _use(self, landmark_id: int, seen: Sightings) -> None:
         """Count and log the ranges of a tracklet as those of a landmark or a wall."""

@@ -5,24 +5,29 @@ evidence of each range for its pose (``UpdateReport.evidence``).
 
 Suspicion
     The evidence since each step is summed over the landmarks known then, at most so much against
-    each: a cumulative sum test (Page, Biometrika 41, 1954). The step with the largest sum against
-    the pose is where the robot may have been carried.
-Recognition
-    Where nothing is known that could be missed, landmarks of the last steps may yet lie on older
-    ones as a constellation. If the whole run can be solved with them merged, a loop is closed; if
-    not, the robot may have been carried before it saw the first of them.
+    each: a cumulative sum test (Page, Biometrika 41, 1954). A carry has a prior, in odds per hour;
+    it is asked for when that is outweighed.
 Search
     A back end with an empty map takes the motions and scans since. Where its landmarks lie on the
     map of the main back end as it was then is searched for (`slam.robust.constellation`). A copy of
     that back end is set down there, and takes the motions and scans since.
 Decision
-    Both are judged by the evidence of the same scans. The place is adopted when it explains more
-    ranges than the main back end does and its evidence is larger by the price of a carry, and
-    dropped when it has not after some steps. Nothing is forgotten before that, and the main back
-    end goes on. The robot is reported as lost while the landmarks known before the carry, three or
-    more of them, are against its pose by that price, and others are seen. That ends when they are
-    no longer against it, or a place is adopted, or after `BranchRule.carry_steps` with no place on
-    trial.
+    Three explanations of all ranges since the step are compared: that the robot stayed, that it is
+    at the place, and that it is where it has never been. Each has its own new landmarks, at the
+    price of a birth; since parts of the world look like each other, births together cost no more
+    than the price of such a likeness, so that a place is never adopted for being alike alone: what
+    should be seen must be missing without it. The price of a place grows with the number of places
+    that look alike.
+Revision
+    The back end that stayed goes on beside the one that is adopted. When the advantage of the place
+    is gone, the adoption is taken back.
+
+The robot is reported as lost while the landmarks known before the carry are against its pose by
+more than the price of a carry, and others are seen. That ends when they are for it, or a place is
+adopted.
+
+Where new landmarks lie on older ones as a constellation, and the whole run can be solved with them
+merged, a loop is closed.
 
 While nothing is suspicious that costs a copy of the back end now and then.
 
@@ -35,7 +40,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,9 +48,15 @@ from slam.geometry import Rig, compose, has_moved
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.constellation import constellation_of, find_placement
+from slam.robust.constellation import (
+    Constellation,
+    Placement,
+    constellation_of,
+    find_placement,
+    find_placements,
+)
 from slam.robust.initialisation import Question
-from slam.robust.parameters import BackEndParameters, BranchRule
+from slam.robust.parameters import MARGIN_NATS, BackEndParameters, BranchRule
 from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
@@ -60,6 +71,7 @@ class Step:
     scans: Sequence[RangeScan]
     next_id: int  # landmarks known before it have smaller ids
     evidence: Array  # shape (k, 2): ids and nats
+    carry_nats: float  # how unlikely it is that the robot was carried before it
 
 
 class Hypotheses:
@@ -157,43 +169,55 @@ def evidence_table(report: UpdateReport) -> Array:
     return np.array(report.evidence).reshape(-1, 2)
 
 
-def totals_of(tables: Iterable[Array], known_before: int, correlated_steps: float) -> Array:
-    """Return ids and summed evidence [nats], (n, 2), of the landmarks below an id.
+def totals_of(tables: Iterable[Array], known: RobustBackEnd, rule: BranchRule) -> Array:
+    """Return ids and summed evidence [nats], (n, 2), of the landmarks that a back end knew.
 
-    The errors of so many steps are taken to be one.
+    The errors of `BranchRule.correlated_steps` steps are taken to be one, and what one landmark
+    says is bounded: it may be hidden or gone, or others may look like it.
     """
     table = np.concatenate([np.empty((0, 2)), *tables])
-    table = table[table[:, 0] < known_before]
+    table = table[np.isin(table[:, 0], known.state.feature_ids)]
     ids, place = np.unique(table[:, 0], return_inverse=True)
-    return np.column_stack([ids, np.bincount(place, table[:, 1], len(ids)) / correlated_steps])
+    sums = np.bincount(place, table[:, 1], len(ids)) / rule.correlated_steps
+    return np.column_stack([ids, np.clip(sums, -known.most_against(ids), rule.most_for)])
 
 
-def gain(own: Array, main: Array, rule: BranchRule) -> float:
-    """Return by how much a place is likelier than the main back end's pose, in nats.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Account:
+    """What an explanation of all ranges since a step is worth."""
 
-    ``own`` and ``main`` are totals of the same landmarks. ``least_landmarks`` of them must be for
-    it if that is to exceed the price, and it must be as much likelier than that the robot is
-    elsewhere. Nothing is likelier by explaining less: where little is certain, little can be
-    missed.
+    hits: float = 0.0  # nats of the landmarks known before that are seen
+    misses: float = 0.0  # of those that should be seen and are not; not positive
+    n_seen: int = 0  # how many of them are seen
+    n_new: int = 0  # landmarks that it has added to the map
+
+
+def account_of(totals: Array, n_new: int) -> Account:
+    """Return the account of totals (n, 2), as `totals_of` has them, and of new landmarks."""
+    nats = totals[:, 1]
+    hits, misses = float(nats[nats > 0.0].sum()), float(nats[nats < 0.0].sum())
+    n_seen = int(np.count_nonzero(nats > 0.0))
+    return Account(hits=hits, misses=misses, n_seen=n_seen, n_new=n_new)
+
+
+def advantage(place: Account, other: Account, rule: BranchRule) -> float:
+    """Return by how much a place explains all ranges better than another account, in nats.
+
+    What a new landmark explains is worth as much as what a known one does, less the price of its
+    birth.
     """
-    ids = np.union1d(own[:, 0], main[:, 0])
-    mine, theirs = np.zeros(len(ids)), np.zeros(len(ids))
-    mine[np.searchsorted(ids, own[:, 0])] = own[:, 1]
-    theirs[np.searchsorted(ids, main[:, 0])] = main[:, 1]
-    most = rule.price_nats / (rule.least_landmarks - 1)
-    return min(
-        float(np.clip(mine - theirs, -most, most).sum()),
-        float(np.clip(mine, -rule.most_against, rule.most_for).sum()),
-        2.0 * float(np.maximum(mine, 0.0).sum() - np.maximum(theirs, 0.0).sum()),
-    )
+    n_more = other.n_new - place.n_new
+    seen = place.hits - other.hits - rule.most_for * n_more
+    return seen + place.misses - other.misses + min(rule.birth_nats * n_more, rule.likeness_nats)
 
 
 class Alternative:
-    """A back end that takes the steps since a carry."""
+    """A back end that takes the steps since a carry beside the main one."""
 
-    def __init__(self, back_end: RobustBackEnd, since: int) -> None:
+    def __init__(self, back_end: RobustBackEnd, since: int, *, merges: bool = False) -> None:
         self.back_end = back_end
-        self.until: int | None = None  # step at which it is dropped, once it has caught up
+        self.since = since
+        self.merges = merges  # and solves for the whole run; otherwise it waits with both
         self.next_step = since
         self.evidence: list[Array] = []  # of each step taken, as `evidence_table` has it
 
@@ -201,11 +225,21 @@ class Alternative:
         """Take the steps before ``end``; of the very first one the motion is the carry."""
         for number in range(self.next_step, end):
             step = steps[number]
-            if self.evidence:
+            if number > self.since:
                 self.back_end.predict(step.increment)
-            report = self.back_end.update(step.scans, solve=False)
+            report = self.back_end.update(step.scans, solve=self.merges)
             self.evidence.append(evidence_table(report))
             self.next_step = number + 1
+
+
+class Place(Alternative):
+    """A copy of the back end before a carry, where the robot may have come to."""
+
+    def __init__(
+        self, back_end: RobustBackEnd, since: int, price_nats: float, *, merges: bool = False
+    ) -> None:
+        super().__init__(back_end, since, merges=merges)
+        self.price_nats = price_nats  # how unlikely it is that the robot came there
 
 
 @dataclass(slots=True, kw_only=True)
@@ -213,12 +247,16 @@ class Carry:
     """The question whether the robot was carried before a step, and to which place."""
 
     since: int
+    price_nats: float  # how unlikely that is
     next_id: int  # landmarks known before it have smaller ids
     map: RobustBackEnd  # the main back end after the step before
     new: Alternative  # with an empty map at first
-    search_from: int  # the step from which on its place is searched for
     moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
-    placed: Alternative | None = None  # with the map before it, and the robot set down on that
+    hidden: Place  # a motion that the wheels did not report, and no carry
+    placed: list[Place] = field(default_factory=list)  # where the robot may be on the map
+    until: int = 0  # step at which these are dropped; 0 until they have caught up
+    adopted: Place | None = None
+    stayed: Alternative | None = None  # the back end that stayed, once the place is adopted
 
 
 class Branches:
@@ -231,9 +269,11 @@ class Branches:
         self.main = RobustBackEnd(rig, parameters)
         self._rule = parameters.branches
         self._look_every, self._window = parameters.map.look_every, parameters.tracklets.window
+        self._fewest = parameters.tracklets.min_frames
         self._steps: dict[int, Step] = {}  # by number, those that are needed still
         self._now = 0  # number of the next step
         self._increment: Array | None = None
+        self._carry_nats = math.inf
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
         self._carry: Carry | None = None
         self._judged = 0  # the evidence of the steps before it has been judged
@@ -257,11 +297,15 @@ class Branches:
         covariance = np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
         return compose(self._carry.map.pose, self._carry.moved), covariance
 
-    def predict(self, increment: Array) -> None:
-        """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it."""
+    def predict(self, increment: Array, elapsed_s: float = 0.2, stood_s: float = 0.0) -> None:
+        """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
+
+        It took ``elapsed_s``, and for ``stood_s`` of that the wheels stood still.
+        """
         if self._now % self._rule.snapshot_every == 0:
             self._keep_snapshot()
         self._increment = increment
+        self._carry_nats = self._rule.carry_nats(elapsed_s, stood_s)
         self.main.predict(increment)
         if self._carry is not None:
             self._carry.moved = compose(self._carry.moved, increment)
@@ -277,6 +321,7 @@ class Branches:
             scans=scans,
             next_id=next_id,
             evidence=evidence_table(report),
+            carry_nats=self._carry_nats,
         )
         self._now += 1
         was_lost = self.is_lost
@@ -306,74 +351,146 @@ class Branches:
         return back_end
 
     def _decide(self, carry: Carry) -> bool:
-        """Answer the question of a carry, if that can be; return whether a place is adopted."""
-        rule, placed = self._rule, carry.placed
-        for alternative in (carry.new, placed):
-            if alternative is not None:
-                end = min(alternative.next_step + rule.catch_up, self._now)
-                alternative.take(self._steps, end)
-        if placed is not None and placed.next_step == self._now:
-            if placed.until is None:
-                placed.until = self._now + rule.patience * self._window
-            first = max(carry.since, self._now - rule.lost_steps)
-            tables = placed.evidence[first - carry.since :]
-            own = totals_of(tables, carry.next_id, rule.correlated_steps)
-            if gain(own, self._totals(carry, first), rule) > rule.price_nats:
-                self._adopt(placed.back_end)
+        """Answer the question of a carry, if that can be; return whether the pose jumps."""
+        rule = self._rule
+        on_trial = [*carry.placed] if self._is_over(carry) else [carry.hidden, *carry.placed]
+        for alternative in [carry.stayed] if carry.stayed else [carry.new, *on_trial]:
+            end = min(alternative.next_step + rule.catch_up, self._now)
+            alternative.take(self._steps, end)
+        if carry.stayed is not None and carry.adopted is not None:
+            return self._is_taken_back(carry, carry.stayed, carry.adopted.price_nats)
+        if on_trial and all(one.next_step == self._now for one in on_trial):
+            found = self._place_of(carry, on_trial) if self._now % self._look_every == 0 else None
+            if found is not None:
+                self._adopt(carry, found)
                 return True
-            if self._now > placed.until:
-                carry.placed, carry.search_from = None, self._now
-        # What one landmark says is bounded: it may be hidden or gone, or others may look like it.
+            carry.until = carry.until or self._now + rule.patience * self._window
+            if self._now > carry.until:
+                carry.placed, carry.until = [], 0
         first = max(carry.since, self._now - rule.lost_steps)
-        of_landmarks = self._totals(carry, first)[:, 1]
-        bounded = np.clip(of_landmarks, -rule.most_against, rule.most_for)
-        total = float(bounded.sum())
+        tables = self._tables(first)
+        of_landmarks = totals_of(tables, carry.map, rule)[:, 1]
+        total = float(of_landmarks.sum())
         if self.is_lost:
-            # If nothing is heard, that is no evidence for the pose.
-            heard = any(len(self._steps[number].evidence) for number in range(first, self._now))
-            self.is_lost = total < 0.0 or not heard
+            # What is new is no evidence for the pose, and neither is it if nothing is heard.
+            self.is_lost = total <= MARGIN_NATS
         else:
-            n_against = int(np.count_nonzero(bounded < 0.0))
-            is_against = total < -rule.price_nats and n_against >= rule.least_landmarks
             # Radars that hear nothing are no reason to be elsewhere.
-            self.is_lost = is_against and bool(carry.new.back_end.reported_rows())
-        is_answered = total > rule.price_nats or self._now - carry.since > rule.carry_steps
-        if is_answered and carry.placed is None:
-            self._carry, self._judged, self.is_lost = None, self._now, False
+            is_elsewhere = bool(carry.new.back_end.reported_rows())
+            self.is_lost = total < -carry.price_nats and is_elsewhere
+        is_answered = total > rule.price_nats or (self._is_over(carry) and not self.is_lost)
+        if is_answered and not carry.placed:
+            self._end(carry)
         return False
 
-    def _totals(self, carry: Carry, first: int) -> Array:
-        """Return the evidence since a step of the landmarks known before a carry, (n, 2)."""
-        tables = (self._steps[number].evidence for number in range(first, self._now))
-        return totals_of(tables, carry.next_id, self._rule.correlated_steps)
+    def _tables(self, first: int) -> list[Array]:
+        """Return the evidence of the main back end in each step from one on."""
+        return [self._steps[number].evidence for number in range(first, self._now)]
 
-    def _adopt(self, back_end: RobustBackEnd) -> None:
-        """Let an alternative be the main back end."""
-        self.main, self._carry, self.is_lost = back_end, None, False
+    def _account(self, carry: Carry, back_end: RobustBackEnd, tables: Sequence[Array]) -> Account:
+        """Return what a back end with the map before a carry makes of the steps since.
+
+        ``tables`` are its evidence. Ranges of the last frames may be of a landmark that is new, and
+        is not in the map yet: they do not count. Those of a new landmark that turned out to be an
+        old one do.
+        """
+        counted = tables[: max(self._now - self._fewest - carry.since, 0)]
+        table = np.concatenate([np.empty((0, 2)), *counted])
+        table[:, 0] = back_end.merged_ids(table[:, 0])
+        totals = totals_of([table], carry.map, self._rule)
+        return account_of(totals, back_end.n_reported_since(carry.next_id))
+
+    def _place_of(self, carry: Carry, places: Sequence[Place]) -> Place | None:
+        """Return the place that the robot is at rather than where it was, or anywhere else.
+
+        What is missed by the one that stayed must pay the price, not what looks alike, and the
+        place must be likelier than any other on trial.
+        """
+        rule = self._rule
+        stay = self._account(carry, self.main, self._tables(carry.since))
+        accounts = [self._account(carry, one.back_end, one.evidence) for one in places]
+        gains = [
+            advantage(account, stay, rule) - one.price_nats
+            for account, one in zip(accounts, places, strict=True)
+        ]
+        best = int(np.argmax(gains))
+        account, found, pose = accounts[best], places[best], places[best].back_end.pose
+        elsewhere = Account(n_new=carry.new.back_end.n_reported_since(0))
+        rivals = [
+            gain
+            for gain, one in zip(gains, places, strict=True)
+            if has_moved(pose, one.back_end.pose, rule.reach_m, rule.reach_m / rule.base_m)
+        ]
+        is_there = (
+            account.n_seen >= (1 if found is carry.hidden else rule.least_landmarks)
+            and account.misses - stay.misses > max(found.price_nats, MARGIN_NATS)
+            and gains[best] > MARGIN_NATS
+            and advantage(account, elsewhere, rule) > MARGIN_NATS
+            and all(gains[best] - gain > rule.placement_nats for gain in rivals)
+        )
+        return found if is_there else None
+
+    def _adopt(self, carry: Carry, placed: Place) -> None:
+        """Let a place be that of the main back end; the one that stayed goes on beside it."""
+        carry.stayed = Alternative(self.main, carry.since)
+        carry.stayed.next_step, carry.stayed.evidence = self._now, self._tables(carry.since)
+        self._exchange(carry, placed)
+        carry.placed, carry.adopted = [], placed
+
+    def _exchange(self, carry: Carry, other: Alternative) -> None:
+        """Let an alternative be the main back end, as if it always had been."""
+        self.main, self.is_lost = other.back_end, False
+        for number, evidence in enumerate(other.evidence, start=carry.since):
+            self._steps[number] = replace(self._steps[number], evidence=evidence)
         self._snapshots = {self._now: self.main.copy()}
-        self._judged = self._now
+
+    def _is_taken_back(self, carry: Carry, stayed: Alternative, price_nats: float) -> bool:
+        """Return whether the robot is put back where it would be had it stayed.
+
+        It is if the place is not worth its price any more, and more is missed there.
+        """
+        if stayed.next_step < self._now or self._now % self._look_every:
+            return False
+        place = self._account(carry, self.main, self._tables(carry.since))
+        stay = self._account(carry, stayed.back_end, stayed.evidence)
+        is_refuted = advantage(place, stay, self._rule) < price_nats
+        is_refuted &= stay.misses - place.misses > MARGIN_NATS
+        if is_refuted:
+            self._exchange(carry, stayed)
+        if is_refuted or self._is_over(carry):
+            self._end(carry)
+        return is_refuted
+
+    def _is_over(self, carry: Carry) -> bool:
+        return self._now - carry.since > self._rule.carry_steps
+
+    def _end(self, carry: Carry) -> None:
+        """End the question of a carry."""
+        self._carry, self._judged, self.is_lost = None, self._now, False
 
     def _look(self) -> None:
         """Look for evidence against the pose, or for the place that the robot was carried to."""
-        if self._carry is None:
-            since, against = self._evidence_of_carry()
-            if against <= self._rule.most_against:
-                since = self._recognised()
+        carry = self._carry
+        if carry is None:
+            since = self._most_suspicious()
             if since < self._now:
                 self._begin_carry(since)
-        elif self._carry.placed is None and self._now >= self._carry.search_from:
-            self._search(self._carry)
+            else:
+                self._recognise()
+        elif not carry.placed and carry.stayed is None:
+            self._search(carry)
 
-    def _evidence_of_carry(self) -> tuple[int, float]:
-        """Return the step before which the robot may have been carried, and the evidence of that.
+    def _most_suspicious(self) -> int:
+        """Return the step before which the robot may have been carried; if there is none, the next.
 
-        More than one landmark must be against the pose: one alone may be hidden or taken away.
+        The evidence against the pose must outweigh the prior of a carry, or of a motion that the
+        wheels did not report.
         """
         rule, first = self._rule, max(min(self._snapshots), self._judged)
         steps = [self._steps[number] for number in range(first, self._now)]
         lengths = [len(step.evidence) for step in steps]
         if not sum(lengths):
-            return self._now, 0.0
+            return self._now
         table = np.concatenate([step.evidence for step in steps])
         ids, place = np.unique(table[:, 0], return_inverse=True)
         against = np.zeros((len(steps), len(ids)))
@@ -382,21 +499,16 @@ class Branches:
         sums = np.cumsum(against[::-1], axis=0)[::-1] / rule.correlated_steps
         known = ids < np.array([step.next_id for step in steps])[:, None]
         unbounded = np.where(known, sums, 0.0).sum(axis=1)
-        sums = np.clip(sums, -rule.most_for, rule.most_against)
+        sums = np.clip(sums, -rule.most_for, self.main.most_against(ids))
         totals = np.where(known, sums, 0.0).sum(axis=1)
-        several = totals > np.where(known, sums, -np.inf).max(axis=1)
-        totals = np.where(several, totals, -np.inf)
+        hidden_nats = math.log(rule.steps_per_hidden)
+        totals -= np.minimum([step.carry_nats for step in steps], hidden_nats)
         # The earliest of equals, those with most evidence beyond the bounds
         best = int(np.argmax(np.where(totals == totals.max(), unbounded, -np.inf)))
-        if not several[best] or totals[best] <= 0.0:
-            return self._now, 0.0
-        return first + best, float(totals[best])
+        return first + best if totals[best] > 0.0 else self._now
 
-    def _recognised(self) -> int:
-        """Return the step before which the robot was elsewhere if new landmarks lie on older ones.
-
-        Where the whole run lets them be the same landmarks, a loop is closed: they are merged.
-        """
+    def _recognise(self) -> None:
+        """Close a loop where new landmarks lie on older ones, if the whole run allows it."""
         main, rule, first = self.main, self._rule, max(min(self._snapshots), self._judged)
         rows, ids = main.reported_rows(), main.state.landmark_ids
         oldest_id = self._steps[first].next_id if first < self._now else main.state.next_id
@@ -404,53 +516,67 @@ class Branches:
         new = [row for row in newest if ids[row] >= oldest_id]
         new_ids = {ids[row] for row in new}
         if new_ids <= self._recognised_ids:
-            return self._now
+            return
         self._recognised_ids = new_ids
         older = [row for row in rows if ids[row] not in new_ids]
         here = constellation_of(main.state, new, rule.model_sigma_m)
         there = constellation_of(main.state, older, rule.model_sigma_m)
         placement = find_placement(here, there, rule)
-        if placement is None or placement.evidence < rule.most_against:
-            return self._now
-        if main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs]):
-            return self._now
-        oldest_new_id = min(here.ids[own] for _, own in placement.pairs)
-        steps = [n for n in range(first, self._now) if self._steps[n].next_id <= oldest_new_id]
-        return max(steps[-1] - self._window, first)
+        if placement is not None:
+            main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs])
 
     def _begin_carry(self, since: int) -> None:
-        before = self._at(since)
-        if len(before.reported_rows()) < self._rule.least_landmarks:
+        before, step = self._at(since), self._steps[since]
+        if not before.reported_rows():
             self._judged = self._now  # no place can be found on such a map
-        else:
-            moved = np.zeros(3)
-            for number in range(since + 1, self._now):
-                moved = compose(moved, self._steps[number].increment)
-            self._carry = Carry(
-                since=since,
-                next_id=self._steps[since].next_id,
-                map=before,
-                new=Alternative(before.with_empty_map(), since),
-                search_from=self._now,
-                moved=moved,
-            )
+            return
+        moved = np.zeros(3)
+        for number in range(since, self._now):
+            moved = compose(moved, self._steps[number].increment)
+        hidden = before.copy()
+        spread = np.square([self._rule.hidden_m, self._rule.hidden_m, self._rule.hidden_rad])
+        hidden.predict(step.increment, np.diag(spread))
+        hidden.state.next_id = self.main.state.next_id + _IDS_APART
+        self._carry = Carry(
+            since=since,
+            price_nats=step.carry_nats,
+            next_id=step.next_id,
+            map=before,
+            new=Alternative(before.with_empty_map(), since),
+            moved=moved,
+            hidden=Place(hidden, since, math.log(self._rule.steps_per_hidden), merges=True),
+        )
 
     def _search(self, carry: Carry) -> None:
-        """Search for the new map's place on the old one; set a copy of the old one down there."""
+        """Search for the new map's places on the old one, and try them.
+
+        Where more look alike than can be tried, none is.
+        """
         rule, new = self._rule, carry.new.back_end
         newest = sorted(new.reported_rows(), key=lambda row: -new.state.landmark_ids[row])
         here = constellation_of(new.state, newest[: rule.newest], rule.model_sigma_m)
         there = constellation_of(carry.map.state, carry.map.reported_rows(), rule.model_sigma_m)
-        placement = find_placement(here, there, rule)
-        if placement is None:
-            return
+        found = find_placements(here, there, rule)
+        if len(found) <= rule.most_places:
+            price_nats = carry.price_nats + math.log(max(len(found), 1))
+            carry.placed = [self._set_down(carry, here, there, one, price_nats) for one in found]
+
+    def _set_down(
+        self,
+        carry: Carry,
+        here: Constellation,
+        there: Constellation,
+        placement: Placement,
+        price_nats: float,
+    ) -> Place:
+        """Return a copy of the back end before a carry, set down at a place on its map."""
         points = []
         for row, own in placement.pairs:
             block = slice(2 * own, 2 * own + 2)
             # The same ranges are taken once more, so this use of them must hardly count.
-            covariance = rule.weakened * here.covariance_m2[block, block]
+            covariance = self._rule.weakened * here.covariance_m2[block, block]
             points.append((there.ids[row], here.points_m[own], covariance))
         back_end = carry.map.copy()
         back_end.set_down(placement.motion, points)
         back_end.state.next_id = self.main.state.next_id + _IDS_APART
-        carry.placed = Alternative(back_end, carry.since)
+        return Place(back_end, carry.since, price_nats)

@@ -65,27 +65,37 @@ def constellation_of(state: State, rows: Sequence[int], sigma_m: float) -> Const
     )
 
 
-def find_placement(here: Constellation, there: Constellation, rule: BranchRule) -> Placement | None:
-    """Return the motion from ``here`` to ``there`` that stands out, or None."""
+def find_placements(here: Constellation, there: Constellation, rule: BranchRule) -> list[Placement]:
+    """Return the motions from ``here`` to ``there``, likeliest first, no two to the same place.
+
+    Those of fewer landmarks than `BranchRule.least_landmarks`, or of less evidence than
+    `BranchRule.placement_nats`, are left out.
+    """
     least = rule.least_landmarks
     if len(here.ids) < least or len(there.ids) < least:
-        return None
+        return []
     found: dict[Pairs, Placement] = {}
     for pairs in dict.fromkeys(_guesses(here.points_m, there.points_m, rule)):
         placement = _judged(here, there, pairs)
         if placement is not None and len(placement.pairs) >= least:
             found[placement.pairs] = placement
-    ranked = sorted(found.values(), key=lambda one: -one.evidence)
-    if not ranked or ranked[0].evidence < rule.placement_nats:
-        return None
-    best = ranked[0]
     middle = here.points_m.mean(axis=0)
-    for rival in ranked[1:]:
-        if best.evidence - rival.evidence >= rule.placement_nats:
+    distinct: list[Placement] = []
+    for one in sorted(found.values(), key=lambda one: -one.evidence):
+        if one.evidence < rule.placement_nats:
             break
-        if _differ(best.motion, rival.motion, middle, rule):
-            return None
-    return best
+        if all(_differ(one.motion, other.motion, middle, rule) for other in distinct):
+            distinct.append(one)
+    return distinct
+
+
+def find_placement(here: Constellation, there: Constellation, rule: BranchRule) -> Placement | None:
+    """Return the motion from ``here`` to ``there`` that stands out, or None."""
+    found = find_placements(here, there, rule)
+    is_alone = len(found) == 1 or (
+        len(found) > 1 and found[0].evidence - found[1].evidence >= rule.placement_nats
+    )
+    return found[0] if is_alone else None
 
 
 def _differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:

@@ -30,13 +30,16 @@ _FLOOR = 1e-12  # what keeps matrices regular, as a share
 class _Record:
     score: float = 0.0
     hits: int = 0
+    n_heard: int = 0  # ranges of it
+    n_unheard: int = 0  # how often a radar had it surely in view and did not hear it
 
 
 class Existence:
-    """Scores of all landmarks, by id."""
+    """Scores of all landmarks, by id, and how often each is detected."""
 
-    def __init__(self, rule: MapRule, report_hits: int) -> None:
+    def __init__(self, rule: MapRule, report_hits: int, detection_probability: float) -> None:
         self._rule, self._report_hits = rule, report_hits
+        self._detection_probability = detection_probability
         self._records: dict[int, _Record] = {}
 
     def hit(self, landmark_id: int, frames: int = 1) -> None:
@@ -49,9 +52,28 @@ class Existence:
         """Count a frame that should have hit a landmark and did not, by no more than ``most``."""
         self._records[landmark_id].score -= min(self._rule.miss, most)
 
+    def heard(self, landmark_id: int) -> None:
+        self._records[landmark_id].n_heard += 1
+
+    def unheard(self, landmark_id: int) -> float:
+        """Count that a radar did not hear a landmark; return the evidence of that, in nats.
+
+        How often the landmark is detected is estimated from how often it was before, with that of
+        all radars as the mean of a beta prior.
+        """
+        record, weight = self._records[landmark_id], self._rule.prior_looks
+        missed = weight * (1.0 - self._detection_probability) + record.n_unheard
+        record.n_unheard += 1
+        return math.log(missed / (weight + record.n_heard + record.n_unheard - 1))
+
     def renew(self, landmark_id: int) -> None:
         """Let the score begin anew; the hits remain."""
         self._records[landmark_id].score = 0.0
+
+    def hits(self, landmark_id: int) -> int:
+        """Return how many frames have hit a landmark; none if there is no such landmark."""
+        record = self._records.get(landmark_id)
+        return 0 if record is None else record.hits
 
     def lost(self) -> list[int]:
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
@@ -66,6 +88,8 @@ class Existence:
         into, other = self._records[kept], self._records[gone]
         into.score = min(max(into.score, 0.0) + max(other.score, 0.0), self._rule.most)
         into.hits += other.hits
+        into.n_heard += other.n_heard
+        into.n_unheard += other.n_unheard
         self.forget(gone)
 
 

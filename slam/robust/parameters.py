@@ -184,6 +184,8 @@ class MapRule:
     """Ceiling of the score; it limits how long a landmark stays that is there no more."""
     least: Annotated[float, Origin.BUDGET, "hits"] = -8.0
     """Score below which a landmark is deleted."""
+    prior_looks: Annotated[float, Origin.CHOSEN, "looks"] = 20.0
+    """Weight of the configured probability of detection in that of a landmark."""
     view_inset_m: Annotated[float, Origin.CHOSEN] = 0.05
     """How far inside the limits of range a landmark must lie to be missed."""
 
@@ -301,21 +303,41 @@ class BranchRule:
     correlated_steps: Annotated[float, Origin.CHOSEN, "scans"] = 2.0
     """Over so many scans the errors of the ranges of one target are correlated; their evidence is
     divided by it."""
-    most_against: Annotated[float, Origin.CHOSEN, "nats"] = 12.0
-    """Most evidence that one landmark gives against a place, for it may have been taken away; with
-    more than that from several, another place is looked for."""
+    carries_per_hour: Annotated[float, Origin.CHOSEN] = 0.01
+    """How often a robot is carried while its wheels turn."""
+    carries_per_hour_stood: Annotated[float, Origin.CHOSEN] = 60.0
+    """How often a robot is carried while its wheels stand, per hour of that: of stops of three
+    seconds, one in twenty is a carry."""
+    steps_per_hidden: Annotated[float, Origin.CHOSEN, "scans"] = 300.0
+    """How many scans there are to one motion that the wheels do not report: one in a minute."""
+    hidden_m: Annotated[float, Origin.CHOSEN] = 0.1
+    """Standard deviation of such a motion, along each axis."""
+    hidden_rad: Annotated[float, Origin.CHOSEN] = 0.2
+    """Standard deviation of its turn."""
+    most_against: Annotated[float, Origin.CHOSEN, "nats"] = 5.0
+    """Most evidence that one landmark gives against a place: one in 150 has been taken away, is
+    hidden, or does not answer to this side."""
     most_for: Annotated[float, Origin.CHOSEN, "nats"] = 9.0
     """Most evidence that one landmark gives for a place, for others may lie near its prediction."""
+    birth_nats: Annotated[float, Origin.CHOSEN] = 8.0
+    """Price of a new landmark: that one lies within a centimetre of a given place, where there is
+    one per square metre."""
+    likeness_nats: Annotated[float, Origin.QUANTILE] = 6.9
+    """Price of a part of the world that looks like another one, however many landmarks it has: one
+    in a thousand."""
     price_nats: Annotated[float, Origin.CHOSEN] = 20.0
-    """By how much something rare must be likelier than that it did not happen: that the robot was
-    carried, that a passage's ranges are of another landmark, or that a hypothesis is right."""
+    """By how much something rare must be likelier than that it did not happen: that a passage's
+    ranges are of another landmark, or that a hypothesis is right; with so much, the question of a
+    carry is settled."""
     least_landmarks: Annotated[int, Origin.CHOSEN, "landmarks"] = 3
-    """Fewest landmarks that place a map on another, that are against a pose, and that can pay the
-    price together."""
+    """Fewest landmarks that place a map on another."""
     lost_steps: Annotated[int, Origin.BUDGET, "scans"] = 100
     """How many of the last scans decide whether the robot is lost, or at a place."""
-    carry_steps: Annotated[int, Origin.BUDGET, "scans"] = 1000
-    """After how many scans the question of a carry is dropped, unless a place is on trial."""
+    carry_steps: Annotated[int, Origin.BUDGET, "scans"] = 500
+    """After how many scans the question of a carry is dropped, unless the robot is lost, and an
+    adoption is final."""
+    most_places: Annotated[int, Origin.BUDGET, "places"] = 4
+    """How many places are on trial at a time."""
     patience: Annotated[int, Origin.BUDGET] = 4
     """After how many times `TrackletRule.window` a place on trial is dropped."""
     snapshot_every: Annotated[int, Origin.BUDGET, "scans"] = 50
@@ -340,6 +362,12 @@ class BranchRule:
     used once more."""
     lost_position_m: Annotated[float, Origin.CHOSEN] = 5.0
     """Standard deviation that is reported for the position while the robot is lost."""
+
+    def carry_nats(self, elapsed_s: float, stood_s: float) -> float:
+        """Return how unlikely a carry is within a time, for a part of which the wheels stood."""
+        moved = self.carries_per_hour * (elapsed_s - stood_s)
+        carries = (moved + self.carries_per_hour_stood * stood_s) / 3600.0
+        return -math.log(-math.expm1(-carries)) if carries > 0.0 else math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

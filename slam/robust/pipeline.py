@@ -24,6 +24,10 @@ from slam.robust.state import quarter_turn
 
 Array = NDArray[np.float64]
 
+_NS_PER_S = 1_000_000_000
+# Wheels that report less than this stand [m, rad]; a shorter stop is none.
+_STILL_M, _STILL_RAD, _STOP_NS = 1e-3, 1e-3, _NS_PER_S
+
 
 class RobustSlam:
     """Ranges of all radars, each at its own time, into the robust back end; nothing is delayed.
@@ -45,6 +49,9 @@ class RobustSlam:
         self._branches = Branches(rig, back_end_parameters(config, wheels, rules))
         self._detector = detector or make_detector(config, rig)
         self._pose: Array | None = None  # odometry at the last state
+        self._t_ns = 0  # time of that
+        # Since when the wheels have stood at a pose, and how long they did since the last state
+        self._still, self._still_ns, self._stood_ns = np.zeros(3), 0, 0
         self._stamps_ns = PackedRows(np.dtype(np.int64))  # of all states
 
     @property
@@ -87,8 +94,11 @@ class RobustSlam:
         t_ns: int,
     ) -> tuple[StepResult, ...]:
         pose = np.array(pose_at(t_ns), dtype=np.float64)
+        if has_moved(self._still, pose, _STILL_M, _STILL_RAD):
+            self._still, self._still_ns = pose, t_ns
+        self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
         if self._pose is None:
-            self._pose = pose
+            self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
             return ()
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         window = self.config.window
@@ -101,9 +111,11 @@ class RobustSlam:
             for radar, stamp_ns in stamps_ns.items()
         }
         branches = self._branches
-        branches.predict(between(self._pose, pose))
+        stood_ns = self._stood_ns if self._stood_ns >= _STOP_NS else 0
+        increment = between(self._pose, pose)
+        branches.predict(increment, (t_ns - self._t_ns) / _NS_PER_S, stood_ns / _NS_PER_S)
         report = branches.update(self._scans(detections, sigmas_m, moved))
-        self._pose = pose
+        self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
         self._stamps_ns.append(t_ns)
         return (
             StepResult(

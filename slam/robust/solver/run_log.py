@@ -297,6 +297,13 @@ class RunLog:
     def rename(self, gone: int, kept: int) -> None:
         self._names[gone] = kept
 
+    def name_of(self, landmark_id: int) -> int | None:
+        """Return the id of the landmark that one was merged into; None if it was dropped."""
+        name: int | None = landmark_id
+        while name is not None and name in self._names:
+            name = self._names[name]
+        return name
+
     def drop(self, landmark_id: int) -> None:
         """Leave out all of a landmark's measurements."""
         self._names[landmark_id] = None
@@ -309,9 +316,7 @@ class RunLog:
         for landmark, pose in zip(
             ranges["landmark"][first].tolist(), ranges["pose"][first].tolist(), strict=True
         ):
-            name: int | None = landmark
-            while name is not None and name in self._names:
-                name = self._names[name]
+            name = self.name_of(landmark)
             if name is not None:
                 found.add((name, pose))
         return Counter(name for name, _ in found)
