@@ -29,6 +29,9 @@ from slam.geometry import FieldOfView
 
 TAIL_PROBABILITY: Annotated[float, Origin.QUANTILE] = 1e-3
 """Probability with which a test rejects what is true."""
+CONSTANTS_TAIL: Annotated[float, Origin.QUANTILE] = 0.01
+"""Probability with which constants of wheels and radars are taken for implausible although they are
+drawn from their priors."""
 MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
 """Logarithm of how many times likelier than any other an explanation must be: twenty times."""
 NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
@@ -254,6 +257,10 @@ class RelinearisationRule:
     """A new slip gains most among so many motions before and after it."""
     radius_scale_m: Annotated[float, Origin.CHOSEN] = 1e-3
     """Scale of the prior of radii; smaller ones are alike."""
+
+    thick_price: Annotated[float, Origin.CHOSEN] = 0.2
+    """What share of the price of a radius counts, in nats, once the constants of a run in which
+    everything is thin are implausible."""
 
     @property
     def outliers_from(self) -> int:

@@ -195,7 +195,8 @@ def belief_of(back_end: RobustBackEnd, lost_pose: tuple[Array, Array] | None = N
     While the robot is lost, ``lost_pose`` replaces its pose (3,) and covariance (3, 3).
 
     With e_add = e + t e_th, t = J x for every point x (``State.additive_transform``), the
-    covariance is P + t p_th^T + p_th t^T + P_thth t t^T: O(m^2), not a product of matrices.
+    covariance is P + t p_th^T + p_th t^T + P_thth t t^T: O(m^2), not a product of matrices. The
+    position has what `State.curved_covariance` adds, too.
     """
     state = back_end.state
     rows = np.array(back_end.reported_rows(), dtype=np.intp)
@@ -207,6 +208,7 @@ def belief_of(back_end: RobustBackEnd, lost_pose: tuple[Array, Array] | None = N
     )
     along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
     covariance = P + (along + along.T)
+    covariance[:2, :2] += state.curved_covariance()
     pose = state.pose
     if lost_pose is not None:
         covariance[:3], covariance[:, :3] = 0.0, 0.0

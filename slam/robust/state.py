@@ -62,6 +62,10 @@ _MOST_GRAMS, _MOST_PAIRS = 44, 15
 # Large matrices grow within spare rows. Not a power of two, columns would share cache sets.
 _SPARE, _ODD = 128, 8
 
+# Of an integral over a normal number
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_WEIGHTS = _WEIGHTS / math.sqrt(math.tau)
+
 HEADING = 0
 POSITION = slice(1, 3)
 CALIBRATION = slice(3, 6)
@@ -262,6 +266,9 @@ class RangeErrors:
     # By how much the variance of a range must be larger where many are averaged: those of one
     # passage err alike. Below 1, errors are smaller than their standard deviations.
     variance_share: float = 1.0
+    # Part of that for which the constants of wheels and radars would else be implausible
+    doubt: float = 1.0
+    radius_price: float = 1.0  # share of the price of a radius that counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -509,6 +516,37 @@ class State:
         T = np.eye(3)
         T[:2, 2] = quarter_turn(self.position_m)
         return np.asarray(T @ P @ T.T)
+
+    def curved_covariance(self) -> Array:
+        """Return what large errors of the heading add to the position's covariance (2, 2) [m^2].
+
+        The position p = Rot(e_th) p^ + V(e_th) e_p lies on an arc about the start, which no ellipse
+        of additive errors covers. The second moment of its error, e_p given e_th being normal, is
+        integrated over e_th by Gauss and Hermite's rule; what exceeds the linear covariance in any
+        direction is returned.
+        """
+        P = self.P.block(np.array([0, 1, 2]))
+        variance = float(P[0, 0])
+        if variance <= 0.0:
+            return np.zeros((2, 2))
+        along = P[1:, 0] / variance
+        given = P[1:, 1:] - np.outer(along, P[0, 1:])
+        angles = math.sqrt(variance) * _NODES
+        # V(a) = f I + g J
+        f, g = np.sinc(angles / math.pi), angles / 2.0 * np.sinc(angles / math.tau) ** 2
+        x, y = self.position_m.tolist()
+        moved = np.outer(angles * f, along) + np.outer(angles * g, quarter_turn(along))
+        moved[:, 0] += (np.cos(angles) - 1.0) * x - np.sin(angles) * y
+        moved[:, 1] += np.sin(angles) * x + (np.cos(angles) - 1.0) * y
+        turned = quarter_turn(given.T).T  # J given
+        both = turned + turned.T
+        opposite = quarter_turn(turned)  # J given J^T
+        curved = (moved.T * _WEIGHTS) @ moved
+        curved += float(_WEIGHTS @ f**2) * given + float(_WEIGHTS @ (f * g)) * both
+        curved += float(_WEIGHTS @ g**2) * opposite
+        linear = self.pose_covariance()[:2, :2]
+        values, vectors = np.linalg.eigh(curved - linear)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
         """Set the pose, x [m], y [m] and heading, and the (3, 3) covariance of its additive error.

@@ -25,6 +25,9 @@ from slam.robust.state import (
 
 _SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 _LEAST_SHARE, _MOST_SHARE = 0.5, 50.0  # keep `RangeErrors.variance_share` finite
+# How often a solution is sought anew, and the most by which all variances grow, where constants are
+# implausible
+_MOST_DOUBTS, _MOST_DOUBT = 4, 1e4
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 _ALONE_STEPS = 8  # of the search for the place of a group of ranges, from each of its begins
 _BEGINS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -49,8 +52,33 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     solution = _solved(log, state, problem, parameters)
     if solution is None or not is_determined(solution.information):
         return False
+    for _ in range(_MOST_DOUBTS):
+        misfit = Smoother(problem, parameters.relinearisation).misfit_of_constants(
+            solution.estimate
+        )
+        if misfit <= 1.0:
+            break
+        state.range_errors = doubted(state.range_errors, misfit, parameters)
+        problem = log.problem(state, parameters)
+        again = _solved(log, state, problem, parameters)
+        if again is None or not is_determined(again.information):
+            return False
+        solution = again
     adopt(log, state, problem, solution, parameters)
     return True
+
+
+def doubted(errors: RangeErrors, misfit: float, parameters: BackEndParameters) -> RangeErrors:
+    """Return what else the errors of ranges may be, as they make the constants implausible.
+
+    Wheels and radars have constants that their makers vouch for. Ranges that are at odds with these
+    are of thicker bodies than was expected; or else they err more than they show, all alike.
+    """
+    thick = parameters.relinearisation.thick_price
+    if errors.radius_price > thick:
+        return replace(errors, radius_price=thick)
+    more = min(misfit, _MOST_DOUBT / errors.doubt)
+    return replace(errors, variance_share=more * errors.variance_share, doubt=more * errors.doubt)
 
 
 def adopt(
@@ -230,9 +258,9 @@ def learn_noise(
     share = n_groups * float(np.sum(sums**2)) / n
     share += rule.prior_groups * parameters.ranges.variance_share
     share /= n_groups + rule.prior_groups
-    share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
+    share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE)) * state.range_errors.doubt
     added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
-    state.range_errors = RangeErrors(added_m, share)
+    state.range_errors = replace(state.range_errors, added_m=added_m, variance_share=share)
 
 
 def solve_whole_run(

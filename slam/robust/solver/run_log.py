@@ -75,7 +75,9 @@ class Problem:
     range_bearings_rad: Array
     range_bearing_sigmas_rad: Array
     huber_sigmas: float = math.inf  # residuals beyond it weigh less
-    variance_share: float = 1.0  # see `RangeErrors`
+    # see `RangeErrors`
+    variance_share: float = 1.0
+    radius_price: float = 1.0
 
     @property
     def is_walking(self) -> bool:
@@ -413,6 +415,7 @@ class RunLog:
             range_bearing_sigmas_rad=ranges["bearing_sigma_rad"].astype(np.float64),
             huber_sigmas=parameters.ranges.huber_sigmas,
             variance_share=state.range_errors.variance_share,
+            radius_price=state.range_errors.radius_price,
         )
 
     def starts(self, state: State, problem: Problem) -> list[Estimate]:

@@ -22,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpbtrf, dtbtrs
+from scipy.special import chdtri
 
 from slam.geometry import wrap_angles
 from slam.robust import kernels
-from slam.robust.parameters import RelinearisationRule
+from slam.robust.parameters import CONSTANTS_TAIL, RelinearisationRule
 from slam.robust.solver.run_log import (
     Estimate,
     Problem,
@@ -479,11 +480,11 @@ class Smoother:
         away, sigmas = self._from_prior(estimate)
         costs = (away / sigmas) ** 2
         # Of a radius the cost is 2 ln(tau + rho), and quadratic where it is less than tau.
-        tau = self._rule.radius_scale_m
+        tau, price = self._rule.radius_scale_m, problem.radius_price
         radii = np.maximum(away[self._radii], tau)
         thin = np.clip(away[self._radii], 0.0, tau)
-        costs[self._radii] = thin**2 / (2.0 * tau * tau)
-        costs[self._radii] += 2.0 * np.log((tau + radii) / (2.0 * tau))
+        costs[self._radii] = price * thin**2 / (2.0 * tau * tau)
+        costs[self._radii] += price * 2.0 * np.log((tau + radii) / (2.0 * tau))
         below = np.minimum(away[self._radii], 0.0)
         return total + float(np.sum(costs) + np.sum((below / tau) ** 2))
 
@@ -491,6 +492,17 @@ class Smoother:
         """Return the cost of values to start from: any motion may be a slip."""
         as_wheels, slipped = self._motion_costs(motion_residuals(self._problem, estimate).residual)
         return self.cost(estimate, slipped < as_wheels)
+
+    def misfit_of_constants(self, estimate: Estimate) -> float:
+        """Return how implausible the constants of wheels and radars are under their priors.
+
+        It is chi-square of the wheels' first calibration and the range offsets over the quantile
+        that one in a hundred exceeds.
+        """
+        away, sigmas = self._from_prior(estimate)
+        constants = slice(CALIBRATION.start, HEAD_SIZE + self._problem.layout.n_radars)
+        square = float(np.sum((away[constants] / sigmas[constants]) ** 2))
+        return square / float(chdtri(constants.stop - constants.start, CONSTANTS_TAIL))
 
     def covariances(self, estimate: Estimate, slips: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return the covariances of all keyframes (k + 1, 3, 3) and of the border at a solution.
@@ -541,15 +553,16 @@ class Smoother:
     def _from_prior(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return how far values are from the prior's mean, and the standard deviations of that.
 
-        Radii have a prior 1 / (tau + rho), which takes most of them for thin, and of those that are
-        not every size for likely: by the quadratic that touches it, as Huber's weights are.
+        Radii have a prior 1 / (tau + rho), or a power of that, which takes most of them for thin,
+        and of those that are not every size for likely: by the quadratic that touches it, as
+        Huber's weights are.
         """
         problem, tau = self._problem, self._rule.radius_scale_m
         first = np.concatenate([estimate.poses[0], estimate.calibration[0], estimate.fixed])
         away, sigmas = first - problem.prior_mean, problem.prior_sigmas.copy()
         radii = away[self._radii]
         least = np.maximum(radii, tau)
-        rounded = np.sqrt(least * (tau + least))
+        rounded = np.sqrt(least * (tau + least) / problem.radius_price)
         sigmas[self._radii] = np.where(radii < 0.0, tau, rounded)
         return away, sigmas
 
