@@ -3,6 +3,9 @@
 The back end itself believes its odometry. ``Branches`` keep its last motions and scans, and the
 evidence of each range for its pose (``UpdateReport.evidence``).
 
+Discontinuity
+    Where the wheels stood for a second or more, the last ranges before and the first ones behind it
+    must be the same. If they are not, the robot was carried, whatever the map holds.
 Suspicion
     The evidence since each step is summed over the landmarks known then, at most so much against
     each: a cumulative sum test (Page, Biometrika 41, 1954). A carry has a prior, in odds per hour;
@@ -56,7 +59,7 @@ from slam.robust.constellation import (
     find_placements,
 )
 from slam.robust.initialisation import Question
-from slam.robust.parameters import MARGIN_NATS, BackEndParameters, BranchRule
+from slam.robust.parameters import MARGIN_NATS, BackEndParameters, BranchRule, RangeNoise
 from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
@@ -71,7 +74,9 @@ class Step:
     scans: Sequence[RangeScan]
     next_id: int  # landmarks known before it have smaller ids
     evidence: Array  # shape (k, 2): ids and nats
-    carry_nats: float  # how unlikely it is that the robot was carried before it
+    # How unlikely it is that the robot was carried before it; negative where the ranges before and
+    # behind a stop show that
+    carry_nats: float
 
 
 class Hypotheses:
@@ -167,6 +172,32 @@ def _answered(
 def evidence_table(report: UpdateReport) -> Array:
     """Return ids and evidence [nats] of a report, shape (k, 2)."""
     return np.array(report.evidence).reshape(-1, 2)
+
+
+def discontinuity(
+    before: Sequence[RangeScan], after: Sequence[RangeScan], reach_m: float, noise: RangeNoise
+) -> float:
+    """Return by how much the ranges of two times are likelier those of two places, in nats.
+
+    A range that is found again within reach, as most are at one place, may be so by chance. Each
+    time is compared with the other one, and half of both counts. Ranges are Bernoulli trials.
+    """
+    of_radar = {scan.radar: (*scan.ranges_m, *scan.blurred_m) for scan in after}
+    pairs = [
+        ((*scan.ranges_m, *scan.blurred_m), of_radar[scan.radar])
+        for scan in before
+        if scan.radar in of_radar
+    ]
+    found, total = noise.detection_probability, 0.0
+    for given, others in [*pairs, *[(others, given) for given, others in pairs]]:
+        share = 2.0 * reach_m * len(others) / (noise.max_range_m - noise.min_range_m)
+        chance = min(max(share, 1.0 - found), found)
+        for range_m in given:
+            if any(abs(range_m - other) <= reach_m for other in others):
+                total += math.log(chance / found)
+            else:
+                total += math.log((1.0 - chance) / (1.0 - found))
+    return 0.5 * total
 
 
 def totals_of(tables: Iterable[Array], known: RobustBackEnd, rule: BranchRule) -> Array:
@@ -272,8 +303,9 @@ class Branches:
         self._fewest = parameters.tracklets.min_frames
         self._steps: dict[int, Step] = {}  # by number, those that are needed still
         self._now = 0  # number of the next step
+        self._noise, self._gate_sigmas = parameters.ranges, parameters.tracklets.gate_sigmas
         self._increment: Array | None = None
-        self._carry_nats = math.inf
+        self._carry_nats, self._has_stood = math.inf, False
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
         self._carry: Carry | None = None
         self._judged = 0  # the evidence of the steps before it has been judged
@@ -306,6 +338,7 @@ class Branches:
             self._keep_snapshot()
         self._increment = increment
         self._carry_nats = self._rule.carry_nats(elapsed_s, stood_s)
+        self._has_stood = stood_s > 0.0
         self.main.predict(increment)
         if self._carry is not None:
             self._carry.moved = compose(self._carry.moved, increment)
@@ -314,14 +347,20 @@ class Branches:
         """Take in the scans of one time; a radar without a frame is absent, not empty."""
         if self._increment is None:
             raise ValueError("scans without a motion before them")
-        next_id = self.main.state.next_id
+        next_id, carry_nats = self.main.state.next_id, self._carry_nats
+        if self._has_stood and self._now - 1 in self._steps:
+            moved_m = math.hypot(*self._increment[:2].tolist())
+            reach_m = self._gate_sigmas * self._rule.model_sigma_m + moved_m
+            before, most = self._steps[self._now - 1].scans, self._rule.price_nats
+            apart = discontinuity(before, scans, reach_m, self._noise)
+            carry_nats -= min(max(apart, -most), most)
         report = self.main.update(scans)
         self._steps[self._now] = Step(
             increment=self._increment,
             scans=scans,
             next_id=next_id,
             evidence=evidence_table(report),
-            carry_nats=self._carry_nats,
+            carry_nats=carry_nats,
         )
         self._now += 1
         was_lost = self.is_lost
@@ -353,7 +392,8 @@ class Branches:
     def _decide(self, carry: Carry) -> bool:
         """Answer the question of a carry, if that can be; return whether the pose jumps."""
         rule = self._rule
-        on_trial = [*carry.placed] if self._is_over(carry) else [carry.hidden, *carry.placed]
+        is_recent = self._now - carry.since <= rule.lost_steps
+        on_trial = [carry.hidden, *carry.placed] if is_recent else [*carry.placed]
         for alternative in [carry.stayed] if carry.stayed else [carry.new, *on_trial]:
             end = min(alternative.next_step + rule.catch_up, self._now)
             alternative.take(self._steps, end)
@@ -371,13 +411,9 @@ class Branches:
         tables = self._tables(first)
         of_landmarks = totals_of(tables, carry.map, rule)[:, 1]
         total = float(of_landmarks.sum())
-        if self.is_lost:
-            # What is new is no evidence for the pose, and neither is it if nothing is heard.
-            self.is_lost = total <= MARGIN_NATS
-        else:
-            # Radars that hear nothing are no reason to be elsewhere.
-            is_elsewhere = bool(carry.new.back_end.reported_rows())
-            self.is_lost = total < -carry.price_nats and is_elsewhere
+        # What is new is no evidence for the pose, and neither is it if nothing is heard.
+        against = -total - carry.price_nats
+        self.is_lost = against > -MARGIN_NATS if self.is_lost else against > 0.0
         is_answered = total > rule.price_nats or (self._is_over(carry) and not self.is_lost)
         if is_answered and not carry.placed:
             self._end(carry)
@@ -421,9 +457,12 @@ class Branches:
             for gain, one in zip(gains, places, strict=True)
             if has_moved(pose, one.back_end.pose, rule.reach_m, rule.reach_m / rule.base_m)
         ]
+        # Where the map lies, most of what is seen must be known.
+        fewest = max(rule.least_landmarks, 2 * account.n_new)
         is_there = (
-            account.n_seen >= (1 if found is carry.hidden else rule.least_landmarks)
-            and account.misses - stay.misses > max(found.price_nats, MARGIN_NATS)
+            account.n_seen > account.n_new
+            and (found is carry.hidden or account.n_seen >= fewest)
+            and account.misses - stay.misses > found.price_nats + MARGIN_NATS
             and gains[best] > MARGIN_NATS
             and advantage(account, elsewhere, rule) > MARGIN_NATS
             and all(gains[best] - gain > rule.placement_nats for gain in rivals)
@@ -489,7 +528,7 @@ class Branches:
         rule, first = self._rule, max(min(self._snapshots), self._judged)
         steps = [self._steps[number] for number in range(first, self._now)]
         lengths = [len(step.evidence) for step in steps]
-        if not sum(lengths):
+        if not steps:
             return self._now
         table = np.concatenate([step.evidence for step in steps])
         ids, place = np.unique(table[:, 0], return_inverse=True)
@@ -527,9 +566,6 @@ class Branches:
 
     def _begin_carry(self, since: int) -> None:
         before, step = self._at(since), self._steps[since]
-        if not before.reported_rows():
-            self._judged = self._now  # no place can be found on such a map
-            return
         moved = np.zeros(3)
         for number in range(since, self._now):
             moved = compose(moved, self._steps[number].increment)

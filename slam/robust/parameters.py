@@ -315,8 +315,8 @@ class BranchRule:
     carries_per_hour_stood: Annotated[float, Origin.CHOSEN] = 60.0
     """How often a robot is carried while its wheels stand, per hour of that: of stops of three
     seconds, one in twenty is a carry."""
-    steps_per_hidden: Annotated[float, Origin.CHOSEN, "scans"] = 300.0
-    """How many scans there are to one motion that the wheels do not report: one in a minute."""
+    steps_per_hidden: Annotated[float, Origin.CHOSEN, "scans"] = 3000.0
+    """How many scans there are to one motion that the wheels do not report: one in ten minutes."""
     hidden_m: Annotated[float, Origin.CHOSEN] = 0.1
     """Standard deviation of such a motion, along each axis."""
     hidden_rad: Annotated[float, Origin.CHOSEN] = 0.2
