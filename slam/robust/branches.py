@@ -222,6 +222,11 @@ class Account:
     n_seen: int = 0  # how many of them are seen
     n_new: int = 0  # landmarks that it has added to the map
 
+    @property
+    def known(self) -> float:
+        """Return the nats of the landmarks known before."""
+        return self.hits + self.misses
+
 
 def account_of(totals: Array, n_new: int) -> Account:
     """Return the account of totals (n, 2), as `totals_of` has them, and of new landmarks."""
@@ -238,8 +243,8 @@ def advantage(place: Account, other: Account, rule: BranchRule) -> float:
     birth.
     """
     n_more = other.n_new - place.n_new
-    seen = place.hits - other.hits - rule.most_for * n_more
-    return seen + place.misses - other.misses + min(rule.birth_nats * n_more, rule.likeness_nats)
+    births = min(rule.birth_nats * n_more, rule.likeness_nats)
+    return place.known - other.known - rule.most_for * n_more + births
 
 
 class Alternative:
@@ -392,8 +397,9 @@ class Branches:
     def _decide(self, carry: Carry) -> bool:
         """Answer the question of a carry, if that can be; return whether the pose jumps."""
         rule = self._rule
-        is_recent = self._now - carry.since <= rule.lost_steps
-        on_trial = [carry.hidden, *carry.placed] if is_recent else [*carry.placed]
+        # What is seen behind a stop shows a carry, or the motion was just now; or it was none.
+        is_hidden = carry.price_nats > 0.0 and self._now - carry.since <= rule.lost_steps
+        on_trial = [carry.hidden, *carry.placed] if is_hidden else [*carry.placed]
         for alternative in [carry.stayed] if carry.stayed else [carry.new, *on_trial]:
             end = min(alternative.next_step + rule.catch_up, self._now)
             alternative.take(self._steps, end)
@@ -452,9 +458,12 @@ class Branches:
         best = int(np.argmax(gains))
         account, found, pose = accounts[best], places[best], places[best].back_end.pose
         elsewhere = Account(n_new=carry.new.back_end.n_reported_since(0))
-        rivals = [
-            gain
-            for gain, one in zip(gains, places, strict=True)
+        # What another place has not made landmarks of yet must not decide between the two.
+        margins = [
+            min(gains[best] - gain, account.known - other.known)
+            if found is not carry.hidden
+            else gains[best] - gain
+            for gain, other, one in zip(gains, accounts, places, strict=True)
             if has_moved(pose, one.back_end.pose, rule.reach_m, rule.reach_m / rule.base_m)
         ]
         # Where the map lies, most of what is seen must be known.
@@ -465,7 +474,7 @@ class Branches:
             and account.misses - stay.misses > found.price_nats + MARGIN_NATS
             and gains[best] > MARGIN_NATS
             and advantage(account, elsewhere, rule) > MARGIN_NATS
-            and all(gains[best] - gain > rule.placement_nats for gain in rivals)
+            and all(margin > rule.placement_nats for margin in margins)
         )
         return found if is_there else None
 
