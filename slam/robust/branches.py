@@ -445,8 +445,9 @@ class Branches:
     def _place_of(self, carry: Carry, places: Sequence[Place]) -> Place | None:
         """Return the place that the robot is at rather than where it was, or anywhere else.
 
-        What is missed by the one that stayed must pay the price, not what looks alike, and the
-        place must be likelier than any other on trial.
+        What is missed by the one that stayed must pay the price, not what looks alike, unless the
+        ranges before and behind a stop show a carry; and the place must be likelier than any other
+        on trial.
         """
         rule = self._rule
         stay = self._account(carry, self.main, self._tables(carry.since))
@@ -467,11 +468,11 @@ class Branches:
             if has_moved(pose, one.back_end.pose, rule.reach_m, rule.reach_m / rule.base_m)
         ]
         # Where the map lies, most of what is seen must be known.
-        fewest = max(rule.least_landmarks, 2 * account.n_new)
+        fewest, is_shown = max(rule.least_landmarks, 2 * account.n_new), carry.price_nats < 0.0
         is_there = (
             account.n_seen > account.n_new
             and (found is carry.hidden or account.n_seen >= fewest)
-            and account.misses - stay.misses > found.price_nats + MARGIN_NATS
+            and (is_shown or account.misses - stay.misses > found.price_nats + MARGIN_NATS)
             and gains[best] > MARGIN_NATS
             and advantage(account, elsewhere, rule) > MARGIN_NATS
             and all(margin > rule.placement_nats for margin in margins)

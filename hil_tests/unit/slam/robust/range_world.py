@@ -195,10 +195,17 @@ def follow(
     back_end: RobustBackEnd | Branches,
     increments: Iterable[Array],
     scans: Iterable[list[RangeScan]],
+    stop: int | None = None,
 ) -> Iterator[UpdateReport]:
-    """Give a back end steps and what the radars saw at their ends; yield its reports."""
-    for increment, of_pose in zip(increments, scans, strict=True):
-        back_end.predict(increment)
+    """Give a back end steps and what the radars saw at their ends; yield its reports.
+
+    Before the step that leads to pose ``stop`` the wheels stood for three seconds.
+    """
+    for k, (increment, of_pose) in enumerate(zip(increments, scans, strict=True), start=1):
+        if isinstance(back_end, Branches) and k == stop:
+            back_end.predict(increment, elapsed_s=3.2, stood_s=3.0)
+        else:
+            back_end.predict(increment)
         yield back_end.update(of_pose)
 
 

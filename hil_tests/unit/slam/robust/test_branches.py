@@ -18,7 +18,15 @@ from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.branches import Branches, Step, gain, totals_of
+from slam.robust.branches import (
+    Account,
+    Branches,
+    Step,
+    account_of,
+    advantage,
+    discontinuity,
+    totals_of,
+)
 from slam.robust.parameters import BackEndParameters, BranchRule
 from slam.robust.state import Array
 
@@ -173,50 +181,78 @@ def test_a_robot_set_down_is_as_certain_as_the_points_it_sees() -> None:
     assert sigmas[2] < 0.02
 
 
-def totals(*evidence: tuple[int, float]) -> Array:
-    table = np.array(evidence, dtype=float).reshape(-1, 2)
-    return totals_of([table], known_before=1000, correlated_steps=RULE.correlated_steps)
+@pytest.fixture(scope="module")
+def known() -> RobustBackEnd:
+    """Return a back end that knows seven landmarks, each hit by dozens of frames."""
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    rng, poses = np.random.default_rng(10), straight(70)
+    scans = scans_of(poses, PLACES, rng, SIGMA_M)
+    list(follow(back_end, reported(poses, LAB, rng, 0.0), scans))
+    assert len(back_end.state.landmark_ids) == len(PLACES)
+    return back_end
 
 
-MISSED = [(id_, -3.0) for id_ in (1, 2, 3)] * 20
-PRICE = RULE.price_nats
+def test_totals_are_sums_of_the_known_landmarks(known: RobustBackEnd) -> None:
+    a, b, *_ = known.state.landmark_ids
+    tables = [np.array([[b, 1.0], [a, -3.0]]), np.empty((0, 2)), np.array([[b, 2.0], [999.0, 5.0]])]
+    found = totals_of(tables, known, RULE)
+    assert found.tolist() == [[a, -3.0 / 2.0], [b, 3.0 / 2.0]]
+    assert totals_of([], known, RULE).shape == (0, 2)
 
 
-def test_totals_are_sums_of_the_landmarks_known_then() -> None:
-    first, second = np.array([[4.0, 1.0], [2.0, -3.0]]), np.array([[4.0, 2.0], [9.0, 5.0]])
-    found = totals_of([first, np.empty((0, 2)), second], known_before=9, correlated_steps=2.0)
-    assert found.tolist() == [[2.0, -1.5], [4.0, 1.5]]
-    assert totals_of([], known_before=9, correlated_steps=2.0).shape == (0, 2)
+def test_what_one_landmark_says_is_bounded(known: RobustBackEnd) -> None:
+    """For a pose by `most_for`; against it by how often it was hit: by Laplace 1 in n + 1."""
+    a, b, *_ = known.state.landmark_ids
+    long = [np.array([[a, -3.0], [b, 3.0]])] * 1000
+    (_, against), (_, hits) = totals_of(long, known, RULE)
+    n = known._existence.hits(a)
+    assert against == pytest.approx(-min(math.log(n + 1), RULE.most_against))
+    assert hits == RULE.most_for
 
 
-def test_ranges_that_lie_near_by_chance_for_long_do_not_make_a_place() -> None:
-    """Two landmarks that seem to be there do not outweigh three that are missing."""
-    chance = totals(*MISSED, *[(id_, 3.0) for id_ in (4, 5)] * 50)
-    assert gain(chance, totals(*[(id_, -3.0) for id_ in (4, 5)] * 50), RULE) < 0.0
+def test_births_are_paid_but_a_likeness_is_not_that_rare() -> None:
+    """A place where all looks alike is no likelier than new landmarks by more than a likeness."""
+    stay = Account(n_new=1)
+    one = account_of(np.array([[1.0, RULE.most_for]]), 0)
+    assert advantage(one, stay, RULE) == pytest.approx(min(RULE.birth_nats, RULE.likeness_nats))
+    many = account_of(np.array([[k, RULE.most_for] for k in range(12)]), 0)
+    assert advantage(many, Account(n_new=12), RULE) == pytest.approx(RULE.likeness_nats)
+    # and new landmarks of its own cost a place as much
+    assert advantage(stay, one, RULE) == pytest.approx(-RULE.birth_nats)
 
 
-def test_two_landmarks_do_not_make_a_place() -> None:
-    """Alone they do not exceed the price; a third one must confirm them."""
-    main = totals(*MISSED)
-    two = totals(*[(id_, 3.0) for id_ in (1, 2)] * 50, *[(3, -3.0)] * 20)
-    three = totals(*[(id_, 3.0) for id_ in (1, 2, 3)] * 50)
-    assert gain(two, main, RULE) <= PRICE
-    assert gain(three, main, RULE) > PRICE
+def test_what_is_missed_counts_in_full() -> None:
+    place, stay = Account(hits=27.0, n_seen=3), Account(hits=0.0, misses=-15.0, n_new=3)
+    likeness = min(3 * RULE.birth_nats, RULE.likeness_nats)
+    assert advantage(place, stay, RULE) == pytest.approx(15.0 + likeness)
+    missing = replace(place, misses=-10.0)
+    assert advantage(missing, stay, RULE) == pytest.approx(5.0 + likeness)
 
 
-def test_the_evidence_of_one_landmark_is_bounded() -> None:
-    """However long one landmark is missed at the main back end's pose, it is one landmark."""
-    gone, there = totals(*[(1, -3.0)] * 1000), totals(*[(1, 3.0)] * 1000)
-    assert gain(there, gone, RULE) <= PRICE / 2.0
-    assert gain(there, gone, RULE) <= RULE.most_for
+def test_the_prior_of_a_carry_is_that_of_a_poisson_process() -> None:
+    moving, standing = RULE.carries_per_hour, RULE.carries_per_hour_stood
+    assert RULE.carry_nats(0.2, 0.0) == pytest.approx(-math.log(moving * 0.2 / 3600), abs=1e-6)
+    chance = 1 - math.exp(-(moving * 0.2 + standing * 3.0) / 3600)
+    assert RULE.carry_nats(3.2, 3.0) == pytest.approx(-math.log(chance))
+    assert replace(RULE, carries_per_hour=0.0).carry_nats(0.2, 0.0) == math.inf
 
 
-def test_a_place_that_explains_less_is_not_likelier() -> None:
-    """However much the other one misses: a pose of which little is certain misses little."""
-    main = totals(*MISSED, *[(4, 3.0)] * 5)
-    silent, better = totals(), totals(*[(id_, 3.0) for id_ in (1, 2, 3, 5)] * 20)
-    assert gain(silent, main, RULE) < 0.0
-    assert gain(better, main, RULE) > PRICE
+def test_ranges_behind_a_stop_show_whether_the_robot_was_carried() -> None:
+    """Four ranges of one radar, Pd 0.9; one lies within 3 cm of another by chance in 0.2."""
+    noise = replace(BackEndParameters().ranges, detection_probability=0.9)
+    noise = replace(noise, min_range_m=0.2, max_range_m=1.4)
+
+    def at(*ranges_m: float) -> list[RangeScan]:
+        return [RangeScan(radar=0, ranges_m=ranges_m)]
+
+    before, other = at(0.4, 0.6, 0.8, 1.0), at(0.5, 0.7, 0.9, 1.1)
+    same = discontinuity(before, at(0.41, 0.61, 0.79, 1.01), 0.03, noise)
+    assert same == pytest.approx(4 * math.log(0.2 / 0.9))
+    assert discontinuity(before, other, 0.03, noise) == pytest.approx(4 * math.log(0.8 / 0.1))
+    blurred = [RangeScan(radar=0, ranges_m=(), blurred_m=(0.4, 0.6, 0.8, 1.0))]
+    assert discontinuity(before, blurred, 0.03, noise) == pytest.approx(same)
+    # a radar without a frame says nothing
+    assert discontinuity(before, [RangeScan(radar=1, ranges_m=(0.5,))], 0.03, noise) == 0.0
 
 
 def test_evidence_is_the_likelihood_of_the_ranges() -> None:
@@ -232,9 +268,7 @@ def test_evidence_is_the_likelihood_of_the_ranges() -> None:
         report = back_end.update(scans)
         hits, missed = report.evidence[: report.dof], report.evidence[report.dof :]
         assert [id_ for id_, _ in hits] == [id_ for _, _, id_ in report.continued]
-        assert all(
-            nats == pytest.approx(math.log(1 - noise.detection_probability)) for _, nats in missed
-        )
+        assert all(nats < 0.0 for _, nats in missed if nats < 10.0)
         if report.dof == 1:
             [(radar, _, landmark_id)] = report.continued
             [variance] = [
@@ -266,7 +300,7 @@ def test_a_robot_carried_to_where_nothing_is_missed_recognises_the_place() -> No
     carried = [
         k
         for k, report in enumerate(
-            follow(branches, increments, scans_of(poses, PLACES, rng, SIGMA_M)), start=1
+            follow(branches, increments, scans_of(poses, PLACES, rng, SIGMA_M), stop=cut), start=1
         )
         if report.carried
     ]
@@ -303,7 +337,7 @@ def test_a_carried_robot_that_hears_nothing_stays_lost_until_it_finds_itself() -
     run, cut = carried_run(0, n_ways=4)
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
     k, lost_at = 0, 0
-    for k, report in enumerate(follow(branches, run.increments, run.scans), start=1):
+    for k, report in enumerate(follow(branches, run.increments, run.scans, stop=cut), start=1):
         if report.lost:
             lost_at = k
             break
@@ -318,18 +352,85 @@ def test_a_carried_robot_that_hears_nothing_stays_lost_until_it_finds_itself() -
     assert error_m(branches.main.pose, run.poses[-1]) < 0.05
 
 
-def test_a_carry_is_dated_to_the_earliest_step_that_explains_as_much() -> None:
+def test_a_carry_is_dated_to_the_earliest_step_that_explains_as_much(known: RobustBackEnd) -> None:
     """Ten steps that confirm the pose, ten that see nothing, ten that miss three landmarks."""
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
-    seen, missed = ([(id_, nats) for id_ in (0, 1, 2)] for nats in (3.0, -3.0))
+    branches.main = known.copy()
+    ids = known.state.landmark_ids[:3]
+    seen, missed = ([(id_, nats) for id_ in ids] for nats in (3.0, -3.0))
     for k, evidence in enumerate([seen] * 10 + [[]] * 10 + [missed] * 10):
         branches._steps[k] = Step(
             increment=np.zeros(3),
             scans=(),
-            next_id=3,
+            next_id=known.state.next_id,
             evidence=np.array(evidence, dtype=float).reshape(-1, 2),
+            carry_nats=RULE.carry_nats(0.2, 0.0),
         )
     branches._snapshots, branches._now = {0: branches.main}, 30
-    since, against = branches._evidence_of_carry()
-    assert since == 10
-    assert against == pytest.approx(3 * min(10 * 3.0 / RULE.correlated_steps, RULE.most_against))
+    assert branches._most_suspicious() == 10
+    # a stop is where robots are carried
+    stop = RULE.carry_nats(3.2, 3.0)
+    branches._steps[14] = replace(branches._steps[14], carry_nats=stop)
+    assert branches._most_suspicious() == 14
+    # and what is seen elsewhere is no reason to be carried
+    for k in range(20, 30):
+        branches._steps[k] = replace(branches._steps[k], evidence=np.empty((0, 2)))
+    assert branches._most_suspicious() == 30
+
+
+def test_a_row_of_equal_things_is_no_reason_to_be_carried() -> None:
+    """Pairs of rods every half metre, 4 m long, there and back: each looks like the one before."""
+    rng = np.random.default_rng(11)
+    x = np.arange(0.0, 3.6, 0.02)
+    there = np.column_stack([x, np.zeros((len(x), 2))])
+    poses = np.vstack([there, there[::-1]])
+    rods = np.array([[0.3 + 0.5 * k, side * 0.8] for k in range(7) for side in (-1, 1)])
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    scans = scans_of(poses, rods, rng, SIGMA_M)
+    reports = list(follow(branches, reported(poses, LAB, rng, 0.0), scans))
+    assert not any(report.carried or report.lost for report in reports)
+    assert error_m(branches.main.pose, poses[-1]) < 0.03
+
+
+def test_a_lost_pose_holds_all_motions_since_the_carry() -> None:
+    """The first of them, too, though it leads from another place: a turn of 17 degrees here."""
+    run, cut = carried_run(0)
+    increments = list(run.increments)
+    increments[cut - 1] = np.array([0.0, 0.0, 0.3])
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for report in follow(branches, increments, run.scans, stop=cut):
+        if report.lost:
+            break
+    assert branches.lost_pose is not None
+    before = branches.map.pose
+    motion = np.zeros(3)
+    assert branches._carry is not None
+    for increment in increments[branches._carry.since : branches._now]:
+        motion = compose(motion, increment)
+    assert branches.lost_pose[0] == pytest.approx(compose(before, motion))
+    assert abs(branches.lost_pose[0][2] - before[2]) > 0.2
+
+
+def test_a_place_that_misses_more_than_staying_is_taken_back() -> None:
+    run, cut = carried_run(0)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for _ in follow(branches, run.increments, run.scans, stop=cut):
+        if branches._carry is not None and branches._carry.stayed is not None:
+            break
+    carry = branches._carry
+    assert carry is not None
+    stayed = carry.stayed
+    assert stayed is not None
+    assert stayed.back_end is not branches.main
+    # Let all evidence change sides: what the place has is that of the one that stayed.
+    adopted = [branches._steps[k].evidence for k in range(carry.since, branches._now)]
+    for k, evidence in enumerate(stayed.evidence, start=carry.since):
+        branches._steps[k] = replace(branches._steps[k], evidence=evidence)
+    stayed.evidence = adopted
+    assert carry.adopted is not None
+    carry.adopted.price_nats = 0.0
+    rest = slice(branches._now, None)
+    for _ in follow(branches, run.increments[rest], run.scans[rest]):
+        if branches._carry is None:
+            break
+    assert branches.main is stayed.back_end
