@@ -266,8 +266,6 @@ class RangeErrors:
     # By how much the variance of a range must be larger where many are averaged: those of one
     # passage err alike. Below 1, errors are smaller than their standard deviations.
     variance_share: float = 1.0
-    # Part of that for which the constants of wheels and radars would else be implausible
-    doubt: float = 1.0
     radius_price: float = 1.0  # share of the price of a radius that counts
 
 

@@ -25,9 +25,7 @@ from slam.robust.state import (
 
 _SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 _LEAST_SHARE, _MOST_SHARE = 0.5, 50.0  # keep `RangeErrors.variance_share` finite
-# How often a solution is sought anew, and the most by which all variances grow, where constants are
-# implausible
-_MOST_DOUBTS, _MOST_DOUBT = 4, 1e4
+_NEARER = 0.8  # what is left, at most, of how implausible the constants are
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 _ALONE_STEPS = 8  # of the search for the place of a group of ranges, from each of its begins
 _BEGINS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -48,37 +46,33 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
 def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
     """Solve for all poses and replace the belief by the result; return whether it worked."""
     log.since_solved = 0
-    problem = log.problem(state, parameters)
-    solution = _solved(log, state, problem, parameters)
-    if solution is None or not is_determined(solution.information):
+    errors = state.range_errors
+    found = _with_errors(log, state, errors, parameters)
+    if found is not None and found[2] > 1.0:
+        # Wheels and radars have constants that their makers vouch for. Ranges at odds with these
+        # are of thicker bodies than was expected, if these bring the constants nearer.
+        thick = replace(errors, radius_price=parameters.relinearisation.thick_price)
+        of_bodies = None if errors == thick else _with_errors(log, state, thick, parameters)
+        if of_bodies is not None and of_bodies[2] < _NEARER * found[2]:
+            found, errors = of_bodies, thick
+    if found is None:
         return False
-    for _ in range(_MOST_DOUBTS):
-        misfit = Smoother(problem, parameters.relinearisation).misfit_of_constants(
-            solution.estimate
-        )
-        if misfit <= 1.0:
-            break
-        state.range_errors = doubted(state.range_errors, misfit, parameters)
-        problem = log.problem(state, parameters)
-        again = _solved(log, state, problem, parameters)
-        if again is None or not is_determined(again.information):
-            return False
-        solution = again
+    problem, solution, _ = found
+    state.range_errors = errors
     adopt(log, state, problem, solution, parameters)
     return True
 
 
-def doubted(errors: RangeErrors, misfit: float, parameters: BackEndParameters) -> RangeErrors:
-    """Return what else the errors of ranges may be, as they make the constants implausible.
-
-    Wheels and radars have constants that their makers vouch for. Ranges that are at odds with these
-    are of thicker bodies than was expected; or else they err more than they show, all alike.
-    """
-    thick = parameters.relinearisation.thick_price
-    if errors.radius_price > thick:
-        return replace(errors, radius_price=thick)
-    more = min(misfit, _MOST_DOUBT / errors.doubt)
-    return replace(errors, variance_share=more * errors.variance_share, doubt=more * errors.doubt)
+def _with_errors(
+    log: RunLog, state: State, errors: RangeErrors, parameters: BackEndParameters
+) -> tuple[Problem, Solution, float] | None:
+    """Return problem, solution and misfit of the constants if ranges err so; None if it failed."""
+    problem = replace(log.problem(state, parameters), radius_price=errors.radius_price)
+    solution = _solved(log, state, problem, parameters)
+    if solution is None or not is_determined(solution.information):
+        return None
+    misfit = Smoother(problem, parameters.relinearisation).misfit_of_constants(solution.estimate)
+    return problem, solution, misfit
 
 
 def adopt(
@@ -258,7 +252,7 @@ def learn_noise(
     share = n_groups * float(np.sum(sums**2)) / n
     share += rule.prior_groups * parameters.ranges.variance_share
     share /= n_groups + rule.prior_groups
-    share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE)) * state.range_errors.doubt
+    share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
     added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
     state.range_errors = replace(state.range_errors, added_m=added_m, variance_share=share)
 
