@@ -159,25 +159,6 @@ EXPERIMENTS: Mapping[str, Experiment] = {
             _count("--runs", 20, "emulated runs, with seeds from there on"),
         ),
     ),
-    "step-cost": Experiment(
-        help="what a step of the robust filter costs against the size of the map",
-        module="step_cost",
-        options=(
-            (
-                "--landmarks",
-                {
-                    "nargs": "+",
-                    "type": count,
-                    "default": [10, 20, 50, 100, 200, 500, 1000, 2000],
-                    "metavar": "N",
-                    "help": "sizes of the map (default: 10 20 50 100 200 500 1000 2000)",
-                },
-            ),
-            _count(
-                "--repetitions", 7, "how often every step is timed; the least counts", metavar="N"
-            ),
-        ),
-    ),
     "consistency": Experiment(
         help="mean NEES and NIS of a sweep at ten times, against their bands",
         module="sweep_results",

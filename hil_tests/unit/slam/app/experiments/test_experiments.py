@@ -29,13 +29,10 @@ from slam.app.experiments.recording import (
     read_slow_time,
 )
 from slam.app.experiments.smoke import in_smoke, light_attenuation_db, smoke_attenuation_db
-from slam.app.experiments.step_cost import mapped_state, slope_of, stepper
 from slam.app.run.pictures import picture
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
-from slam.geometry import paper_rig, transform
-from slam.robust.association import RangeScan, antennas_of, find_known, view
-from slam.robust.parameters import BackEndParameters
+from slam.geometry import transform
 from xethru_protocol.system import StopFlag
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
@@ -117,52 +114,6 @@ def test_a_picture_is_the_same_file_each_time(tmp_path: Path) -> None:
         with picture(tmp_path / name, width_in=2, height_in=2) as figure:
             figure.subplots().plot([0, 1, 2], [1, 0, 1], color="#1f6fd0")
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-
-
-def test_a_step_predicts_and_learns_from_a_landmark_on_each_side() -> None:
-    """The covariance is that of a dense filter: every landmark is surer after what two told."""
-    state = mapped_state(40)
-    before = state.P.full()
-    assert np.count_nonzero(before) == before.size, "the covariance is dense"
-    step = stepper(state)
-    step()
-    assert state.position_m[0] == pytest.approx(0.01, abs=1e-4)
-    after = state.P.full()
-    seen = slice(state.layout.offsets.stop, state.layout.offsets.stop + 4)
-    assert (np.diag(after)[seen] < np.diag(before)[seen]).any()
-    step()
-    assert np.abs(state.position_m).max() < 1e-3, "to and fro"
-
-
-def test_the_gate_of_a_step_has_something_to_weigh() -> None:
-    state, rig = mapped_state(40), paper_rig()
-    seen = view(state, antennas_of(rig, (), np.zeros(3)))
-    scans = [RangeScan(radar=radar, ranges_m=()) for radar in range(4)]
-    sides = np.array([0, 0, 1, 1])
-    known = find_known(state, seen, scans, sides, BackEndParameters())
-    for side in known.of_side[:, :, 0]:
-        assert {0, 1} & set(known.rows[side].tolist())
-
-
-def test_the_slope_is_that_of_a_power_law() -> None:
-    ms_of = {n: 3e-6 * n**1.7 if n >= 200 else 5.0 for n in (10, 200, 600, 2000)}
-    assert slope_of(ms_of) == pytest.approx(1.7)
-    assert slope_of({n: ms_of[n] for n in (10, 200)}) is None
-
-
-def test_the_experiment_tells_measured_from_quoted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["--landmarks", "30", "5", "--repetitions", "1"]
-    assert main(["experiment", "step-cost", "--out", str(tmp_path), *arguments]) == 0
-    numbers = json.loads((tmp_path / "step-cost.json").read_text())
-    assert [row["n_landmarks"] for row in numbers["steps"]] == [5, 30]
-    for row in numbers["steps"]:
-        assert 0.0 < row["step_ms"] <= row["slowest_ms"]
-    assert {row["low_ms"] for row in numbers["quoted"]} == {1604.0, 29.0, 0.4}
-    assert numbers["slope"] is None
-    assert (tmp_path / "step-cost.png").read_bytes().startswith(b"\x89PNG")
-    assert "slowest step" in capsys.readouterr().out
 
 
 SIGMA = 3e-5
