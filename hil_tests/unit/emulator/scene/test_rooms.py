@@ -42,7 +42,8 @@ def test_a_room_is_a_scene_that_can_be_driven(family: str, number: int) -> None:
     assert scene.name == f"{family}_{number}"
     assert scene.path.laps == ("forward", "forward")
     for target in scene.targets:
-        assert off_course_m(scene, target.x_m, target.y_m) > 0.34  # chairs stand within the gap
+        # chairs stand within the gap
+        assert off_course_m(scene, target.x_m, target.y_m) - target.radius_m > 0.34
 
 
 @pytest.mark.parametrize(
@@ -82,6 +83,65 @@ def test_families_hold_what_their_descriptions_promise() -> None:
         assert 3 <= len(yaws) <= 6
         assert 60 <= yaws[0] <= 120
         assert -120 <= yaws[1] <= -60
+
+
+def test_things_of_a_rack_stand_at_one_pitch_on_both_sides_of_an_aisle() -> None:
+    aisles = set()
+    for number in range(20):
+        scene = load_scene(f"rack:{number}")
+        places = np.array(sorted((t.y_m, t.x_m) for t in scene.targets))
+        rows = np.split(places, np.flatnonzero(np.diff(places[:, 0]) > 0.1) + 1)
+        assert len({len(row) for row in rows}) == 1
+        pitches = np.concatenate([np.diff(np.sort(row[:, 1])) for row in rows])
+        assert pitches.std() < 0.01  # two errors of 3 mm
+        assert 0.49 < pitches.mean() < 0.81
+        aisles.add(len({y for _, y in scene.path.waypoints_m}))
+    assert aisles == {1, 2, 3, 4}
+
+
+def test_a_corridor_has_eight_frames_and_walls_between_them() -> None:
+    for number in range(10):
+        scene = load_scene(f"doors:{number}")
+        assert len(scene.targets) == 16
+        assert len(scene.walls) == 10
+        ends = {end for wall in scene.walls for end in (wall.from_m, wall.to_m)}
+        assert all((target.x_m, target.y_m) in ends for target in scene.targets)
+
+
+def test_what_stands_in_rows_of_legs_is_equal() -> None:
+    for number in range(10):
+        x = sorted({target.x_m for target in load_scene(f"legs:{number}").targets})
+        gaps = np.diff(x)
+        np.testing.assert_allclose(gaps[::2], gaps[0], atol=3e-4)
+        np.testing.assert_allclose(gaps[1::2], gaps[1], atol=3e-4)
+
+
+def test_columns_are_wide_and_a_yard_is_empty() -> None:
+    columns = [target for number in range(20) for target in load_scene(f"columns:{number}").targets]
+    assert all(0.05 <= column.radius_m <= 0.4 for column in columns)
+    assert max(column.radius_m for column in columns) > 0.35
+    yards = [load_scene(f"yard:{number}") for number in range(40)]
+    assert {len(yard.targets) for yard in yards} == {0, 1, 2, 3}
+    lab = load_scene("lab").odometry.scale_sigma
+    assert {round(yard.odometry.scale_sigma / lab) for yard in yards} == {1, 3}
+
+
+def test_twins_are_one_room_twice() -> None:
+    for number in range(10):
+        scene = load_scene(f"twins:{number}")
+        places = np.array([(target.x_m, target.y_m) for target in scene.targets])
+        first, second = np.split(places, 2)
+        apart = second - first
+        np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=3e-4)
+        assert apart[0, 0] > 5.0
+        assert abs(apart[0, 1]) < 1e-6
+
+
+def test_rigs_speeds_and_courses_of_deceiving_rooms_vary() -> None:
+    rooms = [load_scene(f"{family}:{n}") for family in ("legs", "columns") for n in range(20)]
+    assert {len(room.radars) for room in rooms} == {2, 3, 4}
+    assert {room.path.speed_mps for room in rooms} == {0.05, 0.3}
+    assert {len(room.path.waypoints_m) for room in rooms} == {2, 4, 7, 24}
 
 
 def test_sensors_and_rig_are_those_of_the_lab() -> None:

@@ -17,7 +17,7 @@ from slam.geometry import paper_rig
 from slam.robust.association import Identity, Pairs
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import BodyPoint, initialise_landmark
-from slam.robust.map import find_merge, judge, named_pairs
+from slam.robust.map import Existence, find_merge, judge, named_pairs
 from slam.robust.parameters import BackEndParameters, MapRule
 from slam.robust.pipeline import RobustSlam
 from slam.robust.state import Array, State, SymmetricMatrix
@@ -194,3 +194,19 @@ def test_ranges_that_err_alike_move_the_pose_less() -> None:
         list(follow(back_end, increments, scans_of(poses, PLACES, rng, SIGMA_M)))
         sigmas.append(math.sqrt(back_end.pose_covariance[0, 0]))
     assert 1.0 < sigmas[1] / sigmas[0] <= 2.0
+
+
+def test_a_miss_says_the_less_the_oftener_a_landmark_was_missed() -> None:
+    """The mean of a beta distribution: a prior of 0.85 with the weight of 20 looks."""
+    rule = MapRule()
+    existence = Existence(rule, 9, 0.85)
+    existence.hit(1)
+    assert rule.prior_looks == 20.0
+    assert existence.unheard(1) == pytest.approx(math.log(0.15))
+    for _ in range(3):
+        existence.heard(1)
+    # 3 of 20 and 1 more of 1 + 3
+    assert existence.unheard(1) == pytest.approx(math.log((3 + 1) / (20 + 4)))
+    for _ in range(1000):
+        existence.unheard(1)
+    assert existence.unheard(1) == pytest.approx(0.0, abs=0.03)

@@ -298,3 +298,48 @@ def test_every_key_of_the_table_reaches_the_back_end() -> None:
 def test_the_table_refuses_what_makes_no_sense() -> None:
     with pytest.raises(ValueError, match="detection_probability"):
         RobustConfig(detection_probability=1.0)
+
+
+def test_an_empty_room_gives_the_wheels() -> None:
+    """To a nanometre over 20 m of a curved way, whatever the wheels report."""
+    rng = np.random.default_rng(12)
+    poses = [np.zeros(3)]
+    for turn in rng.normal(0.0, 0.03, 1000):
+        poses.append(compose(poses[-1], np.array([0.02, 0.001, turn])))
+    slam = robust()
+    beliefs = []
+    for tick, pose in enumerate(poses):
+        stamps = {tick * TICK_NS: pose}
+        beliefs += [
+            row.belief for row in slam.step_detections([], stamps.__getitem__, tick * TICK_NS)
+        ]
+    assert len(beliefs) == 1000
+    path = np.array([belief.pose for belief in beliefs])
+    away = path[:, :2] - np.array(poses[1:])[:, :2]
+    assert np.abs(away).max() < 1e-9
+    assert all(len(belief.landmark_ids) == 0 for belief in beliefs)
+
+
+@pytest.mark.parametrize(("pause_s", "stood_s"), [(0.0, 0.0), (0.6, 0.0), (2.0, 2.0)])
+def test_a_stop_of_a_second_is_told_from_slow_driving(pause_s: float, stood_s: float) -> None:
+    """The wheels stand at 10 cm for a while; a state follows every 5 mm at 2.5 cm/s."""
+    slam, asked = robust(), []
+    predict = slam._branches.predict
+
+    def watched(increment: Array, elapsed_s: float, stood: float) -> None:
+        asked.append((elapsed_s, stood))
+        predict(increment, elapsed_s, stood)
+
+    slam._branches.predict = watched  # type: ignore[method-assign]
+    pause_ns = round(pause_s * 1e9)
+
+    def odometry(t_ns: int) -> Array:
+        moving_ns = min(t_ns, 4_000_000_000) + max(t_ns - 4_000_000_000 - pause_ns, 0)
+        return np.array([2.5e-11 * moving_ns, 0.0, 0.0])
+
+    for t_ns in range(0, 8_000_000_000, TICK_NS):
+        slam.step_detections([], odometry, t_ns)
+    longest = max(asked, key=lambda pair: pair[1])
+    assert longest[1] == pytest.approx(stood_s, abs=0.05)
+    assert sum(stood > 0.0 for _, stood in asked) == (1 if stood_s else 0)
+    assert all(elapsed > stood for elapsed, stood in asked)

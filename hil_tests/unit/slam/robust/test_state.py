@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 
 from slam.robust import state as symmetric
-from slam.robust.state import SymmetricMatrix
+from slam.robust.state import State, SymmetricMatrix
 
 Array = NDArray[np.float64]
 
@@ -104,3 +104,24 @@ def test_many_changes_of_a_large_matrix_are_made_in_one_pass(
         stored.subtract_gram(0.01 * np.ones((30, 2)))
         stored.columns(np.arange(3))
     assert len(passes) == 3
+
+
+def test_the_covariance_of_a_far_position_covers_its_arc() -> None:
+    """Beside a million draws of the error: heading sigma 1 rad, 3.2 m from the start."""
+    state = State((0.007, 0.007, 0.0042), (0.02,) * 4)
+    of_pose = np.array([[1.0, 0.05, 0.1], [0.05, 0.02, 0.003], [0.1, 0.003, 0.05]])
+    P = state.P.full()
+    P[:3, :3] = of_pose
+    state.P, state.position_m = SymmetricMatrix(P), np.array([3.0, 1.0])
+    e_th, *e_p = np.random.default_rng(0).multivariate_normal(np.zeros(3), of_pose, 1_000_000).T
+    c, s = np.cos(e_th), np.sin(e_th)
+    f, g = s / e_th, (1 - c) / e_th
+    x = (c - 1) * 3.0 - s * 1.0 + f * e_p[0] - g * e_p[1]
+    y = s * 3.0 + (c - 1) * 1.0 + g * e_p[0] + f * e_p[1]
+    moment = np.array([[np.mean(x * x), np.mean(x * y)], [np.mean(x * y), np.mean(y * y)]])
+    linear = state.pose_covariance()[:2, :2]
+    values, vectors = np.linalg.eigh(moment - linear)
+    expected = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    np.testing.assert_allclose(state.curved_covariance(), expected, atol=0.02)
+    # where the heading is known, nothing is added
+    assert np.abs(State((0.0, 0.0, 0.0), (0.0,)).curved_covariance()).max() == 0.0

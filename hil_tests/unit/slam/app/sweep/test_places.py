@@ -1,5 +1,6 @@
 """How long a robot was lost, and how soon it was found after a carry, on made-up runs."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.records import RadarInfo, SessionInfo
 from slam.app.run.runner import RunRecord, States
-from slam.app.sweep.places import Carry, carry_of
+from slam.app.sweep.places import Carry, carry_of, confidently_wrong
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import group_line, outcomes, summarise_groups
 from slam.geometry import paper_rig
@@ -94,6 +95,39 @@ def test_fewer_than_three_landmarks_in_view_give_no_result() -> None:
     )
 
 
+def wrong_share(errors_m: Sequence[float], sigma_m: float, lost: Sequence[int] = ()) -> float:
+    """Return the share of ten states, each off by an error across the way, that count as wrong."""
+    truth = TRUTH[: len(errors_m)]
+    estimate = truth + np.column_stack([np.zeros(len(errors_m)), errors_m, np.zeros(len(errors_m))])
+    record = record_of(estimate, truth)
+    record.states.pose_covariances[:, :2, :2] = sigma_m**2 * np.eye(2)
+    is_lost = np.isin(np.arange(len(errors_m)), lost)
+    return confidently_wrong(record, is_lost, None, None)
+
+
+def test_a_position_is_wrong_beyond_15_cm_and_999_of_1000_errors() -> None:
+    """The radius of 99.9 % of a normal error in the plane is sigma sqrt(2 ln 1000)."""
+    radius = math.sqrt(2 * math.log(1000))
+    errors = [0.0] * 8
+    assert wrong_share([*errors, 0.16, 0.14], 0.01) == pytest.approx(0.1)
+    limit = 0.1 * radius
+    assert wrong_share([*errors, 1.001 * limit, 0.999 * limit], 0.1) == pytest.approx(0.1)
+    assert wrong_share([*errors, 1.0, 1.0], 0.01, lost=[8]) == pytest.approx(0.1)
+
+
+def test_after_a_carry_states_count_from_20_s_after_the_third_landmark() -> None:
+    estimate = TRUTH + np.array([0.0, 1.0, 0.0])
+    record = record_of(estimate, TRUTH)
+    record.states.pose_covariances[:] = 1e-4 * np.eye(3)
+    lost, carried_ns = np.zeros(60, dtype=bool), (8 * S, DOWN_NS)
+    seen = Carry(three_seen_s=16.0, found_s=None)
+    # eight states before, those from 10 + 16 + 20 = 46 s on
+    share = confidently_wrong(record, lost, carried_ns, seen)
+    assert share == pytest.approx((8 + 14) / 60)
+    never = Carry(three_seen_s=None, found_s=None)
+    assert confidently_wrong(record, lost, carried_ns, never) == pytest.approx(8 / 60)
+
+
 RUN: SweepRun = replace(run_of(make_case("lab", "paper", 0)), ate_rmse_m=0.01)
 
 
@@ -104,7 +138,9 @@ def test_runs_that_failed_are_counted() -> None:
         replace(RUN, seed=1, ate_rmse_m=0.08, lost_share=0.1),
         replace(RUN, seed=2, lost_share=0.2, lost_at_end=True, carry=carried),
         replace(RUN, seed=3, carry=replace(carried, found_s=20.0)),
-        replace(RUN, seed=4, carry=replace(carried, three_seen_s=None)),
+        replace(
+            RUN, seed=4, carry=replace(carried, three_seen_s=None), confidently_wrong_share=0.25
+        ),
     ]
     assert outcomes(runs) == {
         "runs": 5,
@@ -112,6 +148,9 @@ def test_runs_that_failed_are_counted() -> None:
         "runs_above_odometry": 1,
         "runs_lost": 1,
         "runs_lost_at_end": 1,
+        "runs_harmed": 1,
+        "runs_confidently_wrong": 1,
+        "confidently_wrong_share": pytest.approx(0.05),
         "carries": 2,
         "carries_in_time": 1,
     }
@@ -119,7 +158,9 @@ def test_runs_that_failed_are_counted() -> None:
     # of 0.01 / 0.04 four times, and 2
     assert group["ratio"]["median"] == pytest.approx(0.25)
     line = group_line(group)
-    assert "1 of 5 runs worse than their wheels, 1 of 5 runs lost without a carry" in line
+    assert "1 of 5 runs worse than their wheels, 1 of 5 runs worse than 1.2 x their wheels" in line
+    assert "1 of 5 runs lost without a carry" in line
+    assert "1 of 5 runs confidently wrong (5.00% of the time)" in line
     assert "1 of 2 carries found within 20 s of the third landmark in view" in line
     # 95 % of means of five chi-squares of 3 dof: quantiles of 15 dof over 5, 6.262 and 27.488
     assert re.search(r"mean NEES .*, its means over runs \d+ of 2 in 1.3-5.5$", line)
