@@ -70,7 +70,7 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
     for run in data_set.runs:
         stop.check()
         runs.append(scored := score_run(data_set, run, stop, print_progress))
-        write_run(out / name / run.name, data_set, scored)
+        write_run(out / name / run.name, scored)
     width_in, height_in = _size_in(len(runs))
     with picture(out / f"{name}.png", width_in=width_in, height_in=height_in) as figure:
         _draw(figure, f"{data_set.title} (real data)", runs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -69,7 +69,6 @@ class Run:
     name: str
     steps: tuple[Step, ...]  # at least two
     truth: Path
-    beacons_m: dict[int, tuple[float, float]] = field(default_factory=dict)  # true, by label
     left_out: int = 0  # observations that the reader left out, such as those of other robots
     # Whether it is worth a try without ids: not if its author has left most observations out
     is_dense: bool = True

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from slam.app.errors import AppError, naming
 from slam.app.experiments.benchmarks.back_end import Solution, solve
 from slam.app.experiments.benchmarks.data_set import Array, DataSet, Path, Run
-from slam.app.experiments.benchmarks.pyfg import graph_of, write_pyfg
 from slam.app.odometry.track import NS_PER_S, Trajectory, write_tum
 from slam.evaluation import ate_rmse_m
 from slam.geometry import align_se2, transform
@@ -104,8 +103,8 @@ def mean_ate_m(runs: Sequence[ScoredRun]) -> dict[str, float]:
     return {name: float(np.mean([one.ate_rmse_m[name] for one in runs])) for name in names}
 
 
-def write_run(folder: FilePath, data: DataSet, scored: ScoredRun) -> None:
-    """Write the paths of a run as TUM files, and as a factor graph if true landmarks are known.
+def write_run(folder: FilePath, scored: ScoredRun) -> None:
+    """Write the paths of a run as TUM files.
 
     The truth has no heading: its orientation is the identity.
     """
@@ -118,8 +117,6 @@ def write_run(folder: FilePath, data: DataSet, scored: ScoredRun) -> None:
     _, rows = np.unique(truth.t_ns, return_index=True)
     places = np.column_stack([truth.xy_m[rows], np.zeros(len(rows))])
     _write_tum(folder / "truth.tum", truth.t_ns[rows], places)
-    if run.beacons_m:
-        write_pyfg(folder / "graph.pyfg", graph_of(run, data.sensor))
 
 
 def _write_tum(path: FilePath, t_ns: NDArray[np.int64], poses: Array) -> None:

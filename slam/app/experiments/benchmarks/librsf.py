@@ -75,7 +75,6 @@ def read_run(path: FilePath) -> Run:
     """Read NAME_Input.txt and NAME_GT.txt beside it."""
     ranges: list[tuple[float, Observation]] = []
     odometry: list[list[float]] = []
-    beacons: dict[int, tuple[float, float]] = {}
     for number, kind, values in _measurements(path, ("range2", "odom2diff")):
         if kind == "odom2diff":
             if values[4] <= 0.0:
@@ -84,11 +83,10 @@ def read_run(path: FilePath) -> Run:
                 raise bad_line(path, number, "its time is before that of the odometry before")
             odometry.append(values)
             continue
-        time_s, range_m, variance, x, y, module, _ = values
+        time_s, range_m, variance, _, _, module, _ = values
         if variance <= 0.0 or range_m <= 0.0:
             raise bad_line(path, number, "range and variance must be positive")
         label = int(module)
-        beacons[label] = (x, y)
         seen = Observation(range_m=range_m, range_sigma_m=math.sqrt(variance), label=label)
         ranges.append((time_s, seen))
     if len(odometry) < 2:
@@ -117,7 +115,6 @@ def read_run(path: FilePath) -> Run:
         name=path.name.removesuffix(_INPUT),
         steps=tuple(steps),
         truth=Path(t_ns=nanoseconds(truth[:, 0]), xy_m=truth[:, 1:3]),
-        beacons_m=beacons,
         left_out=len(ranges) - sum(len(step.observations) for step in steps),
     )
 

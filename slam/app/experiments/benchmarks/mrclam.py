@@ -107,7 +107,7 @@ def read_run(folder: FilePath, robot: str) -> Run:
         for subject, barcode in read_table(folder / _BARCODES, ("subject", "barcode")).tolist()
     }
     places = read_table(folder / _LANDMARKS, ("subject", "x", "y", "sigma_x", "sigma_y"))
-    beacons = {int(subject): (x, y) for subject, x, y, *_ in places.tolist()}
+    landmarks = {int(subject) for subject, *_ in places.tolist()}
     odometry = read_table(
         folder / f"{robot}_Odometry.dat", ("time", "forward velocity", "turn rate"), ascending=True
     )
@@ -124,7 +124,7 @@ def read_run(folder: FilePath, robot: str) -> Run:
     left_out = 0
     for time_s, barcode, range_m, bearing_rad in seen.tolist():
         subject = subject_of.get(int(barcode))
-        if subject not in beacons or not first_s <= time_s <= last_s or range_m <= 0.0:
+        if subject not in landmarks or not first_s <= time_s <= last_s or range_m <= 0.0:
             left_out += 1
             continue
         by_time[time_s].append(
@@ -148,6 +148,5 @@ def read_run(folder: FilePath, robot: str) -> Run:
         name=f"{folder.resolve().name}-{robot}",
         steps=tuple(steps),
         truth=Path(t_ns=nanoseconds(truth[:, 0]), xy_m=truth[:, 1:3]),
-        beacons_m=beacons,
         left_out=left_out,
     )

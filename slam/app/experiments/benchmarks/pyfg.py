@@ -1,4 +1,4 @@
-"""Factor graphs in two dimensions as PyFactorGraph writes them (.pyfg), read and written.
+"""Factor graphs in two dimensions as PyFactorGraph writes them (.pyfg).
 
 One item per line; times in seconds, metres, radians, covariances as upper triangles row by row::
 
@@ -18,15 +18,15 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path as FilePath
 
 import numpy as np
 
-from slam.app.errors import AppError, naming
+from slam.app.errors import AppError
 from slam.app.experiments.benchmarks.data_set import (
     Array,
     DataSet,
@@ -38,11 +38,8 @@ from slam.app.experiments.benchmarks.data_set import (
 )
 from slam.app.experiments.benchmarks.tables import bad_line, found, number_of, rows_of
 from slam.config import WheelNoise
-from xethru_protocol.system import written_whole
 
 _NAME = re.compile(r"[A-Za-z][0-9]{1,18}")
-_LANDMARK = "L"
-_POSE = "A"
 _NS_PER_S = 10**9
 _WHAT = "a factor graph in two dimensions, .pyfg"
 _NUMBERS = {"VERTEX_SE2": 3, "VERTEX_XY": 2, "EDGE_SE2": 9, "EDGE_SE2_XY": 5, "EDGE_RANGE": 2}
@@ -76,19 +73,9 @@ SENSOR = Sensor(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """A true pose."""
+    """The true place of a pose."""
 
     t_ns: int
-    name: str
-    x_m: float
-    y_m: float
-    heading_rad: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Landmark:
-    """A true place."""
-
     name: str
     x_m: float
     y_m: float
@@ -98,7 +85,6 @@ class Landmark:
 class Edge:
     """A measurement: (dx, dy, turn) of a pose, (x, y) of a landmark, or a range."""
 
-    t_ns: int
     first: str
     second: str
     values: tuple[float, ...]
@@ -107,18 +93,16 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FactorGraph:
-    """The lines of a file by kind, each kind in its order."""
+    """Poses and edges of a file, each kind in its order."""
 
-    poses: tuple[Pose, ...] = ()
-    landmarks: tuple[Landmark, ...] = ()
-    # By kind, such as EDGE_RANGE
-    edges: Mapping[str, tuple[Edge, ...]] = field(default_factory=dict)
+    poses: tuple[Pose, ...]
+    edges: Mapping[str, tuple[Edge, ...]]  # by kind, such as EDGE_RANGE
 
 
 def read_pyfg(path: FilePath) -> FactorGraph:
     """Read a graph; AppError names a line that is none of it, or what no line defines."""
     poses: dict[str, Pose] = {}
-    landmarks: dict[str, Landmark] = {}
+    landmarks: set[str] = set()
     edges: dict[str, list[Edge]] = defaultdict(list)
     line_of: dict[str, list[int]] = defaultdict(list)
     for number, (kind, *words) in rows_of(path, _WHAT):
@@ -127,21 +111,20 @@ def read_pyfg(path: FilePath) -> FactorGraph:
         try:
             if kind == "VERTEX_XY":
                 name, values = words[0] if words else "", words[1:]
-                x, y = _numbers(kind, values)
+                _numbers(kind, values)
                 _must_be_new(name, landmarks)
-                landmarks[name] = Landmark(name=name, x_m=x, y_m=y)
+                landmarks.add(name)
                 continue
             t_ns = _stamp_ns(words[0] if words else "")
             if kind == "VERTEX_SE2":
                 name, values = words[1] if len(words) > 1 else "", words[2:]
-                x, y, heading = _numbers(kind, values)
+                x, y, _ = _numbers(kind, values)
                 _must_be_new(name, poses)
-                poses[name] = Pose(t_ns=t_ns, name=name, x_m=x, y_m=y, heading_rad=heading)
+                poses[name] = Pose(t_ns=t_ns, name=name, x_m=x, y_m=y)
                 continue
             numbers = _numbers(kind, words[3:])
             size = {"EDGE_SE2": 3, "EDGE_SE2_XY": 2, "EDGE_RANGE": 1}[kind]
             edge = Edge(
-                t_ns=t_ns,
                 first=words[1],
                 second=words[2],
                 values=numbers[:size],
@@ -154,19 +137,18 @@ def read_pyfg(path: FilePath) -> FactorGraph:
         except ValueError as error:
             raise bad_line(path, number, error) from None
     for kind, some in edges.items():
-        seconds = poses if kind == "EDGE_SE2" else landmarks
+        seconds: Container[str] = poses if kind == "EDGE_SE2" else landmarks
         for edge, number in zip(some, line_of[kind], strict=True):
             for name, known in ((edge.first, poses), (edge.second, seconds)):
                 if name not in known:
                     raise bad_line(path, number, f"no line defines {name[:40]}")
     return FactorGraph(
         poses=tuple(poses.values()),
-        landmarks=tuple(landmarks.values()),
         edges={kind: tuple(some) for kind, some in edges.items()},
     )
 
 
-def _must_be_new(name: str, known: Mapping[str, object]) -> None:
+def _must_be_new(name: str, known: Container[str]) -> None:
     if not _NAME.fullmatch(name):
         raise ValueError("a name must be a letter and a number, such as A0")
     if name in known:
@@ -191,99 +173,6 @@ def matrix_of(triangle: Sequence[float]) -> Array:
     matrix = np.zeros((size, size))
     matrix[np.triu_indices(size)] = triangle
     return np.asarray(matrix + np.triu(matrix, 1).T)
-
-
-def write_pyfg(path: FilePath, graph: FactorGraph) -> None:
-    """Write a graph; reading it again gives the same numbers to the last bit."""
-    lines = [
-        f"VERTEX_SE2 {_stamp(one.t_ns)} {one.name} {_words((one.x_m, one.y_m, one.heading_rad))}"
-        for one in graph.poses
-    ]
-    lines += [f"VERTEX_XY {one.name} {_words((one.x_m, one.y_m))}" for one in graph.landmarks]
-    for kind, edges in graph.edges.items():
-        lines += [
-            f"{kind} {_stamp(edge.t_ns)} {edge.first} {edge.second} "
-            + _words((*edge.values, *edge.covariance))
-            for edge in edges
-        ]
-    with naming(path), written_whole(path) as fresh:
-        fresh.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
-
-
-def _stamp(t_ns: int) -> str:
-    whole, rest = divmod(abs(t_ns), _NS_PER_S)
-    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
-
-
-def _words(numbers: Sequence[float]) -> str:
-    return " ".join(repr(float(number)) for number in numbers)
-
-
-def graph_of(run: Run, sensor: Sensor) -> FactorGraph:
-    """Return a run whose observations have labels as a graph, for other solvers.
-
-    True poses are interpolated, those before the first and behind the last are these; the truth has
-    no heading, which is dead reckoning's. Covariances of steps are those of the sensor's wheel
-    model; range and bearing are written as the place that they mean.
-    """
-    dead = run.dead_reckoning()
-    clipped = np.clip(run.t_ns, run.truth.t_ns[0], run.truth.t_ns[-1])
-    truth, _ = run.truth.at(clipped)
-    poses, edges = [], defaultdict(list)
-    for number, (step, place, pose) in enumerate(zip(run.steps, truth, dead, strict=True)):
-        here = f"{_POSE}{number}"
-        poses.append(
-            Pose(
-                t_ns=step.t_ns,
-                name=here,
-                x_m=float(place[0]),
-                y_m=float(place[1]),
-                heading_rad=float(pose[2]),
-            )
-        )
-        if number:
-            way_m = math.hypot(*step.increment[:2].tolist())
-            variances = sensor.wheels.step_variances(way_m, float(step.increment[2]))
-            edges["EDGE_SE2"].append(
-                Edge(
-                    t_ns=step.t_ns,
-                    first=f"{_POSE}{number - 1}",
-                    second=here,
-                    values=tuple(step.increment.tolist()),
-                    covariance=tuple(np.diag(variances)[np.triu_indices(3)].tolist()),
-                )
-            )
-        for seen in step.observations:
-            if seen.label in run.beacons_m:
-                kind, values, triangle = _edge_of(seen)
-                edges[kind].append(
-                    Edge(
-                        t_ns=step.t_ns,
-                        first=here,
-                        second=f"{_LANDMARK}{seen.label}",
-                        values=values,
-                        covariance=triangle,
-                    )
-                )
-    landmarks = [
-        Landmark(name=f"{_LANDMARK}{label}", x_m=x, y_m=y)
-        for label, (x, y) in run.beacons_m.items()
-    ]
-    return FactorGraph(
-        poses=tuple(poses),
-        landmarks=tuple(landmarks),
-        edges={kind: tuple(some) for kind, some in edges.items()},
-    )
-
-
-def _edge_of(seen: Observation) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
-    r = seen.range_m
-    if seen.bearing_rad is None or seen.bearing_sigma_rad is None:
-        return "EDGE_RANGE", (r,), (seen.range_sigma_m**2,)
-    c, s = math.cos(seen.bearing_rad), math.sin(seen.bearing_rad)
-    along, across = seen.range_sigma_m**2, (r * seen.bearing_sigma_rad) ** 2
-    triangle = (along * c * c + across * s * s, (along - across) * c * s)
-    return "EDGE_SE2_XY", (r * c, r * s), (*triangle, along * s * s + across * c * c)
 
 
 def read_data_set(folder: FilePath) -> DataSet:
@@ -344,5 +233,4 @@ def run_of(path: FilePath, graph: FactorGraph) -> Run:
             t_ns=np.array([pose.t_ns for pose in chain], dtype=np.int64),
             xy_m=np.array([[pose.x_m, pose.y_m] for pose in chain]),
         ),
-        beacons_m={int(each.name[1:]): (each.x_m, each.y_m) for each in graph.landmarks},
     )

@@ -53,8 +53,6 @@ def test_a_benchmark_is_better_than_dead_reckoning(
             assert ate[f"{way}_smoothed"] < 0.5 * ate["odometry"]
         folder = out / name / run["run"]
         files = {f"{path}.tum" for path in ate} | {"truth.tum"}
-        # the true places of trees are not known
-        files |= {"graph.pyfg"} if "with_ids" in ways and name != "victoria-park" else set()
         assert {path.name for path in folder.iterdir()} == files
         truth = read_tum(folder / "truth.tum")
         for path, expected in ate.items():
