@@ -1,6 +1,6 @@
 """SLAM is not worse than the wheels, nor sure and wrong, in places that deceive: whole runs.
 
-Each run failed before carries were judged by all ranges, and wide bodies were modelled: it was worse
+Each run failed before carries were judged by all ranges and wide bodies were modelled: it was worse
 than 1.2 times the wheels, or confidently wrong. All numbers are simulated.
 """
 
