@@ -334,7 +334,7 @@ class Branches:
         covariance = np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
         return compose(self._carry.map.pose, self._carry.moved), covariance
 
-    def predict(self, increment: Array, elapsed_s: float = 0.2, stood_s: float = 0.0) -> None:
+    def predict(self, increment: Array, elapsed_s: float = 1.0, stood_s: float = 0.0) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
 
         It took ``elapsed_s``, and for ``stood_s`` of that the wheels stood still.
@@ -342,8 +342,9 @@ class Branches:
         if self._now % self._rule.snapshot_every == 0:
             self._keep_snapshot()
         self._increment = increment
+        self._has_stood = stood_s >= self._rule.stop_s
+        stood_s = stood_s if self._has_stood else 0.0
         self._carry_nats = self._rule.carry_nats(elapsed_s, stood_s)
-        self._has_stood = stood_s > 0.0
         self.main.predict(increment)
         if self._carry is not None:
             self._carry.moved = compose(self._carry.moved, increment)

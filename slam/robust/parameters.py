@@ -261,6 +261,8 @@ class RelinearisationRule:
     thick_price: Annotated[float, Origin.CHOSEN] = 0.2
     """What share of the price of a radius counts, in nats, once the constants of a run in which
     everything is thin are implausible."""
+    nearer: Annotated[float, Origin.CHOSEN] = 0.8
+    """What is left, at most, of how implausible the constants are, if that is to remain so."""
 
     @property
     def outliers_from(self) -> int:
@@ -315,6 +317,8 @@ class BranchRule:
     carries_per_hour_stood: Annotated[float, Origin.CHOSEN] = 60.0
     """How often a robot is carried while its wheels stand, per hour of that: of stops of three
     seconds, one in twenty is a carry."""
+    stop_s: Annotated[float, Origin.CHOSEN, "s"] = 1.0
+    """Shortest stop of the wheels: one that is shorter counts as driving."""
     steps_per_hidden: Annotated[float, Origin.CHOSEN, "scans"] = 3000.0
     """How many scans there are to one motion that the wheels do not report: one in ten minutes."""
     hidden_m: Annotated[float, Origin.CHOSEN] = 0.1
@@ -373,7 +377,7 @@ class BranchRule:
     def carry_nats(self, elapsed_s: float, stood_s: float) -> float:
         """Return how unlikely a carry is within a time, for a part of which the wheels stood."""
         moved = self.carries_per_hour * (elapsed_s - stood_s)
-        carries = (moved + self.carries_per_hour_stood * stood_s) / 3600.0
+        carries = (moved + self.carries_per_hour_stood * stood_s) / 3600
         return -math.log(-math.expm1(-carries)) if carries > 0.0 else math.inf
 
 

@@ -25,8 +25,7 @@ from slam.robust.state import quarter_turn
 Array = NDArray[np.float64]
 
 _NS_PER_S = 1_000_000_000
-# Wheels that report less than this stand [m, rad]; a shorter stop is none.
-_STILL_M, _STILL_RAD, _STOP_NS = 1e-3, 1e-3, _NS_PER_S
+_STILL_M, _STILL_RAD = 1e-3, 1e-3  # wheels that report less stand
 
 
 class RobustSlam:
@@ -111,9 +110,8 @@ class RobustSlam:
             for radar, stamp_ns in stamps_ns.items()
         }
         branches = self._branches
-        stood_ns = self._stood_ns if self._stood_ns >= _STOP_NS else 0
-        increment = between(self._pose, pose)
-        branches.predict(increment, (t_ns - self._t_ns) / _NS_PER_S, stood_ns / _NS_PER_S)
+        elapsed_s = (t_ns - self._t_ns) / _NS_PER_S
+        branches.predict(between(self._pose, pose), elapsed_s, self._stood_ns / _NS_PER_S)
         report = branches.update(self._scans(detections, sigmas_m, moved))
         self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
         self._stamps_ns.append(t_ns)

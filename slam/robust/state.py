@@ -43,6 +43,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,10 +62,6 @@ _PROMPT_SIZE = 500
 _MOST_GRAMS, _MOST_PAIRS = 44, 15
 # Large matrices grow within spare rows. Not a power of two, columns would share cache sets.
 _SPARE, _ODD = 128, 8
-
-# Of an integral over a normal number
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
-_WEIGHTS = _WEIGHTS / math.sqrt(math.tau)
 
 HEADING = 0
 POSITION = slice(1, 3)
@@ -235,6 +232,13 @@ class SymmetricMatrix:
 
     def _add_pairs_now(self, a: Array, b: Array) -> None:
         self._lower = dsyr2k(1.0, a, b, beta=1.0, c=self._lower, lower=1, overwrite_c=1)
+
+
+@cache
+def _normal_rule() -> tuple[Array, Array]:
+    """Return nodes and weights (9,) of an integral over a normal number."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    return nodes, weights / math.sqrt(math.tau)
 
 
 def rotation(angle_rad: float) -> Array:
@@ -529,7 +533,8 @@ class State:
             return np.zeros((2, 2))
         along = P[1:, 0] / variance
         given = P[1:, 1:] - np.outer(along, P[0, 1:])
-        angles = math.sqrt(variance) * _NODES
+        nodes, weights = _normal_rule()
+        angles = math.sqrt(variance) * nodes
         # V(a) = f I + g J
         f, g = np.sinc(angles / math.pi), angles / 2.0 * np.sinc(angles / math.tau) ** 2
         x, y = self.position_m.tolist()
@@ -539,9 +544,9 @@ class State:
         turned = quarter_turn(given.T).T  # J given
         both = turned + turned.T
         opposite = quarter_turn(turned)  # J given J^T
-        curved = (moved.T * _WEIGHTS) @ moved
-        curved += float(_WEIGHTS @ f**2) * given + float(_WEIGHTS @ (f * g)) * both
-        curved += float(_WEIGHTS @ g**2) * opposite
+        curved = (moved.T * weights) @ moved
+        curved += float(weights @ f**2) * given + float(weights @ (f * g)) * both
+        curved += float(weights @ g**2) * opposite
         linear = self.pose_covariance()[:2, :2]
         values, vectors = np.linalg.eigh(curved - linear)
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

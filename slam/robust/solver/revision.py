@@ -25,7 +25,6 @@ from slam.robust.state import (
 
 _SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 _LEAST_SHARE, _MOST_SHARE = 0.5, 50.0  # keep `RangeErrors.variance_share` finite
-_NEARER = 0.8  # what is left, at most, of how implausible the constants are
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 _ALONE_STEPS = 8  # of the search for the place of a group of ranges, from each of its begins
 _BEGINS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -51,9 +50,10 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     if found is not None and found[2] > 1.0:
         # Wheels and radars have constants that their makers vouch for. Ranges at odds with these
         # are of thicker bodies than was expected, if these bring the constants nearer.
-        thick = replace(errors, radius_price=parameters.relinearisation.thick_price)
+        rule = parameters.relinearisation
+        thick = replace(errors, radius_price=rule.thick_price)
         of_bodies = None if errors == thick else _with_errors(log, state, thick, parameters)
-        if of_bodies is not None and of_bodies[2] < _NEARER * found[2]:
+        if of_bodies is not None and of_bodies[2] < rule.nearer * found[2]:
             found, errors = of_bodies, thick
     if found is None:
         return False

@@ -78,7 +78,7 @@ def test_a_carried_robot_finds_itself_on_the_map() -> None:
     run, cut = carried_run(0)
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
     carried, lost = [], []
-    for k, report in enumerate(follow(branches, run.increments, run.scans), start=1):
+    for k, report in enumerate(follow(branches, run.increments, run.scans, stop=cut), start=1):
         if report.carried:
             carried.append(k)
         if report.lost:

@@ -321,16 +321,19 @@ def test_an_empty_room_gives_the_wheels() -> None:
 
 
 @pytest.mark.parametrize(("pause_s", "stood_s"), [(0.0, 0.0), (0.6, 0.0), (2.0, 2.0)])
-def test_a_stop_of_a_second_is_told_from_slow_driving(pause_s: float, stood_s: float) -> None:
+def test_a_stop_of_a_second_is_told_from_slow_driving(
+    pause_s: float, stood_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The wheels stand at 10 cm for a while; a state follows every 5 mm at 2.5 cm/s."""
-    slam, asked = robust(), []
+    slam, asked = robust(), list[tuple[float, float]]()
+    rule = slam.back_end.parameters.branches
     predict = slam._branches.predict
 
     def watched(increment: Array, elapsed_s: float, stood: float) -> None:
-        asked.append((elapsed_s, stood))
+        asked.append((elapsed_s, stood if stood >= rule.stop_s else 0.0))
         predict(increment, elapsed_s, stood)
 
-    slam._branches.predict = watched  # type: ignore[method-assign]
+    monkeypatch.setattr(slam._branches, "predict", watched)
     pause_ns = round(pause_s * 1e9)
 
     def odometry(t_ns: int) -> Array:
