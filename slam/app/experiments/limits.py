@@ -1,34 +1,16 @@
 """The experiment `limits`: what the front ends reach, beside what no front end can pass.
 
-Positions in bins, s the envelope's standard deviation in bins, sigma the noise per RF sample.
-
-``chip_frames`` uses the emulator: its pulse, its receiver (noise by counter, counting,
-clipping) and the module's normalisation. ``closed_form_frames`` writes the pulse down and adds
-NumPy's noise, without counting or clipping. Both give the same numbers, so an error in one of them
-would show.
-
-Three other methods are compared with `slam.front_end.overlapping`. They get the same windows and
-the same pulse, and accept one more echo by the same test. Each works on the correlation of the
-window with pulses on a fine grid of positions, cosine and sine taken as orthogonal.
-
-CLEAN
-    Subtracts the strongest pulse of what is left, again and again (Hogbom 1974). Each is placed as
-    if it were alone.
-OMP
-    Places pulses like CLEAN, but then fits the amplitudes of all of them together (Pati et al.
-    1993). Positions stay where they were first put.
-LASSO
-    Amplitudes for every grid position at once, their absolute sum penalised (Tibshirani 1996;
-    solved by FISTA, Beck and Teboulle 2009); neighbours are merged, weakest first out.
+Positions in bins, s the envelope's standard deviation in bins, sigma the noise per RF sample. The
+frames are the emulator's: its pulse, its receiver (noise by counter, counting, clipping) and the
+module's normalisation.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,19 +26,18 @@ from emulator.scene.scene import NoiseSpec, RadarSpec, empty_room
 from slam.app.experiments import Result, Table, table
 from slam.app.rig.sources import sampler_limits
 from slam.app.run.output import print_progress
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, label
 from slam.config import FrontEnd, MatchedFilterConfig, SlamConfig, override
 from slam.frames import Detector, RadarFrame
 from slam.front_end import make_detector
 from slam.front_end.matched_filter import threshold_sigmas
-from slam.front_end.overlapping import KnownPulse, SplitTest, split_threshold
+from slam.front_end.overlapping import KnownPulse
 from slam.front_end.pulse import PulseModel
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.x4 import Normalisation
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 N_BINS = 1431
 RANGE_START_M = 0.2
@@ -65,9 +46,8 @@ PULSE = KnownPulse(
     envelope_sigma_bins=PulseModel().sigma_bins(BIN_LENGTH_M),
     carrier_rad_per_bin=PulseModel().carrier_rad(BIN_LENGTH_M),
 )
-NARROW, FULL = (949, 1100), (0, 2047)
-"""Ends of the DAC sweep: +-0.0742 as radars are used, and everything."""
 DAC_WINDOW = 0.07421875
+"""Largest amplitude within the DAC sweep of `RawConfig`."""
 
 AMPLITUDE = 0.015
 NOISE_SIGMA = 5e-4
@@ -78,27 +58,14 @@ MATCH_M = 0.1
 SNRS_DB = (18, 21, 24, 27, 30, 33, 36, 42, 48)
 SEPARATIONS_M = (0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09, 0.10, 0.12, 0.14, 0.16, 0.18, 0.20)
 SATURATIONS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-LEAKAGES = tuple((amplitude, at_m) for amplitude in (0.06, 0.5) for at_m in (0.05, 0.15))
 DETECTION_SNRS_DB = (0, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20, 22, 23, 24, 25, 26, 28)
-FALSE_ALARMS = (1e-3, 1e-2, 1e-1)
 _NEAREST_M, _FARTHEST_M = 0.5, 1.3
-_WHOLE_FRAME: Mapping[str, object] = {"detection.min_range_m": 0.0, "detection.max_range_m": 100.0}
-
-_FINE_STEP_BINS = 0.25
-_COARSE_STEP_BINS = 1.0
-_LASSO_STEPS = 200
-_MERGED_BINS = 4.0
-"""LASSO spreads one echo over neighbouring grid places; closer ones are taken as one."""
 
 FRONT_ENDS = tuple(front_end.value for front_end in FrontEnd)
-METHODS = (*FRONT_ENDS, "lasso", "omp", "clean")
 _LOOKS: Mapping[str, dict[str, Any]] = {
     "paper": {"color": ODOMETRY, "marker": "s"},
     "matched_filter": {"color": LANDMARK, "marker": "^"},
     "joint": {"color": ESTIMATE, "marker": "o"},
-    "lasso": {"color": "#3a8f5c", "marker": "v"},
-    "omp": {"color": "#7a5cc2", "marker": "D"},
-    "clean": {"color": TRUTH, "marker": "x"},
 }
 _BOUND: dict[str, Any] = {"color": INK, "linewidth": 1.2, "linestyle": "--"}
 
@@ -169,14 +136,12 @@ class Echoes:
         return (self.range_m - RANGE_START_M) / BIN_LENGTH_M
 
 
-def chip_frames(
-    echoes: Echoes, *, noise_sigma: float, seed: int, dac: tuple[int, int] = NARROW
-) -> list[RadarFrame]:
+def chip_frames(echoes: Echoes, *, noise_sigma: float, seed: int) -> list[RadarFrame]:
     """Return frames as the emulated chip takes them and the driver reads them.
 
-    ``noise_sigma`` is per RF sample, in normalised units; ``dac`` holds the ends of the DAC sweep.
+    ``noise_sigma`` is per RF sample, in normalised units.
     """
-    config = RawConfig(dac_min=dac[0], dac_max=dac[1])
+    config = RawConfig()
     capture = CaptureSettings(
         first_sample_m=RANGE_START_M,
         n_samples=N_BINS,
@@ -215,23 +180,6 @@ def chip_frames(
     return [_frame(counter, row, limits) for counter, row in enumerate(samples)]
 
 
-def closed_form_frames(echoes: Echoes, *, noise_sigma: float, seed: int) -> list[RadarFrame]:
-    """Return frames by the formula of the pulse and NumPy's noise; arguments as `chip_frames`."""
-    rng = np.random.default_rng(seed)
-    pulse = PulseModel()
-    sigma_m, wavelength_m = pulse.sigma_m, pulse.wavelength_m
-    labels = RANGE_START_M + BIN_LENGTH_M * np.arange(N_BINS)
-    frames = []
-    for n in range(len(echoes.range_m)):
-        off = labels - echoes.range_m[n, :, np.newaxis]
-        envelope = echoes.amplitude[n, :, np.newaxis] * np.exp(-0.5 * (off / sigma_m) ** 2)
-        turn = math.tau * off / wavelength_m + echoes.phase_rad[n, :, np.newaxis]
-        samples = (envelope * np.cos(turn)).sum(axis=0)
-        samples += noise_sigma * rng.standard_normal(N_BINS)
-        frames.append(_frame(n, samples.astype(np.float32), None))
-    return frames
-
-
 def _frame(
     counter: int, samples: NDArray[np.float32], limits: tuple[float, float] | None
 ) -> RadarFrame:
@@ -244,132 +192,6 @@ def _frame(
         bin_length_m=BIN_LENGTH_M,
         limits=limits,
     )
-
-
-Separator = Callable[[Array, KnownPulse, Array, SplitTest], list[Array]]
-"""(windows (b, n), pulse, noise sigma (b,), split) -> positions in bins of each window, sorted."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Dictionary:
-    """Pulses of norm 1 on a grid, and what of the windows each explains."""
-
-    grid: Array  # (g,), bins
-    gram: Array  # (g, g): correlation of the pulses
-    matched: ComplexArray  # (b, g): correlation of the windows, over the noise
-    root_h: float  # square root of the power from which one more echo is accepted
-
-
-def _dictionary(
-    windows: Array, pulse: KnownPulse, noise_sigma: Array, split: SplitTest, step_bins: float
-) -> _Dictionary:
-    n = np.arange(windows.shape[1])
-    sigma = pulse.envelope_sigma_bins
-    grid = np.arange(1.5 * sigma, len(n) - 1 - 1.5 * sigma, step_bins)
-    envelopes = np.exp(-0.5 * ((n - grid[:, np.newaxis]) / sigma) ** 2)
-    envelopes /= np.sqrt((envelopes**2).sum(axis=1, keepdims=True))
-    angle = pulse.carrier_rad_per_bin * n
-    # a cosine of envelope norm 1 has norm sqrt(1/2)
-    whitened = windows * (math.sqrt(2) / noise_sigma[:, np.newaxis])
-    matched = (whitened * np.cos(angle)) @ envelopes.T - 1j * (
-        (whitened * np.sin(angle)) @ envelopes.T
-    )
-    length = float(grid[-1] - grid[0])
-    return _Dictionary(
-        grid=grid,
-        gram=envelopes @ envelopes.T,
-        matched=matched,
-        root_h=math.sqrt(split_threshold(split.false_split, length / sigma)),
-    )
-
-
-def matching_pursuit(
-    windows: Array, pulse: KnownPulse, noise_sigma: Array, split: SplitTest, *, refit: bool
-) -> list[Array]:
-    """Return positions by OMP (with ``refit``) or by CLEAN; other arguments as in `Separator`."""
-    dictionary = _dictionary(windows, pulse, noise_sigma, split, _FINE_STEP_BINS)
-    return [_greedy(dictionary, matched, split, refit=refit) for matched in dictionary.matched]
-
-
-def _greedy(
-    dictionary: _Dictionary, matched: ComplexArray, split: SplitTest, *, refit: bool
-) -> Array:
-    left, chosen, explained = matched, list[int](), 0.0
-    while len(chosen) < split.max_echoes:
-        power = left.real**2 + left.imag**2
-        best = int(power.argmax())
-        needed = (dictionary.root_h + split.model_error * math.sqrt(explained)) ** 2
-        # one that is in is no pulse of its own
-        if chosen and (power[best] <= needed or best in chosen):
-            break
-        chosen.append(best)
-        if refit:
-            linear = np.linalg.solve(dictionary.gram[np.ix_(chosen, chosen)], matched[chosen])
-            left = matched - dictionary.gram[:, chosen] @ linear
-            explained = float((matched[chosen].conj() @ linear).real)
-        else:
-            explained += float(power[best])
-            left = left - dictionary.gram[:, best] * left[best]
-    return np.sort(dictionary.grid[chosen])
-
-
-def lasso(windows: Array, pulse: KnownPulse, noise_sigma: Array, split: SplitTest) -> list[Array]:
-    """Return positions by LASSO on a grid; arguments as in `Separator`."""
-    dictionary = _dictionary(windows, pulse, noise_sigma, split, _COARSE_STEP_BINS)
-    gram, matched = dictionary.gram, dictionary.matched
-    # The penalty at which noise, and what the pulse leaves of itself, stays at zero.
-    strongest = np.abs(matched).max(axis=1, keepdims=True)
-    penalty = dictionary.root_h + split.model_error * strongest
-    rate = 1 / float(np.linalg.eigvalsh(gram)[-1])
-    amplitudes = ahead = np.zeros_like(matched)
-    momentum = 1.0
-    for _ in range(_LASSO_STEPS):
-        moved = ahead + rate * (matched - ahead @ gram)
-        size = np.abs(moved)
-        shrunk = moved * np.maximum(0.0, 1 - rate * penalty / np.maximum(size, 1e-300))
-        following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
-        ahead = shrunk + (momentum - 1) / following * (shrunk - amplitudes)
-        amplitudes, momentum = shrunk, following
-    return [
-        _pruned(_merged(dictionary.grid, np.abs(row)), dictionary, each, split)
-        for row, each in zip(amplitudes, matched, strict=True)
-    ]
-
-
-def _merged(grid: Array, size: Array) -> Array:
-    """Return the centres of runs of grid places in use, weighted by their amplitudes."""
-    used = np.flatnonzero(size > 0.02 * size.max())
-    runs = np.split(used, np.flatnonzero(np.diff(grid[used]) > _MERGED_BINS) + 1)
-    return np.array([np.average(grid[run], weights=size[run]) for run in runs])
-
-
-def _pruned(
-    positions: Array, dictionary: _Dictionary, matched: ComplexArray, split: SplitTest
-) -> Array:
-    """Drop the echo that explains least while the others explain nearly as much without it."""
-
-    def energy(kept: Array) -> float:
-        places = np.searchsorted(dictionary.grid, kept).clip(0, len(dictionary.grid) - 1)
-        linear = np.linalg.lstsq(dictionary.gram[np.ix_(places, places)], matched[places])[0]
-        return float((matched[places].conj() @ linear).real)
-
-    while len(positions) > 1:
-        whole = energy(positions)
-        without = [energy(np.delete(positions, k)) for k in range(len(positions))]
-        weakest = int(np.argmax(without))
-        others = math.sqrt(max(0.0, without[weakest]))
-        needed = (dictionary.root_h + split.model_error * others) ** 2
-        if len(positions) <= split.max_echoes and whole - without[weakest] > needed:
-            break
-        positions = np.delete(positions, weakest)
-    return positions
-
-
-SEPARATORS: Mapping[str, Separator] = {
-    "clean": partial(matching_pursuit, refit=False),
-    "omp": partial(matching_pursuit, refit=True),
-    "lasso": lasso,
-}
 
 
 def front_end(name: str, settings: Mapping[str, object] | None = None) -> Detector:
@@ -466,7 +288,7 @@ def _bound_mm(snr: float) -> float:
 
 
 def ranging_against_snr(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
-    """Yield one row per SNR: the bound, and each front end on both kinds of frames."""
+    """Yield one row per SNR: the bound, and each front end."""
     for snr_db in SNRS_DB:
         rng = np.random.default_rng([seed, 1, snr_db])
         echoes = single_echoes(trials, AMPLITUDE, rng)
@@ -475,19 +297,12 @@ def ranging_against_snr(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row
             "snr_db": snr_db,
             "bound_mm": _bound_mm(snr),
         }
-        for source, make in (("chip", chip_frames), ("closed_form", closed_form_frames)):
-            frames = make(echoes, noise_sigma=AMPLITUDE / snr, seed=seed + snr_db)
-            for name, cell in _of_each_front_end(frames, echoes, stop).items():
-                row[f"{source}.{name}"] = cell
-        yield row
+        frames = chip_frames(echoes, noise_sigma=AMPLITUDE / snr, seed=seed + snr_db)
+        yield row | _of_each_front_end(frames, echoes, stop)
 
 
 def resolution_against_separation(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
-    """Yield one row per separation of two equal echoes: the bound, and each method.
-
-    The methods of `SEPARATORS` get the window of each frame that holds the two echoes, 3.5
-    envelope sigmas either side; the front ends get the frame.
-    """
+    """Yield one row per separation of two equal echoes: the bound, and each front end."""
     for separation_m in SEPARATIONS_M:
         rng = np.random.default_rng([seed, 2, round(1e3 * separation_m)])
         echoes = echo_pairs(trials, separation_m, rng)
@@ -514,29 +329,7 @@ def resolution_against_separation(trials: int, seed: int, stop: StopFlag) -> Ite
         for name in FRONT_ENDS:
             stop.check()
             row[name] = resolution(ranges_of(front_end(name), frames), echoes.range_m)
-        windows, first_bins = windows_of(frames, echoes)
-        for name, separator in SEPARATORS.items():
-            stop.check()
-            positions = separator(windows, PULSE, np.full(trials, NOISE_SIGMA), SplitTest())
-            found = [
-                frames[0].range_start_m + BIN_LENGTH_M * (first + each)
-                for first, each in zip(first_bins, positions, strict=True)
-            ]
-            row[name] = resolution(found, echoes.range_m)
         yield row
-
-
-def windows_of(frames: Sequence[RadarFrame], echoes: Echoes) -> tuple[Array, NDArray[np.intp]]:
-    """Cut the window around the echoes out of each frame: shape (n, m), and its first bins."""
-    sigma = PULSE.envelope_sigma_bins
-    position = echoes.position_bins
-    reach = math.ceil(3.5 * sigma + 0.5 * float(np.ptp(position, axis=1).max()))
-    first = np.rint(position.mean(axis=1)).astype(np.intp) - reach
-    windows = [
-        frame.samples[start : start + 2 * reach + 1].astype(np.float64)
-        for frame, start in zip(frames, first, strict=True)
-    ]
-    return np.stack(windows), first
 
 
 def detection_against_snr(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
@@ -572,52 +365,6 @@ def detection_against_snr(trials: int, seed: int, stop: StopFlag) -> Iterator[_R
         yield row
 
 
-def false_alarms(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
-    """Yield one row per configured rate: peaks per frame of noise alone, the whole frame."""
-    nothing = single_echoes(trials, 0.0, np.random.default_rng([seed, 6]))
-    frames = chip_frames(nothing, noise_sigma=NOISE_SIGMA, seed=seed + 4)
-
-    def per_frame(name: str, settings: Mapping[str, object]) -> float:
-        stop.check()
-        found = ranges_of(front_end(name, {**_WHOLE_FRAME, **settings}), frames)
-        return sum(map(len, found)) / trials
-
-    paper = per_frame("paper", {})
-    for rate in FALSE_ALARMS:
-        settings: _Row = {"matched_filter.false_alarms_per_frame": rate}
-        told = settings | {"matched_filter.noise_sigma": NOISE_SIGMA}
-        yield {
-            "configured_per_frame": rate,
-            "trials": trials,
-            "standard_error": float(np.sqrt(rate / trials)),
-            "paper": paper,
-            "matched_filter": per_frame("matched_filter", settings),
-            "told": per_frame("matched_filter", told),
-            "joint": per_frame("joint", settings),
-        }
-
-
-def leakage(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
-    """Yield one row per leakage and DAC window: each front end's view of one echo beside it."""
-    for window, dac in (("narrow", NARROW), ("full", FULL)):
-        for amplitude, at_m in ((0.0, 0.05), *LEAKAGES):
-            rng = np.random.default_rng([seed, 3, round(1e3 * amplitude), round(1e3 * at_m)])
-            echoes = single_echoes(trials, AMPLITUDE, rng)
-            nothing = np.zeros((trials, 1))
-            both = Echoes(
-                range_m=np.hstack([echoes.range_m, nothing + at_m]),
-                amplitude=np.hstack([echoes.amplitude, nothing + amplitude]),
-                phase_rad=np.hstack([echoes.phase_rad, rng.uniform(0, math.tau, (trials, 1))]),
-            )
-            frames = chip_frames(both, noise_sigma=NOISE_SIGMA, seed=seed + 2, dac=dac)
-            row: _Row = {
-                "dac_window": window,
-                "leakage_amplitude": amplitude,
-                "leakage_m": at_m,
-            }
-            yield row | _of_each_front_end(frames, echoes, stop)
-
-
 def saturation(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
     """Yield one row per strength of an echo over the DAC window: each front end's view of it."""
     for strength in SATURATIONS:
@@ -644,7 +391,7 @@ def _ranging(axes: Axes, rows: Sequence[_Row]) -> None:
     x = [row["snr_db"] for row in rows]
     axes.plot(x, [row["bound_mm"] for row in rows], label="Cramer-Rao bound", **_BOUND)
     for name in FRONT_ENDS:
-        _line(axes, x, [row[f"chip.{name}"]["std_mm"] for row in rows], name)
+        _line(axes, x, [row[name]["std_mm"] for row in rows], name)
     axes.set_yscale("log")
     label(axes, "One echo: standard deviation of its range", "SNR [dB]", "std [mm]")
     axes.legend(frameon=False)
@@ -654,7 +401,7 @@ def _resolution(axes: Axes, rows: Sequence[_Row]) -> None:
     x = [row["separation_mm"] for row in rows]
     bound = [1e2 * row["bound_resolved"] for row in rows]
     axes.plot(x, bound, label="at the Cramer-Rao bound", **_BOUND)
-    for name in METHODS:
+    for name in FRONT_ENDS:
         _line(axes, x, [1e2 * row[name]["resolved"] for row in rows], name)
     axes.set_ylim(-4, 104)
     axes.set_xlim(x[0] - 8, x[-1] + 120)  # room for the legend
@@ -697,9 +444,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     cells = {
         "ranging": ranging_against_snr,
         "detection": detection_against_snr,
-        "false_alarms": false_alarms,
         "resolution": resolution_against_separation,
-        "leakage": leakage,
         "saturation": saturation,
     }
     trials, seed = arguments.trials, arguments.seed
@@ -727,7 +472,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
 
 
 def _printed(tables: Mapping[str, Sequence[_Row]], conditions: str) -> list[Table]:
-    ranging, detection, alarms, resolution, leakage, saturation = tables.values()
+    ranging, detection, resolution, saturation = tables.values()
     return [
         table(
             f"error of one echo's range, bias / std [mm]; {conditions}",
@@ -735,7 +480,7 @@ def _printed(tables: Mapping[str, Sequence[_Row]], conditions: str) -> list[Tabl
                 "SNR": [f"{row['snr_db']} dB" for row in ranging],
                 "bound": [f"{row['bound_mm']:.3f}" for row in ranging],
             }
-            | {name: [_error(row[f"chip.{name}"]) for row in ranging] for name in FRONT_ENDS},
+            | {name: [_error(row[name]) for row in ranging] for name in FRONT_ENDS},
         ),
         table(
             "share of echoes found",
@@ -748,33 +493,12 @@ def _printed(tables: Mapping[str, Sequence[_Row]], conditions: str) -> list[Tabl
             },
         ),
         table(
-            "peaks per frame of noise alone",
-            {
-                "configured": [f"{row['configured_per_frame']:g}" for row in alarms],
-                "std. error": [f"{row['standard_error']:.4f}" for row in alarms],
-                "sigma told": [f"{row['told']:.4f}" for row in alarms],
-                "matched_filter": [f"{row['matched_filter']:.4f}" for row in alarms],
-                "joint": [f"{row['joint']:.4f}" for row in alarms],
-                "paper": [f"{row['paper']:.4f}" for row in alarms],
-            },
-        ),
-        table(
             "share of pairs of equal echoes resolved",
             {
                 "separation": [f"{row['separation_mm']} mm" for row in resolution],
                 "bound": [f"{row['bound_resolved']:.3f}" for row in resolution],
             }
-            | {name: [f"{row[name]['resolved']:.3f}" for row in resolution] for name in METHODS},
-        ),
-        table(
-            "one echo beside leakage: found, others per frame, bias / std [mm]",
-            {
-                "DAC window, leakage": [
-                    f"{row['dac_window']}, {row['leakage_amplitude']:g} at {row['leakage_m']:g} m"
-                    for row in leakage
-                ]
-            }
-            | {name: [_seen(row[name]) for row in leakage] for name in FRONT_ENDS},
+            | {name: [f"{row[name]['resolved']:.3f}" for row in resolution] for name in FRONT_ENDS},
         ),
         table(
             "one echo beyond the DAC window: found, others per frame, bias / std [mm]",
