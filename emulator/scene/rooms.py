@@ -317,7 +317,7 @@ def columns(rng: np.random.Generator) -> Room:
 
 
 def yard(rng: np.random.Generator) -> Room:
-    """No more than three rods in range, the lab's wheels or three times as bad ones."""
+    """No more than three rods, the lab's wheels or three times as bad ones."""
     way = [(3 * x, 3 * y) for x, y in _course(rng)]
     rods = _rods(_beside(rng, int(rng.integers(4)), way, off=(0.5, 1.4), apart=2.0))
     wheels_factor = float(rng.choice([1.0, 3.0]))

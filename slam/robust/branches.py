@@ -15,19 +15,20 @@ Search
     map of the main back end as it was then is searched for (`slam.robust.constellation`). A copy of
     that back end is set down there, and takes the motions and scans since.
 Decision
-    Three explanations of all ranges since the step are compared: that the robot stayed, that it is
-    at the place, and that it is where it has never been. Each has its own new landmarks, at the
+    Four explanations of all ranges since the step are compared: that the robot stayed, that it made
+    a small motion that the wheels did not report, that it is at the place, and that it is where it
+    has never been. Each has its own new landmarks, at the
     price of a birth; since parts of the world look like each other, births together cost no more
     than the price of such a likeness, so that a place is never adopted for being alike alone: what
     should be seen must be missing without it. The price of a place grows with the number of places
     that look alike.
 Revision
     The back end that stayed goes on beside the one that is adopted. When the advantage of the place
-    is gone, the adoption is taken back.
+    is gone, and more is missed there, the adoption is taken back.
 
 The robot is reported as lost while the landmarks known before the carry are against its pose by
-more than the price of a carry, and others are seen. That ends when they are for it, or a place is
-adopted.
+more than the price of a carry, and others are seen, or ranges have shown a carry. That ends when
+several of them are seen where they should be, or a place is adopted.
 
 Where new landmarks lie on older ones as a constellation, and the whole run can be solved with them
 merged, a loop is closed.
@@ -253,7 +254,7 @@ class Alternative:
     def __init__(self, back_end: RobustBackEnd, since: int, *, merges: bool = False) -> None:
         self.back_end = back_end
         self.since = since
-        self.merges = merges  # and solves for the whole run; otherwise it waits with both
+        self.merges = merges  # whether it merges landmarks, and solves for the whole run
         self.next_step = since
         self.evidence: list[Array] = []  # of each step taken, as `evidence_table` has it
 
@@ -283,6 +284,7 @@ class Carry:
     """The question whether the robot was carried before a step, and to which place."""
 
     since: int
+    opened: int  # the step at which it was asked, or a place adopted
     price_nats: float  # how unlikely that is
     next_id: int  # landmarks known before it have smaller ids
     map: RobustBackEnd  # the main back end after the step before
@@ -309,6 +311,8 @@ class Branches:
         self._steps: dict[int, Step] = {}  # by number, those that are needed still
         self._now = 0  # number of the next step
         self._noise, self._gate_sigmas = parameters.ranges, parameters.tracklets.gate_sigmas
+        self._edge_rad = parameters.tracklets.edge_rad
+        self._lever_m = max(math.hypot(mount.x_m, mount.y_m) for mount in rig.mounts)
         self._increment: Array | None = None
         self._carry_nats, self._has_stood = math.inf, False
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
@@ -355,11 +359,7 @@ class Branches:
             raise ValueError("scans without a motion before them")
         next_id, carry_nats = self.main.state.next_id, self._carry_nats
         if self._has_stood and self._now - 1 in self._steps:
-            moved_m = math.hypot(*self._increment[:2].tolist())
-            reach_m = self._gate_sigmas * self._rule.model_sigma_m + moved_m
-            before, most = self._steps[self._now - 1].scans, self._rule.price_nats
-            apart = discontinuity(before, scans, reach_m, self._noise)
-            carry_nats -= min(max(apart, -most), most)
+            carry_nats -= self._shown(self._steps[self._now - 1].scans, scans, self._increment)
         report = self.main.update(scans)
         self._steps[self._now] = Step(
             increment=self._increment,
@@ -375,6 +375,23 @@ class Branches:
             self._look()
         carried = (moved or self.is_lost) and not was_lost
         return replace(report, carried=carried, lost=self.is_lost)
+
+    def _shown(
+        self, before: Sequence[RangeScan], after: Sequence[RangeScan], increment: Array
+    ) -> float:
+        """Return the nats for a carry that the ranges before and behind a stop show.
+
+        Between the two the wheels made an increment, (3,). A turn moves the antennas, and other
+        things come into view: where it is larger than the edge of a view is wide, nothing is shown.
+        """
+        rule, turn_rad = self._rule, abs(float(increment[2]))
+        if turn_rad > self._edge_rad / 2.0:
+            return 0.0
+        moved_m = math.hypot(*increment[:2].tolist()) + self._lever_m * turn_rad
+        reach_m = self._gate_sigmas * rule.model_sigma_m + moved_m
+        apart = discontinuity(before, after, reach_m, self._noise)
+        # One range that is missed for another reason shows nothing.
+        return min(max(apart - MARGIN_NATS, -rule.price_nats), rule.price_nats)
 
     def _keep_snapshot(self) -> None:
         self._snapshots[self._now] = self.main.copy()
@@ -398,7 +415,7 @@ class Branches:
     def _decide(self, carry: Carry) -> bool:
         """Answer the question of a carry, if that can be; return whether the pose jumps."""
         rule = self._rule
-        # What is seen behind a stop shows a carry, or the motion was just now; or it was none.
+        # Where ranges show a carry it was no such motion; and one that was long ago has been found.
         is_hidden = carry.price_nats > 0.0 and self._now - carry.since <= rule.lost_steps
         on_trial = [carry.hidden, *carry.placed] if is_hidden else [*carry.placed]
         for alternative in [carry.stayed] if carry.stayed else [carry.new, *on_trial]:
@@ -412,15 +429,19 @@ class Branches:
                 self._adopt(carry, found)
                 return True
             carry.until = carry.until or self._now + rule.patience * self._window
-            if self._now > carry.until:
+            if self._now > carry.until or not carry.placed:
                 carry.placed, carry.until = [], 0
         first = max(carry.since, self._now - rule.lost_steps)
         tables = self._tables(first)
         of_landmarks = totals_of(tables, carry.map, rule)[:, 1]
         total = float(of_landmarks.sum())
-        # What is new is no evidence for the pose, and neither is it if nothing is heard.
+        # What is new is no evidence for the pose. Radars that hear nothing are none against it.
         against = -total - carry.price_nats
-        self.is_lost = against > -MARGIN_NATS if self.is_lost else against > 0.0
+        if not self.is_lost:
+            is_elsewhere = carry.price_nats < 0.0 or bool(carry.new.back_end.reported_rows())
+            self.is_lost = against > 0.0 and is_elsewhere
+        elif self._is_over(carry):
+            self._begin_again(carry)
         is_answered = total > rule.price_nats or (self._is_over(carry) and not self.is_lost)
         if is_answered and not carry.placed:
             self._end(carry)
@@ -460,7 +481,7 @@ class Branches:
         best = int(np.argmax(gains))
         account, found, pose = accounts[best], places[best], places[best].back_end.pose
         elsewhere = Account(n_new=carry.new.back_end.n_reported_since(0))
-        # What another place has not made landmarks of yet must not decide between the two.
+        # Two places of the map are told apart by known landmarks alone: new ones take their time.
         margins = [
             min(gains[best] - gain, account.known - other.known)
             if found is not carry.hidden
@@ -485,11 +506,14 @@ class Branches:
         carry.stayed = Alternative(self.main, carry.since)
         carry.stayed.next_step, carry.stayed.evidence = self._now, self._tables(carry.since)
         self._exchange(carry, placed)
-        carry.placed, carry.adopted = [], placed
+        carry.placed, carry.adopted, carry.opened = [], placed, self._now
 
     def _exchange(self, carry: Carry, other: Alternative) -> None:
         """Let an alternative be the main back end, as if it always had been."""
+        # Ids that were reported are of no other landmark.
+        next_id = max(self.main.state.next_id, other.back_end.state.next_id)
         self.main, self.is_lost = other.back_end, False
+        self.main.state.next_id = next_id
         for number, evidence in enumerate(other.evidence, start=carry.since):
             self._steps[number] = replace(self._steps[number], evidence=evidence)
         self._snapshots = {self._now: self.main.copy()}
@@ -512,7 +536,7 @@ class Branches:
         return is_refuted
 
     def _is_over(self, carry: Carry) -> bool:
-        return self._now - carry.since > self._rule.carry_steps
+        return self._now - carry.opened > self._rule.carry_steps
 
     def _end(self, carry: Carry) -> None:
         """End the question of a carry."""
@@ -586,6 +610,7 @@ class Branches:
         hidden.state.next_id = self.main.state.next_id + _IDS_APART
         self._carry = Carry(
             since=since,
+            opened=self._now,
             price_nats=step.carry_nats,
             next_id=step.next_id,
             map=before,
@@ -593,6 +618,12 @@ class Branches:
             moved=moved,
             hidden=Place(hidden, since, math.log(self._rule.steps_per_hidden), merges=True),
         )
+
+    def _begin_again(self, carry: Carry) -> None:
+        """Search for a lost robot by what it sees from now on: what it saw has led nowhere."""
+        carry.since = carry.opened = self._now
+        carry.new = Alternative(carry.map.with_empty_map(), self._now)
+        carry.placed, carry.until = [], 0
 
     def _search(self, carry: Carry) -> None:
         """Search for the new map's places on the old one, and try them.

@@ -68,8 +68,8 @@ def constellation_of(state: State, rows: Sequence[int], sigma_m: float) -> Const
 def find_placements(here: Constellation, there: Constellation, rule: BranchRule) -> list[Placement]:
     """Return the motions from ``here`` to ``there``, likeliest first, no two to the same place.
 
-    Those of fewer landmarks than `BranchRule.least_landmarks`, or of less evidence than
-    `BranchRule.placement_nats`, are left out.
+    Those of fewer landmarks than `BranchRule.least_landmarks`, or by `BranchRule.placement_nats`
+    less likely than the likeliest, are left out; and all, if that has less evidence.
     """
     least = rule.least_landmarks
     if len(here.ids) < least or len(there.ids) < least:
@@ -82,7 +82,8 @@ def find_placements(here: Constellation, there: Constellation, rule: BranchRule)
     middle = here.points_m.mean(axis=0)
     distinct: list[Placement] = []
     for one in sorted(found.values(), key=lambda one: -one.evidence):
-        if one.evidence < rule.placement_nats:
+        best = distinct[0].evidence if distinct else one.evidence
+        if best < rule.placement_nats or best - one.evidence >= rule.placement_nats:
             break
         if all(_differ(one.motion, other.motion, middle, rule) for other in distinct):
             distinct.append(one)
@@ -92,10 +93,7 @@ def find_placements(here: Constellation, there: Constellation, rule: BranchRule)
 def find_placement(here: Constellation, there: Constellation, rule: BranchRule) -> Placement | None:
     """Return the motion from ``here`` to ``there`` that stands out, or None."""
     found = find_placements(here, there, rule)
-    is_alone = len(found) == 1 or (
-        len(found) > 1 and found[0].evidence - found[1].evidence >= rule.placement_nats
-    )
-    return found[0] if is_alone else None
+    return found[0] if len(found) == 1 else None
 
 
 def _differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:

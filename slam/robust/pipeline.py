@@ -97,7 +97,8 @@ class RobustSlam:
             self._still, self._still_ns = pose, t_ns
         self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
         if self._pose is None:
-            self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
+            self._pose, self._t_ns = pose, t_ns
+            self._still, self._still_ns, self._stood_ns = pose, t_ns, 0
             return ()
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         window = self.config.window

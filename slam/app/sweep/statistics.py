@@ -171,7 +171,8 @@ def outcomes(runs: Sequence[SweepRun]) -> dict[str, Any]:
         "runs_lost": sum(run.carry is None and run.lost_share > 0.0 for run in runs),
         "runs_lost_at_end": sum(run.lost_at_end for run in runs),
         "runs_confidently_wrong": sum(run.confidently_wrong_share > 0.0 for run in runs),
-        "confidently_wrong_share": statistics.fmean(run.confidently_wrong_share for run in runs),
+        "confidently_wrong_share": sum(run.confidently_wrong_share for run in runs)
+        / max(len(runs), 1),
         "carries": len(carries),
         "carries_in_time": sum(carries),
     }
@@ -306,7 +307,7 @@ def stress_table(
         ],
         "worse": [str(row["runs_above_odometry"]) for row in rows],
         "lost": [str(row["runs_lost"]) for row in rows],
-        "confidently wrong": [str(row["runs_confidently_wrong"]) for row in rows],
+        "confidently wrong": [str(row.get("runs_confidently_wrong", "-")) for row in rows],
         "carries found": [carries_text(row) for row in rows],
         "mean NEES": [f"{row['anees_mean']:.2f}" for row in rows],
         "ANEES in band": [in_band_text(row) for row in rows],

@@ -47,7 +47,7 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     log.since_solved = 0
     errors = state.range_errors
     found = _with_errors(log, state, errors, parameters)
-    if found is not None and found[2] > 1.0:
+    if found is not None and found[2] > 1.0 and state.layout.has_radii:
         # Wheels and radars have constants that their makers vouch for. Ranges at odds with these
         # are of thicker bodies than was expected, if these bring the constants nearer.
         rule = parameters.relinearisation
