@@ -290,7 +290,7 @@ class Carry:
     map: RobustBackEnd  # the main back end after the step before
     new: Alternative  # with an empty map at first
     moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
-    hidden: Place  # a motion that the wheels did not report, and no carry
+    hidden: Place | None  # a motion that the wheels did not report, and no carry
     placed: list[Place] = field(default_factory=list)  # where the robot may be on the map
     until: int = 0  # step at which these are dropped; 0 until they have caught up
     adopted: Place | None = None
@@ -416,8 +416,9 @@ class Branches:
         """Answer the question of a carry, if that can be; return whether the pose jumps."""
         rule = self._rule
         # Where ranges show a carry it was no such motion; and one that was long ago has been found.
-        is_hidden = carry.price_nats > 0.0 and self._now - carry.since <= rule.lost_steps
-        on_trial = [carry.hidden, *carry.placed] if is_hidden else [*carry.placed]
+        if carry.price_nats <= 0.0 or self._now - carry.since > rule.lost_steps:
+            carry.hidden = None
+        on_trial = [*carry.placed] if carry.hidden is None else [carry.hidden, *carry.placed]
         for alternative in [carry.stayed] if carry.stayed else [carry.new, *on_trial]:
             end = min(alternative.next_step + rule.catch_up, self._now)
             alternative.take(self._steps, end)
@@ -622,6 +623,7 @@ class Branches:
     def _begin_again(self, carry: Carry) -> None:
         """Search for a lost robot by what it sees from now on: what it saw has led nowhere."""
         carry.since = carry.opened = self._now
+        carry.hidden = None
         carry.new = Alternative(carry.map.with_empty_map(), self._now)
         carry.placed, carry.until = [], 0
 

@@ -434,3 +434,30 @@ def test_a_place_that_misses_more_than_staying_is_taken_back() -> None:
         if branches._carry is None:
             break
     assert branches.main is stayed.back_end
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_robot_that_stays_lost_needs_bounded_memory(*, stops: bool) -> None:
+    """It is carried to where it has never been, and drives to and fro there for 1300 scans.
+
+    Its wheels stood before that, or did not report a step.
+    """
+    rng = np.random.default_rng(13)
+    x = np.arange(0.0, 1.5, 0.02)
+    there = straight(60)
+    ways = [np.column_stack([20.0 + x, np.zeros((len(x), 2))])]
+    ways.append(ways[0][::-1])
+    poses = np.vstack([there, *(ways * 9)])
+    unknown = np.array([[20.2, 0.7], [20.5, -0.9], [20.9, 1.0], [21.3, -0.6], [21.4, 0.8]])
+    increments = reported(poses, LAB, rng, 0.0, unaware=len(there))
+    scans = scans_of(poses, np.vstack([PLACES, unknown]), rng, SIGMA_M)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    rule = replace(RULE, carry_steps=600)
+    branches._rule = rule
+    most, lost = 0, list[bool]()
+    for report in follow(branches, increments, scans, stop=len(there) if stops else None):
+        most = max(most, len(branches._steps))
+        lost.append(report.lost)
+    assert all(lost[-1000:])
+    # what the snapshots reach back to, and a search
+    assert most <= rule.snapshots * rule.snapshot_every + rule.carry_steps + rule.snapshot_every
