@@ -436,7 +436,7 @@ def test_a_place_that_misses_more_than_staying_is_taken_back() -> None:
     assert branches.main is stayed.back_end
 
 
-@pytest.mark.parametrize("stops", [True, False])
+@pytest.mark.parametrize("stops", [pytest.param(True, marks=pytest.mark.thorough), False])
 def test_a_robot_that_stays_lost_needs_bounded_memory(*, stops: bool) -> None:
     """It is carried to where it has never been, and drives to and fro there for 1300 scans.
 
