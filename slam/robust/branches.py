@@ -244,8 +244,8 @@ def advantage(place: Account, other: Account, rule: BranchRule) -> float:
     birth.
     """
     n_more = other.n_new - place.n_new
-    births = min(rule.birth_nats * n_more, rule.likeness_nats)
-    return place.known - other.known - rule.most_for * n_more + births
+    price = min(rule.new_landmark_nats * n_more, rule.likeness_nats)
+    return place.known - other.known - rule.most_for * n_more + price
 
 
 class Alternative:
@@ -482,7 +482,7 @@ class Branches:
         best = int(np.argmax(gains))
         account, found, pose = accounts[best], places[best], places[best].back_end.pose
         elsewhere = Account(n_new=carry.new.back_end.n_reported_since(0))
-        # Two places of the map are told apart by known landmarks alone: new ones take their time.
+        # Between two places of the map known landmarks decide: new ones are mapped with a delay.
         margins = [
             min(gains[best] - gain, account.known - other.known)
             if found is not carry.hidden

@@ -330,7 +330,7 @@ class BranchRule:
     hidden, or does not answer to this side."""
     most_for: Annotated[float, Origin.CHOSEN, "nats"] = 9.0
     """Most evidence that one landmark gives for a place, for others may lie near its prediction."""
-    birth_nats: Annotated[float, Origin.CHOSEN] = 8.0
+    new_landmark_nats: Annotated[float, Origin.CHOSEN] = 8.0
     """Price of a new landmark: that one lies within a centimetre of a given place, where there is
     one per square metre."""
     likeness_nats: Annotated[float, Origin.QUANTILE] = 6.9
@@ -343,7 +343,8 @@ class BranchRule:
     least_landmarks: Annotated[int, Origin.CHOSEN, "landmarks"] = 3
     """Fewest landmarks that place a map on another."""
     lost_steps: Annotated[int, Origin.BUDGET, "scans"] = 100
-    """How many of the last scans decide whether the robot is lost, or at a place."""
+    """How many of the last scans decide whether the robot is lost, and for how many scans a motion
+    that the wheels did not report is tried."""
     carry_steps: Annotated[int, Origin.BUDGET, "scans"] = 500
     """After how many scans the question of a carry is dropped, unless the robot is lost, and an
     adoption is final."""

@@ -214,16 +214,18 @@ def test_births_are_paid_but_a_likeness_is_not_that_rare() -> None:
     """A place where all looks alike is no likelier than new landmarks by more than a likeness."""
     stay = Account(n_new=1)
     one = account_of(np.array([[1.0, RULE.most_for]]), 0)
-    assert advantage(one, stay, RULE) == pytest.approx(min(RULE.birth_nats, RULE.likeness_nats))
+    assert advantage(one, stay, RULE) == pytest.approx(
+        min(RULE.new_landmark_nats, RULE.likeness_nats)
+    )
     many = account_of(np.array([[k, RULE.most_for] for k in range(12)]), 0)
     assert advantage(many, Account(n_new=12), RULE) == pytest.approx(RULE.likeness_nats)
     # and new landmarks of its own cost a place as much
-    assert advantage(stay, one, RULE) == pytest.approx(-RULE.birth_nats)
+    assert advantage(stay, one, RULE) == pytest.approx(-RULE.new_landmark_nats)
 
 
 def test_what_is_missed_counts_in_full() -> None:
     place, stay = Account(hits=27.0, n_seen=3), Account(hits=0.0, misses=-15.0, n_new=3)
-    likeness = min(3 * RULE.birth_nats, RULE.likeness_nats)
+    likeness = min(3 * RULE.new_landmark_nats, RULE.likeness_nats)
     assert advantage(place, stay, RULE) == pytest.approx(15.0 + likeness)
     missing = replace(place, misses=-10.0)
     assert advantage(missing, stay, RULE) == pytest.approx(5.0 + likeness)
