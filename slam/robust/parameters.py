@@ -259,8 +259,8 @@ class RelinearisationRule:
     """Scale of the prior of radii; smaller ones are alike."""
 
     thick_price: Annotated[float, Origin.CHOSEN] = 0.2
-    """What share of the price of a radius counts, in nats, once the constants of a run in which
-    everything is thin are implausible."""
+    """Share of the price of a radius that counts once the constants of a run in which everything is
+    thin are implausible."""
     nearer: Annotated[float, Origin.CHOSEN] = 0.8
     """What is left, at most, of how implausible the constants are, if that is to remain so."""
 
