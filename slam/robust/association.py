@@ -239,12 +239,13 @@ def find_known(
     parameters: BackEndParameters,
     *,
     beacons: Sequence[int] = (),
+    sure_m: float | None = None,
 ) -> Known:
     """Return the likeliest one-to-one assignment of ranges without labels to landmarks.
 
     ``side_of`` (r,) is the side of each radar. Those whose ranges the prior predicts less surely
-    than the radars' ``sigma_m`` take no part, nor do the rows ``beacons``, whose ranges have labels
-    and which do not answer every time.
+    than ``sure_m``, by default the radars' ``sigma_m``, take no part, nor do the rows ``beacons``,
+    whose ranges have labels and which do not answer every time.
     """
     noise, rule, tracklets = parameters.ranges, parameters.continuation, parameters.tracklets
     ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
@@ -288,7 +289,7 @@ def find_known(
                 margin_m,
                 tracklets.edge_rad,
                 parameters.map.view_inset_m,
-                noise.sigma_m**2,
+                (sure_m or noise.sigma_m) ** 2,
                 *chdtri([1, 2], TAIL_PROBABILITY),
                 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau),
                 math.hypot(noise.sigma_m, parameters.branches.model_sigma_m),
@@ -305,6 +306,51 @@ def find_known(
         unheard=unheard,
         at=at,
         H=H,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WeighedRanges:
+    """The k ranges that are of known landmarks, and what they do to a state."""
+
+    ranges_m: Array
+    sigmas_m: Array
+    gain: Array  # shape (m, k), of the ranges in ``weighted``
+    weighted: Array  # white innovations, weighted by Huber
+    white: Array  # those before the weights
+    # ln(Pd p / lambda), where p is the density of a range given those before it, and lambda that of
+    # ranges in its scan, whatever they are of
+    evidence: Array
+
+
+def weigh_known(
+    state: State, known: Known, seen: View, scans: Sequence[RangeScan], noise: RangeNoise
+) -> WeighedRanges:
+    """Weigh all ranges that are of known landmarks by Huber; the state stays as it is."""
+    radars, rows = known.assigned[:, 0], known.rows[known.assigned[:, 2]]
+    pairs, of_radar = known.assigned[:, :2].tolist(), {scan.radar: scan for scan in scans}
+    ranges_m = np.array([of_radar[radar].ranges_m[index] for radar, index in pairs])
+    sigmas_m = np.array([of_radar[radar].sigma(index, noise.sigma_m) for radar, index in pairs])
+    gain, weighted, white, scales_m = kernels.weigh(
+        state.P.columns(known.at),
+        known.at,
+        known.H,
+        ranges_m - seen.ranges_m[radars, rows],
+        np.square(sigmas_m) + np.square(state.feature_added_sigmas_m[rows]),
+        noise.huber_sigmas,
+        state.range_errors.variance_share,
+    )
+    span_m = noise.max_range_m - noise.min_range_m
+    density = np.array([len(of_radar[radar].ranges_m) / span_m for radar, _ in pairs])
+    odds = noise.detection_probability / np.maximum(density, noise.clutter_per_m)
+    log_density = -0.5 * (np.square(white) + math.log(math.tau)) - np.log(scales_m)
+    return WeighedRanges(
+        ranges_m=ranges_m,
+        sigmas_m=sigmas_m,
+        gain=gain,
+        weighted=weighted,
+        white=white,
+        evidence=np.log(odds) + log_density,
     )
 
 

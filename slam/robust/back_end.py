@@ -28,6 +28,7 @@ from slam.robust.association import (
     point_view,
     predicted_ranges,
     view,
+    weigh_known,
 )
 from slam.robust.initialisation import (
     BodyPoint,
@@ -53,6 +54,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters
+from slam.robust.slips import Change, Course, free_motion, judge_change, move_anew
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     find_split,
@@ -121,6 +123,10 @@ class RobustBackEnd:
         self._log = RunLog(parameters.wheels, parameters.splits.gap_poses)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
+        self._motion: Motion | None = None  # the last one, if it is known from the wheels
+        self._course: Course | None = None
+        self.slip_probability = 0.0
+        """Probability that the wheels slipped in the newest step."""
         self._landmark_of_label: dict[int, int] = {}
         # Beacons, whose ranges have labels: all labels heard, and by label those without a place
         self._heard: set[int] = set()
@@ -227,6 +233,10 @@ class RobustBackEnd:
         wheels = self.parameters.wheels
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
         self._log.add_motion(increment, motion, is_loose=covariance is not None)
+        before, self._motion = self._motion, motion if covariance is None else None
+        self._course = None
+        if before is not None and self._motion is not None:
+            self._course = Course(pose=self.state.pose, before=before, reported=motion)
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
         self._tentative.move(motion)
@@ -238,9 +248,9 @@ class RobustBackEnd:
         and the covariances of that: the pose becomes as certain as they make it.
         """
         increment = np.zeros(3)
-        free = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
-        motion = Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=free, walk_variance=0.0)
-        self._log.add_motion(increment, motion, is_loose=True)
+        free = free_motion(_CARRIED_M, _CARRIED_RAD)
+        self._log.add_motion(increment, free, is_loose=True)
+        self._motion = None
         self._unassigned.clear()
         self._tentative.clear()
         state = self.state
@@ -274,6 +284,11 @@ class RobustBackEnd:
         known = find_known(
             self.state, seen, widened, self._side_of, self.parameters, beacons=beacons
         )
+        change = self._judge_change(antennas, widened, beacons)
+        self.slip_probability = 0.0 if change is None else change.probability
+        if change is not None and change.slip is not None:
+            motion, known = change.slip
+            seen = self._slip(motion, antennas)
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
         continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
@@ -330,6 +345,36 @@ class RobustBackEnd:
             relinearise(self._log, self.state, self.parameters)
         return True
 
+    def _judge_change(
+        self, antennas: Antennas, scans: Sequence[RangeScan], beacons: Sequence[int]
+    ) -> Change | None:
+        """Return what the ranges of landmarks say of a sudden change of the wheels' motion."""
+        if self._course is None:
+            return None
+        walls = range(len(self.state.landmark_ids), len(self.state.feature_ids))
+        # As uncertain as after a slip, all landmarks take part.
+        sure_m = self.parameters.branches.hidden_m
+
+        def find(state: State, parameters: BackEndParameters) -> tuple[View, Known]:
+            seen, excluded = view(state, antennas), [*beacons, *walls]
+            return seen, find_known(
+                state, seen, scans, self._side_of, parameters, beacons=excluded, sure_m=sure_m
+            )
+
+        return judge_change(self.state, self._course, scans, self.parameters, find)
+
+    def _slip(self, motion: Motion, antennas: Antennas) -> View:
+        """Believe another motion than the wheels reported last; return the view after it."""
+        assert self._course is not None
+        rule = self.parameters.branches
+        hidden = free_motion(rule.hidden_m, rule.hidden_rad)
+        move_anew(self.state, self._course, motion, hidden, self.parameters.wheels)
+        self._log.loosen(self._log.n_poses - 1, hidden.covariance)
+        self._unassigned.clear()
+        self._tentative.clear()
+        self._motion = motion
+        return self._walls.look(view(self.state, antennas), antennas)
+
     def _count(self, known: Known) -> list[int]:
         """Count hits and misses; return landmarks surely in view and not heard, once per radar."""
         features, existence = self.state.feature_ids, self._existence
@@ -353,48 +398,19 @@ class RobustBackEnd:
         """Correct the state with all ranges found at once, weighted by Huber; log them.
 
         Returns (radar, index, landmark id) of each range, the NIS before the weights, and of each
-        range the landmark and ln(Pd p / lambda), where p is its density given those before it, and
-        lambda that of ranges in its scan, whatever they are of.
+        range the landmark and its evidence.
         """
         if not len(known.assigned):
             return (), 0.0, []
         state, ids = self.state, self.state.feature_ids
-        radars, landmarks = known.assigned[:, 0], known.rows[known.assigned[:, 2]]
-        pairs = known.assigned[:, :2].tolist()
+        weighed = weigh_known(state, known, seen, scans, self.parameters.ranges)
         continued = tuple(
-            (radar, index, ids[row])
-            for (radar, index), row in zip(pairs, landmarks.tolist(), strict=True)
+            (radar, index, ids[int(known.rows[place])])
+            for radar, index, place in known.assigned.tolist()
         )
-        of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
-        z = np.array([of_radar[radar].ranges_m[index] for radar, index in pairs])
-        innovations_m = z - seen.ranges_m[radars, landmarks]
-        sigmas = np.array([of_radar[radar].sigma(index, noise.sigma_m) for radar, index in pairs])
-        variances = np.square(sigmas) + np.square(state.feature_added_sigmas_m[landmarks])
-        gain, weighted, white, scales = kernels.weigh(
-            state.P.columns(known.at),
-            known.at,
-            known.H,
-            innovations_m,
-            variances,
-            noise.huber_sigmas,
-            state.range_errors.variance_share,
-        )
-        span_m = noise.max_range_m - noise.min_range_m
-        likelihoods = [
-            (
-                id_,
-                math.log(noise.detection_probability / max(noise.clutter_per_m, n_ranges / span_m))
-                - 0.5 * (square + math.log(math.tau))
-                - math.log(scale_m),
-            )
-            for (radar, _, id_), square, scale_m in zip(
-                continued, np.square(white).tolist(), scales.tolist(), strict=True
-            )
-            if (n_ranges := len(of_radar[radar].ranges_m))
-        ]
         nominal_m, turns_rad = antennas.nominal_m.tolist(), antennas.turns_rad.tolist()
         for (radar, _, landmark_id), range_m, sigma_m in zip(
-            continued, z.tolist(), sigmas.tolist(), strict=True
+            continued, weighed.ranges_m.tolist(), weighed.sigmas_m.tolist(), strict=True
         ):
             self._log.add_range(
                 self._log.n_poses - 1,
@@ -405,8 +421,9 @@ class RobustBackEnd:
                 range_m=range_m,
                 sigma_m=sigma_m,
             )
-        state.apply(gain, weighted)
-        return continued, float(white @ white), likelihoods
+        state.apply(weighed.gain, weighed.weighted)
+        evidence = zip((id_ for _, _, id_ in continued), weighed.evidence.tolist(), strict=True)
+        return continued, float(weighed.white @ weighed.white), list(evidence)
 
     def _beacon_rows(self) -> list[int]:
         """Return the rows of landmarks whose ranges have labels."""

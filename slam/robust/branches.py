@@ -17,14 +17,16 @@ Search
 Decision
     Four explanations of all ranges since the step are compared: that the robot stayed, that it made
     a small motion that the wheels did not report, that it is at the place, and that it is where it
-    has never been. Each has its own new landmarks, at the
-    price of a birth; since parts of the world look like each other, births together cost no more
-    than the price of such a likeness, so that a place is never adopted for being alike alone: what
-    should be seen must be missing without it. The price of a place grows with the number of places
-    that look alike.
+    has never been. Each has its own new landmarks, at the price of a birth; since parts of the
+    world look like each other, births together cost no more than the price of such a likeness, so
+    that a place is never adopted for being alike alone: what should be seen must be missing without
+    it. The price of a place grows with the number of places that look alike.
 Revision
     The back end that stayed goes on beside the one that is adopted. When the advantage of the place
     is gone, and more is missed there, the adoption is taken back.
+Doubt
+    What may have happened without being decided, a slip (`slam.robust.slips`) or a carry during a
+    stop, adds to the reported covariance until landmarks known before it confirm the pose.
 
 The robot is reported as lost while the landmarks known before the carry are against its pose by
 more than the price of a carry, and others are seen, or ranges have shown a carry. That ends when
@@ -47,6 +49,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import expit
 
 from slam.geometry import Rig, compose, has_moved
 from slam.results import UpdateReport
@@ -61,7 +64,7 @@ from slam.robust.constellation import (
 )
 from slam.robust.initialisation import Question
 from slam.robust.parameters import MARGIN_NATS, BackEndParameters, BranchRule, RangeNoise
-from slam.robust.state import Array
+from slam.robust.state import Array, quarter_turn
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
 _IDS_APART = 1000
@@ -279,6 +282,30 @@ class Place(Alternative):
         self.price_nats = price_nats  # how unlikely it is that the robot came there
 
 
+@dataclass(slots=True, kw_only=True, eq=False)
+class Doubt:
+    """A motion that the wheels may not have reported, until known landmarks confirm the pose."""
+
+    next_id: int  # landmarks known before it have smaller ids
+    position_m: Array  # shape (2,), where it may have been
+    variances: Array  # shape (3,) of x, y [m^2] and heading, its probability counted
+    nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
+
+    def take(self, evidence: Array, rule: BranchRule) -> bool:
+        """Add the evidence of a step; return whether the pose is confirmed."""
+        for landmark, nats in evidence.tolist():
+            if landmark < self.next_id:
+                total = self.nats.get(int(landmark), 0.0) + nats / rule.correlated_steps
+                self.nats[int(landmark)] = min(max(total, -rule.most_against), rule.most_for)
+        return sum(self.nats.values()) > rule.price_nats
+
+    def covariance(self, position_m: Array) -> Array:
+        """Return what it adds to the covariance (3, 3) of a pose at a position (2,)."""
+        T = np.eye(3)
+        T[:2, 2] = quarter_turn(position_m - self.position_m)
+        return np.asarray(T * self.variances @ T.T)
+
+
 @dataclass(slots=True, kw_only=True)
 class Carry:
     """The question whether the robot was carried before a step, and to which place."""
@@ -319,6 +346,7 @@ class Branches:
         self._carry: Carry | None = None
         self._judged = 0  # the evidence of the steps before it has been judged
         self._recognised_ids: set[int] = set()  # new landmarks that were searched for
+        self._doubts: list[Doubt] = []
         self.is_lost = False
 
     @property
@@ -337,6 +365,12 @@ class Branches:
         sigma_m = self._rule.lost_position_m
         covariance = np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
         return compose(self._carry.map.pose, self._carry.moved), covariance
+
+    @property
+    def doubted_covariance(self) -> Array:
+        """Return what doubts of the wheels add to the covariance of the pose, (3, 3)."""
+        position_m = self.main.state.position_m
+        return sum((one.covariance(position_m) for one in self._doubts), np.zeros((3, 3)))
 
     def predict(self, increment: Array, elapsed_s: float = 1.0, stood_s: float = 0.0) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
@@ -360,14 +394,17 @@ class Branches:
         next_id, carry_nats = self.main.state.next_id, self._carry_nats
         if self._has_stood and self._now - 1 in self._steps:
             carry_nats -= self._shown(self._steps[self._now - 1].scans, scans, self._increment)
+        position_m = self.main.state.position_m.copy()
         report = self.main.update(scans)
-        self._steps[self._now] = Step(
+        step = Step(
             increment=self._increment,
             scans=scans,
             next_id=next_id,
             evidence=evidence_table(report),
             carry_nats=carry_nats,
         )
+        self._steps[self._now] = step
+        self._doubt(step, position_m)
         self._now += 1
         was_lost = self.is_lost
         moved = self._carry is not None and self._decide(self._carry)
@@ -375,6 +412,18 @@ class Branches:
             self._look()
         carried = (moved or self.is_lost) and not was_lost
         return replace(report, carried=carried, lost=self.is_lost)
+
+    def _doubt(self, step: Step, position_m: Array) -> None:
+        """Keep what is doubtful of the wheels, until it is confirmed."""
+        rule, slipped = self._rule, self.main.slip_probability
+        self._doubts = [one for one in self._doubts if not one.take(step.evidence, rule)]
+        carried = float(expit(-step.carry_nats)) if self._has_stood else 0.0
+        hidden = np.square([rule.hidden_m, rule.hidden_m, rule.hidden_rad])
+        anywhere = np.square([rule.lost_position_m] * 2 + [math.pi / math.sqrt(3.0)])
+        variances = slipped * hidden + carried * anywhere
+        if slipped + carried > 0.0:
+            doubt = Doubt(next_id=step.next_id, position_m=position_m, variances=variances)
+            self._doubts.append(doubt)
 
     def _shown(
         self, before: Sequence[RangeScan], after: Sequence[RangeScan], increment: Array

@@ -271,6 +271,19 @@ class RelinearisationRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SlipRule:
+    """When the wheels are taken to have slipped in the newest step."""
+
+    steady_m: Annotated[float, Origin.CHOSEN] = 0.01
+    """Standard deviation of the change of a robot's motion from one step to the next; where the
+    wheels report a larger one, they may have slipped."""
+    steady_rad: Annotated[float, Origin.CHOSEN] = 0.02
+    """The same of its turn."""
+    changes_per_slip: Annotated[float, Origin.CHOSEN] = 60.0
+    """How many larger changes there are to one slip."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseRule:
     """What the residuals of a solution say of the noise of ranges."""
 
@@ -393,6 +406,7 @@ class BackEndParameters:
     map: MapRule = field(default_factory=MapRule)
     walls: WallRule = field(default_factory=WallRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)
+    slips: SlipRule = field(default_factory=SlipRule)
     noise: NoiseRule = field(default_factory=NoiseRule)
     splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)

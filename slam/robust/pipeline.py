@@ -120,7 +120,7 @@ class RobustSlam:
             StepResult(
                 t_ns=t_ns,
                 odometry_pose=pose,
-                belief=belief_of(branches.map, branches.lost_pose),
+                belief=belief_of(branches.map, branches.lost_pose, branches.doubted_covariance),
                 detections=detections,
                 report=report,
                 range_sigmas_m=sigmas_m,
@@ -188,7 +188,11 @@ def back_end_parameters(
     )
 
 
-def belief_of(back_end: RobustBackEnd, lost_pose: tuple[Array, Array] | None = None) -> Belief:
+def belief_of(
+    back_end: RobustBackEnd,
+    lost_pose: tuple[Array, Array] | None = None,
+    doubted: Array | None = None,
+) -> Belief:
     """Return pose and reported landmarks with additive errors, as a belief of its own.
 
     While the robot is lost, ``lost_pose`` replaces its pose (3,) and covariance (3, 3).
@@ -208,6 +212,8 @@ def belief_of(back_end: RobustBackEnd, lost_pose: tuple[Array, Array] | None = N
     along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
     covariance = P + (along + along.T)
     covariance[:2, :2] += state.curved_covariance()
+    if doubted is not None:
+        covariance[:3, :3] += doubted
     pose = state.pose
     if lost_pose is not None:
         covariance[:3], covariance[:, :3] = 0.0, 0.0

@@ -115,8 +115,12 @@ def test_a_slip_is_taken_back() -> None:
     run = slipped_run(2, slip)
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
     rules = parameters_for(LAB, SIGMA_M)
-    never = replace(rules.relinearisation, steps_per_slip=math.inf)
-    plain = RobustBackEnd(paper_rig(), replace(rules, relinearisation=never))
+    never = replace(
+        rules,
+        relinearisation=replace(rules.relinearisation, steps_per_slip=math.inf),
+        slips=replace(rules.slips, changes_per_slip=math.inf),
+    )
+    plain = RobustBackEnd(paper_rig(), never)
     for report in follow(branches, run.increments, run.scans):
         assert not report.carried
         assert not report.lost
