@@ -12,8 +12,9 @@ Suspicion
     it is asked for when that is outweighed.
 Search
     A back end with an empty map takes the motions and scans since. Where its landmarks lie on the
-    map of the main back end as it was then is searched for (`slam.robust.constellation`). A copy of
-    that back end is set down there, and takes the motions and scans since.
+    map of the main back end as it was then is searched for
+    (`slam.robust.proposals.constellation`). A copy of that back end is set down there, and takes
+    the motions and scans since.
 Decision
     Four explanations of all ranges since the step are compared: that the robot stayed, that it made
     a small motion that the wheels did not report, that it is at the place, and that it is where it
@@ -25,8 +26,8 @@ Revision
     The back end that stayed goes on beside the one that is adopted. When the advantage of the place
     is gone, and more is missed there, the adoption is taken back.
 Doubt
-    What may have happened without being decided, a slip (`slam.robust.slips`) or a carry during a
-    stop, adds to the reported covariance until landmarks known before it confirm the pose.
+    What may have happened without being decided, a slip (`slam.robust.proposals.slips`) or a carry
+    during a stop, adds to the reported covariance until landmarks known before it confirm the pose.
 
 The robot is reported as lost while the landmarks known before the carry are against its pose by
 more than the price of a carry, and others are seen, or ranges have shown a carry. That ends when
@@ -55,15 +56,15 @@ from slam.geometry import Rig, compose, has_moved
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.constellation import (
+from slam.robust.initialisation import Question
+from slam.robust.parameters import MARGIN_NATS, BackEndParameters, BranchRule, RangeNoise
+from slam.robust.proposals.constellation import (
     Constellation,
     Placement,
     constellation_of,
     find_placement,
     find_placements,
 )
-from slam.robust.initialisation import Question
-from slam.robust.parameters import MARGIN_NATS, BackEndParameters, BranchRule, RangeNoise
 from slam.robust.state import Array, quarter_turn
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.

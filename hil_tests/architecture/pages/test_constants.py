@@ -23,7 +23,7 @@ DECIDE_NOTHING = {
     "association": "LONGEST_M _LEAST_RANGE_M",
     "back_end": "_CARRIED_M _CARRIED_RAD _FREE_M _FREE_RAD _ANYWHERE_M2",
     "branches": "_IDS_APART",
-    "constellation": "_STEPS _LEAST_CHANGE _VARIANCE_FLOOR_M2",
+    "proposals.constellation": "_STEPS _LEAST_CHANGE _VARIANCE_FLOOR_M2",
     "initialisation": "_FORBIDDEN _LEAST_WAY_M _KNOWN_SHARE SEEN _FEWEST_SLOTS _STEPS "
     "_DAMPING _LEAST_SHARE _LEAST_DECREASE _FLOOR",
     "kernels": "_LEAST_ENTRY",

@@ -7,13 +7,13 @@ import pytest
 
 from slam.geometry import between, transform
 from slam.robust.association import density_per_m2
-from slam.robust.constellation import (
+from slam.robust.initialisation import BodyPoint, initialise_landmark
+from slam.robust.parameters import BranchRule
+from slam.robust.proposals.constellation import (
     Constellation,
     constellation_of,
     find_placement,
 )
-from slam.robust.initialisation import BodyPoint, initialise_landmark
-from slam.robust.parameters import BranchRule
 from slam.robust.state import Array, State
 
 PLACES = np.array(
