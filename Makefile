@@ -89,9 +89,9 @@ harm: $(VENV)/installed-demo
 		--scene $(DECEIVING:=:$(FIRST_SEED)-$(call upto,9)) $(FAMILIES:=:$(FIRST_SEED)-$(call upto,2)) \
 		--stress slip_large noise_stated_low carried
 
-# The pictures of fixtures/pictures, and the numbers of `limits`: about a quarter of an hour of one
-# core. Needs Mesa's lavapipe (Debian: mesa-vulkan-drivers) for the screenshot of Rerun and Chromium
-# for that of the report. RECORDING names the real recording that `recording` compares with.
+# The pictures of fixtures/pictures: about ten minutes of one core. Needs Mesa's lavapipe (Debian:
+# mesa-vulkan-drivers) for the screenshot of Rerun and Chromium for that of the report. RECORDING
+# names the real recording that docs/studies/recording.py compares with.
 pictures: $(VENV)/installed-test
 	$(BIN)/uwb-slam demo --out out/pictures/demo
 	$(BIN)/uwb-slam demo --scene classroom --out out/pictures/classroom
@@ -99,13 +99,12 @@ pictures: $(VENV)/installed-test
 	$(BIN)/uwb-slam view out/pictures/demo --screenshot fixtures/pictures/lab_rerun.png --at 330
 	$(BIN)/uwb-slam report out/pictures/demo
 	$(BIN)/python -m hil_tests.browser out/pictures/demo/report.html fixtures/pictures/lab_report.png
-	$(BIN)/uwb-slam experiment figure7 --out out/pictures
-	$(BIN)/uwb-slam experiment smoke --out out/pictures
-	$(BIN)/uwb-slam experiment filter --scene lab two_rooms --out out/pictures
-	$(BIN)/uwb-slam experiment limits --out out/pictures
-	$(if $(RECORDING),$(BIN)/uwb-slam experiment recording --recording '$(RECORDING)' --out out/pictures)
+	$(BIN)/python docs/studies/figure7.py --out out/pictures
+	$(BIN)/python docs/studies/smoke.py --out out/pictures
+	$(BIN)/python docs/studies/outlier_filter.py --out out/pictures
+	$(BIN)/python docs/studies/limits.py --out out/pictures
+	$(if $(RECORDING),$(BIN)/python docs/studies/recording.py --recording '$(RECORDING)' --out out/pictures)
 	cp out/pictures/*.png fixtures/pictures
-	cp out/pictures/limits.json fixtures/baselines/front_end.json
 	$(BIN)/python -m hil_tests.golden.update_manifest
 
 $(VENV)/bin/python:

@@ -1,12 +1,17 @@
-"""Where the source tree, its data files and data too large for it are."""
+"""Where the source tree, its data files, its studies and data too large for it are."""
 
 import os
+import sys
+from functools import cache
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
 FIXTURES = REPOSITORY / "fixtures"
+STUDIES = REPOSITORY / "docs" / "studies"
 SHARED_DATA = Path(os.environ.get("XETHRU_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
 
 
@@ -26,3 +31,17 @@ def real_recording() -> Path:
 def real_raw_recording() -> Path:
     """Return a recording of an X4M03, DATA FLOAT of 2025; skip the test without it."""
     return shared_data("x4m03_rf_2025")
+
+
+@cache
+def study(name: str) -> ModuleType:
+    """Return a script of `docs/studies` as a module; skip the test or file where there is none."""
+    path = STUDIES / f"{name}.py"
+    if not path.exists():
+        pytest.skip("studies are in the source tree", allow_module_level=True)
+    spec = spec_from_file_location(f"docs_studies_{name}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
-from slam.app.experiments import add_experiments
 from slam.app.experiments.benchmarks import BENCHMARKS
 from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
@@ -364,6 +363,38 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_experiment(experiment: argparse.ArgumentParser) -> None:
+    names = experiment.add_subparsers(required=True, metavar="NAME", dest="name")
+    for name, made_by, text in (
+        (
+            "consistency",
+            "`uwb-slam sweep`, like `make sweep`",
+            "mean NEES and NIS of a sweep at ten times, against their bands",
+        ),
+        (
+            "stress",
+            "`uwb-slam sweep --stress ...`",
+            "what each hardship of a sweep costs, in units of its clean runs",
+        ),
+        (
+            "scenes",
+            "`uwb-slam sweep --scene ...`",
+            "what one preset does in each scene of a sweep",
+        ),
+    ):
+        parser = names.add_parser(name, help=text, description=text)
+        parser.add_argument(
+            "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
+        )
+        parser.add_argument(
+            "--sweep",
+            type=Path,
+            default=Path("out/sweep.json" if name == "consistency" else f"out/{name}.json"),
+            metavar="JSON",
+            help=f"result of {made_by} (default: %(default)s)",
+        )
+
+
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     benchmark.add_argument(
         "name",
@@ -489,6 +520,13 @@ _COMMANDS = (
         + "; ".join(f"{name}: {stress.help}" for name, stress in STRESSES.items())
         + f". The families of random rooms are {', '.join(FAMILIES)}; statistics are of families.",
     ),
+    _Command(
+        "experiment",
+        "slam.app.sweep.pictures:run_experiment",
+        "draw the result of a sweep",
+        _add_experiment,
+        "Draws the result of a sweep; writes NAME.png and NAME.json. All numbers are simulated.",
+    ),
 )
 
 
@@ -505,14 +543,6 @@ def _parser() -> argparse.ArgumentParser:
         )
         row.add_arguments(command)
         command.set_defaults(command=row.start, extra=row.extra)
-
-    experiment = commands.add_parser(
-        "experiment",
-        help="repeat an experiment of the paper, or show a limit, as picture and numbers",
-        description="Runs one experiment on emulated radars; writes NAME.png and NAME.json. All "
-        "numbers are simulated.",
-    )
-    add_experiments(experiment)
     return parser
 
 

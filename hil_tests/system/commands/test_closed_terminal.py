@@ -257,13 +257,6 @@ def _is_view(folder: Path) -> bool:
     return sum(count_rows(folder / "out" / "view.rrd").values()) > 100
 
 
-def _is_experiment(folder: Path) -> bool:
-    numbers = json.loads((folder / "out" / "figure7.json").read_text())
-    return bool(numbers) and (folder / "out" / "figure7.png").read_bytes().endswith(
-        b"IEND\xaeB`\x82"
-    )
-
-
 def _is_demo(folder: Path) -> bool:
     return has_results(folder / "out") and is_finished(folder / "out" / "session.mcap")
 
@@ -282,7 +275,6 @@ COMMANDS: dict[str, tuple[str, Callable[[Path], bool]]] = {
         "calibrate {session} --rig {out}/rig.toml",
         lambda folder: "[[radars]]" in (folder / "out" / "rig.toml").read_text(),
     ),
-    "experiment": ("experiment figure7 --frames 1 --out {out}", _is_experiment),
     "repair": (
         "repair {session} --out {out}/session.mcap",
         lambda folder: is_finished(folder / "out" / "session.mcap"),

@@ -54,8 +54,10 @@ STYLE: dict[Any, Any] = {
 
 
 @contextmanager
-def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) -> Iterator[Figure]:
-    """Give a figure to draw in, and write it as a PNG file at the end.
+def picture(
+    path: Path, *, width_in: float, height_in: float, dpi: int = 100, title: str = ""
+) -> Iterator[Figure]:
+    """Give a figure to draw in, and write it as a PNG file at the end, with its folder.
 
     Its colours are cut to a palette of 256, which makes the file a third of the size. No software
     version or date goes into it: the same figure gives the same bytes.
@@ -65,14 +67,18 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
             figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white"
         )
         FigureCanvasAgg(figure)
+        if title:
+            figure.suptitle(title, fontsize=11, color=INK, x=0.01, ha="left")
         yield figure
         _make_printable(figure)
         drawn = io.BytesIO()
         figure.savefig(drawn, format="png")
         with Image.open(drawn) as colours:
             few = colours.convert("RGB").quantize(_PALETTE, dither=Image.Dither.NONE)
-        with naming(path), written_whole(path) as fresh:
-            few.save(fresh, format="png", optimize=True)
+        with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as fresh:
+                few.save(fresh, format="png", optimize=True)
 
 
 NARROW_IN = 4.4

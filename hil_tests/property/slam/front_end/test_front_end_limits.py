@@ -1,8 +1,6 @@
-"""The front ends and the experiment limits against what statistics allows."""
+"""The front ends and the study `limits` against what statistics allows."""
 
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,22 +10,17 @@ from numpy.typing import NDArray
 from scipy.special import eval_genlaguerre
 from scipy.stats import ncx2
 
+from hil_tests.paths import study
 from hil_tests.unit.slam.simulation import BIN_LENGTH_M as BIN_M
 from hil_tests.unit.slam.simulation import frame_of
-from slam.app.cli import main
-from slam.app.experiments.limits import (
-    PULSE,
-    detection_probability,
-    pair_covariance,
-    ranging,
-    resolution,
-)
 from slam.config import SlamConfig, override
 from slam.frames import RadarFrame
 from slam.front_end import make_detector
 from slam.front_end.matched_filter import _MEDIAN_EFFICIENCY
 
 Array = NDArray[np.float64]
+
+limits = study("limits")
 
 TRIALS = 2000
 AMPLITUDE, NOISE_SIGMA = 0.015, 5e-4
@@ -210,7 +203,7 @@ def test_an_echo_is_found_as_often_as_marcum_says(snr_db: float) -> None:
     assert low <= np.mean(hits) <= high
 
 
-KNOWN_SIGMA, KNOWN_CARRIER = PULSE.envelope_sigma_bins, PULSE.carrier_rad_per_bin
+KNOWN_SIGMA, KNOWN_CARRIER = limits.SIGMA_BINS, limits.CARRIER_RAD
 MIDDLE = 60
 
 
@@ -239,7 +232,7 @@ def test_pair_bound_is_that_of_the_whole_fisher_matrix(
     snr = 30.0
     whole = np.linalg.inv(snr**2 * jacobian @ jacobian.T)[:2, :2]
     turn = other - one - KNOWN_CARRIER * apart * KNOWN_SIGMA
-    bound = pair_covariance(
+    bound = limits.pair_covariance(
         np.array([apart * KNOWN_SIGMA]),
         ratio,
         np.array([turn]),
@@ -257,7 +250,7 @@ def test_marcum_is_what_a_correlation_with_the_pulse_exceeds() -> None:
     norm = math.sqrt(KNOWN_SIGMA * math.sqrt(math.pi) / 2)
     samples = snr * cosine + rng.standard_normal((n, cosine.size))
     height = np.hypot(samples @ cosine, samples @ sine) / norm
-    expected = float(detection_probability(np.array(snr), threshold, KNOWN_SIGMA))
+    expected = float(limits.detection_probability(np.array(snr), threshold, KNOWN_SIGMA))
     assert 0.2 < expected < 0.8
     error = math.sqrt(expected * (1 - expected) / n)
     assert np.mean(height > threshold) == pytest.approx(expected, abs=4 * error)
@@ -266,10 +259,7 @@ def test_marcum_is_what_a_correlation_with_the_pulse_exceeds() -> None:
 def test_what_counts_as_found_and_as_resolved() -> None:
     true_m = np.array([1.0, 1.0, 1.0, 1.0])
     found = [np.array([1.002]), np.array([0.998, 2.0]), np.array([]), np.array([1.2])]
-    seen = ranging(found, true_m)
-    assert (seen["found"], seen["others_per_frame"]) == (0.5, 0.5)
-    assert seen["bias_mm"] == pytest.approx(0.0)
-    assert seen["std_mm"] == pytest.approx(2 * math.sqrt(2))
+    np.testing.assert_allclose(limits.errors_m(found, true_m), [0.002, -0.002, math.nan, math.nan])
 
     pairs = np.tile([1.0, 1.1], (4, 1))
     split = [
@@ -278,22 +268,7 @@ def test_what_counts_as_found_and_as_resolved() -> None:
         np.array([1.0]),
         np.array([1.0, 1.1, 1.2]),
     ]
-    told_apart = resolution(split, pairs)
-    assert (told_apart["resolved"], told_apart["two_found"]) == (0.25, 0.5)
-    assert told_apart["rms_mm"] == pytest.approx(math.sqrt((100 + 100 + 0 + 900) / 4))
-
-
-def test_the_command_writes_table_picture_and_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["experiment", "limits", "--trials", "2", "--out", str(tmp_path)]) == 0
-    numbers = json.loads((tmp_path / "limits.json").read_text())
-    assert numbers["command"] == "uwb-slam experiment limits --trials 2 --seed 0"
-    assert {len(numbers[name]) > 0 for name in ("ranging", "detection", "resolution")} == {True}
-    assert (tmp_path / "limits.png").read_bytes().startswith(b"\x89PNG")
-    out, err = capsys.readouterr()
-    assert "share of pairs of equal echoes resolved" in out
-    assert "4/4 saturation" in err
+    assert limits.resolved(split, pairs) == 25.0
 
 
 def test_the_scatter_of_the_estimated_noise_is_that_of_a_median_of_correlated_powers() -> None:

@@ -28,7 +28,6 @@ from slam.app.experiments.benchmarks.evaluation import (
 from slam.app.run.output import print_progress, print_table, print_text, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
-    INK,
     LANDMARK,
     SMOOTHED,
     TRUTH,
@@ -72,8 +71,9 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
         runs.append(scored := score_run(data_set, run, stop, print_progress))
         write_run(out / name / run.name, scored)
     width_in, height_in = _size_in(len(runs))
-    with picture(out / f"{name}.png", width_in=width_in, height_in=height_in) as figure:
-        _draw(figure, f"{data_set.title} (real data)", runs)
+    path, title = out / f"{name}.png", f"{data_set.title} (real data)"
+    with picture(path, width_in=width_in, height_in=height_in, title=title) as figure:
+        _draw(figure, runs)
     numbers: dict[str, object] = {
         "benchmark": name,
         "runs": [scored.numbers() for scored in runs],
@@ -117,13 +117,12 @@ def _size_in(n_runs: int) -> tuple[float, float]:
     return columns * panel_in, math.ceil(n_runs / columns) * panel_in + 0.9
 
 
-def _draw(figure: Figure, title: str, runs: Sequence[ScoredRun]) -> None:
+def _draw(figure: Figure, runs: Sequence[ScoredRun]) -> None:
     """Draw the truth of each run, and its paths after the alignment that the ATE uses."""
     columns = min(len(runs), _PANELS)
     rows = math.ceil(len(runs) / columns)
     for number, scored in enumerate(runs, start=1):
         _draw_map(figure.add_subplot(rows, columns, number), scored, small=len(runs) > 1)
-    figure.suptitle(title, fontsize=11, color=INK, x=0.01, ha="left")
     used = [name for name in _STYLES if any(name in one.paths for one in runs)]
     handles = [Line2D([], [], color=TRUTH, linewidth=3.0, alpha=0.6)]
     handles += [Line2D([], [], color=_STYLES[name][1], linewidth=1.6) for name in used]

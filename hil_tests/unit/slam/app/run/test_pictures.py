@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from slam.app.run.pictures import (
     draw_map,
     ellipse_95,
     enlargement,
+    picture,
     rotate_covariances,
 )
 from slam.app.run.runner import RunRecord, States
@@ -212,3 +214,10 @@ def test_colours_differ_for_those_who_see_two(colours: list[tuple[int, ...]], vi
     for one, other in itertools.combinations(colours, 2):
         # 2.3 can just be seen; lines of a pixel need much more
         assert np.linalg.norm(lab(one, vision) - lab(other, vision)) > 15, (one, other)
+
+
+def test_a_picture_is_the_same_file_each_time(tmp_path: Path) -> None:
+    for name in ("one.png", "two.png"):
+        with picture(tmp_path / name, width_in=2, height_in=2) as figure:
+            figure.subplots().plot([0, 1, 2], [1, 0, 1], color="#1f6fd0")
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()

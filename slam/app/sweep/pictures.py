@@ -1,11 +1,11 @@
-"""The experiments `consistency`, `stress` and `scenes`: tables and pictures of a sweep's result."""
+"""The command `experiment`: tables and pictures of a sweep's result."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from pydantic import BaseModel, Field, ValidationError
 
-from slam.app.errors import AppError
-from slam.app.experiments import Result, table
-from slam.app.run.output import mm_text, share_text
+from slam.app.errors import AppError, naming
+from slam.app.run.output import mm_text, print_table, share_text, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
     GRID,
@@ -26,6 +25,7 @@ from slam.app.run.pictures import (
     SMOOTHED,
     TRUTH,
     label,
+    picture,
 )
 from slam.app.sweep import CLEAN
 from slam.app.sweep.statistics import (
@@ -121,24 +121,51 @@ class _Sweep(BaseModel):
     groups: Annotated[tuple[_Group, ...], Field(min_length=1)]
 
 
-def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Experiment:
+    """What is shown of a sweep: NAME.json, NAME.png and tables on standard output."""
+
+    numbers: Mapping[str, object]
+    title: str  # of the picture
+    size_in: tuple[float, float]  # its width and height
+    draw: Callable[[Figure], None]
+    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence[str]]]]  # title, header, rows
+
+
+def run_experiment(stop: StopFlag, *, name: str, sweep: Path, out: Path) -> None:
+    """Write NAME.json and NAME.png into ``out`` and print tables.
+
+    Raises AppError if the folder or a file cannot be written, or `experiment_of` does.
+    """
+    with naming(out):
+        out.mkdir(parents=True, exist_ok=True)
+    shown = experiment_of(name, sweep, out)
+    stop.check()
+    write_json(out / f"{name}.json", shown.numbers)
+    width_in, height_in = shown.size_in
+    path = out / f"{name}.png"
+    with picture(path, width_in=width_in, height_in=height_in, title=shown.title) as figure:
+        shown.draw(figure)
+    for each in shown.tables:
+        print_table(*each)
+
+
+def experiment_of(name: str, sweep: Path, out: Path) -> Experiment:
     """Read the sweep and return the experiment of that name.
 
     Raises AppError if the file cannot be read, is not a sweep's, would be replaced by the result,
     or has no runs of those that are shown.
     """
-    path: Path = arguments.sweep
-    groups = _read_groups(path, arguments.out / f"{arguments.name}.json")
-    stop.check()
-    if arguments.name == "stress":
+    groups = _read_groups(sweep, out / f"{name}.json")
+    if name == "stress":
         tables = stress_tables(groups)
         if not tables:
-            raise AppError(f"{path}: has no stressed runs; `uwb-slam sweep --stress` does")
+            raise AppError(f"{sweep}: has no stressed runs; `uwb-slam sweep --stress` does")
         return _stress(tables)
     clean = [group for group in groups if group["stress"] == CLEAN]
     if not clean:
-        raise AppError(f"{path}: has no clean runs, and `experiment {arguments.name}` shows those")
-    return _consistency(clean) if arguments.name == "consistency" else _scenes(clean)
+        raise AppError(f"{sweep}: has no clean runs, and `experiment {name}` shows those")
+    return _consistency(clean) if name == "consistency" else _scenes(clean)
 
 
 def _read_groups(path: Path, result: Path) -> list[Group]:
@@ -162,7 +189,7 @@ def _read_groups(path: Path, result: Path) -> list[Group]:
     return groups
 
 
-def _consistency(groups: Sequence[Group]) -> Result:
+def _consistency(groups: Sequence[Group]) -> Experiment:
     scenes = list(dict.fromkeys(group["scene"] for group in groups))
     rows = [
         {
@@ -187,7 +214,7 @@ def _consistency(groups: Sequence[Group]) -> Result:
         )
         for group in groups
     ]
-    return Result(
+    return Experiment(
         numbers={"simulated": True, "groups": rows},
         title="Mean over seeds against the 95 % band of a consistent filter (simulated)",
         size_in=(1.2 + 4.6 * len(scenes), 7.2),
@@ -234,7 +261,7 @@ def _line(axes: Axes, rows: Sequence[Sequence[float]], colour: str, name: str) -
     axes.plot(times, values, marker="o", markersize=4, linewidth=1.4, color=colour, label=name)
 
 
-def _stress(tables: Sequence[tuple[Group, Sequence[Group]]]) -> Result:
+def _stress(tables: Sequence[tuple[Group, Sequence[Group]]]) -> Experiment:
     numbers = [
         {
             "name": group_name(group),
@@ -259,7 +286,7 @@ def _stress(tables: Sequence[tuple[Group, Sequence[Group]]]) -> Result:
             _draw_nees(nees, groups, names)
         _legend_below(figure, panels[0, 0], panels[0, 1])
 
-    return Result(
+    return Experiment(
         numbers={"simulated": True, "groups": numbers},
         title="What each hardship costs, on equal seeds (simulated)",
         size_in=(10.4, 0.9 + (1.1 + 0.3 * most_rows) * len(tables)),
@@ -296,7 +323,7 @@ def _draw_times_clean(
     _name_rows(axes, names)
 
 
-def _scenes(groups: Sequence[Group]) -> Result:
+def _scenes(groups: Sequence[Group]) -> Experiment:
     rows = [
         {
             "name": group_name(group),
@@ -341,16 +368,17 @@ def _scenes(groups: Sequence[Group]) -> Result:
         _draw_nees(nees, groups, [""] * len(groups))
         _legend_below(figure, errors, nees)
 
-    return Result(
+    return Experiment(
         numbers={"simulated": True, "groups": rows},
         title="Clean runs, a row per scene and preset (simulated)",
         size_in=(10.4, 1.6 + 0.34 * len(groups)),
         draw=draw,
         tables=[
-            table(
+            (
                 "clean runs by scene and preset; errors, precision, recall: medians over seeds; "
                 "simulated",
-                columns,
+                list(columns),
+                list(zip(*columns.values(), strict=True)),
             )
         ],
     )
