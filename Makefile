@@ -110,7 +110,7 @@ pictures: $(VENV)/installed-test
 
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "no Python >= 3.11 found; set PYTHON=/path/to/python3" >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	"$(PYTHON)" -m venv $(VENV)
 
 $(VENV)/installed-demo: EXTRA = [slam]
 $(VENV)/installed-test: EXTRA = [test]

@@ -1,6 +1,7 @@
 """The plugin as a user runs it: pytest in an empty folder, radars of another process."""
 
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -302,9 +303,17 @@ def test_a_power_command_on_a_module_of_another_process(tmp_path: Path) -> None:
         "    assert radar_place.power_cycle().x4.iterations == 8\n"
     )
     with emulator("serve", "--bare", "--tcp", "0") as served:
-        command = f"{sys.executable} -m emulator.cli ctl {served.control} unplug 0.3"
+        control = [
+            sys.executable,
+            "-m",
+            "emulator.cli",
+            "ctl",
+            str(served.control),
+            "unplug",
+            "0.3",
+        ]
         address = ("--radar", f"tcp://127.0.0.1:{served.tcp_ports[0]}")
-        done = run(tmp_path, *address, "--hil-power-cmd", command)
+        done = run(tmp_path, *address, "--hil-power-cmd", shlex.join(control))
         failed = run(tmp_path, *address, "--hil-power-cmd", "sh -c 'echo no hub; exit 3'")
     assert done.returncode == 0, done.stdout
     assert failed.returncode == 1

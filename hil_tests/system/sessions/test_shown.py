@@ -217,8 +217,10 @@ class _Ready:
     def wait_until_ready(self, _: StopFlag) -> None: ...
 
 
+# A shell starts it: the path after #! may have no blanks.
 _ENDS_SOON = """\
-#!{python}
+#!/bin/sh
+'''exec' "{python}" "$0" "$@" # '''
 import socket, sys, time
 listener = socket.create_server(("127.0.0.1", int(sys.argv[sys.argv.index("--port") + 1])))
 listener.settimeout(0.1)
