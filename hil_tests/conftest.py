@@ -6,10 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
+from hil_tests.paths import NO_SHARED_DATA, shared_data
 from hil_tests.patience import seconds
 
 HERE = Path(__file__).parent
@@ -85,6 +87,16 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 def pytest_report_collectionfinish() -> list[str]:
     left_out = "hil_tests: of an installed package the device suite runs, without a source tree"
     return [] if IN_SOURCE_TREE else [left_out]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Give all tests without the shared data one place of their skip: the report joins them."""
+    report = yield
+    if isinstance(report.longrepr, tuple) and report.longrepr[2] == f"Skipped: {NO_SHARED_DATA}":
+        code = shared_data.__code__
+        report.longrepr = (code.co_filename, code.co_firstlineno, report.longrepr[2])
+    return report
 
 
 def pytest_collection_finish() -> None:
