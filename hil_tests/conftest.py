@@ -6,10 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
+from hil_tests.paths import NO_SHARED_DATA, shared_data
 from hil_tests.patience import seconds
 
 HERE = Path(__file__).parent
@@ -20,18 +22,17 @@ SLOW_TIMEOUT_S = 120.0
 
 if importlib.util.find_spec("hypothesis") is not None:
     from hypothesis import HealthCheck, settings
-    from hypothesis.internal.conjecture import providers
 
     # No verdict on speed, which is that of the machine.
     timeless = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-    # CI repeats the same examples; what it finds becomes an @example beside the test.
+    # CI repeats its examples, but for constants, which Hypothesis takes from the modules loaded so
+    # far. What `make test-explore` finds becomes an @example beside the test.
     settings.register_profile("thorough", timeless, derandomize=True, print_blob=True)
     settings.register_profile("ci", settings.get_profile("thorough"), max_examples=60)
-    settings.register_profile("explore", timeless, max_examples=2000)
+    settings.register_profile(
+        "explore", timeless, derandomize=False, print_blob=True, max_examples=2000
+    )
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
-    # Hypothesis also draws constants of the modules loaded so far, hence other examples after other
-    # tests and with another number of workers. It has no setting for that.
-    vars(providers)["is_local_module_file"] = lambda path: False
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -86,6 +87,16 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 def pytest_report_collectionfinish() -> list[str]:
     left_out = "hil_tests: of an installed package the device suite runs, without a source tree"
     return [] if IN_SOURCE_TREE else [left_out]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Give all tests without the shared data one place of their skip: the report joins them."""
+    report = yield
+    if isinstance(report.longrepr, tuple) and report.longrepr[2] == f"Skipped: {NO_SHARED_DATA}":
+        code = shared_data.__code__
+        report.longrepr = (code.co_filename, code.co_firstlineno, report.longrepr[2])
+    return report
 
 
 def pytest_collection_finish() -> None:

@@ -13,13 +13,19 @@ REPOSITORY = Path(__file__).parents[1]
 FIXTURES = REPOSITORY / "fixtures"
 STUDIES = REPOSITORY / "docs" / "studies"
 SHARED_DATA = Path(os.environ.get("XETHRU_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
+NO_SHARED_DATA = (
+    f"recordings of real modules are not in {SHARED_DATA}: set XETHRU_SHARED_DATA to their folder"
+)
 
 
 def shared_data(name: str) -> Path:
-    """Return a file or folder of the data that is not in the tree; skip the test without it."""
+    """Return a file or folder of the data that is not in the tree; skip the test without it.
+
+    The reason is the same for all, so that the report has one line, with the number of tests.
+    """
     path = SHARED_DATA / name
     if not path.exists():
-        pytest.skip(f"no {path}: set XETHRU_SHARED_DATA to the folder that holds it")
+        pytest.skip(NO_SHARED_DATA)
     return path
 
 

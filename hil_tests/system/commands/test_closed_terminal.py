@@ -291,7 +291,8 @@ def test_a_terminal_that_is_gone_from_the_start_costs_no_result(
     """As after `nohup`; that the table could not be printed is exit code 1."""
     line, is_whole = COMMANDS[name]
     (out := tmp_path / "out").mkdir()
-    words = line.format(session=session, out=out, scene=write_shorter_scene(tmp_path)).split()
+    paths = {"session": session, "out": out, "scene": write_shorter_scene(tmp_path)}
+    words = [word.format(**paths) for word in line.split()]
     with in_terminal(UWB_SLAM, words, tmp_path / "crash", ignores_hangup=True) as command:
         command.wait_for_handlers()
         command.hang_up()

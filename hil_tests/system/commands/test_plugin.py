@@ -1,6 +1,8 @@
 """The plugin as a user runs it: pytest in an empty folder, radars of another process."""
 
 import json
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -295,6 +297,46 @@ def test_a_radar_of_ones_own_by_a_hook(tmp_path: Path) -> None:
     assert "--radar mylab:rack3: names no radar" in unknown.stderr
 
 
+MARKED = """
+import pytest
+
+@pytest.mark.writes_flash
+def test_flash(radar):
+    radar.ping()
+
+@pytest.mark.writes_factory_settings
+def test_factory(radar):
+    radar.ping()
+
+@pytest.mark.slow_hw(seconds=30)
+def test_slow(radar):
+    radar.ping()
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "ran"),
+    [
+        ((), set()),
+        (("--allow-flash",), {"test_flash"}),
+        (("--allow-factory-reset", "--hil-slow"), {"test_factory", "test_slow"}),
+    ],
+    ids=["none", "flash", "others"],
+)
+def test_options_permit_what_markers_ask_for(
+    options: tuple[str, ...], ran: set[str], tmp_path: Path, address: str
+) -> None:
+    """Of a real module; the emulated one, in virtual time, takes all three."""
+    (tmp_path / "test_mine.py").write_text(MARKED)
+    done = run(tmp_path, "-v", "--radar", address, "--radar", "emu", *options)
+    assert done.returncode == 0, done.stdout
+    passed = re.findall(r"::(test_\w+)\[(\w+).*\] PASSED", done.stdout)
+    assert {test for test, radar in passed if radar == "emu"} == {
+        *("test_flash", "test_factory", "test_slow")
+    }
+    assert {test for test, radar in passed if radar != "emu"} == ran
+
+
 def test_a_power_command_on_a_module_of_another_process(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(
         "def test_power(radar_place):\n"
@@ -302,9 +344,17 @@ def test_a_power_command_on_a_module_of_another_process(tmp_path: Path) -> None:
         "    assert radar_place.power_cycle().x4.iterations == 8\n"
     )
     with emulator("serve", "--bare", "--tcp", "0") as served:
-        command = f"{sys.executable} -m emulator.cli ctl {served.control} unplug 0.3"
+        control = [
+            sys.executable,
+            "-m",
+            "emulator.cli",
+            "ctl",
+            str(served.control),
+            "unplug",
+            "0.3",
+        ]
         address = ("--radar", f"tcp://127.0.0.1:{served.tcp_ports[0]}")
-        done = run(tmp_path, *address, "--hil-power-cmd", command)
+        done = run(tmp_path, *address, "--hil-power-cmd", shlex.join(control))
         failed = run(tmp_path, *address, "--hil-power-cmd", "sh -c 'echo no hub; exit 3'")
     assert done.returncode == 0, done.stdout
     assert failed.returncode == 1

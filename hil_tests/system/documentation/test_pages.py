@@ -31,7 +31,7 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -182,7 +182,7 @@ class Reader:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_RUNTIME_DIR", str(self._folder))
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
-                program, *words = shlex.split(self._here(command), comments=True)
+                program, *words = shlex.split(self._for_shell(command), comments=True)
                 code = (slam_main if program == "uwb-slam" else xethru_main)(words)
         if code == 0 and shown.strip():
             check_output(command, self._here(shown), printed.getvalue() or errors.getvalue())
@@ -201,7 +201,7 @@ class Reader:
         self, command: str, stderr: int = subprocess.DEVNULL
     ) -> Iterator[subprocess.Popen[str]]:
         process = subprocess.Popen(
-            ["bash", "-c", self._here(command)],
+            ["bash", "-c", self._for_shell(command)],
             cwd=self._folder,
             env=self._environment,
             stdout=subprocess.PIPE,
@@ -220,10 +220,13 @@ class Reader:
             if process.stderr is not None:
                 process.stderr.close()
 
-    def _here(self, text: str) -> str:
+    def _here(self, text: str, quoted: Callable[[str], str] = str) -> str:
         for place, emulated in self._places.items():
-            text = text.replace(place, emulated)
+            text = text.replace(place, quoted(emulated))
         return text
+
+    def _for_shell(self, command: str) -> str:
+        return self._here(command, shlex.quote)  # the temporary folder may have blanks in its path
 
 
 def check_output(command: str, shown: str, printed: str) -> None:

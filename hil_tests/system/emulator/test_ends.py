@@ -1,6 +1,7 @@
 """How serve and play start and end, whatever happens around them."""
 
 import json
+import shlex
 import signal
 import socket
 import subprocess
@@ -114,8 +115,9 @@ def test_a_killed_emulator_is_succeeded_by_the_next(tmp_path: Path, announcement
 
 
 def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
-    command = f"exec {sys.executable} -m emulator.cli serve --bare --link-dir {tmp_path}/l >&-"
-    with subprocess.Popen(["sh", "-c", command]) as process:
+    serve = [sys.executable, "-m", "emulator.cli", "serve", "--bare"]
+    command = shlex.join([*serve, "--link-dir", str(tmp_path / "l")])
+    with subprocess.Popen(["sh", "-c", f"exec {command} >&-"]) as process:
         port = tmp_path / "l" / "radar_1"
         wait_until(port.is_symlink, process)
         with open_radar(str(port)) as driver:

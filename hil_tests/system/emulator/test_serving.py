@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import resource
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from hil_tests.bench.virtual_time import counters_of
 from hil_tests.device.serving import emulator, open_radar
 from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds
+from hil_tests.unit.full_disk import child_on_full_disk
 from xethru_protocol.cli import main
 from xethru_protocol.driver.files import FileName
 from xethru_protocol.driver.link import RawConfig
@@ -170,7 +170,7 @@ def test_a_full_disk_under_the_capture_ends_the_proxy_with_one_line(tmp_path: Pa
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, 3_000)),
+            **child_on_full_disk(3_000),
         ) as proxy:
             assert proxy.stdout is not None
             ready = json.loads(proxy.stdout.readline())

@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from mcap.reader import make_reader
 from hil_tests.patience import catches, seconds, wait_until
 from hil_tests.system.recorded_session import write_shorter_scene
 from hil_tests.system.short_scene import write_short_scene
+from hil_tests.unit.full_disk import child_on_full_disk
 from hil_tests.unit.slam.app.sessions import surviving_counters
 from slam.app.cli import main
 from slam.app.run import results
@@ -113,7 +113,7 @@ def test_a_signal_half_way(which: signal.Signals, times: int, code: int, tmp_pat
     assert abs(count_rows(out / "session.rrd")["/radar/left_rear/frame"] - len(counters)) <= 1
 
 
-def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "slam.app.cli", "demo", "--preset", "paper"]
     command += ["--scene", str(write_short_scene(tmp_path)), "--out", str(tmp_path / "out")]
     limit = 1_000_000  # bytes, of which the session takes several times as many
@@ -122,7 +122,7 @@ def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        **child_on_full_disk(limit),
     )
     assert (run.returncode, run.stdout) == (1, "")
     *progress, last = run.stderr.splitlines()

@@ -1,12 +1,10 @@
 """What `view` and `report` share: they show what was recorded, and leave no half file."""
 
 import io
-import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ from PIL import Image
 
 from hil_tests.patience import seconds
 from hil_tests.system.recorded_session import record_session
+from hil_tests.unit.full_disk import child_on_full_disk, full_disk
 from slam.app.cli import main
 from slam.app.commands import report, view
 from slam.app.run import output
@@ -154,17 +153,6 @@ class StopsSoon(StopFlag):
             raise StopRequestedError(signal.SIGTERM)
 
 
-@contextmanager
-def room_on_disk(n_bytes: int) -> Iterator[None]:
-    """Let no file grow longer than this while the block runs."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
@@ -196,8 +184,8 @@ def test_a_full_disk_leaves_what_was_there(session: Path, tmp_path: Path, comman
         stderr=subprocess.PIPE,
         text=True,
         timeout=seconds(30),
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
         check=False,
+        **child_on_full_disk(20_000),
     )
     assert ended.returncode == 1
     assert contents(tmp_path) == before
@@ -219,7 +207,7 @@ def test_a_full_disk_leaves_the_earlier_picture(
     Image.fromarray(noise).save(png := io.BytesIO(), format="png")
     monkeypatch.setattr(view, "ViewerProcess", lambda _: nullcontext(_Ready()))
     monkeypatch.setattr(view, "_settled", lambda *_: png.getvalue())
-    with room_on_disk(20_000):
+    with full_disk(20_000):
         assert main(["view", str(rrd), "--screenshot", str(out)]) == 1
     assert contents(tmp_path) == before
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"uwb-slam: {out}: ")
@@ -229,8 +217,10 @@ class _Ready:
     def wait_until_ready(self, _: StopFlag) -> None: ...
 
 
+# A shell starts it: the path after #! may have no blanks.
 _ENDS_SOON = """\
-#!{python}
+#!/bin/sh
+'''exec' "{python}" "$0" "$@" # '''
 import socket, sys, time
 listener = socket.create_server(("127.0.0.1", int(sys.argv[sys.argv.index("--port") + 1])))
 listener.settimeout(0.1)

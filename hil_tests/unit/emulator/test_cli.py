@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -82,13 +83,13 @@ def test_the_list_of_faults_is_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_closed_stderr_leaves_the_exit_code() -> None:
-    command = f"exec {sys.executable} -m emulator.cli serve no_such_scene 2>&-"
-    run = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, check=False)
+    command = shlex.join([sys.executable, "-m", "emulator.cli", "serve", "no_such_scene"])
+    run = subprocess.run(["sh", "-c", f"exec {command} 2>&-"], stdout=subprocess.PIPE, check=False)
     assert (run.returncode, run.stdout) == (2, b"")
 
 
-def run(arguments: str, stdout: int | IO[bytes]) -> tuple[int, str]:
-    command = [sys.executable, "-m", "emulator.cli", *arguments.split()]
+def run(arguments: list[str], stdout: int | IO[bytes]) -> tuple[int, str]:
+    command = [sys.executable, "-m", "emulator.cli", *arguments]
     done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
     return done.returncode, done.stderr
 
@@ -101,8 +102,10 @@ def broken_pipe() -> Iterator[int]:
     os.close(write_end)
 
 
-@pytest.mark.parametrize("arguments", ["faults", "faults --json"])
-def test_a_reader_of_the_list_that_left_is_no_failure(arguments: str, broken_pipe: int) -> None:
+@pytest.mark.parametrize("arguments", [["faults"], ["faults", "--json"]])
+def test_a_reader_of_the_list_that_left_is_no_failure(
+    arguments: list[str], broken_pipe: int
+) -> None:
     assert run(arguments, broken_pipe) == (0, "")
 
 
@@ -110,7 +113,8 @@ def test_a_reader_of_the_ready_line_that_left_ends_serving(
     tmp_path: Path, broken_pipe: int
 ) -> None:
     said = "xethru-emulator: stdout: cannot write the ready line: Broken pipe\n"
-    assert run(f"serve --bare --link-dir {tmp_path}/l", broken_pipe) == (1, said)
+    serve = ["serve", "--bare", "--link-dir", str(tmp_path / "l")]
+    assert run(serve, broken_pipe) == (1, said)
     assert not (tmp_path / "l").exists()
 
 
@@ -118,7 +122,7 @@ def test_a_reader_of_the_ready_line_that_left_ends_serving(
 def test_a_full_disk_is_one_line() -> None:
     said = "xethru-emulator: stdout: cannot write: No space left on device\n"
     with Path("/dev/full").open("wb") as full:
-        assert run("faults", full) == (1, said)
+        assert run(["faults"], full) == (1, said)
 
 
 def test_ctrl_c_ends_a_request_without_answer(tmp_path: Path) -> None:

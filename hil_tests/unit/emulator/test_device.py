@@ -298,6 +298,29 @@ def test_reset_of_a_running_module_restores_its_profile(host: BareHost) -> None:
     assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_2,))
 
 
+@pytest.mark.parametrize("restart", ["reset", "power"])
+def test_a_module_whose_profile_was_loaded_but_not_run_starts_stopped(
+    host: BareHost, restart: str
+) -> None:
+    """Protocol reference 8.2: only one that was in RUN starts its profile; 8.3: RUN needs one."""
+    assert mode_of(host) == 0x01, "as shipped"
+    host.command(m.LoadApp(profile_id=PRESENCE_2))
+    assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_2,))
+    if restart == "reset":
+        host.command(m.ModReset())
+    else:
+        host.device.power_cycle(host.now_ns)
+    assert host.at(5 * SECOND) == [m.System(code=0x10), m.System(code=0x11)]
+    assert mode_of(host) == 0x13
+    assert host.ask(m.SetMode(mode=SensorMode.XTID_SM_RUN)) == m.Error(code=0x20)
+    # once it runs, it starts running
+    host.command(m.LoadApp(profile_id=PRESENCE_2), m.SetMode(mode=SensorMode.XTID_SM_RUN))
+    host.hear()
+    host.command(m.ModReset())
+    host.at(10 * SECOND)
+    assert mode_of(host) == 0x01
+
+
 @pytest.mark.parametrize("pace", list(Pace))
 def test_a_host_that_never_reads_is_held_back(pace: Pace) -> None:
     device = ramp_device(pace)

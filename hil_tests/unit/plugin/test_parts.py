@@ -125,7 +125,7 @@ def test_a_line_is_closed_where_the_firmware_turns_out_to_lack_something(
 
 def test_power_is_switched_off_and_on_with_a_pause(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    script = f'echo "$0 $1 $2" >> {log}'
+    script = f'echo "$0 $1 $2" >> "{log}"'
     slept: list[float] = []
     command = PowerCommand(f"sh -c '{script}' {{action}} {{port}} {{serial}}")
     command.cycle("/dev/ttyACM0", "202611210001", 1.5, slept.append)
@@ -136,7 +136,7 @@ def test_power_is_switched_off_and_on_with_a_pause(tmp_path: Path) -> None:
 
 def test_power_comes_back_after_an_interrupted_pause(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    command = PowerCommand(f"sh -c 'echo {{action}} >> {log}'")
+    command = PowerCommand(f"sh -c 'echo {{action}} >> \"{log}\"'")
 
     def interrupted(seconds: float) -> None:
         raise KeyboardInterrupt

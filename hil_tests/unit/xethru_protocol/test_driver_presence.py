@@ -208,13 +208,14 @@ def test_output_is_not_asked_for_while_no_profile_is_loaded(emulated: Emulated) 
 
 def test_messages_that_pile_up_are_dropped_and_told_of(loaded: Emulated) -> None:
     radar, line, _ = loaded
-    said = presence(1, PRESENCE)
-    for _ in range(4100):
-        radar._link._take(said, 0)
-    radar._link._take(presence(2, PRESENCE), 0)
+    for number in range(4101):
+        radar._link._take(presence(number, PRESENCE), 0)
     assert radar.messages_dropped == 5
     assert radar.warnings == ["4096 messages wait unread, so the oldest are dropped"]
     assert line.pending == []
+    waiting = radar.messages(timeout_s=0.0)
+    kept = [next(waiting) for _ in range(4096)]
+    assert kept == [presence(number, PRESENCE) for number in range(5, 4101)]
 
 
 @pytest.mark.parametrize(("control", "limit_s"), [(2, 25.0), (6, 25.0), (3, 125.0), (7, 125.0)])

@@ -6,7 +6,7 @@ from random import Random
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
@@ -87,6 +87,79 @@ def test_order_of_points_does_not_matter(points: Array, shuffler: Random) -> Non
     labels[order] = cluster_labels(points[order], PAPER)
     assert np.array_equal(labels == NOISE, noise)
     assert partition(labels, sorted(set().union(*groups))) == groups
+
+
+def assert_border_points_belong_to_a_core_neighbour(points: Array, config: ClusteringConfig) -> int:
+    """Return the number of border points (Ester 1996, definition 5)."""
+    labels = cluster_labels(points, config)
+    near = distances(points) <= config.search_radius_m
+    core = near.sum(axis=1) >= config.min_observations
+    border = np.flatnonzero(~core & (near & core[None, :]).any(axis=1))
+    for k in border:
+        assert labels[k] in labels[near[k] & core]
+    return len(border)
+
+
+def distances(points: Array) -> Array:
+    offsets = points[:, None, :] - points[None, :, :]
+    return np.hypot(offsets[..., 0], offsets[..., 1])
+
+
+@settings(max_examples=300)
+@given(clouds, st.integers(2, 10))
+def test_a_border_point_is_in_the_cluster_of_a_core_neighbour(points: Array, count: int) -> None:
+    assert_border_points_belong_to_a_core_neighbour(
+        points, ClusteringConfig(min_observations=count)
+    )
+
+
+def test_border_points_of_two_clusters_are_told_apart() -> None:
+    """Seven points and two ends: the seven have nine points within the radius, an end has eight."""
+    heap = [(0.0, 0.0)] * 7 + [(-0.19, 0.0), (0.19, 0.0)]
+    points = np.array([*heap, *((x + 2.0, y) for x, y in heap)])
+    labels = cluster_labels(points, PAPER)
+    assert labels.tolist() == [0] * 9 + [1] * 9
+    assert assert_border_points_belong_to_a_core_neighbour(points, PAPER) == 4
+
+
+@pytest.mark.parametrize("place", [0, 9, 18])
+def test_a_border_point_of_two_clusters_does_not_join_them(place: int) -> None:
+    """It is near one core point of each, and may be in either cluster."""
+    left = [(-0.3, 0.0)] * 8 + [(-0.19, 0.0)]
+    right = [(0.3, 0.0)] * 8 + [(0.19, 0.0)]
+    points = np.insert(np.array([*left, *right]), place, (0.0, 0.0), axis=0)
+    labels = cluster_labels(points, PAPER)
+    assert np.delete(labels, place).tolist() == [0] * 9 + [1] * 9
+    assert assert_border_points_belong_to_a_core_neighbour(points, PAPER) == 1
+
+
+@pytest.mark.parametrize("radius_m", [1e-3, 0.2, 1e3])
+def test_the_radius_is_exact_at_every_scale(radius_m: float) -> None:
+    """Two heaps of five: ten points within the radius, or five."""
+    config = ClusteringConfig(search_radius_m=radius_m, min_observations=9)
+    for factor, label in ((1 - 1e-9, 0), (1 + 1e-9, NOISE)):
+        points = np.repeat([[0.0, 0.0], [factor * radius_m, 0.0]], 5, axis=0)
+        assert set(cluster_labels(points, config).tolist()) == {label}
+
+
+@given(
+    clouds,
+    st.integers(1, 10),
+    st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-math.pi, math.pi)).map(np.array),
+    st.floats(0.1, 10.0),
+)
+def test_motion_and_scale_change_no_label(
+    points: Array, count: int, motion: Array, scale: float
+) -> None:
+    """Distances to each other, in radii, are all that counts."""
+    radius_m = PAPER.search_radius_m + 3.47e-6  # between the distances of the lattice
+    assume(np.all(np.abs(distances(points) - radius_m) > 1e-9))
+    here = ClusteringConfig(min_observations=count, search_radius_m=radius_m)
+    there = ClusteringConfig(min_observations=count, search_radius_m=scale * radius_m)
+    labels = cluster_labels(points, here)
+    moved = np.reshape(transform(motion, points), (-1, 2))
+    assert np.array_equal(cluster_labels(moved, here), labels)
+    assert np.array_equal(cluster_labels(scale * moved, there), labels)
 
 
 @given(clouds, st.floats(0.05, 0.4), st.floats(1.0, 3.0))

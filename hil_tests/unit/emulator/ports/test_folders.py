@@ -132,6 +132,13 @@ def test_settings_are_saved_when_the_profile_starts(tmp_path: Path) -> None:
     assert sensitivity(host) == 7
 
 
+def test_a_profile_that_was_loaded_and_not_run_does_not_start(tmp_path: Path) -> None:
+    """8.2: the module was not in RUN."""
+    assert start(tmp_path).ask(m.GetMode()) == m.ReplyByte(values=b"\x01"), "as shipped"
+    start(tmp_path).command(LOAD)
+    assert start(tmp_path).ask(m.GetMode()) == m.ReplyByte(values=b"\x13")
+
+
 def test_presence_outputs_are_kept_and_the_others_are_off(tmp_path: Path) -> None:
     """4.7, last column."""
     host = start(tmp_path)

@@ -1,6 +1,7 @@
 """uwb-slam itself: help is light, wrong usage is 2, signals, and no traceback."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -95,9 +96,10 @@ def test_a_closed_standard_stream_changes_nothing(
     closed: str, scene: str, code: int, tmp_path: Path
 ) -> None:
     path = trajectory(tmp_path)
-    arguments = f"sweep --json o --scene {scene}" if scene else f"evaluate {path} {path}"
+    arguments = ["sweep", "--json", "o", "--scene", scene] if scene else ["evaluate", path, path]
+    command = shlex.join([sys.executable, "-m", "slam.app.cli", *arguments])
     run = subprocess.run(
-        ["sh", "-c", f"exec {sys.executable} -m slam.app.cli {arguments} {closed}"],
+        ["sh", "-c", f"exec {command} {closed}"],
         capture_output=True,
         text=True,
         check=False,

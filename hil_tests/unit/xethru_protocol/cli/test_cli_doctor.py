@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shlex
 import subprocess
 import sys
 import termios
@@ -252,16 +253,14 @@ def test_a_module_that_stops_answering_half_way(capsys: Capture) -> None:
 # --- the port ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "quoted"), [("radar", "{}"), ("my {radar} $(id)", "'{}'")], ids=["plain", "quoted"]
-)
-def test_a_link_to_nothing(name: str, quoted: str, tmp_path: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize("name", ["radar", "my {radar} $(id)"], ids=["plain", "quoted"])
+def test_a_link_to_nothing(name: str, tmp_path: Path, capsys: Capture) -> None:
     link = tmp_path / name
     link.symlink_to(tmp_path / "gone")
     code, finding = only_finding(capsys, str(link))
     assert (code, finding["check"]) == (1, "link leads to a port")
     assert str(tmp_path / "gone") in finding["found"]
-    assert finding["remedy"].endswith(f"rm {quoted.format(link)}")
+    assert shlex.split(finding["remedy"])[-2:] == ["rm", str(link)]
 
 
 def test_a_port_that_vanishes_while_it_is_examined(
@@ -401,8 +400,9 @@ def test_what_dead_emulators_left(
     findings = {check["check"]: check for check in not_well(reports[-1])}
     assert code == 1
     found = findings["no dead emulators"]
-    assert found["remedy"].endswith(f"rm -r {stale[0]} {stale[1]}")
-    assert f"rm {folder / f'{os.getpid()}.json'}" in findings["emulators' word readable"]["remedy"]
+    assert shlex.split(found["remedy"])[-4:] == ["rm", "-r", *map(str, stale)]
+    damaged = shlex.join(["rm", str(folder / f"{os.getpid()}.json")])
+    assert damaged in findings["emulators' word readable"]["remedy"]
 
 
 def test_all_found_ports_are_examined(

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -18,9 +19,16 @@ from xethru_protocol.recordings import describe_recording
 from xethru_protocol.system import one_line
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
-XETHRU = f"{sys.executable} -m xethru_protocol.cli"
-DECODE = f"printf '7D 10 6D 7E\\n7D 10 6D 7E\\n' | {XETHRU} decode --hex"
+XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
 ACK = '{"framing": "normal", "payload_hex": "10", "message": "ACK", "fields": {}}\n'
+
+
+def xethru(*arguments: object) -> str:
+    """Return the command for a shell; the path of this Python may have blanks."""
+    return shlex.join([*XETHRU, *map(str, arguments)])
+
+
+DECODE = f"printf '7D 10 6D 7E\\n7D 10 6D 7E\\n' | {xethru('decode', '--hex')}"
 
 
 def shell(command: str) -> subprocess.CompletedProcess[str]:
@@ -56,20 +64,20 @@ def test_output_that_takes_nothing(redirection: str, code: int, out: str, err: s
 
 def test_errors_that_cannot_be_printed_are_still_errors(tmp_path: Path) -> None:
     for redirection in ("2>&-", "2>/dev/full"):
-        result = shell(f"{XETHRU} ping --port {tmp_path}/none {redirection}")
+        result = shell(f"{xethru('ping', '--port', tmp_path / 'none')} {redirection}")
         assert (result.returncode, result.stdout, result.stderr) == (1, "", "")
 
 
 def test_a_port_is_not_opened_in_place_of_a_closed_stream(tmp_path: Path) -> None:
     """Else what Python itself writes there would go to the module."""
     with PtyModule() as module:
-        result = shell(f"{XETHRU} ping --port {module.path} <&- 2>&-")
+        result = shell(f"{xethru('ping', '--port', module.path)} <&- 2>&-")
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout.startswith(f"{module.path}: ready (")
 
 
 def test_input_that_is_closed() -> None:
-    result = shell(f"{XETHRU} decode <&-")
+    result = shell(f"{xethru('decode')} <&-")
     assert (result.returncode, result.stdout, result.stderr) == (
         *(1, ""),
         "xethru decode: standard input is closed; there is nothing to decode\n",
@@ -80,8 +88,8 @@ def test_input_that_is_closed() -> None:
 @pytest.mark.parametrize("command", ["list", "info", "ping", "stream", "doctor"])
 def test_what_cannot_be_printed_is_one_line(command: str) -> None:
     with PtyModule() as module:
-        port = "" if command == "list" else f"--port {module.path}"
-        result = shell(f"{XETHRU} {command} {port} >/dev/full")
+        port = () if command == "list" else ("--port", module.path)
+        result = shell(f"{xethru(command, *port)} >/dev/full")
         assert module.fps == 0
     text = "standard output cannot be written: No space left on device"
     assert (result.returncode, result.stderr) == (1, f"xethru {command}: {text}\n")
@@ -101,7 +109,7 @@ def test_a_signal_leaves_a_complete_recording_and_a_stopped_module(
     number: signal.Signals, before: signal.Handlers, code: int, tmp_path: Path
 ) -> None:
     out = tmp_path / "recording"
-    command = [*XETHRU.split(), "record", "--out", str(out), "--count", "100", "--json", "--port"]
+    command = [*XETHRU, "record", "--out", str(out), "--count", "100", "--json", "--port"]
     with (
         PtyModule() as module,
         subprocess.Popen(

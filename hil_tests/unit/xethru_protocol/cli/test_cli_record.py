@@ -4,7 +4,6 @@ import io
 import itertools
 import json
 import re
-import resource
 import subprocess
 import sys
 import uuid
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.unit.full_disk import child_on_full_disk
 from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
 from hil_tests.unit.xethru_protocol.scripted import frame
@@ -420,8 +420,7 @@ def test_a_full_disk_keeps_what_is_there(module: PtyModule, tmp_path: Path) -> N
         capture_output=True,
         text=True,
         check=False,
-        # the nearest to a full disk that needs no rights
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+        **child_on_full_disk(20_000),
     )
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()

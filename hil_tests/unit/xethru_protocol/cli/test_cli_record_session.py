@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 from hil_tests.patience import seconds, wait_until
+from hil_tests.unit.full_disk import child_on_full_disk
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
 from xethru_protocol import load
 from xethru_protocol.cli import main
@@ -197,7 +197,7 @@ def test_lines_of_a_serial_port(slow_module: PtyModule, tmp_path: Path) -> None:
 
 
 def test_a_full_disk_keeps_what_is_there(tmp_path: Path) -> None:
-    """A limit on the size of files stands for the disk; a chunk that does not fit is left out."""
+    """A chunk that does not fit is left out."""
     out = tmp_path / "a.mcap"
     with SlowModule() as left, SlowModule() as right:
         words = ["--port", f"left={left.path}", "--port", f"right={right.path}", "--out", out]
@@ -206,7 +206,7 @@ def test_a_full_disk_keeps_what_is_there(tmp_path: Path) -> None:
             capture_output=True,
             text=True,
             check=False,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (6_000, 6_000)),
+            **child_on_full_disk(6_000),
         )
     assert (ran.returncode, ran.stdout) == (1, "")
     assert f"xethru record: {out} cannot be written: File too large; all but" in ran.stderr

@@ -236,6 +236,35 @@ def test_the_rate_comes_from_the_longest_run_of_counters(tmp_path: Path) -> None
     assert load(tmp_path / "a.xtwire").frame_rate_hz == pytest.approx(20.0)
 
 
+def run_of(n_frames: int, rate_hz: float, begin_s: int, first: int) -> list[tuple[m.Response, int]]:
+    """Return frames in a row, at times that are multiples of their period."""
+    return [
+        (frame(first + at), begin_s * 1000 * MS + round(at * 1000 * MS / rate_hz))
+        for at in range(n_frames)
+    ]
+
+
+@pytest.mark.parametrize("place", [0, 1, 2], ids=["first", "middle", "last"])
+@pytest.mark.parametrize("step", [0, 1], ids=["repeated", "falling"])
+def test_the_longest_run_is_that_of_most_frames(tmp_path: Path, place: int, step: int) -> None:
+    """Wherever it stands, and although the others take longer; a repeated counter ends a run."""
+    runs = [(3, 0.5), (4, 0.25)]
+    runs.insert(place, (7, 20.0))
+    sent: list[tuple[m.Response, int | None]] = []
+    first = 100
+    for number, (n_frames, rate_hz) in enumerate(runs):
+        sent += run_of(n_frames, rate_hz, begin_s=30 * number, first=first)
+        first += n_frames - 1 - step
+    write_capture(tmp_path / "a.xtwire", sent)
+    assert load(tmp_path / "a.xtwire").frame_rate_hz == pytest.approx(20.0)
+
+
+def test_of_runs_of_equal_length_the_first_gives_the_rate(tmp_path: Path) -> None:
+    sent = [*run_of(4, 20.0, begin_s=0, first=9), *run_of(4, 5.0, begin_s=10, first=1)]
+    write_capture(tmp_path / "a.xtwire", sent)
+    assert load(tmp_path / "a.xtwire").frame_rate_hz == pytest.approx(20.0)
+
+
 def test_a_cut_file_gives_what_is_there(tmp_path: Path) -> None:
     (file,) = (RECORDINGS / "iq").glob("xethru_baseband_iq_*.dat")
     cut = tmp_path / file.name

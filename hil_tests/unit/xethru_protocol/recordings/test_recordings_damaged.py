@@ -358,7 +358,7 @@ def test_a_small_file_takes_no_large_memory(
         f"resource.setrlimit(resource.RLIMIT_AS, ({limit}, {limit})); sys.exit(main(sys.argv[1:]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script, "dump", path],
+        [sys.executable, "-B", "-c", script, "dump", path],
         capture_output=True,
         text=True,
         timeout=seconds(2),

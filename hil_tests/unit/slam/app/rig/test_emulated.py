@@ -68,7 +68,7 @@ def test_one_that_ignores_sigterm_is_killed(
     monkeypatch.setattr(emulator_process, "END_LIMIT_S", 0.3)
     pid_file = tmp_path / "pid"
     fake_emulator.write_text(
-        f"#!/bin/sh\ntrap '' TERM\necho $$ > {pid_file}.new; mv {pid_file}.new {pid_file}\n"
+        f"#!/bin/sh\ntrap '' TERM\necho $$ > '{pid_file}.new'; mv '{pid_file}.new' '{pid_file}'\n"
         "while :; do sleep 0.05; done\n"
     )
     with EmulatorProcess("lab", 0):
@@ -81,7 +81,7 @@ def test_the_arguments_are_those_of_the_emulators_command_line(
     fake_emulator: Path, tmp_path: Path
 ) -> None:
     said = tmp_path / "arguments"
-    fake_emulator.write_text(f'#!/bin/sh\necho "$@" > {said}\n')
+    fake_emulator.write_text(f'#!/bin/sh\necho "$@" > "{said}"\n')
     with EmulatorProcess("scene.toml", 42) as emulator, pytest.raises(EmulatorError):
         emulator.wait_until_ready(StopFlag())
     assert said.read_text() == "-P -m emulator.cli serve scene.toml --pace asap --seed 42\n"

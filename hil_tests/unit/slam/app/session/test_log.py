@@ -287,34 +287,33 @@ def test_a_file_that_was_never_finished_lacks_its_last_chunk_only(tmp_path: Path
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
-def test_a_disk_that_is_full_from_the_start_is_one_line() -> None:
+def test_a_full_disk_from_the_start_is_one_line() -> None:
     with pytest.raises(CannotWriteError, match="/dev/full: cannot be written: No space") as caught:
         SessionLog(Path("/dev/full"), session_info(), odometry(20))
     assert "nothing was recorded" in str(caught.value)
 
 
 FULL_DISK = """
-import resource, sys
+import sys
 from pathlib import Path
+from hil_tests.unit.full_disk import full_disk
 from hil_tests.unit.slam.app.sessions import feed, session_info
 from slam.app.session.log import CannotWriteError, SessionLog
-from slam.app.session.reader import open_session
-from xethru_protocol.recordings.mcap import McapWriter
 
-resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))  # as a disk with that much room
-log = SessionLog(Path(sys.argv[1]), session_info(), clock_ns=lambda: 0)
-try:
-    feed(log, 300)
-except CannotWriteError as error:
-    print(error)
-feed(log, 3)  # goes nowhere
-log.on_wire("radar0", "rx", b"7", 0)
-log.close()
-log.close()
+with full_disk(1_000_000):
+    log = SessionLog(Path(sys.argv[1]), session_info(), clock_ns=lambda: 0)
+    try:
+        feed(log, 300)
+    except CannotWriteError as error:
+        print(error)
+    feed(log, 3)  # goes nowhere
+    log.on_wire("radar0", "rx", b"7", 0)
+    log.close()
+    log.close()
 """
 
 
-def test_a_disk_that_fills_up_keeps_every_whole_chunk(tmp_path: Path) -> None:
+def test_a_full_disk_keeps_every_whole_chunk(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, str(path)], capture_output=True, text=True, check=False

@@ -3,11 +3,9 @@
 import json
 import math
 import os
-import resource
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,6 +13,7 @@ from typing import Any, NoReturn
 import pytest
 
 from hil_tests.system.short_scene import write_short_scene
+from hil_tests.unit.full_disk import full_disk
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.errors import AppError
 from slam.app.sweep import sweep
@@ -170,22 +169,11 @@ def test_cut_at_any_byte_it_loses_the_last_line_only_and_goes_on(
         assert path.read_bytes() == whole, size
 
 
-@contextmanager
-def largest_file(n_bytes: int) -> Iterator[None]:
-    """Let no file of this process grow beyond that: a write that would is cut short there."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 @pytest.mark.parametrize("room", [0, 1, 400])
 def test_what_a_full_disk_takes_of_a_run_is_taken_away_again(room: int, tmp_path: Path) -> None:
     part = part_with(path := tmp_path / "o.part", 1)
     before = path.read_bytes()
-    with largest_file(len(before) + room), pytest.raises(AppError, match="cannot be written"):
+    with full_disk(len(before) + room), pytest.raises(AppError, match="cannot be written"):
         part.add(runs()[1])
     assert path.read_bytes() == before
     part.add(runs()[1])
@@ -193,11 +181,11 @@ def test_what_a_full_disk_takes_of_a_run_is_taken_away_again(room: int, tmp_path
 
 
 @pytest.mark.parametrize("room", [0, 5])
-def test_a_disk_that_is_full_from_the_first_leaves_nothing(
+def test_a_full_disk_from_the_first_leaves_nothing(
     room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep, "run_case", interrupted_after(99, []))
-    with largest_file(room), StopFlag() as stop, pytest.raises(AppError):
+    with full_disk(room), StopFlag() as stop, pytest.raises(AppError):
         run_sweep(stop, **options_of(tmp_path / "out"))
     assert list(tmp_path.iterdir()) == []
 
@@ -215,7 +203,7 @@ def test_a_result_that_does_not_fit_costs_no_run_and_not_the_result_before(
             run_sweep(stop, **options_of(out))
         monkeypatch.setattr(sweep, "run_case", interrupted_after(1, []))
         # room for the last run, and not for the result, which is longer by its line ends
-        with largest_file(part.stat().st_size * 12 // 10), pytest.raises(AppError) as failed:
+        with full_disk(part.stat().st_size * 12 // 10), pytest.raises(AppError) as failed:
             run_sweep(stop, **options_of(out))
         assert f"12 of 12 runs are in {part}" in str(failed.value)
         assert out.read_bytes() == before
