@@ -2,10 +2,11 @@
 
 Where the wheels suddenly report another motion than that of the step before, either the robot made
 it, or the wheels slipped, and the robot went on as before, or stood. The ranges at the end of the
-step are compared under each of these motions. If a slip explains them better by its price, it is
-believed: the pose becomes as uncertain as after a motion that the wheels do not report
-(`BranchRule.hidden_m`, `BranchRule.hidden_rad`), and the ranges correct it. If not, the slip
-remains possible (`slam.robust.branches.Doubt`), and the solution over all poses may find it.
+step are compared under each of these motions. A slip that explains those of several landmarks
+better by its price and `MARGIN_NATS` is believed: the pose becomes as uncertain as after a motion
+that the wheels do not report (`BranchRule.hidden_m`, `BranchRule.hidden_rad`), and the ranges
+correct it. If not, the slip remains possible (`slam.robust.branches.Doubt`), and the solution over
+all poses may find it.
 
 The limits of view are widened by the difference of the motions: all are judged by the same
 landmarks.
@@ -104,8 +105,7 @@ def judge_change(
     reported, *others = found
     most, motion, known = max(others, key=lambda one: one[0])
     log_odds = most - reported[0] - math.log(rule.changes_per_slip)
-    # A range of one landmark alone may be another one's.
+    # Ranges of one landmark alone may be another one's.
     is_alone = len(np.unique(known.assigned[:, 2])) <= 1
-    is_slip = log_odds > (MARGIN_NATS if is_alone else 0.0)
-    slip = (motion, known) if is_slip else None
+    slip = (motion, known) if log_odds > MARGIN_NATS and not is_alone else None
     return Change(probability=float(expit(log_odds)), slip=slip)
