@@ -89,9 +89,9 @@ harm: $(VENV)/installed-demo
 		--scene $(DECEIVING:=:$(FIRST_SEED)-$(call upto,9)) $(FAMILIES:=:$(FIRST_SEED)-$(call upto,2)) \
 		--stress slip_large noise_stated_low carried
 
-# The pictures of fixtures/pictures: about ten minutes of one core. Needs Mesa's lavapipe (Debian:
-# mesa-vulkan-drivers) for the screenshot of Rerun and Chromium for that of the report. RECORDING
-# names the real recording that docs/studies/recording.py compares with.
+# The pictures of fixtures/pictures. Needs Mesa's lavapipe (Debian: mesa-vulkan-drivers) for the
+# screenshot of Rerun and Chromium for that of the report. RECORDING names the real recording that
+# docs/studies/recording.py compares with.
 pictures: $(VENV)/installed-test
 	$(BIN)/uwb-slam demo --out out/pictures/demo
 	$(BIN)/uwb-slam demo --scene classroom --out out/pictures/classroom

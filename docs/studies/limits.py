@@ -139,7 +139,7 @@ def chip_frames(
 def ranges_m(frames: Sequence[RadarFrame]) -> dict[str, list[Array]]:
     """Return the ranges that each front end with the settings of the paper finds in each frame."""
     found = {}
-    # From 180 frames on a detector learns the pulse, and where all echoes are pairs a wrong one.
+    # From 60 echoes on, three frames apart, a detector learns the pulse, and of pairs a wrong one.
     parts = [frames[first : first + 50] for first in range(0, len(frames), 50)]
     for name in LOOKS:
         config = override(SlamConfig(), {"detection.front_end": name})

@@ -365,19 +365,22 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
 
 def _add_experiment(experiment: argparse.ArgumentParser) -> None:
     names = experiment.add_subparsers(required=True, metavar="NAME", dest="name")
-    for name, made_by, text in (
+    for name, default, made_by, text in (
         (
             "consistency",
+            "out/sweep.json",
             "`uwb-slam sweep`, like `make sweep`",
             "mean NEES and NIS of a sweep at ten times, against their bands",
         ),
         (
             "stress",
+            "out/stress.json",
             "`uwb-slam sweep --stress ...`",
             "what each hardship of a sweep costs, in units of its clean runs",
         ),
         (
             "scenes",
+            "out/scenes.json",
             "`uwb-slam sweep --scene ...`",
             "what one preset does in each scene of a sweep",
         ),
@@ -389,7 +392,7 @@ def _add_experiment(experiment: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "--sweep",
             type=Path,
-            default=Path("out/sweep.json" if name == "consistency" else f"out/{name}.json"),
+            default=Path(default),
             metavar="JSON",
             help=f"result of {made_by} (default: %(default)s)",
         )

@@ -289,7 +289,7 @@ def find_known(
                 margin_m,
                 tracklets.edge_rad,
                 parameters.map.view_inset_m,
-                (sure_m or noise.sigma_m) ** 2,
+                (noise.sigma_m if sure_m is None else sure_m) ** 2,
                 *chdtri([1, 2], TAIL_PROBABILITY),
                 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau),
                 math.hypot(noise.sigma_m, parameters.branches.model_sigma_m),
@@ -311,15 +311,15 @@ def find_known(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WeighedRanges:
-    """The k ranges that are of known landmarks, and what they do to a state."""
+    """The k ranges that are of known landmarks, and what they do to a state; shapes (k,)."""
 
     ranges_m: Array
     sigmas_m: Array
     gain: Array  # shape (m, k), of the ranges in ``weighted``
     weighted: Array  # white innovations, weighted by Huber
     white: Array  # those before the weights
-    # ln(Pd p / lambda), where p is the density of a range given those before it, and lambda that of
-    # ranges in its scan, whatever they are of
+    # In nats, ln(Pd p / lambda), where p is the density of a range given those before it, and
+    # lambda that of ranges in its scan, whatever they are of
     evidence: Array
 
 

@@ -54,7 +54,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
 from slam.robust.parameters import BackEndParameters
-from slam.robust.proposals.slips import Change, Course, free_motion, judge_change, move_anew
+from slam.robust.proposals.slips import Change, Course, judge_change, move_anew
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     find_split,
@@ -72,6 +72,7 @@ from slam.robust.state import (
     RangeErrors,
     State,
     calibrated_motion,
+    free_motion,
     predict,
 )
 from slam.robust.walls import WallKeeper

@@ -26,8 +26,8 @@ Revision
     The back end that stayed goes on beside the one that is adopted. When the advantage of the place
     is gone, and more is missed there, the adoption is taken back.
 Doubt
-    What may have happened without being decided, a slip (`slam.robust.proposals.slips`) or a carry
-    during a stop, adds to the reported covariance until landmarks known before it confirm the pose.
+    A slip (`slam.robust.proposals.slips`), believed or only possible, and a carry that is possible
+    during a stop add to the reported covariance until landmarks known before confirm the pose.
 
 The robot is reported as lost while the landmarks known before the carry are against its pose by
 more than the price of a carry, and others are seen, or ranges have shown a carry. That ends when
@@ -285,11 +285,12 @@ class Place(Alternative):
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Doubt:
-    """A motion that the wheels may not have reported, until known landmarks confirm the pose."""
+    """Motions that the wheels may not have reported, until known landmarks confirm the pose."""
 
-    next_id: int  # landmarks known before it have smaller ids
-    position_m: Array  # shape (2,), where it may have been
-    variances: Array  # shape (3,) of x, y [m^2] and heading, its probability counted
+    next_id: int  # landmarks known before them have smaller ids
+    position_m: Array  # shape (2,), where the newest of them may have been
+    # shape (3, 3), of x, y [m] and heading for a pose there, their probabilities counted
+    covariance: Array
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
 
     def take(self, evidence: Array, rule: BranchRule) -> bool:
@@ -300,11 +301,15 @@ class Doubt:
                 self.nats[int(landmark)] = min(max(total, -rule.most_against), rule.most_for)
         return sum(self.nats.values()) > rule.price_nats
 
-    def covariance(self, position_m: Array) -> Array:
-        """Return what it adds to the covariance (3, 3) of a pose at a position (2,)."""
+    def at(self, position_m: Array) -> Array:
+        """Return what they add to the covariance (3, 3) of a pose at a position (2,)."""
         T = np.eye(3)
         T[:2, 2] = quarter_turn(position_m - self.position_m)
-        return np.asarray(T * self.variances @ T.T)
+        return np.asarray(T @ self.covariance @ T.T)
+
+    def add(self, newer: Doubt) -> None:
+        self.covariance = self.at(newer.position_m) + newer.covariance
+        self.position_m = newer.position_m
 
 
 @dataclass(slots=True, kw_only=True)
@@ -363,15 +368,14 @@ class Branches:
         """
         if not self.is_lost or self._carry is None:
             return None
-        sigma_m = self._rule.lost_position_m
-        covariance = np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
-        return compose(self._carry.map.pose, self._carry.moved), covariance
+        moved = compose(self._carry.map.pose, self._carry.moved)
+        return moved, np.diag(self._rule.lost_variances)
 
     @property
     def doubted_covariance(self) -> Array:
         """Return what doubts of the wheels add to the covariance of the pose, (3, 3)."""
         position_m = self.main.state.position_m
-        return sum((one.covariance(position_m) for one in self._doubts), np.zeros((3, 3)))
+        return sum((one.at(position_m) for one in self._doubts), np.zeros((3, 3)))
 
     def predict(self, increment: Array, elapsed_s: float = 1.0, stood_s: float = 0.0) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
@@ -417,14 +421,21 @@ class Branches:
     def _doubt(self, step: Step, position_m: Array) -> None:
         """Keep what is doubtful of the wheels, until it is confirmed."""
         rule, slipped = self._rule, self.main.slip_probability
-        self._doubts = [one for one in self._doubts if not one.take(step.evidence, rule)]
+        doubts = [one for one in self._doubts if not one.take(step.evidence, rule)]
         carried = float(expit(-step.carry_nats)) if self._has_stood else 0.0
-        hidden = np.square([rule.hidden_m, rule.hidden_m, rule.hidden_rad])
-        anywhere = np.square([rule.lost_position_m] * 2 + [math.pi / math.sqrt(3.0)])
-        variances = slipped * hidden + carried * anywhere
         if slipped + carried > 0.0:
-            doubt = Doubt(next_id=step.next_id, position_m=position_m, variances=variances)
-            self._doubts.append(doubt)
+            covariance = slipped * np.diag(rule.hidden_variances)
+            covariance += carried * np.diag(rule.lost_variances)
+            newest = Doubt(next_id=step.next_id, position_m=position_m, covariance=covariance)
+            doubts.append(newest)
+        # Those with the same evidence end together: they are one, so a long run needs few.
+        self._doubts = doubts[:1]
+        for one in doubts[1:]:
+            last = self._doubts[-1]
+            if (one.next_id, one.nats) == (last.next_id, last.nats):
+                last.add(one)
+            else:
+                self._doubts.append(one)
 
     def _shown(
         self, before: Sequence[RangeScan], after: Sequence[RangeScan], increment: Array
@@ -656,8 +667,7 @@ class Branches:
         for number in range(since, self._now):
             moved = compose(moved, self._steps[number].increment)
         hidden = before.copy()
-        spread = np.square([self._rule.hidden_m, self._rule.hidden_m, self._rule.hidden_rad])
-        hidden.predict(step.increment, np.diag(spread))
+        hidden.predict(step.increment, np.diag(self._rule.hidden_variances))
         hidden.state.next_id = self.main.state.next_id + _IDS_APART
         self._carry = Carry(
             since=since,

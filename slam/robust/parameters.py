@@ -276,11 +276,11 @@ class SlipRule:
 
     steady_m: Annotated[float, Origin.CHOSEN] = 0.01
     """Standard deviation of the change of a robot's motion from one step to the next; where the
-    wheels report a larger one, they may have slipped."""
+    wheels report more than twice as much, they may have slipped."""
     steady_rad: Annotated[float, Origin.CHOSEN] = 0.02
     """The same of its turn."""
     changes_per_slip: Annotated[float, Origin.CHOSEN] = 60.0
-    """How many larger changes there are to one slip."""
+    """How many of such changes there are to one slip."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -387,6 +387,16 @@ class BranchRule:
     used once more."""
     lost_position_m: Annotated[float, Origin.CHOSEN] = 5.0
     """Standard deviation that is reported for the position while the robot is lost."""
+
+    @property
+    def hidden_variances(self) -> tuple[float, float, float]:
+        """Variances of a motion that the wheels do not report: x, y [m^2] and heading."""
+        return self.hidden_m**2, self.hidden_m**2, self.hidden_rad**2
+
+    @property
+    def lost_variances(self) -> tuple[float, float, float]:
+        """Variances of the pose of a lost robot, x, y [m^2] and heading; that is uniform."""
+        return self.lost_position_m**2, self.lost_position_m**2, math.pi**2 / 3.0
 
     def carry_nats(self, elapsed_s: float, stood_s: float) -> float:
         """Return how unlikely a carry is within a time, for a part of which the wheels stood."""

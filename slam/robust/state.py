@@ -612,6 +612,12 @@ class Motion:
         return math.hypot(self.step_m[0], self.step_m[1])
 
 
+def free_motion(sigma_m: float, sigma_rad: float) -> Motion:
+    """Return a motion that is known by its standard deviations alone: along each axis, and turn."""
+    covariance = np.diag(np.square([sigma_m, sigma_m, sigma_rad]))
+    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=covariance, walk_variance=0.0)
+
+
 def calibrated_motion(
     increment: Array, calibration: Array, wheels: WheelNoise, covariance: Array | None = None
 ) -> Motion:

@@ -5,8 +5,8 @@ it, or the wheels slipped, and the robot went on as before, or stood. The ranges
 step are compared under each of these motions. A slip that explains those of several landmarks
 better by its price and `MARGIN_NATS` is believed: the pose becomes as uncertain as after a motion
 that the wheels do not report (`BranchRule.hidden_m`, `BranchRule.hidden_rad`), and the ranges
-correct it. If not, the slip remains possible (`slam.robust.branches.Doubt`), and the solution over
-all poses may find it.
+correct it. If not, the solution over all poses may find it. Either way a doubt remains
+(`slam.robust.branches.Doubt`).
 
 The limits of view are widened by the difference of the motions: all are judged by the same
 landmarks.
@@ -26,7 +26,7 @@ from slam.config import WheelNoise
 from slam.geometry import compose
 from slam.robust.association import Known, RangeScan, View, weigh_known
 from slam.robust.parameters import MARGIN_NATS, BackEndParameters
-from slam.robust.state import Array, Motion, State, predict
+from slam.robust.state import Array, Motion, State, free_motion, predict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,12 +52,6 @@ class Change:
     probability: float  # that they slipped
     # If that is believed: the motion of the robot, and whose the ranges are after it
     slip: tuple[Motion, Known] | None = None
-
-
-def free_motion(sigma_m: float, sigma_rad: float) -> Motion:
-    """Return a motion of which nothing is known but that it is small: standard deviations."""
-    covariance = np.diag(np.square([sigma_m, sigma_m, sigma_rad]))
-    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=covariance, walk_variance=0.0)
 
 
 def move_anew(

@@ -23,6 +23,7 @@ from slam.robust.parameters import BranchRule, SlipRule
 SIGMA_M = 3e-3
 SLIP = np.array([0.03, 0.0, math.radians(8.0)])
 PRIOR = 1.0 / (1.0 + SlipRule().changes_per_slip)
+N_CHANGES = 15  # two laps of four corners, each of which begins and, but for the last one, ends
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,7 @@ def n_in_view(run: Run, step: int) -> int:
 
 def test_corners_are_no_slips(run: Run) -> None:
     found = [probability for _, probability in probabilities(run, run.increments)]
-    # Two laps of four corners, each of which begins and, but for the last one, ends
-    assert sum(probability > 0.0 for probability in found) == 15
+    assert sum(probability > 0.0 for probability in found) == N_CHANGES
     assert max(found) < 0.5
 
 
@@ -87,20 +87,39 @@ def test_of_a_slip_in_sight_of_nothing_the_prior_is_left(run: Run) -> None:
     np.testing.assert_allclose(branches.doubted_covariance, np.diag(expected), rtol=1e-9)
 
 
+def doubtful_turn(x_m: float) -> Doubt:
+    covariance = np.diag([1e-4, 1e-4, 0.01])
+    return Doubt(next_id=3, position_m=np.array([x_m, 0.0]), covariance=covariance)
+
+
 def test_a_doubtful_turn_is_a_doubtful_position_far_from_it() -> None:
-    doubt = Doubt(
-        next_id=3, position_m=np.array([1.0, 0.0]), variances=np.array([1e-4, 1e-4, 0.01])
-    )
-    covariance = doubt.covariance(np.array([3.0, 0.0]))
     np.testing.assert_allclose(
-        covariance, [[1e-4, 0.0, 0.0], [0.0, 1e-4 + 4.0 * 0.01, 2.0 * 0.01], [0.0, 0.02, 0.01]]
+        doubtful_turn(1.0).at(np.array([3.0, 0.0])),
+        [[1e-4, 0.0, 0.0], [0.0, 1e-4 + 4.0 * 0.01, 2.0 * 0.01], [0.0, 0.02, 0.01]],
     )
+
+
+def test_doubts_of_two_places_add_up_as_independent_ones_do() -> None:
+    here = np.array([3.0, 0.0])
+    both = doubtful_turn(0.0)
+    both.add(doubtful_turn(1.0))
+    np.testing.assert_allclose(
+        both.at(here), [[2e-4, 0.0, 0.0], [0.0, 2e-4 + 0.09 + 0.04, 0.05], [0.0, 0.05, 0.02]]
+    )
+
+
+def test_all_corners_in_sight_of_nothing_are_doubted(run: Run) -> None:
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for _ in follow(branches, run.increments, [[]] * len(run.increments)):
+        pass
+    expected = N_CHANGES * PRIOR * BranchRule().hidden_rad ** 2
+    assert branches.doubted_covariance[2, 2] == pytest.approx(expected)
 
 
 def test_landmarks_known_before_end_a_doubt_and_new_ones_do_not() -> None:
     """Three of them, each with no more evidence than one may give."""
     rule = BranchRule()
-    doubt = Doubt(next_id=3, position_m=np.zeros(2), variances=np.ones(3))
+    doubt = Doubt(next_id=3, position_m=np.zeros(2), covariance=np.eye(3))
     much = 2.0 * rule.correlated_steps * rule.most_for
     assert not doubt.take(np.array([[7, much], [8, much], [9, much]]), rule)
     assert not doubt.take(np.array([[0, much], [1, much]]), rule)
