@@ -50,7 +50,7 @@ def test_a_hostile_client_disturbs_no_other_port(seed: int, pace: Pace) -> None:
 
 
 class Watched:
-    """A process from outside, and a reader of one of its ports that must miss no frame."""
+    """A process from outside, and a reader of one of its ports."""
 
     def __init__(self, served: Served, port: int) -> None:
         self._process = Path(f"/proc/{served.process.pid}")
@@ -140,8 +140,10 @@ def test_hostile_hosts_at_real_ports() -> None:
             os.close(fd)
         assert after[0] == before[0], "descriptors"
         assert after[1] - before[1] < 4096, "KiB of memory"
-        first = watched.counters[0]
-        assert watched.counters == list(range(first, first + len(watched.counters)))
+        # A module more than a second behind its clock loses frames (protocol reference 8.4), and a
+        # busy machine can hold up this process that long: only in virtual time (the test above) can
+        # a test ask for every frame.
+        assert watched.counters == sorted(set(watched.counters))
         for path in (opened, shared, deaf):
             assert ping_through_whatever(path), path
         os.close(watched.fd)
