@@ -46,24 +46,31 @@ Multiple Targets", IEEE Transactions on Automatic Control 24(6), 1979).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import chdtri, expit
 
-from slam.geometry import Rig, compose, has_moved
+from slam.geometry import Rig, compose, has_moved, transform
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import Question
-from slam.robust.parameters import MARGIN_NATS, BackEndParameters, BranchRule, RangeNoise
+from slam.robust.parameters import (
+    MARGIN_NATS,
+    TAIL_PROBABILITY,
+    BackEndParameters,
+    BranchRule,
+    RangeNoise,
+)
 from slam.robust.proposals.constellation import (
     Constellation,
     Placement,
     constellation_of,
     find_placement,
     find_placements,
+    own_nats,
 )
 from slam.robust.state import Array, quarter_turn
 
@@ -174,6 +181,19 @@ def _answered(
     return [back_end, *found] if back_end.answer(question, first) else found
 
 
+def covered_share(probability: float) -> float:
+    """Return the share of a motion's variance that allows for a motion of a probability.
+
+    With probability p the position is away by a normal error of variance V, else it is right. The
+    region that a normal distribution of variance s V leaves with the probability q is left with q
+    by that, too, if s = ln(p / q) / ln(1 / q) (two dimensions; q is `TAIL_PROBABILITY`); p V is the
+    least, the variance of such a mixture.
+    """
+    if probability <= TAIL_PROBABILITY:
+        return probability
+    return max(probability, 1.0 - math.log(probability) / math.log(TAIL_PROBABILITY))
+
+
 def evidence_table(report: UpdateReport) -> Array:
     """Return ids and evidence [nats] of a report, shape (k, 2)."""
     return np.array(report.evidence).reshape(-1, 2)
@@ -218,10 +238,11 @@ def totals_of(tables: Iterable[Array], known: RobustBackEnd, rule: BranchRule) -
     return np.column_stack([ids, np.clip(sums, -known.most_against(ids), rule.most_for)])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Account:
     """What an explanation of all ranges since a step is worth."""
 
+    totals: Array = field(default_factory=lambda: np.empty((0, 2)))  # as `totals_of` has them
     hits: float = 0.0  # nats of the landmarks known before that are seen
     misses: float = 0.0  # of those that should be seen and are not; not positive
     n_seen: int = 0  # how many of them are seen
@@ -238,7 +259,7 @@ def account_of(totals: Array, n_new: int) -> Account:
     nats = totals[:, 1]
     hits, misses = float(nats[nats > 0.0].sum()), float(nats[nats < 0.0].sum())
     n_seen = int(np.count_nonzero(nats > 0.0))
-    return Account(hits=hits, misses=misses, n_seen=n_seen, n_new=n_new)
+    return Account(totals=totals, hits=hits, misses=misses, n_seen=n_seen, n_new=n_new)
 
 
 def advantage(place: Account, other: Account, rule: BranchRule) -> float:
@@ -291,10 +312,12 @@ class Doubt:
     position_m: Array  # shape (2,), where the newest of them may have been
     # shape (3, 3), of x, y [m] and heading for a pose there, their probabilities counted
     covariance: Array
+    variances: Array  # shape (3,), of the largest of them if it happened
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
+    alike: frozenset[int] = frozenset()  # landmarks that were found to fit elsewhere, too
 
     def take(self, evidence: Array, rule: BranchRule) -> bool:
-        """Add the evidence of a step; return whether the pose is confirmed."""
+        """Add the evidence of a step; return whether known landmarks fit the pose."""
         for landmark, nats in evidence.tolist():
             if landmark < self.next_id:
                 total = self.nats.get(int(landmark), 0.0) + nats / rule.correlated_steps
@@ -309,6 +332,7 @@ class Doubt:
 
     def add(self, newer: Doubt) -> None:
         self.covariance = self.at(newer.position_m) + newer.covariance
+        self.variances = np.maximum(self.variances, newer.variances)
         self.position_m = newer.position_m
 
 
@@ -421,12 +445,23 @@ class Branches:
     def _doubt(self, step: Step, position_m: Array) -> None:
         """Keep what is doubtful of the wheels, until it is confirmed."""
         rule, slipped = self._rule, self.main.slip_probability
-        doubts = [one for one in self._doubts if not one.take(step.evidence, rule)]
-        carried = float(expit(-step.carry_nats)) if self._has_stood else 0.0
+        doubts = [
+            one
+            for one in self._doubts
+            if not one.take(step.evidence, rule) or self._is_alike_elsewhere(one)
+        ]
+        # Alike ranges before and behind a stop tell little where the world repeats itself.
+        nats = min(step.carry_nats, self._carry_nats)
+        carried = float(expit(-nats)) if self._has_stood else 0.0
         if slipped + carried > 0.0:
             covariance = slipped * np.diag(rule.hidden_variances)
-            covariance += carried * np.diag(rule.lost_variances)
-            newest = Doubt(next_id=step.next_id, position_m=position_m, covariance=covariance)
+            covariance += covered_share(carried) * np.diag(rule.lost_variances)
+            newest = Doubt(
+                next_id=step.next_id,
+                position_m=position_m,
+                covariance=covariance,
+                variances=np.array(rule.lost_variances if carried else rule.hidden_variances),
+            )
             doubts.append(newest)
         # Those with the same evidence end together: they are one, so a long run needs few.
         self._doubts = doubts[:1]
@@ -436,6 +471,43 @@ class Branches:
                 last.add(one)
             else:
                 self._doubts.append(one)
+
+    def _is_alike_elsewhere(self, doubt: Doubt) -> bool:
+        """Return whether the landmarks that fit the pose may be others of the map.
+
+        Those of them that a motion which the doubt allows lays on others confirm nothing.
+        """
+        named = self.main.merged_ids(np.array(list(doubt.nats), dtype=np.float64))
+        ids, place = np.unique(named, return_inverse=True)
+        nats = np.bincount(place, list(doubt.nats.values()), len(ids))
+        fitting = frozenset(ids[nats > 0.0].tolist())
+        if fitting == doubt.alike:
+            return True
+        position_m, limit = self.main.state.position_m, float(chdtri(3, TAIL_PROBABILITY))
+
+        def is_possible(placement: Placement) -> bool:
+            away_m = transform(placement.motion, position_m) - position_m
+            turn_rad = math.remainder(float(placement.motion[2]), math.tau)
+            return float(np.sum(np.array([*away_m, turn_rad]) ** 2 / doubt.variances)) <= limit
+
+        totals = np.column_stack([ids, nats])
+        own = self._own_nats(self.main, totals, doubt.next_id, is_possible)
+        doubt.alike = fitting if own <= self._rule.price_nats else frozenset()
+        return own <= self._rule.price_nats
+
+    def _own_nats(
+        self,
+        back_end: RobustBackEnd,
+        totals: Array,
+        next_id: int,
+        is_possible: Callable[[Placement], bool],
+    ) -> float:
+        """Return the nats, of totals (n, 2), of reported landmarks that could be no others."""
+        state, of_ids = back_end.state, dict(totals.tolist())
+        rows = [row for row in back_end.reported_rows() if state.landmark_ids[row] < next_id]
+        known = constellation_of(state, rows, self._rule.model_sigma_m)
+        nats = np.array([of_ids.get(id_, 0.0) for id_ in known.ids])
+        return own_nats(nats, known, self._rule, is_possible)
 
     def _shown(
         self, before: Sequence[RangeScan], after: Sequence[RangeScan], increment: Array
@@ -561,7 +633,21 @@ class Branches:
             and advantage(account, elsewhere, rule) > MARGIN_NATS
             and all(margin > rule.placement_nats for margin in margins)
         )
-        return found if is_there else None
+        return found if is_there and self._stands_out(carry, found, account) else None
+
+    def _stands_out(self, carry: Carry, place: Place, account: Account) -> bool:
+        """Return whether landmarks that are like no others say that this is the place.
+
+        Where the world repeats itself, what fits here fits elsewhere, too. After a motion that the
+        wheels did not report the robot is near, whatever is alike elsewhere.
+        """
+        hits = account.totals[account.totals[:, 1] > 0.0]
+
+        def is_no_chance(placement: Placement) -> bool:
+            return placement.evidence > self._rule.likeness_nats
+
+        own = self._own_nats(carry.map, hits, carry.next_id, is_no_chance)
+        return place is carry.hidden or own > self._rule.price_nats
 
     def _adopt(self, carry: Carry, placed: Place) -> None:
         """Let a place be that of the main back end; the one that stayed goes on beside it."""

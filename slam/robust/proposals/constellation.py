@@ -18,7 +18,7 @@ of the merge.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,7 @@ from scipy.special import chdtri
 from slam.geometry import align_se2, compose, transform
 from slam.robust.association import Pairs, density_per_m2
 from slam.robust.parameters import NEIGHBOURHOOD_M, TAIL_PROBABILITY, BranchRule
-from slam.robust.state import HEADING, Array, State, quarter_turn, rotation
+from slam.robust.state import HEADING, Array, Indices, State, quarter_turn, rotation
 
 # Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
 # that keeps the matrix regular
@@ -71,6 +71,22 @@ def find_placements(here: Constellation, there: Constellation, rule: BranchRule)
     Those of fewer landmarks than `BranchRule.least_landmarks`, or by `BranchRule.placement_nats`
     less likely than the likeliest, are left out; and all, if that has less evidence.
     """
+    found = possible_placements(here, there, rule)
+    distinct: list[Placement] = []
+    for one in sorted(found, key=lambda one: -one.evidence):
+        best = distinct[0].evidence if distinct else one.evidence
+        if best < rule.placement_nats or best - one.evidence >= rule.placement_nats:
+            break
+        middle = here.points_m.mean(axis=0)
+        if all(_differ(one.motion, other.motion, middle, rule) for other in distinct):
+            distinct.append(one)
+    return distinct
+
+
+def possible_placements(
+    here: Constellation, there: Constellation, rule: BranchRule
+) -> list[Placement]:
+    """Return the motions that lay `BranchRule.least_landmarks` or more on others, in any order."""
     least = rule.least_landmarks
     if len(here.ids) < least or len(there.ids) < least:
         return []
@@ -79,15 +95,36 @@ def find_placements(here: Constellation, there: Constellation, rule: BranchRule)
         placement = _judged(here, there, pairs)
         if placement is not None and len(placement.pairs) >= least:
             found[placement.pairs] = placement
-    middle = here.points_m.mean(axis=0)
-    distinct: list[Placement] = []
-    for one in sorted(found.values(), key=lambda one: -one.evidence):
-        best = distinct[0].evidence if distinct else one.evidence
-        if best < rule.placement_nats or best - one.evidence >= rule.placement_nats:
-            break
-        if all(_differ(one.motion, other.motion, middle, rule) for other in distinct):
-            distinct.append(one)
-    return distinct
+    return list(found.values())
+
+
+def own_nats(
+    nats: Array, known: Constellation, rule: BranchRule, is_possible: Callable[[Placement], bool]
+) -> float:
+    """Return the nats of landmarks, of all of a map (n,), that could not be others of the map.
+
+    They could be others if a possible placement lays them on these, at least
+    `BranchRule.least_landmarks` of them. Where fewer than that have positive nats, all could.
+    """
+    seen = np.flatnonzero(nats > 0.0)
+    if len(seen) < rule.least_landmarks:
+        return 0.0
+    here = Constellation(
+        ids=tuple(known.ids[row] for row in seen.tolist()),
+        points_m=known.points_m[seen],
+        covariance_m2=_part(known.covariance_m2, seen),
+    )
+    variances = known.covariance_m2.diagonal().reshape(-1, 2).mean(axis=1)
+    limits = float(chdtri(2, TAIL_PROBABILITY)) * (variances[seen][:, None] + variances[None, :])
+    most = 0.0
+    for one in possible_placements(here, known, rule):
+        is_other = any(row != seen[own] for row, own in one.pairs)
+        if is_other and is_possible(one):
+            # Two landmarks of one thing lie on one other landmark.
+            away = transform(one.motion, here.points_m)[:, None] - known.points_m[None, :]
+            is_alike = np.any(np.sum(away**2, axis=2) <= limits, axis=1)
+            most = max(most, float(nats[seen[is_alike]].sum()))
+    return float(nats.sum()) - most
 
 
 def find_placement(here: Constellation, there: Constellation, rule: BranchRule) -> Placement | None:
@@ -196,6 +233,6 @@ def _aligned(
     return motion, residual, S, N
 
 
-def _part(covariance: Array, rows: Array) -> Array:
+def _part(covariance: Array, rows: Indices) -> Array:
     at = np.stack([2 * rows, 2 * rows + 1], axis=-1).ravel()
     return np.asarray(covariance[np.ix_(at, at)])

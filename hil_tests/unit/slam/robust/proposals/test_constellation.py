@@ -11,8 +11,10 @@ from slam.robust.initialisation import BodyPoint, initialise_landmark
 from slam.robust.parameters import BranchRule
 from slam.robust.proposals.constellation import (
     Constellation,
+    Placement,
     constellation_of,
     find_placement,
+    own_nats,
 )
 from slam.robust.state import Array, State
 
@@ -114,3 +116,47 @@ def test_a_constellation_has_the_errors_of_its_landmarks() -> None:
     swept = np.array([-PLACES[0, 1], PLACES[0, 0], -PLACES[2, 1], PLACES[2, 0]])
     expected = 0.01 * np.outer(swept, swept) + (2.5e-5 + 1e-4) * np.eye(4)
     assert found.covariance_m2 == pytest.approx(expected, abs=1e-12)
+
+
+def anywhere(placement: Placement) -> bool:
+    return len(placement.pairs) >= RULE.least_landmarks
+
+
+def test_landmarks_that_lie_as_others_do_say_nothing_of_the_place() -> None:
+    """A row of equal frames repeats itself; one thing between two of them is nowhere else."""
+    frames = np.array(
+        [[pitch + side, y] for pitch in range(4) for side in (0, 0.4) for y in (0, 1)]
+    )
+    nats = np.zeros(len(frames))
+    nats[4:8] = 9.0
+    assert own_nats(nats, known(frames), RULE, anywhere) == 0.0
+    one_more = known(np.vstack([frames, [1.7, 0.45]]))
+    assert own_nats(np.append(nats, 9.0), one_more, RULE, anywhere) == 9.0
+    nats[8] = -2.0
+    assert own_nats(np.append(nats, 9.0), one_more, RULE, anywhere) == 7.0
+
+
+def test_only_possible_motions_make_landmarks_doubtful() -> None:
+    frames = np.array([[pitch, y] for pitch in range(5) for y in (0.0, 0.8)])
+    nats = np.where(np.isin(np.arange(10), [2, 3, 4]), 9.0, 0.0)
+    assert own_nats(nats, known(frames), RULE, anywhere) == 0.0
+
+    def is_near(placement: Placement) -> bool:
+        return float(np.hypot(*placement.motion[:2])) < 0.5
+
+    assert own_nats(nats, known(frames), RULE, is_near) == 27.0
+
+
+def test_two_landmarks_fit_too_many_places() -> None:
+    nats = np.zeros(len(PLACES))
+    nats[:2] = 15.0
+    assert own_nats(nats, known(PLACES), RULE, anywhere) == 0.0
+    nats[2] = 9.0
+    assert own_nats(nats, known(PLACES), RULE, anywhere) == 39.0
+
+
+def test_two_landmarks_of_one_thing_are_alike_with_one() -> None:
+    frames = np.array([[pitch, y] for pitch in range(5) for y in (0.0, 0.8)])
+    twice = np.vstack([frames, frames[2] + [0.004, 0.0]])
+    nats = np.where(np.isin(np.arange(11), [2, 3, 4, 10]), 9.0, 0.0)
+    assert own_nats(nats, known(twice), RULE, anywhere) == 0.0

@@ -17,8 +17,8 @@ from hil_tests.unit.slam.robust.range_world import (
 )
 from slam.geometry import compose, paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.branches import Branches, Doubt
-from slam.robust.parameters import BranchRule, SlipRule
+from slam.robust.branches import Branches, Doubt, covered_share
+from slam.robust.parameters import TAIL_PROBABILITY, BranchRule, SlipRule
 
 SIGMA_M = 3e-3
 SLIP = np.array([0.03, 0.0, math.radians(8.0)])
@@ -87,9 +87,18 @@ def test_of_a_slip_in_sight_of_nothing_the_prior_is_left(run: Run) -> None:
     np.testing.assert_allclose(branches.doubted_covariance, np.diag(expected), rtol=1e-9)
 
 
+@pytest.mark.parametrize("probability", [2e-3, 0.05, 0.5, 1.0])
+def test_a_doubt_covers_what_may_have_happened(probability: float) -> None:
+    """What lies outside a region of it: exp(-r^2 / 2 V) for a variance V, in two dimensions."""
+    limit = -2.0 * covered_share(probability) * math.log(TAIL_PROBABILITY)  # r^2 / V
+    assert probability * math.exp(-limit / 2.0) <= TAIL_PROBABILITY * (1.0 + 1e-9)
+    assert covered_share(probability) >= probability
+
+
 def doubtful_turn(x_m: float) -> Doubt:
     covariance = np.diag([1e-4, 1e-4, 0.01])
-    return Doubt(next_id=3, position_m=np.array([x_m, 0.0]), covariance=covariance)
+    position_m, variances = np.array([x_m, 0.0]), np.ones(3)
+    return Doubt(next_id=3, position_m=position_m, covariance=covariance, variances=variances)
 
 
 def test_a_doubtful_turn_is_a_doubtful_position_far_from_it() -> None:
@@ -119,7 +128,7 @@ def test_all_corners_in_sight_of_nothing_are_doubted(run: Run) -> None:
 def test_landmarks_known_before_end_a_doubt_and_new_ones_do_not() -> None:
     """Three of them, each with no more evidence than one may give."""
     rule = BranchRule()
-    doubt = Doubt(next_id=3, position_m=np.zeros(2), covariance=np.eye(3))
+    doubt = doubtful_turn(0.0)
     much = 2.0 * rule.correlated_steps * rule.most_for
     assert not doubt.take(np.array([[7, much], [8, much], [9, much]]), rule)
     assert not doubt.take(np.array([[0, much], [1, much]]), rule)
@@ -134,5 +143,6 @@ def test_a_stop_may_have_been_a_carry_until_landmarks_are_recognised(run: Run) -
         for _ in follow(branches, run.increments[:n], run.scans[:n], stop)
     ]
     carried = -math.expm1(-rule.carries_per_hour_stood * 3.0 / 3600.0)
-    assert sigmas_m[stop - 1] > 0.9 * math.sqrt(carried / (1 + carried)) * rule.lost_position_m
+    probability = carried / (1.0 + carried)
+    assert sigmas_m[stop - 1] > math.sqrt(probability) * rule.lost_position_m
     assert sigmas_m[-1] < 0.1 * sigmas_m[stop - 1]
