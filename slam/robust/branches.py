@@ -70,7 +70,7 @@ from slam.robust.proposals.constellation import (
     constellation_of,
     find_placement,
     find_placements,
-    own_nats,
+    stands_out,
 )
 from slam.robust.state import Array, quarter_turn
 
@@ -491,23 +491,23 @@ class Branches:
             return float(np.sum(np.array([*away_m, turn_rad]) ** 2 / doubt.variances)) <= limit
 
         totals = np.column_stack([ids, nats])
-        own = self._own_nats(self.main, totals, doubt.next_id, is_possible)
-        doubt.alike = fitting if own <= self._rule.price_nats else frozenset()
-        return own <= self._rule.price_nats
+        is_alike = not self._stand_out(self.main, totals, doubt.next_id, is_possible)
+        doubt.alike = fitting if is_alike else frozenset()
+        return is_alike
 
-    def _own_nats(
+    def _stand_out(
         self,
         back_end: RobustBackEnd,
         totals: Array,
         next_id: int,
         is_possible: Callable[[Placement], bool],
-    ) -> float:
-        """Return the nats, of totals (n, 2), of reported landmarks that could be no others."""
+    ) -> bool:
+        """Return whether reported landmarks that could be no others say enough; totals (n, 2)."""
         state, of_ids = back_end.state, dict(totals.tolist())
         rows = [row for row in back_end.reported_rows() if state.landmark_ids[row] < next_id]
         known = constellation_of(state, rows, self._rule.model_sigma_m)
         nats = np.array([of_ids.get(id_, 0.0) for id_ in known.ids])
-        return own_nats(nats, known, self._rule, is_possible)
+        return stands_out(nats, known, self._rule, is_possible)
 
     def _shown(
         self, before: Sequence[RangeScan], after: Sequence[RangeScan], increment: Array
@@ -633,21 +633,21 @@ class Branches:
             and advantage(account, elsewhere, rule) > MARGIN_NATS
             and all(margin > rule.placement_nats for margin in margins)
         )
-        return found if is_there and self._stands_out(carry, found, account) else None
+        return found if is_there and self._is_only_there(carry, found, account) else None
 
-    def _stands_out(self, carry: Carry, place: Place, account: Account) -> bool:
-        """Return whether landmarks that are like no others say that this is the place.
+    def _is_only_there(self, carry: Carry, place: Place, account: Account) -> bool:
+        """Return whether what fits at a place would fit nowhere else on the map.
 
-        Where the world repeats itself, what fits here fits elsewhere, too. After a motion that the
-        wheels did not report the robot is near, whatever is alike elsewhere.
+        After a motion that the wheels did not report the robot is near, whatever is alike.
         """
+        if place is carry.hidden:
+            return True
         hits = account.totals[account.totals[:, 1] > 0.0]
 
         def is_no_chance(placement: Placement) -> bool:
             return placement.evidence > self._rule.likeness_nats
 
-        own = self._own_nats(carry.map, hits, carry.next_id, is_no_chance)
-        return place is carry.hidden or own > self._rule.price_nats
+        return self._stand_out(carry.map, hits, carry.next_id, is_no_chance)
 
     def _adopt(self, carry: Carry, placed: Place) -> None:
         """Let a place be that of the main back end; the one that stayed goes on beside it."""

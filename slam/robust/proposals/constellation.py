@@ -71,44 +71,39 @@ def find_placements(here: Constellation, there: Constellation, rule: BranchRule)
     Those of fewer landmarks than `BranchRule.least_landmarks`, or by `BranchRule.placement_nats`
     less likely than the likeliest, are left out; and all, if that has less evidence.
     """
-    found = possible_placements(here, there, rule)
+    least = rule.least_landmarks
+    if len(here.ids) < least or len(there.ids) < least:
+        return []
+    found: dict[Pairs, Placement] = {}
+    for pairs in dict.fromkeys(_guesses(here.points_m, there.points_m, rule, len(here.ids))):
+        placement = _judged(here, there, pairs)
+        if placement is not None and len(placement.pairs) >= least:
+            found[placement.pairs] = placement
+    middle = here.points_m.mean(axis=0)
     distinct: list[Placement] = []
-    for one in sorted(found, key=lambda one: -one.evidence):
+    for one in sorted(found.values(), key=lambda one: -one.evidence):
         best = distinct[0].evidence if distinct else one.evidence
         if best < rule.placement_nats or best - one.evidence >= rule.placement_nats:
             break
-        middle = here.points_m.mean(axis=0)
         if all(_differ(one.motion, other.motion, middle, rule) for other in distinct):
             distinct.append(one)
     return distinct
 
 
-def possible_placements(
-    here: Constellation, there: Constellation, rule: BranchRule
-) -> list[Placement]:
-    """Return the motions that lay `BranchRule.least_landmarks` or more on others, in any order."""
-    least = rule.least_landmarks
-    if len(here.ids) < least or len(there.ids) < least:
-        return []
-    found: dict[Pairs, Placement] = {}
-    for pairs in dict.fromkeys(_guesses(here.points_m, there.points_m, rule)):
-        placement = _judged(here, there, pairs)
-        if placement is not None and len(placement.pairs) >= least:
-            found[placement.pairs] = placement
-    return list(found.values())
-
-
-def own_nats(
+def stands_out(
     nats: Array, known: Constellation, rule: BranchRule, is_possible: Callable[[Placement], bool]
-) -> float:
-    """Return the nats of landmarks, of all of a map (n,), that could not be others of the map.
+) -> bool:
+    """Return whether landmarks that could not be others of a map say where the robot is.
 
-    They could be others if a possible placement lays them on these, at least
-    `BranchRule.least_landmarks` of them. Where fewer than that have positive nats, all could.
+    ``nats`` are those of all of the map, (n,). Of the landmarks that say most, at most
+    `BranchRule.newest`, some could be others if a possible placement lays them on these; the rest,
+    less what is missed, must say more than `BranchRule.price_nats`.
     """
-    seen = np.flatnonzero(nats > 0.0)
-    if len(seen) < rule.least_landmarks:
-        return 0.0
+    order = np.argsort(-nats, kind="stable")[: rule.newest]
+    seen = order[nats[order] > 0.0]
+    own = float(nats[seen].sum() + nats[nats < 0.0].sum())
+    if len(seen) < rule.least_landmarks or own <= rule.price_nats:
+        return False
     here = Constellation(
         ids=tuple(known.ids[row] for row in seen.tolist()),
         points_m=known.points_m[seen],
@@ -116,15 +111,20 @@ def own_nats(
     )
     variances = known.covariance_m2.diagonal().reshape(-1, 2).mean(axis=1)
     limits = float(chdtri(2, TAIL_PROBABILITY)) * (variances[seen][:, None] + variances[None, :])
-    most = 0.0
-    for one in possible_placements(here, known, rule):
+    # Of so many landmarks two must be alike, if the rest is not to say enough.
+    seeds = math.ceil(rule.price_nats / rule.most_for) + 2
+    for pairs in dict.fromkeys(_guesses(here.points_m, known.points_m, rule, seeds)):
+        one = _judged(here, known, pairs)
+        if one is None or len(one.pairs) < rule.least_landmarks:
+            continue
         is_other = any(row != seen[own] for row, own in one.pairs)
         if is_other and is_possible(one):
             # Two landmarks of one thing lie on one other landmark.
             away = transform(one.motion, here.points_m)[:, None] - known.points_m[None, :]
             is_alike = np.any(np.sum(away**2, axis=2) <= limits, axis=1)
-            most = max(most, float(nats[seen[is_alike]].sum()))
-    return float(nats.sum()) - most
+            if own - float(nats[seen[is_alike]].sum()) <= rule.price_nats:
+                return False
+    return True
 
 
 def find_placement(here: Constellation, there: Constellation, rule: BranchRule) -> Placement | None:
@@ -140,15 +140,19 @@ def _differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:
     return math.hypot(away[0], away[1]) > rule.reach_m or abs(turn) > rule.reach_m / rule.base_m
 
 
-def _guesses(points: Array, targets: Array, rule: BranchRule) -> list[Pairs]:
-    """Return the pairs that agree when two landmarks of either map are laid on each other."""
+def _guesses(points: Array, targets: Array, rule: BranchRule, seeds: int) -> list[Pairs]:
+    """Return the pairs that agree when two landmarks of either map are laid on each other.
+
+    Of ``points``, two of the first ``seeds``.
+    """
     gaps = targets[None, :] - targets[:, None]
     lengths = np.hypot(gaps[..., 0], gaps[..., 1])
     angles = np.arctan2(gaps[..., 1], gaps[..., 0])
     long_enough = lengths >= rule.base_m
     found: list[Pairs] = []
-    for a in range(len(points)):
-        for b in range(a + 1, len(points)):
+    first = points[:seeds]
+    for a in range(len(first)):
+        for b in range(a + 1, len(first)):
             gap = points[b] - points[a]
             length = math.hypot(gap[0], gap[1])
             if length < rule.base_m:

@@ -14,7 +14,7 @@ from slam.robust.proposals.constellation import (
     Placement,
     constellation_of,
     find_placement,
-    own_nats,
+    stands_out,
 )
 from slam.robust.state import Array, State
 
@@ -118,45 +118,45 @@ def test_a_constellation_has_the_errors_of_its_landmarks() -> None:
     assert found.covariance_m2 == pytest.approx(expected, abs=1e-12)
 
 
+FRAMES = np.array([[pitch, y] for pitch in range(5) for y in (0.0, 0.8)])
+"""A row of equal frames, which repeats itself."""
+
+
+def fits(*rows: int, n: int = 10) -> Array:
+    """Return the evidence of some landmarks that lie where they should."""
+    return np.where(np.isin(np.arange(n), rows), RULE.most_for, 0.0)
+
+
 def anywhere(placement: Placement) -> bool:
     return len(placement.pairs) >= RULE.least_landmarks
 
 
 def test_landmarks_that_lie_as_others_do_say_nothing_of_the_place() -> None:
-    """A row of equal frames repeats itself; one thing between two of them is nowhere else."""
-    frames = np.array(
-        [[pitch + side, y] for pitch in range(4) for side in (0, 0.4) for y in (0, 1)]
-    )
-    nats = np.zeros(len(frames))
-    nats[4:8] = 9.0
-    assert own_nats(nats, known(frames), RULE, anywhere) == 0.0
-    one_more = known(np.vstack([frames, [1.7, 0.45]]))
-    assert own_nats(np.append(nats, 9.0), one_more, RULE, anywhere) == 9.0
-    nats[8] = -2.0
-    assert own_nats(np.append(nats, 9.0), one_more, RULE, anywhere) == 7.0
+    assert not stands_out(fits(2, 3, 4, 5), known(FRAMES), RULE, anywhere)
+    more = known(np.vstack([FRAMES, [[1.4, 0.3], [1.7, 0.5], [2.2, 0.6]]]))
+    assert not stands_out(fits(2, 3, 4, 5, 10, 11, n=13), more, RULE, anywhere)
+    assert stands_out(fits(2, 3, 4, 5, 10, 11, 12, n=13), more, RULE, anywhere)
+    assert stands_out(fits(0, 1, 2, 6), known(PLACES), RULE, anywhere)
+
+
+def test_what_is_missed_counts_against_the_place() -> None:
+    nats = np.array([9.0, 9.0, 9.0, 0.0, 0.0, 0.0, -7.5])
+    assert stands_out(nats.clip(0.0), known(PLACES), RULE, anywhere)
+    assert not stands_out(nats, known(PLACES), RULE, anywhere)
 
 
 def test_only_possible_motions_make_landmarks_doubtful() -> None:
-    frames = np.array([[pitch, y] for pitch in range(5) for y in (0.0, 0.8)])
-    nats = np.where(np.isin(np.arange(10), [2, 3, 4]), 9.0, 0.0)
-    assert own_nats(nats, known(frames), RULE, anywhere) == 0.0
-
     def is_near(placement: Placement) -> bool:
         return float(np.hypot(*placement.motion[:2])) < 0.5
 
-    assert own_nats(nats, known(frames), RULE, is_near) == 27.0
+    assert not stands_out(fits(2, 3, 4), known(FRAMES), RULE, anywhere)
+    assert stands_out(fits(2, 3, 4), known(FRAMES), RULE, is_near)
 
 
 def test_two_landmarks_fit_too_many_places() -> None:
-    nats = np.zeros(len(PLACES))
-    nats[:2] = 15.0
-    assert own_nats(nats, known(PLACES), RULE, anywhere) == 0.0
-    nats[2] = 9.0
-    assert own_nats(nats, known(PLACES), RULE, anywhere) == 39.0
+    assert not stands_out(np.array([15.0, 15.0, *np.zeros(5)]), known(PLACES), RULE, anywhere)
 
 
 def test_two_landmarks_of_one_thing_are_alike_with_one() -> None:
-    frames = np.array([[pitch, y] for pitch in range(5) for y in (0.0, 0.8)])
-    twice = np.vstack([frames, frames[2] + [0.004, 0.0]])
-    nats = np.where(np.isin(np.arange(11), [2, 3, 4, 10]), 9.0, 0.0)
-    assert own_nats(nats, known(twice), RULE, anywhere) == 0.0
+    twice = known(np.vstack([FRAMES, FRAMES[[2, 3, 4]] + [0.004, 0.0]]))
+    assert not stands_out(fits(2, 3, 4, 10, 11, 12, n=13), twice, RULE, anywhere)
