@@ -75,7 +75,7 @@ class Belief:
     def __post_init__(self) -> None:
         """Check the shapes and make the fields read-only views.
 
-        The arrays are not copied: the caller must not write to them any more.
+        The arrays are not copied: the caller must not write to them afterwards.
         """
         size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
         if self.mean.shape != (size,) or self.covariance.shape != (size, size):

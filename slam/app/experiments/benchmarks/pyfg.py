@@ -9,7 +9,7 @@ One item per line; times in seconds, metres, radians, covariances as upper trian
     EDGE_RANGE   time pose landmark range variance
 
 Names are a letter and a number; those of landmarks begin with L. Graphs in three dimensions and
-priors are no drives on a floor and are an error. Format: the files of PyFactorGraph and
+priors do not occur on a floor and are an error. Format: the files of PyFactorGraph and
 CORA, Marine Robotics Group.
 """
 
@@ -100,7 +100,7 @@ class FactorGraph:
 
 
 def read_pyfg(path: FilePath) -> FactorGraph:
-    """Read a graph; AppError names a line that is none of it, or what no line defines."""
+    """Read a graph; AppError names a line that is not part of it, or what is not defined."""
     poses: dict[str, Pose] = {}
     landmarks: set[str] = set()
     edges: dict[str, list[Edge]] = defaultdict(list)
@@ -163,7 +163,7 @@ def _numbers(kind: str, words: Sequence[str]) -> tuple[float, ...]:
 
 def _stamp_ns(word: str) -> int:
     if abs(number_of(word)) >= 2**63 / _NS_PER_S:
-        raise ValueError(f"{word[:40]} is no time in seconds")
+        raise ValueError(f"{word[:40]} is not a time in seconds")
     return round(Decimal(word) * _NS_PER_S)
 
 
@@ -183,7 +183,7 @@ def read_data_set(folder: FilePath) -> DataSet:
 
 
 def run_of(path: FilePath, graph: FactorGraph) -> Run:
-    """Return the drive that a graph holds; AppError if its poses are no single chain.
+    """Return the drive that a graph holds; AppError if its poses are not one chain.
 
     A range belongs to its pose; the time of the edge is not used.
     """
@@ -192,7 +192,7 @@ def run_of(path: FilePath, graph: FactorGraph) -> Run:
         raise AppError(f"{path}: holds no EDGE_SE2; a drive has odometry")
     names = [edges[0].first, *(edge.second for edge in edges)]
     if [edge.first for edge in edges] != names[:-1] or len(set(names)) != len(graph.poses):
-        raise AppError(f"{path}: its EDGE_SE2 are no chain through all poses of one robot")
+        raise AppError(f"{path}: its EDGE_SE2 are not a chain through all poses of one robot")
     pose_of = {pose.name: pose for pose in graph.poses}
     chain = [pose_of[name] for name in names]
     if any(b.t_ns <= a.t_ns for a, b in pairwise(chain)):
