@@ -52,7 +52,7 @@ class Conversation:
     """Commands to one module and what comes from it.
 
     ``name`` is what messages to people call the line. ``take_data`` is called with every message
-    that is no answer, and the time its last byte was read [ns]. ``clock`` and ``observer`` as of
+    but answers, and the time its last byte was read [ns]. ``clock`` and ``observer`` as of
     `X4M300`; its properties describe the listener and the counters.
 
     Attributes
@@ -63,8 +63,8 @@ class Conversation:
         What would answer it besides ERROR; empty if no command waits for an answer.
     answer_owed
         Whether the answer of a request that was given up may still come. The module answers in
-        order, so a PING brings both sides into step again: all before its PONG belongs to nothing
-        any more (Protocol reference 13). That holds only if no other PONG may come.
+        order, so a PING brings both sides into step again: answers before its PONG are dropped
+        (Protocol reference 13). That holds only if no other PONG may come.
     pings
         PINGs that were sent.
     pongs_owed
@@ -231,7 +231,7 @@ class Conversation:
             )
         if self._damaged_since:
             return ResponseTimeout(
-                f"{missing}, but bytes that are no XeThru packets; "
+                f"{missing}, but bytes that are not XeThru packets; "
                 "is it another device, or another baud rate?"
             )
         return ResponseTimeout(f"{missing}; {likely}")

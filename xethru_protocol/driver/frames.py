@@ -320,7 +320,7 @@ def complex_of(i: Float32s, q: Float32s) -> NDArray[np.complex64]:
 
 DEFAULT_FRAMES = 1024  # a minute at 17 frames/s; 6 MB of RF frames
 _COUNTER_WRAP = 1 << 32
-_ENOUGH = 128  # samples that are judged of a frame behind one that is no radar's, if most are off
+_ENOUGH = 128  # samples that are judged of a frame behind one that no radar sent, if most are off
 
 
 class FrameQueue:
@@ -348,7 +348,7 @@ class FrameQueue:
     dropped
         Frames that came, but left a full queue unread.
     discarded
-        Data messages that are no frame of this geometry.
+        Data messages that are not frames of this geometry.
     misfit
         Why the last data message was discarded.
     last_counter

@@ -96,7 +96,7 @@ def _display(arguments: Namespace) -> Iterator[Display]:
 
 
 class _Keys:
-    """Keys pressed on the terminal of standard input, without Enter; none if it is no terminal.
+    """Keys pressed on the terminal of standard input, without Enter; none if it is not a terminal.
 
     A terminal is read while this process is in its foreground only, and gets its mode back.
     """
