@@ -147,7 +147,7 @@ class Bootloader:
     Attributes
     ----------
     started
-        Whether START_APP was accepted; whoever owns the clock leaves for the application then.
+        Whether START_APP was accepted; the module then starts the application.
     """
 
     def __init__(
