@@ -111,8 +111,8 @@ class Belief:
 class Association:
     """The result of one observation."""
 
-    landmark_id: int  # the landmark it updated, or the one born from it
-    is_new: bool  # true if the landmark was born from this observation
+    landmark_id: int  # the landmark it updated, or the one made from it
+    is_new: bool  # true if the landmark was made from this observation
     # shape (n,): squared distance to every landmark of the map before this observation, before any
     # gate; inf for one under the robot's own position. Two degrees of freedom.
     mahalanobis_sq: Array
