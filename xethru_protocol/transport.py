@@ -236,7 +236,7 @@ class SerialTransport(LineTransport):
 class SocketTransport(LineTransport):
     """A module behind ``tcp://HOST:PORT`` or ``socket://HOST:PORT``, such as ser2net's raw ports.
 
-    There is no lock: who else may connect is the server's affair, and most take one client at a
+    It has no lock: the server decides who else may connect, and most take one client at a
     time. Raises PortUnavailable if the server cannot be reached.
     """
 

@@ -221,7 +221,7 @@ class Conversation:
     ) -> ResponseTimeout:
         """Error for something that did not come, with the likeliest reason and remedy.
 
-        Judged by what came since the last frame or answer: what was before that explains nothing.
+        Only bytes since the last frame or answer count: earlier ones are not the reason.
         ``likely`` is the reason given when nothing came at all.
         """
         missing = f"no {what} from {self.name} within {timeout_s:g} s"
@@ -261,7 +261,7 @@ class Conversation:
             f"{self.name} answered {summary(command)} with {came}, where {wanted} was expected; "
             "is its firmware another one, or does another program use the port, too?"
         )
-        # no PONG is silence all the same: who pings a module that starts asks again
+        # without PONG it is a timeout, after which callers ask a module that starts again
         return ResponseTimeout(text) if isinstance(command, m.Ping) else RemoteProtocolError(text)
 
     def report(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:

@@ -171,7 +171,7 @@ class Lattice:
             return off
         doubtful = ~on & (np.abs(counters) > _SURE)
         unsure = int(np.count_nonzero(doubtful))
-        if 2 * (off - unsure) > samples.size:  # the verdict is clear without them
+        if 2 * (off - unsure) > samples.size:  # they cannot change the result
             return off - unsure
         return off - self._count_neighbours(samples[doubtful])
 
@@ -438,7 +438,7 @@ class FrameQueue:
         self._queue(message.info, samples, geometry, arrival_ns)
 
     def _count_off(self, lattice: Lattice, values: Float32s) -> int:
-        """Count the samples off the lattice; where the verdict is clear, at least so many."""
+        """Count the samples off the lattice; a lower bound where most are."""
         if self._off_lattice:
             off = lattice.off_lattice(values[:_ENOUGH])
             if 2 * off > _ENOUGH:

@@ -255,10 +255,10 @@ class Link:
     Attributes
     ----------
     messages
-        Messages that were not taken yet: those of the running profile, if somebody reads them,
-        and texts (DATA STRING), whoever reads.
+        Messages that were not taken yet: those of the running profile, if they are read,
+        and texts (DATA STRING) always.
     keeps_messages
-        Whether somebody reads a profile's messages.
+        Whether a profile's messages are read.
     home
         The path the user named; ``path`` is where the module is now.
     plan
