@@ -163,7 +163,7 @@ def _numbers(kind: str, words: Sequence[str]) -> tuple[float, ...]:
 
 def _stamp_ns(word: str) -> int:
     if abs(number_of(word)) >= 2**63 / _NS_PER_S:
-        raise ValueError(f"{word[:40]} is not a time in seconds")
+        raise ValueError(f"{word[:40]} is no time in seconds")
     return round(Decimal(word) * _NS_PER_S)
 
 
@@ -192,7 +192,7 @@ def run_of(path: FilePath, graph: FactorGraph) -> Run:
         raise AppError(f"{path}: holds no EDGE_SE2; a drive has odometry")
     names = [edges[0].first, *(edge.second for edge in edges)]
     if [edge.first for edge in edges] != names[:-1] or len(set(names)) != len(graph.poses):
-        raise AppError(f"{path}: its EDGE_SE2 are not a chain through all poses of one robot")
+        raise AppError(f"{path}: its EDGE_SE2 are no chain through all poses of one robot")
     pose_of = {pose.name: pose for pose in graph.poses}
     chain = [pose_of[name] for name in names]
     if any(b.t_ns <= a.t_ns for a, b in pairwise(chain)):
