@@ -177,7 +177,7 @@ def _control(arguments: argparse.Namespace) -> int:
         reply = json.loads(answer)
         refused = None if reply["ok"] else str(reply["error"])
     except (ValueError, KeyError, TypeError):
-        return _failed(f"{path}: what answers there is no emulator")
+        return _failed(f"{path}: what answers there is not an emulator")
     if refused is not None:
         return _failed(refused)
     _print(json_text(reply))

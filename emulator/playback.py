@@ -184,7 +184,7 @@ def kinds(names: Iterable[str]) -> frozenset[str]:
     Raises
     ------
     ValueError
-        When a name is no kind that can be played; the message lists them.
+        When a name is not a kind that can be played; the message lists them.
 
     Examples
     --------
@@ -375,7 +375,7 @@ class PlayStream(MessageStream):
     def seek(self, position_ns: int, now_ns: int) -> None:
         """Go on at once with the first message at or after a time of the recording.
 
-        Past the end there is none: it ends, or in a loop the next round follows. Without a host,
+        At the end it stops, or in a loop the next round follows. Without a host,
         the next one begins there.
 
         Raises

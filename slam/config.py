@@ -201,8 +201,8 @@ class MatchedFilterConfig(_Model):
     # Unexplained over expected energy from which ``joint`` looks for several pulses.
     max_single_misfit: Positive = 4.0
     # Relative error of the pulse: root of the energy of its difference from the real pulse, as a
-    # share of the pulse's energy; 0.07 for a width 10 % off. A difference of this size is no second
-    # echo, and near the peak no misfit.
+    # share of the pulse's energy; 0.07 for a width 10 % off. A difference of this size is not a
+    # second echo, and near the peak not a misfit.
     model_error: NonNegative = 0.08
 
 

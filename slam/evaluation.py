@@ -39,7 +39,7 @@ _ICP_ITERATIONS = 100
 # A share of a variance (of a unit one) that is rounding, and an error [m, rad] that is.
 _ROUNDING_VARIANCE = 1e-12
 _ROUNDING_ERROR = 1e-9
-# Half of a pulse's width at half height: what lies farther from a target is no echo of it.
+# Half of a pulse's width at half height: what lies farther from a target is not an echo of it.
 ECHO_LENGTH_M = 0.06
 # As many poses as the paper wants observations of a landmark (min_opc) ...
 MIN_POSES = 9
@@ -268,7 +268,7 @@ class TrueAssociationNis:
 
     An observation is judged before it is counted and whatever the filter made of it, so a tight
     gate cannot improve the numbers. One of clutter, or of a true landmark that no landmark of the
-    map belongs to at that moment, is not counted: there is no innovation.
+    map belongs to at that moment, is not counted, since it has no innovation.
 
     ``true_xy`` has shape (m, 2) [m], all true landmarks, world frame.
     """

@@ -31,7 +31,7 @@ class PackedRows(Generic[Number]):
         self._buffer: NDArray[Number] = np.empty((_FIRST_ROWS, *shape), dtype=kind)
         self._n_rows = 0
         self._n_shared = 0  # rows that copies may have, too
-        self._is_copy = False  # what lies behind the rows belongs to another then
+        self._is_copy = False  # then the buffer beyond the rows is another's
 
     def __deepcopy__(self, memo: dict[int, Any]) -> PackedRows[Number]:
         """Return a copy that shares the buffer for as long as that is possible."""

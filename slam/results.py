@@ -75,7 +75,7 @@ class Belief:
     def __post_init__(self) -> None:
         """Check the shapes and make the fields read-only views.
 
-        The arrays are not copied: the caller must not write to them any more.
+        The arrays are not copied: the caller must not write to them afterwards.
         """
         size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
         if self.mean.shape != (size,) or self.covariance.shape != (size, size):
@@ -111,8 +111,8 @@ class Belief:
 class Association:
     """The result of one observation."""
 
-    landmark_id: int  # the landmark it updated, or the one born from it
-    is_new: bool  # true if the landmark was born from this observation
+    landmark_id: int  # the landmark it updated, or the one made from it
+    is_new: bool  # true if the landmark was made from this observation
     # shape (n,): squared distance to every landmark of the map before this observation, before any
     # gate; inf for one under the robot's own position. Two degrees of freedom.
     mahalanobis_sq: Array

@@ -374,7 +374,7 @@ class Outlet:
         try:
             try:
                 stream.write(text)
-            except UnicodeEncodeError:  # a file name that is no text, or a terminal without UTF-8
+            except UnicodeEncodeError:  # a file name that is not text, or a terminal without UTF-8
                 encoding = stream.encoding or "ascii"
                 stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
             stream.flush()

@@ -191,7 +191,7 @@ class SerialTransport(LineTransport):
     system refuse further opens (``TIOCEXCL``), since not every program asks for the lock.
 
     ``path`` is, for example, ``/dev/ttyACM0`` or a link made by ``xethru-emulator``; ``baudrate``
-    matters on a UART only. Raises PortUnavailable if the port does not exist, is no serial port,
+    matters on a UART only. Raises PortUnavailable if the port does not exist, is not a serial port,
     is in use, or may not be opened.
     """
 
@@ -236,7 +236,7 @@ class SerialTransport(LineTransport):
 class SocketTransport(LineTransport):
     """A module behind ``tcp://HOST:PORT`` or ``socket://HOST:PORT``, such as ser2net's raw ports.
 
-    There is no lock: who else may connect is the server's affair, and most take one client at a
+    It has no lock: the server decides who else may connect, and most take one client at a
     time. Raises PortUnavailable if the server cannot be reached.
     """
 
@@ -664,7 +664,7 @@ def run_directory() -> Path:
 def is_private(folder: Path) -> bool:
     """Whether a folder is this user's, and no other user may write there.
 
-    Only then is the run directory believed: in the folder for temporary files anybody can make one
+    Only then is the run directory used: in the folder for temporary files anybody can make one
     of that name.
     """
     try:

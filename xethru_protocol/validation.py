@@ -52,7 +52,7 @@ def problem_text(problems: Sequence[Problem], model: Any) -> str:  # noqa: ANN40
 
     ``model`` is the class of the table, whose ``model_fields`` name what is allowed.
     """
-    # A refused row makes its list too short as well: that is no problem of its own.
+    # A refused row makes its list too short as well: that is not a problem of its own.
     refused = {each["loc"][:depth] for each in problems for depth in range(len(each["loc"]))}
     texts: dict[str, list[str]] = {}
     for each in problems:
@@ -146,7 +146,7 @@ def _plain(limit: object) -> object:
 def _place(location: Location, model: Any) -> tuple[Location, list[str], Any]:  # noqa: ANN401 - as above
     """Follow a location: without the kinds of value that were tried, and its table's keys.
 
-    Third comes the model of what is there, None if that is no table.
+    Third comes the model of what is there, None if that is not a table.
     """
     keys: list[str] = []
     for depth, part in enumerate(location):

@@ -3,7 +3,7 @@
 The chest of a person at rest moves by millimetres, which turns the phase of its echo.
 `BreathingMonitor` takes baseband frames as they come and answers, once a second, with the mean rate
 of the newest 60 s: breaths per minute, how clear they are from 0 to 1, and at which range. It
-answers None when nobody breathes there at rest. This is no medical device.
+answers None when nobody breathes there at rest. This is not a medical device.
 
 The example listens to an emulated person asleep at 1.6 m, who takes 13 breaths a minute. With a
 module of your own: `python 14_breathing.py /dev/ttyACM0`. It prints

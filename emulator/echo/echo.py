@@ -21,7 +21,7 @@ Time t
     the reader of the frame cannot see. The robot stands still within a frame: a sweep at 5 cm/s
     moves it by micrometres per pulse.
 Place of a radar
-    Its mount and, beside what its user believes, mount_error_m and mount_error_deg.
+    Its mount and, beside what its user assumes, mount_error_m and mount_error_deg.
 Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
     R is half the length of the path; c = 299 792 458 m/s; offset is the module's range error; L is
     the label of sample 0 in module metres (c_module = 3.0e8 m/s, protocol reference 9.1).

@@ -138,7 +138,7 @@ class Faces:
     outward_only
         Whether it reflects on the side of its normal only.
     closures
-        Ends that are no edges.
+        Ends that are not edges.
     """
 
     a_x: Array
@@ -257,7 +257,7 @@ def _with_closures(faces: Faces) -> Faces:
 
 
 def closed_ends(faces: Faces, height_m: Array) -> NDArray[np.bool_]:
-    """Return which ends are no edges for a radar, shape (n_frames, n_faces, 2).
+    """Return which ends are not edges for a radar, shape (n_frames, n_faces, 2).
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ def passing(
     from_x, from_y, to_x, to_y
         Shape (m,) each, world frame [m].
     but
-        Bodies that do not count, shape (m,) each: those a leg was reflected by; -1 is none.
+        Bodies that do not count, shape (m,) each: those a leg was reflected by; -1: none.
     """
     share = np.ones(len(from_x))
     # A row for each face: NumPy's inner loops run over the legs, of which there are more.
@@ -524,7 +524,7 @@ class _Legs:
     """Ways from the radar to the target: shape (n_frames, n_targets, n_legs) each.
 
     The first is the straight one, the others go by way of a mirror each. ``gain`` is the share of
-    a free leg's amplitude on boresight, and 0 where there is no leg; ``to_x``, ``to_y`` is the
+    a free leg's amplitude on boresight, and 0 without a leg; ``to_x``, ``to_y`` is the
     unit vector from the target back along the leg; ``antenna_m`` is how much longer the antenna
     makes it.
     """

@@ -61,7 +61,7 @@ class PacketClass(Enum):
     SYSTEM = "system"
     """BOOTING, READY and the like. Protocol reference 5."""
     DATA = "data"
-    """Anything else: profile output, strings, and bytes that are no packet."""
+    """Anything else: profile output, strings, and bytes that are not a packet."""
 
 
 def classify(packet: bytes) -> PacketClass:
@@ -111,7 +111,7 @@ def frame_packet(counter: int, samples: Samples) -> bytes:
 
 
 def normal_payload(packet: bytes) -> bytes | None:
-    """Return the unescaped payload of a Normal packet; None if it is none."""
+    """Return the unescaped payload of a Normal packet; None for anything else."""
     if len(packet) < 4 or packet[0] != START:
         return None
     return unescape(packet[1:-1])[:-1]

@@ -189,7 +189,7 @@ class FaultPlan(Table):
 
 
 def fault_spec(kind: str, **keys: Any) -> FaultSpec:  # noqa: ANN401 - any key, all validated
-    """Return one fault; what is no key of a fault is a parameter of its kind.
+    """Return one fault; other keys than a fault's are parameters of its kind.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def fault_spec(kind: str, **keys: Any) -> FaultSpec:  # noqa: ANN401 - any key, 
 
 
 def parse_fault(table: object, source: str = "fault") -> FaultSpec:
-    """Return a fault from a table; `FaultPlanError` if it is none."""
+    """Return a fault from a table; `FaultPlanError` if it is not one."""
     try:
         return FaultSpec.model_validate(table)
     except ValidationError as error:

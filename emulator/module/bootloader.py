@@ -147,7 +147,7 @@ class Bootloader:
     Attributes
     ----------
     started
-        Whether START_APP was accepted; whoever owns the clock leaves for the application then.
+        Whether START_APP was accepted; the module then starts the application.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class Bootloader:
     def receive(self, data: bytes) -> Iterator[bytes]:
         """Take bytes from the host; yields the payloads of the answers."""
         for found in self._parser.receive(data):
-            if self.started:  # nothing is received any more
+            if self.started:  # everything that follows is ignored
                 return
             if isinstance(found, BootloaderFraming):
                 yield bytes((BootloaderReply.FRAMING_ERROR, found))

@@ -459,7 +459,7 @@ class LosslessOutbox(Outbox):
             self._queue.append(_Queued(MessageKind.FRAME, message))
 
     def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
-        """Fetch nothing; who advances the device asks for a packet if the line takes one."""
+        """Fetch nothing; the device asks for a packet if the line takes one."""
         self._wants_step = False
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:

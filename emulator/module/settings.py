@@ -90,7 +90,7 @@ _GRID_TOLERANCE = 1e-3
 class DeviceOptions:
     """How one emulated module behaves where the reference allows more than one answer.
 
-    A question the reference answers is no option. Where it marks a guess, the default is that
+    A question that the reference answers has no option. Where it marks a guess, the default is that
     guess; where it reports an observation of hardware, the default is the observation.
 
     Attributes
@@ -217,7 +217,7 @@ def option_texts() -> list[OptionText]:
 
 
 def option_of(text: str) -> tuple[str, object]:
-    """Return name and value of an option ``name=value``; ValueError, one line, if there is none.
+    """Return name and value of an option ``name=value``; ValueError, one line, if unknown.
 
     Examples
     --------

@@ -93,7 +93,7 @@ def _remove_stale(folder: Path) -> None:
 
 
 def _is_dead(pid: str) -> bool:
-    # What bears no process number is not ours: leave it alone.
+    # A name without a process number is not ours: leave it alone.
     return pid.isdigit() and not is_running(int(pid))
 
 

@@ -137,7 +137,7 @@ class PtyLink:
     Raises
     ------
     LinkError
-        When no terminal can be had, or something that is no link is in the way.
+        When no terminal can be had, or a file that is not a link has the path.
     """
 
     def __init__(self, path: Path, *, flushed: Callable[[], None] | None = None) -> None:

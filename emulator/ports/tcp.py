@@ -45,7 +45,7 @@ class TcpLink(Service):
     port
         Port number; 0 for any that is free.
     admits
-        Asked when a client comes while there is none; False hangs up on it.
+        Asked when a client connects while none is connected; False closes it.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class TcpLink(Service):
         return -1 if self._client is None else self._client.fileno()
 
     def read(self) -> bytes:
-        """Return what the client sent; ``b""`` when there is nothing, or no client any more."""
+        """Return what the client sent; ``b""`` if it sent nothing or has gone."""
         if self._client is None:
             return b""
         try:

@@ -10,7 +10,7 @@ Chest
 Rate
     The highest peak between 6 and 40 breaths a minute of the displacement's spectrum (Hann window,
     zero-padded); the window resolves 3 a minute. It is clear if the peak holds at least half of
-    the power above 3 a minute and is no slope at the edge of the band, as a shift of the body
+    the power above 3 a minute and is not a slope at the edge of the band, as a shift of the body
     leaves one; only then a rate is reported.
 State
     Initialising until the matrices are full and the noise map is there; no movement without a

@@ -2,7 +2,7 @@
 
 | file | what |
 |---|---|
-| `log.txt` | every packet both ways, decoded, and bytes that are no packet; why the test failed |
+| `log.txt` | every packet both ways, decoded, and other bytes; why the test failed |
 | `wire.mcap` | the bytes as they passed (`/radar/NAME/rx`, `/tx`), and the module's messages |
 | `about.json` | test, radar, identity, seeds, versions, link statistics, measurements |
 | `scene.toml` | the scene of an emulated radar, if it has one |

@@ -220,7 +220,7 @@ def groups_of(nodeids: Sequence[str], radars: Mapping[str, str]) -> dict[str, st
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Begin anew where a test runs again: what was found belongs to the try before."""
+    """Clear the findings where a test runs again: they belong to the run before."""
     if item.stash.get(FINDINGS, None) is not None:
         del item.stash[FINDINGS]
         kept = [one for one in item.user_properties if not one[0].startswith("measurement ")]

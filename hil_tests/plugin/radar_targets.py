@@ -393,7 +393,7 @@ class PortTarget(RadarTarget):
 
 
 def target_of(spec: RadarSpec, power: PowerCommand | None = None) -> RadarTarget:
-    """Return the target of a built-in spec; `TargetError` or `PortUnavailable` if there is none."""
+    """Return the target of a built-in spec; `TargetError` or `PortUnavailable` if it has none."""
     match spec.kind:
         case Kind.EMULATED if spec.line == "memory":
             return InProcessTarget(spec)

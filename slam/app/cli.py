@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         exit_code = _run(_parser().parse_args(argv))
     except KeyboardInterrupt:  # before a command took note of signals
         exit_code = _end("stopped by SIGINT", 128 + signal.SIGINT)
-    finally:  # also of --help; who sent a signal does not wait for a stream that blocks
+    finally:  # also of --help; a signal ends the wait for a stream that blocks
         flush_streams(wait=exit_code < _BY_A_SIGNAL)
     return exit_code
 

@@ -112,7 +112,7 @@ def minimise(start: Array, terms: Sequence[Term], stop: Stop | None = None) -> S
         step = -_factor(damped).solve(gradient)
         trial = state + step
         trial_cost = _cost(terms, trial)
-        if not trial_cost < cost:  # NaN is no improvement either
+        if not trial_cost < cost:  # NaN does not count as an improvement either
             curved = np.asarray(information @ step)
             decrease = -float(gradient @ step) - float(step @ curved) / 2
             if decrease <= rule.relative_decrease * cost:

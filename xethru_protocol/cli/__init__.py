@@ -53,6 +53,6 @@ def _run(argv: Sequence[str] | None, stop: StopFlag) -> int:
             raise
         warn("xethru: standard output cannot be written")
         code = 1
-    finally:  # who sent a signal does not wait for a stream that blocks
+    finally:  # a signal ends the wait for a stream that blocks
         flush_streams(wait=code < _BY_A_SIGNAL)
     return code

@@ -28,7 +28,7 @@ def utf8_text(text: str) -> str:
     try:
         text.encode()
     except UnicodeEncodeError:  # bytes that the shell passed on
-        raise ArgumentTypeError("this is no text in UTF-8") from None
+        raise ArgumentTypeError("this is not text in UTF-8") from None
     return text
 
 

@@ -40,7 +40,7 @@ class Machine:
 
     @property
     def stale(self) -> tuple[Path, ...]:
-        """Entries of emulators that do not run any more."""
+        """Entries of emulators that have ended."""
         return tuple(
             entry
             for entry in self._entries("*")
@@ -109,7 +109,7 @@ def _not_private(machine: Machine) -> str | None:
     folder = machine.run_directory
     if is_private(folder) or not os.path.lexists(folder):
         return None
-    return f"{folder} is not this user's alone: what it says about emulators is not believed"
+    return f"{folder} is not this user's alone: its list of emulators is ignored"
 
 
 @Check(

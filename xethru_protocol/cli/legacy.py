@@ -70,7 +70,7 @@ def legacy(arguments: argparse.Namespace) -> int:
 
 
 def _compiled(path: Path) -> CodeType | None:
-    """Compile a script; None if it is no Python 3 and its error was shown."""
+    """Compile a script; None if it is not Python 3 and its error was shown."""
     try:
         source = path.read_bytes()
     except OSError as error:
@@ -87,7 +87,7 @@ def _compiled(path: Path) -> CodeType | None:
         traceback.print_exception(error, limit=0)
     except (ValueError, RecursionError, MemoryError) as error:  # null bytes, or nested too deeply
         reason = str(error) or "it is nested too deeply"
-        raise _ScriptError(f"{path} is no Python script: {reason}") from None
+        raise _ScriptError(f"{path} is not a Python script: {reason}") from None
     return None
 
 

@@ -181,7 +181,7 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
             try:
                 yield radar
             finally:
-                # what is skipped to stop the module is no loss
+                # what is skipped to stop the module does not count as lost
                 if radar.frames_lost or radar.fault_count:
                     lost = counted(radar.frames_lost, "frame")
                     damaged = counted(radar.fault_count, "damaged place")

@@ -221,7 +221,7 @@ class Contact:
     pong: int | None = None  # answer to PING
     baudrate: int = USUAL_BAUDRATE  # at which that came
     talks: bool = False  # other messages came
-    damaged: bool = False  # bytes came that are no packets
+    damaged: bool = False  # bytes came that are not packets
     bootloader: bool = False  # a bootloader answered
     gone: bool = False  # the port went away meanwhile
 

@@ -356,7 +356,7 @@ def files_to_replace(targets: Iterable[Path], *, replace: bool) -> list[Path]:
     """
     old = [path for target in targets for path in _recording_files(target)]
     for path in old:
-        if not path.is_file():  # --force is no reason to remove a device
+        if not path.is_file():  # --force must not remove a device
             raise RecordingError(f"{path} is no file; name a new one")
     if old and not replace:
         raise RecordingError(f"there is a recording already: {old[0]}; --force replaces it")

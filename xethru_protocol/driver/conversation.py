@@ -52,7 +52,7 @@ class Conversation:
     """Commands to one module and what comes from it.
 
     ``name`` is what messages to people call the line. ``take_data`` is called with every message
-    that is no answer, and the time its last byte was read [ns]. ``clock`` and ``observer`` as of
+    but answers, and the time its last byte was read [ns]. ``clock`` and ``observer`` as of
     `X4M300`; its properties describe the listener and the counters.
 
     Attributes
@@ -63,8 +63,8 @@ class Conversation:
         What would answer it besides ERROR; empty if no command waits for an answer.
     answer_owed
         Whether the answer of a request that was given up may still come. The module answers in
-        order, so a PING brings both sides into step again: all before its PONG belongs to nothing
-        any more (Protocol reference 13). That holds only if no other PONG may come.
+        order, so a PING brings both sides into step again: answers before its PONG are dropped
+        (Protocol reference 13). That holds only if no other PONG may come.
     pings
         PINGs that were sent.
     pongs_owed
@@ -221,7 +221,7 @@ class Conversation:
     ) -> ResponseTimeout:
         """Error for something that did not come, with the likeliest reason and remedy.
 
-        Judged by what came since the last frame or answer: what was before that explains nothing.
+        Only bytes since the last frame or answer count: earlier ones are not the reason.
         ``likely`` is the reason given when nothing came at all.
         """
         missing = f"no {what} from {self.name} within {timeout_s:g} s"
@@ -261,7 +261,7 @@ class Conversation:
             f"{self.name} answered {summary(command)} with {came}, where {wanted} was expected; "
             "is its firmware another one, or does another program use the port, too?"
         )
-        # no PONG is silence all the same: who pings a module that starts asks again
+        # without PONG it is a timeout, after which callers ask a module that starts again
         return ResponseTimeout(text) if isinstance(command, m.Ping) else RemoteProtocolError(text)
 
     def report(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:

@@ -202,7 +202,7 @@ def _then_close(link: Link, file_type: int, identifier: int, body: Steps[T]) -> 
     close = link.request(m.CloseFile(file_type=file_type, identifier=identifier))
     try:
         result = yield from body
-    except GeneratorExit:  # the steps are not carried out any more
+    except GeneratorExit:  # the steps are no longer carried out
         raise
     except BaseException:  # also an interrupt: the module has room for ten open files
         yield from _clean_up(link, close)

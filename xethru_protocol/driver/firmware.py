@@ -113,8 +113,8 @@ class FirmwareImage:
     def parse(cls, content: bytes) -> Self:
         """Make an image of a file's content: Intel hex, or the bytes from address 410000h on.
 
-        Raises `FirmwareError` if it is damaged, does not fit the flash, or is no application for a
-        module with bootloader.
+        Raises `FirmwareError` if it is damaged, does not fit the flash, or is not an application
+        for a module with bootloader.
         """
         if content.startswith(b"\x7fELF"):
             raise FirmwareError("this is an ELF file; convert it with objcopy -O ihex")

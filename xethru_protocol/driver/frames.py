@@ -171,7 +171,7 @@ class Lattice:
             return off
         doubtful = ~on & (np.abs(counters) > _SURE)
         unsure = int(np.count_nonzero(doubtful))
-        if 2 * (off - unsure) > samples.size:  # the verdict is clear without them
+        if 2 * (off - unsure) > samples.size:  # they cannot change the result
             return off - unsure
         return off - self._count_neighbours(samples[doubtful])
 
@@ -320,7 +320,7 @@ def complex_of(i: Float32s, q: Float32s) -> NDArray[np.complex64]:
 
 DEFAULT_FRAMES = 1024  # a minute at 17 frames/s; 6 MB of RF frames
 _COUNTER_WRAP = 1 << 32
-_ENOUGH = 128  # samples that are judged of a frame behind one that is no radar's, if most are off
+_ENOUGH = 128  # samples that are judged of a frame behind one that no radar sent, if most are off
 
 
 class FrameQueue:
@@ -348,7 +348,7 @@ class FrameQueue:
     dropped
         Frames that came, but left a full queue unread.
     discarded
-        Data messages that are no frame of this geometry.
+        Data messages that are not frames of this geometry.
     misfit
         Why the last data message was discarded.
     last_counter
@@ -438,7 +438,7 @@ class FrameQueue:
         self._queue(message.info, samples, geometry, arrival_ns)
 
     def _count_off(self, lattice: Lattice, values: Float32s) -> int:
-        """Count the samples off the lattice; where the verdict is clear, at least so many."""
+        """Count the samples off the lattice; a lower bound where most are."""
         if self._off_lattice:
             off = lattice.off_lattice(values[:_ENOUGH])
             if 2 * off > _ENOUGH:

@@ -58,7 +58,7 @@ class Write:
 
 @dataclass(frozen=True, slots=True)
 class Sleep:
-    """Wait while there is no line."""
+    """Wait while the line is closed."""
 
     seconds: float
 
@@ -228,8 +228,8 @@ class ModuleInfo:
 
 
 _BOOTLOADER_REPLIES = ((m.BootloaderSuccess,), (m.BootloaderEchoed,))
-# The module answers PINGs that waited for it one right after the other; a PONG that stays out
-# this long after the last one was probably never sent.
+# The module answers PINGs that waited for it one right after the other; a PONG that does
+# not come within this time of the last one was probably never sent.
 _SETTLED_NS = 250_000_000
 # Part of the timeout for which the right answer is waited for after a wrong one.
 _AFTER_A_WRONG_ONE = 0.25
@@ -255,10 +255,10 @@ class Link:
     Attributes
     ----------
     messages
-        Messages that were not taken yet: those of the running profile, if somebody reads them,
-        and texts (DATA STRING), whoever reads.
+        Messages that were not taken yet: those of the running profile, if they are read,
+        and texts (DATA STRING) always.
     keeps_messages
-        Whether somebody reads a profile's messages.
+        Whether a profile's messages are read.
     home
         The path the user named; ``path`` is where the module is now.
     plan
@@ -351,7 +351,7 @@ class Link:
         return reply  # type: ignore[return-value]
 
     def _catch_up(self, command: Command[Response], timeout_s: float) -> Steps[None]:
-        """Receive until no answer to an abandoned request can come any more."""
+        """Receive until answers to an abandoned request can no longer come."""
         conversation = self.conversation
         if ROWS[type(command)].replies in _BOOTLOADER_REPLIES:  # the bootloader does not have PING
             echo = m.BootloaderEcho(data=self.clock().to_bytes(8, "little"))

@@ -216,7 +216,7 @@ class RadarState:
 
     @property
     def frames_discarded(self) -> int:
-        """Data that are no frame of the geometry, such as frames of older settings."""
+        """Data that are not frames of the geometry, such as frames of older settings."""
         return self._link.frames.discarded
 
     @property
@@ -325,7 +325,7 @@ class X4M300(RadarState):
     candidates
         Ports at which a module that vanished may come back.
     sleep
-        Waits [s] while there is no line.
+        Waits [s] while the line is closed.
     """
 
     _port_type = staticmethod(open_line)
@@ -512,7 +512,7 @@ class X4M300(RadarState):
         RemoteProtocolError
             If it reads back another value than was set; names the setting.
         ResponseTimeout
-            If the port is no radar.
+            If the port is not a radar.
         """
         return self._call(raw_mode.configure_raw, config)
 

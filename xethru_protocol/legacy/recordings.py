@@ -38,7 +38,7 @@ def _kinds(data_types: int) -> frozenset[Kind]:
 def _kind(data_type: int) -> Kind:
     (kind,) = _kinds(data_type) or {None}
     if kind is None:
-        raise ModuleConnectorError(f"{data_type} is no single DataType that can be recorded")
+        raise ModuleConnectorError(f"{data_type} is not a single DataType that can be recorded")
     return kind
 
 
@@ -311,7 +311,7 @@ class DataRecorder:
 
 
 class DataRecord:
-    """A record as stored. Titles of text files and user headers are no records here."""
+    """A record as stored. Titles of text files and user headers do not count as records."""
 
     def __init__(self) -> None:
         self.data = Vector()

@@ -135,7 +135,7 @@ class ClutterFilter:
         with np.errstate(invalid="ignore", over="ignore"):
             products = ring @ row.conj()
         is_finite = bool(np.isfinite(products).all())
-        if not is_finite:  # there are no eigenvectors, for as long as the frame is in the window
+        if not is_finite:  # no eigenvectors exist while the frame is in the window
             ring[place] = 0
             products = np.zeros_like(products)
         self._state[:, place] = products

@@ -52,7 +52,7 @@ class Window:
 
 
 def check_rate(frame_rate_hz: float) -> None:
-    """Raise `ValueError` for a frame rate that is none."""
+    """Raise `ValueError` for an impossible frame rate."""
     if not 0 < frame_rate_hz < math.inf:
         raise ValueError(f"frame_rate_hz {frame_rate_hz:g}: must be above 0")
 

@@ -276,7 +276,7 @@ def _read_npz(path: Path) -> Frames:
         beside = {name: archive[name] for name in names if name != "settings"}
         settings = json.loads(str(archive["settings"])) if "settings" in names else {}
     if not isinstance(settings, dict):
-        raise ValueError("its settings are no table")
+        raise ValueError("its settings are not a table")
     settings = {
         name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()
     }

@@ -71,7 +71,7 @@ def recording_format(path: Path | str) -> RecordingFormat:
         if path.is_dir() or is_vendor_file(path):
             return "vendor"
         if not path.is_file():  # a pipe would be waited for
-            raise RecordingError(f"{path} is no file; a recording is read from files only")
+            raise RecordingError(f"{path} is not a file; a recording is read from files only")
         with path.open("rb") as stream:
             start = stream.read(8)
     for magic, found in _MAGICS.items():

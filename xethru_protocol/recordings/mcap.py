@@ -123,7 +123,7 @@ def _counted(text: str) -> bytes:
 
 
 def unpack_array(message_type: str, data: bytes) -> npt.NDArray[Any]:
-    """Return the values, shape (n,), read-only; ValueError or struct.error if it is no array."""
+    """Return the values, shape (n,), read-only; ValueError or struct.error for other bytes."""
     body, dtype = _body(data), _DTYPE[message_type]
     (dimensions,) = _U32.unpack_from(body, 0)
     position = 4
@@ -141,7 +141,7 @@ def unpack_array(message_type: str, data: bytes) -> npt.NDArray[Any]:
 
 
 def unpack_string(data: bytes) -> str:
-    """Return the text; ValueError or struct.error if it is no String message."""
+    """Return the text; ValueError or struct.error if it is not a String message."""
     body = _body(data)
     (length,) = _U32.unpack_from(body)
     return body[4 : 4 + length].rstrip(b"\0").decode()
@@ -442,7 +442,7 @@ def _unpacked(name: str, packed: bytes, size: int) -> bytes:
 def _records_in(at: int, content: bytes) -> Iterator[Record]:
     """Yield the records of a chunk, up to where it was cut; ValueError for others than it may hold.
 
-    Zeros, which a few kilobytes may unpack to by the hundred megabytes, are none.
+    Zeros are such: a few kilobytes may unpack to hundreds of megabytes of them.
     """
     here = 0
     while here + _HEAD.size <= len(content):

@@ -94,8 +94,8 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
     """Chunks of a wire capture in the order in which they passed.
 
     A cut last chunk is yielded as far as it is there, then reported. A chunk of more than 1 MiB,
-    which a damaged length makes, comes in pieces of that size. RecordingError if the file is no
-    wire capture, or is cut and ``on_fault`` is None.
+    which a damaged length makes, comes in pieces of that size. RecordingError if the file is not
+    a wire capture, or is cut and ``on_fault`` is None.
     """
     path = Path(path)
 
@@ -127,7 +127,7 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
 
 
 def read_note(path: Path | str) -> dict[str, Any]:
-    """Return the note; RecordingError if the file is no wire capture."""
+    """Return the note; RecordingError if the file is not a wire capture."""
     path = Path(path)
     with reading(path), path.open("rb") as stream:
         return _read_note(path, stream)

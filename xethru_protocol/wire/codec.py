@@ -125,7 +125,7 @@ def describe(message: Message) -> tuple[str, dict[str, Any]]:
     >>> describe(decode_response(bytes.fromhex("01 EA AE EE AA")))
     ('PONG', {'value': '0xAAEEAEEA'})
 
-    Floats that are no JSON numbers are shown as "NaN", "Infinity" and "-Infinity".
+    Floats that JSON does not have are shown as "NaN", "Infinity" and "-Infinity".
     """
     if isinstance(message, UnknownMessage):
         shown: dict[str, Any] = {"code": message.code, "payload": hex_bytes(message.payload)}

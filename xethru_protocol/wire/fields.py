@@ -429,7 +429,7 @@ class Block:
 class Text:
     """A NUL-terminated text, one byte per character; the field ``count`` includes the NUL.
 
-    The NUL is no part of the value; a text that comes without one is accepted.
+    The NUL is not part of the value; a text that comes without one is accepted.
     """
 
     count: str

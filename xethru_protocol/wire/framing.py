@@ -1,7 +1,7 @@
 """Packets in their two framings, and the receiver that finds them in any bytes.
 
 Normal framing escapes 7D, 7E, 7F and ends with an XOR checksum; NoEscape framing announces a
-length and has neither (Protocol reference 1.1, 1.3). A receiver that believes a damaged length
+length and has neither (Protocol reference 1.1, 1.3). A receiver that trusts a damaged length
 field loses all that follows, so a NoEscape header is judged by its length and at most the first 14
 payload bytes, in the same way by every receiver (1.4).
 
@@ -21,7 +21,7 @@ The receiver guarantees, for any bytes in any chunks:
   it is refuted, by the next unescaped 7D or 7E or at the longest possible packet.
 - A Normal packet of an unknown kind gives way to a plausible NoEscape header inside it: its
   checksum fits by chance in 1 of 256 cases, a header in hardly any. A known one is data throughout.
-- Every byte is searched and parsed a bounded number of times, also in input made to hurt. In a
+- Every byte is searched and parsed a bounded number of times, for any input. In a
   run of damaged packets all within one window are judged, and counted, together.
 - `LinkStatistics` counts every byte: in a packet, junk, or not judged yet.
 
@@ -373,7 +373,7 @@ class PatternFinder:
 class TerminatorFinder:
     """Where the next 7D or 7E stands that is not escaped: it ends a Normal packet, well or badly.
 
-    Escaped is a byte behind an odd number of 7F in a row. A start is no 7F, so that run lies
+    Escaped is a byte behind an odd number of 7F in a row. A start is not 7F, so that run lies
     behind the start whatever start is asked for: which bytes are terminators depends on none,
     and those of a whole window can be marked at once.
 
@@ -532,7 +532,7 @@ def _judge(raw: Bytes, places: Places, drop: Places, base: int) -> _Judged:
     end, end_offset = ends[group], places[group] + base
     size = end - starts - 1
     folded = np.bitwise_xor.accumulate(content)
-    fits = folded[end - 1] ^ folded[starts] == START  # False where there is no content
+    fits = folded[end - 1] ^ folded[starts] == START  # False without content
     cut_short = content[end] == START
     good = fits & ~cut_short & (size > 1)
     doubled = cut_short & (size == 0)
@@ -755,7 +755,7 @@ class PacketReader:
         return None if reported else self._fault(kind, first)
 
     def _reject_run(self, first: int) -> bool:
-        """Give up a run of damaged packets from ``first`` on; False if it is none."""
+        """Give up a run of damaged packets from ``first`` on; False if it is not one."""
         judged = self._terminators.window.judged()
         begin = bisect_left(judged.first, first)
         if begin == len(judged.first) or judged.first[begin] != first:

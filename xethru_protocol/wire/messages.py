@@ -1183,7 +1183,7 @@ def _image_checksum(message: "BootloaderWritePage") -> dict[str, Any]:
 class BootloaderWritePage(Command[BootloaderSuccess]):
     """Write a page of 512 bytes, the last one padded with FF. 4.12.
 
-    Page 0 is no page of the flash: its first four bytes are the sum of the image's bytes, and it
+    Page 0 is not a page of the flash: its first four bytes are the sum of the image's bytes, and it
     unlocks the flash.
     """
 

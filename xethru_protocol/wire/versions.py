@@ -112,7 +112,7 @@ class Difference:
     is_fault: bool = False
 
     def is_in(self, firmware: Firmware) -> bool:
-        """Whether a module has it as today; assumed of a text that is no version."""
+        """Whether a module has it as today; assumed of a text that is not a version."""
         for since, has in ((self.sensor, firmware.sensor), (self.xep, firmware.xep)):
             oldest = None if since is None else version_key(since)
             version = None if has is None else version_key(has)

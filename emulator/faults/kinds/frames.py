@@ -207,7 +207,7 @@ def truncated_frame(packet: bytes, wanted: _Cut, rng: Rng, context: Context) -> 
 
 @of_frame("off_lattice_samples = samples", _Samples)
 def nan_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
-    """Samples of a frame are no numbers."""
+    """Samples of a frame are NaN."""
     return _replaced(packet, wanted, rng, lambda samples: np.full_like(samples, np.nan))
 
 

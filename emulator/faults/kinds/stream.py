@@ -119,7 +119,7 @@ def counter_back(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> 
     return _renumbered(packet, lambda counter: counter - wanted.frames * context.firings)
 
 
-@of_frame("nothing; a wrap is no loss", _Frames, lasting=True, hidden=_BACK)
+@of_frame("nothing; a wrap is not a loss", _Frames, lasting=True, hidden=_BACK)
 def counter_wrap(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter goes on shortly before 2**32, and wraps after some frames."""
     return _renumbered(

@@ -77,7 +77,7 @@ def run_calibrate(
     known = None if reflectors is None else _read_reflectors(reflectors)
     scene = None if truth is None else _scene(truth)
     recorded = open_session(session, stop)
-    # before minutes of work: what can be refused already
+    # refuse what can be refused before minutes of work
     _planted(recorded.rig, scene)
     if rig is not None:
         _check_rig_place(rig, session)

@@ -79,7 +79,7 @@ def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -
     Raises
     ------
     AppError
-        There is no graphics driver, the recording is no view of a session, the viewer does not
+        No graphics driver is found, the recording is not a view of a session, the viewer does not
         come to rest, or the picture cannot be written.
     """
     with ViewerProcess(ViewerKind.HEADLESS) as process:

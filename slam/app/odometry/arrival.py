@@ -1,7 +1,7 @@
 """Time base `arrival`: when frames were taken, from when they arrived.
 
 A frame carries a counter and no time. It arrives after it was taken, later by a delay that is
-never negative and often small: what a USB hub or a busy host adds comes and goes. So the frames
+never negative and often small: what a USB hub or a busy host adds varies. So the frames
 that came soonest give the module's clock: the line below all points (counter, arrival) that lies
 closest to them. Jitter goes, drift stays.
 

@@ -317,7 +317,7 @@ def _path_source(text: str) -> LineSource:
 def read_lines(source: LineSource, is_stopped: Callable[[], bool]) -> Iterator[tuple[str, int]]:
     """Yield every line with the host's monotonic time [ns] at which its end was read.
 
-    The last line may lack its end. Bytes that are no text come as replacement characters.
+    The last line may lack its end. Bytes that are not text come as replacement characters.
     `is_stopped` is called a few times a second; reading ends when it returns True. Raises
     OdometryError if the source cannot be opened, or breaks off.
     """

@@ -74,7 +74,7 @@ def parse_tum_line(line: str) -> TumSample:
     Raises
     ------
     TumError
-        Fewer or more than eight numbers, one that is no finite decimal in ASCII, a stamp that
+        Fewer or more than eight numbers, one that is not a finite decimal in ASCII, a stamp that
         cannot be seconds, a quaternion without length.
 
     >>> parse_tum_line("12.000000005 1.5 -2 0 0 0 0 1")
@@ -210,7 +210,7 @@ class OdometryTrack:
     def gap_ns(self, t_ns: int) -> float:
         """Return how far apart the two samples around a time are; infinite outside of all.
 
-        At a sample's own time there is no gap.
+        At a sample's own time the gap is 0.
         """
         after = bisect_left(self._stamps_ns, t_ns)
         if after == len(self._stamps_ns) or (after == 0 and self._stamps_ns[0] != t_ns):

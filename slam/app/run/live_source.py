@@ -363,7 +363,7 @@ _DRIFT_EVERY_S = 60.0
 class LiveLog(LinkLog):
     """Writes a live run into its session log; keeps odometry until there is one.
 
-    If the log cannot be written any more, a warning is logged once, and the run goes on without it.
+    If the log cannot be written, a warning is logged once, and the run goes on without it.
 
     Attributes
     ----------
@@ -604,7 +604,7 @@ class LiveSource:
         return self._odometry.last_ns if self._odometry.ended else MOST_STAMP_NS
 
     def _drain(self, wait_s: float) -> None:
-        """Take the events that wait, no more than those; wait for the first if there is none."""
+        """Take the events that wait, and no others; wait for the first if none does."""
         try:
             self._take(self._inbox.get(timeout=wait_s) if wait_s else self._inbox.get_nowait())
             for _ in range(MOST_EVENTS):

@@ -121,7 +121,7 @@ def print_progress(line: str) -> None:
 def print_text(lines: str) -> None:
     """Print lines of a result on standard output, after its files are written.
 
-    What cannot be printed is no error here: the exit code says so.
+    What cannot be printed does not raise here: the exit code reports it.
     """
     STDOUT.write(each_line(lines) + "\n")
 

@@ -71,7 +71,7 @@ class Odometry(Protocol):
 
 
 class StepGivenUpError(BaseException):
-    """SLAM broke off a step since the run has to end; it must not be used any more.
+    """SLAM broke off a step since the run has to end; it must not be used afterwards.
 
     No `Exception`: it comes in the middle of anything, as KeyboardInterrupt does.
     """

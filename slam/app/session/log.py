@@ -243,7 +243,7 @@ class SessionLog(SessionObserver):
     Raises
     ------
     CannotWriteError
-        Here and in every other method: the disk takes no more.
+        Here and in every other method: the disk is full or fails.
     """
 
     def __init__(

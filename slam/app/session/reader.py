@@ -135,7 +135,7 @@ def read_entries(
     The last entry is a `Cut` if the file ends too early. `size` is how many bytes to read, so that
     a file that grows reads the same again; None: all. `channels` by their numbers are known
     already, as where the chunk that names them is damaged. Damage before a copy of the head that
-    no other message precedes is no loss.
+    no other message precedes loses nothing.
 
     Raises
     ------
@@ -573,7 +573,7 @@ def _session_table(path: Path, message: Message) -> dict[str, str]:
     with _naming(path, message):
         table = json.loads(unpack_string(message.data))
         if not isinstance(table, dict):
-            raise ValueError("it is no table")
+            raise ValueError("it is not a table")
         return {str(key): str(value) for key, value in table.items()}
 
 

@@ -163,7 +163,7 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
     ------
     AppError
         Not an MCAP file, nothing left of it, still being written, or no place to write; or a
-        session that nothing describes any more, of which only `out` gets what is whole.
+        session without any description left, of which only `out` gets what is whole.
     """
     with _held(path):
         survey = _survey(path, stop)
@@ -204,7 +204,7 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
 
 
 def _lost_description(fresh: Path, stop: StopFlag) -> str:
-    """Return why nobody can read a session as one; "" if they can."""
+    """Return why a session cannot be read as one; "" if it can."""
     try:
         open_session(fresh, stop)
     except AppError as error:
@@ -378,7 +378,7 @@ def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
         if survey.is_session:
             copy.write_head()
         for found in stop.each(mcap.RecordReader(*opened).read()):
-            stop.check()  # also where nothing is read any more, but much is written
+            stop.check()  # also while nothing is read, but much is written
             if isinstance(found, mcap.Damage) and found.at in survey.gaps:
                 copy.write_gap(survey.gaps[found.at])
             if not isinstance(found, mcap.Record):

@@ -18,7 +18,7 @@ Derivatives are by body-frame changes of the poses (GTSAM's) and by (s, w, kappa
 the function runs once per step and linearisation, and arrays of three cost more than they do.
 
 What the bound is: the best that this noise model gives on these ranges, up to ISAM2's thresholds.
-It is no bound on luck: a filter with fewer ranges may end nearer to the truth in a single run.
+A single run can be luckier: a filter with fewer ranges may end nearer to the truth.
 Calibration errors that wander are one set per ``WALK_STEPS`` steps.
 Source: Kaess et al., iSAM2, IJRR 31(2), 2012; GTSAM is BSD-licensed.
 """

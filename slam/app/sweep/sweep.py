@@ -145,7 +145,7 @@ def _finished(out: Path, command: Mapping[str, str]) -> list[SweepRun]:
     """Return the runs of a result that this command wrote before; none if there is no such file.
 
     The result of another command is replaced at the end, and a line says so. Raises AppError for
-    what is no result of a sweep.
+    what is not a result of a sweep.
     """
     try:
         content = read_bounded(out, _MOST_BYTES)
@@ -194,7 +194,7 @@ def run_sweep(
     of a scheduler that runs them instead.
 
     Raises AppError before the first run for a wrong name, or a file that cannot be written, is not
-    this sweep's, or is no sweep's; later for a scene too short, a full disk, or a worker process
+    this sweep's, or of no sweep; later for a scene too short, a full disk, or a worker process
     or a cluster that died. Raises StopRequestedError after a signal; OUT.part stays if it holds a
     run.
     """

@@ -83,7 +83,7 @@ def _signals_left_to_the_parent() -> Iterator[None]:
     thread in which joblib replaces workers later inherits it, too.
     """
     # Python 3.11's tracker unblocks SIGINT and SIGTERM when it is first needed, that is, when the
-    # first worker is about to start. Running already, it does so no more.
+    # first worker is about to start. One that runs already does not.
     _start_trackers()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEFT_TO_THE_PARENT)
     try:

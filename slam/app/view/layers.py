@@ -409,7 +409,7 @@ class MapLayer:
         self._paths["odometry"].append(transform(odom, snapshot.odometry[:2]))
         self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
         if np.isfinite(snapshot.truth).all():
-            if not self._paths["truth"]:  # no robot is shown where there is no truth
+            if not self._paths["truth"]:  # without truth its robot is not shown
                 self._send_robot("map/truth/robot", TRUTH_RGB, TRUTH_RGB, 45.0)
             self._paths["truth"].append(snapshot.truth[:2])
         if snapshot.t_ns >= self._next_map_ns:

@@ -226,7 +226,7 @@ class Recording:
             return
         stream, self._stream = self._stream, None
         is_file = isinstance(self._target, Path)
-        if self._target is None:  # who reads decides how fast
+        if self._target is None:  # the reader decides how fast
             limit_s = None
         else:
             limit_s = _FILE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S

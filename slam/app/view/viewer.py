@@ -45,7 +45,7 @@ def require_listening(url: str) -> None:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port or _DEFAULT_PORT
     except ValueError:
-        raise AppError(f"{url}: is no address of a viewer") from None
+        raise AppError(f"{url}: is not an address of a viewer") from None
     try:
         socket.create_connection((host, port), timeout=_CONNECT_LIMIT_S).close()
     except OSError as error:

@@ -51,7 +51,7 @@ _ABOUT = """\
   The filter ({clutter}) removes what stands still. A blue line: where somebody breathes.
 * **Range-Doppler**: what moves, by range and radial velocity, approaching above.
 * **Chest**: displacement towards the radar where somebody breathes.
-* **Breathing rate**: of the last minutes. An estimate for experiments; this is no medical device.
+* **Breathing rate**: of the last minutes. An estimate for experiments: not a medical device.
 
 Ranges are metres as the module counts them.
 """

@@ -96,7 +96,7 @@ def _display(arguments: Namespace) -> Iterator[Display]:
 
 
 class _Keys:
-    """Keys pressed on the terminal of standard input, without Enter; none if it is no terminal.
+    """Keys pressed on the terminal of standard input, without Enter; none if it is not a terminal.
 
     A terminal is read while this process is in its foreground only, and gets its mode back.
     """
@@ -208,7 +208,7 @@ class _Snapshots:
 
 
 class _Viewer:
-    """Draws in a Rerun viewer, in a thread: what is slow there delays no frame.
+    """Draws in a Rerun viewer, in a thread, so that a slow viewer delays no frame.
 
     Rerun is imported in that thread, too: a signal raises in the main one, which modules written in
     C do not pass on while they are imported.

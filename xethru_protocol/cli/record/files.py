@@ -72,7 +72,7 @@ class RecordingFiles:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Complete the files, however it ended; what was recorded into none goes."""
+        """Complete the files, however it ended; files without records are removed."""
         for file in (self._writer, self._wire):
             try:
                 if file is not None:

@@ -45,7 +45,7 @@ class Listen:
     parameter_file: bytes | None = None  # the module's own
 
     def prepare(self, radar: X4M300) -> None:
-        """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
+        """Set the module up without starting it; data that come meanwhile are old."""
 
     def start(self, radar: X4M300) -> float:
         """Let it send; returns after how much silence [s] something must be wrong."""

@@ -148,7 +148,7 @@ class _Module(_Source):
 
 
 class _Text(_Source):
-    """Lines from standard input or a serial port; its end is no failure of standard input."""
+    """Lines from standard input or a serial port; the end of standard input is not a failure."""
 
     noun = "line"
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _MOST_GAP_NS = 1_000_000_000
 """Between two poses that are farther apart in time the path is not interpolated."""
 _STILL_RAD = 1e-9
-"""A turn that small is none: the chord is as long as the arc to the last bit."""
+"""A turn that small counts as zero: the chord is as long as the arc to the last bit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ class Path:
     def at(self, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
         """Return the places at some stamps, (k, 2), interpolated, and where they are known, (k,).
 
-        A place is known between two positions that are no more than a second apart.
+        A place is known between two positions that are at most a second apart.
         """
         after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, len(self.t_ns) - 1)
         first, second = self.t_ns[after - 1], self.t_ns[after]
@@ -208,7 +208,7 @@ def nanoseconds(seconds: Array) -> NDArray[np.int64]:
 def step_times(times_s: Array, first_s: float, last_s: float, most_gap_s: float) -> Array:
     """Return ascending times from first to last: the given ones in there, and others.
 
-    Between two of them there is no more than ``most_gap_s``.
+    Two of them are at most ``most_gap_s`` apart.
     """
     inside = times_s[(times_s >= first_s) & (times_s <= last_s)]
     ends = np.unique(np.concatenate([inside, [first_s, last_s]]))

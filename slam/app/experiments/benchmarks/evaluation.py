@@ -68,7 +68,7 @@ def score_run(
 ) -> ScoredRun:
     """Run the back end with the ids of landmarks and without them, where there are such data.
 
-    A range alone is only used with its id: what measures such ranges knows whom it asked. Raises
+    A range alone is only used with its id, which the sensor that asks for it knows. Raises
     AppError if truth and odometry do not share some time.
     """
     paths = {ODOMETRY: run.dead_reckoning()}

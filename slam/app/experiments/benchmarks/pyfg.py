@@ -9,7 +9,7 @@ One item per line; times in seconds, metres, radians, covariances as upper trian
     EDGE_RANGE   time pose landmark range variance
 
 Names are a letter and a number; those of landmarks begin with L. Graphs in three dimensions and
-priors are no drives on a floor and are an error. Format: the files of PyFactorGraph and
+priors do not occur on a floor and are an error. Format: the files of PyFactorGraph and
 CORA, Marine Robotics Group.
 """
 
@@ -100,7 +100,7 @@ class FactorGraph:
 
 
 def read_pyfg(path: FilePath) -> FactorGraph:
-    """Read a graph; AppError names a line that is none of it, or what no line defines."""
+    """Read a graph; AppError names a line that is not part of it, or what is not defined."""
     poses: dict[str, Pose] = {}
     landmarks: set[str] = set()
     edges: dict[str, list[Edge]] = defaultdict(list)
@@ -183,7 +183,7 @@ def read_data_set(folder: FilePath) -> DataSet:
 
 
 def run_of(path: FilePath, graph: FactorGraph) -> Run:
-    """Return the drive that a graph holds; AppError if its poses are no single chain.
+    """Return the drive that a graph holds; AppError if its poses are not one chain.
 
     A range belongs to its pose; the time of the edge is not used.
     """

@@ -45,7 +45,7 @@ def rows_of(path: Path, what: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def number_of(word: str) -> float:
-    """Return a finite decimal number; ValueError if the word is none."""
+    """Return a finite decimal number; ValueError if the word is not one."""
     value = float(word) if _DECIMAL.fullmatch(word) else math.nan
     if not math.isfinite(value):
         raise ValueError(f"{shown(word)} is no finite decimal number")
@@ -83,7 +83,7 @@ def read_table(path: Path, columns: Sequence[str], *, ascending: bool = False) -
 
 
 def folder_at(path: Path) -> Path:
-    """Return the folder; AppError if it is none."""
+    """Return the folder; AppError if it is not a folder."""
     if not path.is_dir():
         raise AppError(f"{path}: no such folder; {REMEDY}")
     return path
