@@ -74,7 +74,7 @@ emulators' ports are found with `xethru list`.
 
 _PLAY_HELP = """\
 Plays a recording at the port of an emulated X4M300, every message byte-exact: a directory of
-ModuleConnector, a wire capture (.xtwire), MCAP or .npz. Same ready line as serve. A session of
+ModuleConnector, a wire capture (.xtwire) or MCAP. Same ready line as serve. A session of
 several radars gets a port for each, named as in the session; they loop in step.
 
 Playing begins anew for every host that opens the port: at once when the host starts the radar

@@ -555,8 +555,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "dump",
         "print a recording",
         "recordings:dump",
-        "Reads the vendor's recordings (the directory, or one of its files), wire captures, "
-        ".mcap and .npz. Prints a summary and one line per message; with --json one object per "
+        "Reads the vendor's recordings (the directory, or one of its files), wire captures and "
+        ".mcap. Prints a summary and one line per message; with --json one object per "
         "message, as decode does, with its time t_ns. Exit 1 if a part could not be read.",
     )
     one.add_argument(
@@ -572,8 +572,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "convert",
         "turn a recording into another format",
         "recordings:convert",
-        "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture), .pcap (of a wire "
-        "capture, for Wireshark); .csv and .mat (MATLAB) for frames as arrays; a name without "
+        "The name of TARGET says which: .mcap, .xtwire (a wire capture), .pcap (of a wire capture, "
+        "for Wireshark); .csv, .mat (MATLAB) and .npz (numpy) for frames as arrays; a name without "
         "suffix is a directory in the vendor's format.",
     )
     one.add_argument(

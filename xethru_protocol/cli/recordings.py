@@ -34,7 +34,7 @@ from xethru_protocol.recordings import (
     recording_facts,
 )
 from xethru_protocol.recordings import convert as convert_recording
-from xethru_protocol.recordings.array_files import is_array_file
+from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file
 from xethru_protocol.recordings.records import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
@@ -321,7 +321,7 @@ def convert(arguments: Namespace) -> int:
             }
         )
     else:
-        noun = "frame" if path.suffix in {".csv", ".mat"} else "message"
+        noun = "frame" if path.suffix in SUFFIXES else "message"
         print_line(f"{target}: {counted(done.messages, noun)}")
     for name, number in sorted(done.skipped.items()):
         warn(f"xethru convert: {number} {name} left out: the format has no place for them")

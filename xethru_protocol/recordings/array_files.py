@@ -60,6 +60,10 @@ DTYPES: Mapping[Kind, np.dtype[Any]] = {
     "iq": np.dtype(np.complex64),
 }
 SUFFIXES = (".csv", ".mat", ".npz")
+ONLY_MESSAGES = (
+    "is an archive of messages, which are kept in .mcap now; 'xethru convert' of version 0.2 turns "
+    "it into one"
+)
 _AT_ONCE = 256  # frames of a file that are read together
 _LINES_AT_ONCE = 8  # a number as text is ten times as large
 
@@ -108,16 +112,8 @@ _DAMAGED = (
 
 
 def is_array_file(path: Path) -> bool:
-    """Whether a file holds arrays and no messages, by its suffix; of archives, by what is there."""
-    if not path.is_file() or kind_of_file(path.name) is not None:
-        return False
-    if path.suffix != ".npz":
-        return path.suffix in SUFFIXES
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return "format.npy" not in archive.namelist()
-    except (OSError, *_DAMAGED):
-        return False
+    """Whether a file holds arrays and no messages, by its suffix."""
+    return path.suffix in SUFFIXES and path.is_file() and kind_of_file(path.name) is None
 
 
 def read_array_file(path: Path) -> Frames:
@@ -146,8 +142,7 @@ def write_array_file(path: Path, frames: Frames) -> None:
             case ".mat":
                 _write_mat(fresh, frames, frames.kind, path)
             case _:
-                with zipfile.ZipFile(fresh, "w", zipfile.ZIP_DEFLATED) as archive:
-                    add_arrays(archive, frames, frames.kind)
+                _write_npz(fresh, frames, frames.kind)
 
 
 @contextmanager
@@ -242,29 +237,29 @@ def _beside(frames: Frames) -> dict[str, npt.NDArray[Any]]:
 # --- .npz ---------------------------------------------------------------------------------------
 
 
-def add_arrays(archive: zipfile.ZipFile, frames: Frames, kind: Kind) -> None:
-    """Add the arrays to a numpy archive, a part of the samples at a time."""
-    for name, values in (_beside(frames) | {"settings": _json(frames.settings)}).items():
-        with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
-            write_array(stream, np.asarray(values), allow_pickle=False)
+def _write_npz(fresh: Path, frames: Frames, kind: Kind) -> None:
+    """Write the archive, a part of the samples at a time."""
     dtype = DTYPES[kind].newbyteorder("<")
     about = {
         "descr": dtype.str,
         "fortran_order": False,
         "shape": (frames.n_frames, frames.n_bins),
     }
-    with archive.open(f"{kind}.npy", "w", force_zip64=True) as stream:
-        write_array_header_1_0(stream, about)
-        for chunk in frames.chunks():
-            stream.write(np.ascontiguousarray(chunk, dtype).tobytes())
-
-
-def _json(settings: Settings) -> npt.NDArray[Any]:
-    return np.array(json.dumps(dict(settings)))
+    settings = np.array(json.dumps(dict(frames.settings)))
+    with zipfile.ZipFile(fresh, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in (_beside(frames) | {"settings": settings}).items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                write_array(stream, np.asarray(values), allow_pickle=False)
+        with archive.open(f"{kind}.npy", "w", force_zip64=True) as stream:
+            write_array_header_1_0(stream, about)
+            for chunk in frames.chunks():
+                stream.write(np.ascontiguousarray(chunk, dtype).tobytes())
 
 
 def _read_npz(path: Path) -> Frames:
     with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
+        if "message_payload" in archive.files and not {"iq", "rf"} & {*archive.files}:
+            raise RecordingError(f"{path} {ONLY_MESSAGES}")
         kind = _kind_in(archive.files)
         shape, dtype = _declared(archive.zip, kind)
         names = [name for name in (*_VECTORS, "settings") if name in archive.files]

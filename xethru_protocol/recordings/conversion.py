@@ -6,24 +6,18 @@ messages and the like, nor for the counter of RESP_STATUS; text files of theirs 
 bits of a NaN. A recording that was split into files or directories comes out as one. Only wire
 captures hold what the host sent and how messages lay in packets. Messages are written as the
 message table encodes them: with a trailer or NUL that was left out, without what lies behind the
-last field. ``.csv`` and ``.mat`` hold the frames only, as `load` gives them; ``.npz`` has them
-beside the messages. Lines of other sensors are in MCAP only.
+last field. ``.csv``, ``.mat`` and ``.npz`` hold the frames only, as `load` gives them. Lines of
+other sensors are in MCAP only.
 """
 
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from xethru_protocol.recordings import npz, pcap, wire_capture
-from xethru_protocol.recordings.array_files import (
-    SUFFIXES,
-    Frames,
-    is_array_file,
-    write_array_file,
-)
-from xethru_protocol.recordings.arrays import Recording, load
+from xethru_protocol.recordings import pcap, wire_capture
+from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file, write_array_file
+from xethru_protocol.recordings.arrays import load
 from xethru_protocol.recordings.formats import (
     message_name,
     optional_packages,
@@ -74,8 +68,8 @@ def convert(
     source
         Any recording that `read_recording` takes.
     target
-        A new file ``*.mcap``, ``*.npz``, ``*.xtwire`` or, of a wire capture, ``*.pcap``; ``*.csv``
-        or ``*.mat`` for arrays; a name without suffix is a new directory of ModuleConnector.
+        A new file ``*.mcap``, ``*.xtwire`` or, of a wire capture, ``*.pcap``; ``*.csv``, ``*.mat``
+        or ``*.npz`` for arrays; a name without suffix is a new directory of ModuleConnector.
     on_progress
         Called with the number of messages so far, every thousand and at the end.
     radar
@@ -86,7 +80,7 @@ def convert(
     source, target = Path(source), Path(target)
     faults: list[RecordingFault] = []
     of_arrays = is_array_file(source)
-    if target.suffix in SUFFIXES and (of_arrays or target.suffix != npz.SUFFIX):
+    if target.suffix in SUFFIXES:
         if target.exists():
             raise RecordingError(f"{target} exists already")
         loaded = load(source, faults.append, area_m=area_m, downconversion=downconversion)
@@ -112,9 +106,6 @@ def convert(
         packets = pcap.write_pcap(source, target, faults.append)
         return Conversion(messages=packets, skipped={}, faults=tuple(faults))
     write = _writer(target)
-    if write is npz.write_npz:
-        known = load(source, lambda fault: None, area_m=area_m, downconversion=downconversion)
-        write = partial(npz.write_npz, arrays=lambda: _only_frames(known, radar))
     facts = recording_facts(source)
     n_messages = 0
 
@@ -135,12 +126,6 @@ def convert(
     return Conversion(messages=n_messages, skipped=skipped, faults=tuple(faults))
 
 
-def _only_frames(loaded: Recording, radar: str | None) -> Frames | None:
-    """Return the frames if all have one layout, which is known."""
-    parts = (loaded.radar if radar is None else loaded.named(radar)).parts
-    return parts[0].frames if len(parts) == 1 and parts[0].kind is not None else None
-
-
 _Writer = Callable[[Path, TimedMessages, RecordingFacts], dict[str, int] | None]
 
 
@@ -155,8 +140,6 @@ def _writer(target: Path) -> _Writer:
                 from xethru_protocol.recordings.mcap import write_mcap
 
             writer = write_mcap
-        case npz.SUFFIX:
-            writer = npz.write_npz
         case wire_capture.SUFFIX:
             writer = _write_wire
         case unknown:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from xethru_protocol.extras import what_is_missing
-from xethru_protocol.recordings import npz, wire_capture
+from xethru_protocol.recordings import wire_capture
+from xethru_protocol.recordings.array_files import SUFFIXES
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.records import (
     FaultHandler,
@@ -24,7 +25,7 @@ from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
 from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
 
-RecordingFormat = Literal["vendor", "wire", "mcap", "npz"]
+RecordingFormat = Literal["vendor", "wire", "mcap"]
 
 
 def message_name(message: Response) -> str:
@@ -58,7 +59,6 @@ class RecordingSummary:
 _MAGICS: dict[bytes, RecordingFormat] = {
     wire_capture.MAGIC: "wire",
     b"\x89MCAP0\r\n": "mcap",
-    b"PK\x03\x04": "npz",
 }
 
 
@@ -77,14 +77,14 @@ def recording_format(path: Path | str) -> RecordingFormat:
     for magic, found in _MAGICS.items():
         if start.startswith(magic):
             return found
-    if path.suffix in {".csv", ".mat"}:
+    if path.suffix in SUFFIXES:
         raise RecordingError(
             f"{path} holds no messages, at most arrays, which xethru_protocol.load and 'xethru"
-            " convert' read"
+            " convert' read; messages are kept in .mcap"
         )
     raise RecordingError(
         f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
-        " a wire capture (.xtwire), MCAP or .npz"
+        " a wire capture (.xtwire) or MCAP"
     )
 
 
@@ -112,7 +112,7 @@ def read_recording(
     ----------
     path
         A directory of ModuleConnector, its meta file or one data file in it; a wire capture
-        (`WireCapture`), an MCAP file or a numpy archive that `convert` wrote.
+        (`WireCapture`) or an MCAP file.
     on_fault
         Called with what could not be read; the rest is read all the same. None: what costs
         messages raises, what costs only times passes.
@@ -126,8 +126,6 @@ def read_recording(
     match found:
         case "wire":
             yield from wire_capture.read_wire(path, on_fault)
-        case "npz":
-            yield from npz.read_npz(path)
         case "mcap":
             with optional_packages():
                 from xethru_protocol.recordings.mcap import read_mcap
@@ -174,8 +172,6 @@ def recording_facts(path: Path | str) -> RecordingFacts:
     match recording_format(path):
         case "wire":
             return wire_capture.wire_facts(path)
-        case "npz":
-            return npz.npz_facts(path)
         case "mcap":
             with optional_packages():
                 from xethru_protocol.recordings.mcap import mcap_facts

@@ -24,7 +24,6 @@ from xethru_protocol.recordings import (
     read_recording,
 )
 from xethru_protocol.recordings.mcap import read_mcap, write_mcap
-from xethru_protocol.recordings.npz import read_npz, write_npz
 from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
@@ -139,13 +138,11 @@ def test_every_stored_kind_is_a_response_of_the_table() -> None:
         max_size=6,
     )
 )
-def test_archives_mcap_and_captures_give_back_what_was_written(
+def test_mcap_and_captures_give_back_what_was_written(
     timed: list[tuple[m.Response, int | None]],
 ) -> None:
     facts = RecordingFacts(session_id="s", user_header=b"\xff")
     with tempfile.TemporaryDirectory() as folder:
-        write_npz(Path(folder) / "x.npz", timed, facts)
-        assert payloads(list(read_npz(Path(folder) / "x.npz"))) == payloads(timed)
         write_mcap(Path(folder) / "x.mcap", timed, facts)
         if timed:
             assert payloads(list(read_mcap(Path(folder) / "x.mcap", None))) == payloads(timed)

@@ -99,7 +99,7 @@ def test_answers_and_unknown_messages_in_a_wire_capture(tmp_path: Path, capsys: 
 # --- convert --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["c.npz", "c.mcap", "c.xtwire", "c"])
+@pytest.mark.parametrize("name", ["c.mcap", "c.xtwire", "c"])
 @pytest.mark.parametrize("source", ["iq", "float", "single"])
 def test_every_format_gives_the_same_messages_back(
     source: str, name: str, tmp_path: Path, capsys: Capture
@@ -111,7 +111,7 @@ def test_every_format_gives_the_same_messages_back(
 
 
 def test_a_target_is_overwritten_only_with_force(tmp_path: Path, capsys: Capture) -> None:
-    for name in ("c.npz", "c"):
+    for name in ("c.mcap", "c"):
         target = tmp_path / name
         assert main(["convert", str(IQ), str(target)]) == 0
         assert main(["convert", str(RECORDINGS / "single"), str(target)]) == 1
@@ -146,7 +146,7 @@ def test_a_conversion_that_fails_leaves_nothing(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("xethru_protocol.cli.recordings.convert_recording", stopped)
-    assert main(["convert", str(IQ), str(tmp_path / "c.npz")]) == 130
+    assert main(["convert", str(IQ), str(tmp_path / "c.mcap")]) == 130
     assert list(tmp_path.iterdir()) == []
 
 
@@ -236,7 +236,7 @@ def test_a_conversion_that_is_killed_between_renames_leaves_one_of_both_files(
         "pathlib.Path.replace = killed\n"
         "sys.exit(main(sys.argv[2:]))\n"
     )
-    target = tmp_path / "kept.npz"
+    target = tmp_path / "kept.mcap"
     assert main(["convert", str(IQ), str(target)]) == 0
     command = ["convert", str(RECORDINGS / "single"), str(target), "--force"]
     subprocess.run([sys.executable, "-c", code, str(n_renamed), *command], check=False)
@@ -252,8 +252,8 @@ def test_a_part_of_a_recording_is_not_converted_into_it(tmp_path: Path, capsys: 
         for target in (own, tmp_path / "link"):
             assert main(["convert", str(source), str(target), "--force"]) == 1
     assert snapshot(own) == before
-    assert main(["convert", str(own), str(tmp_path / "copy.npz")]) == 0
-    assert main(["convert", str(tmp_path / "copy.npz"), str(tmp_path)]) == 0
+    assert main(["convert", str(own), str(tmp_path / "copy.mcap")]) == 0
+    assert main(["convert", str(tmp_path / "copy.mcap"), str(tmp_path)]) == 0
 
 
 def snapshot(folder: Path) -> dict[Path, bytes]:
@@ -269,7 +269,7 @@ def test_one_radar_of_a_session_is_dumped_and_converted(tmp_path: Path, capsys: 
     assert [fields["data"] for fields in told] == [pytest.approx(row) for row in expected]
     assert main(["dump", str(session), "--radar", "middle"]) == 0
     assert "  3 DATA FLOAT" in capsys.readouterr().out.splitlines()
-    target = session.with_suffix(".npz")
+    target = session.with_suffix(".xtwire")
     assert main(["convert", str(session), str(target), "--radar", "middle"]) == 0
     rows = [
         message.values.tolist()
