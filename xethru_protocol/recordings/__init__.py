@@ -26,7 +26,7 @@ from xethru_protocol.recordings.records import (
     RecordingFacts,
     RecordingFault,
 )
-from xethru_protocol.recordings.vendor.record_reader import Record, RecordingReader
+from xethru_protocol.recordings.vendor.reader import Record, RecordingReader
 from xethru_protocol.recordings.vendor.writer import (
     RecordingOptions,
     RecordingWriter,

@@ -1,7 +1,13 @@
-"""Reads recording directories of the vendor's ModuleConnector: what was received, and when.
+"""Reads recordings of the vendor's ModuleConnector: all that was received, or single records.
 
-The data files alone give every message; the index of the meta file adds the times and the order
-among several files. An error in the index costs times, never messages.
+`read_vendor` gives every message: the data files alone are enough for that, and the index of the
+meta file adds the times and the order among several files. An error in the index costs times, never
+messages.
+
+`RecordingReader` reads by the index, at any place: seek, peek, filter. That is what the vendor's
+DataReader can do, with two differences. That one cannot seek into the last record of a meta file;
+this one can. Of a recording split into directories that one adds the durations up, so that
+positions leave out the time between them; here a position is the time since the start.
 """
 
 from __future__ import annotations
@@ -9,10 +15,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from xethru_protocol.recordings.records import (
     MS_NS,
@@ -29,9 +38,12 @@ from xethru_protocol.recordings.vendor.layouts import (
     ALL_BITS,
     CLOSED,
     ENTRY,
+    KIND_OF_MESSAGE,
     KIND_OF_TYPE,
     META_NAME,
     PARAMETER_FILE_NAME,
+    RECORD,
+    VERSION,
     BinaryKind,
     Entry,
     Kind,
@@ -48,8 +60,160 @@ from xethru_protocol.wire.rows import Response
 _LONGEST_USER_HEADER = 4096  # bytes; searched where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16
 _LAST_CONTENT_ID = 14  # Protocol reference 6.1
+_FURTHEST = 1 << 48  # byte of a recording; sums of such numbers stay within 64 bits
 _DIRECTORY_PREFIX = "xethru_recording_"
 _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT")
+
+
+# --- directories and their files ----------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Part:
+    """A directory of a recording.
+
+    ``files`` are the data files to read in it; ``meta`` is None without a usable meta file, and
+    ``problem`` says why.
+    """
+
+    directory: Path
+    files: dict[Path, Kind]
+    meta: Meta | None
+    problem: str
+
+    def files_by_number(self) -> dict[tuple[int, int], tuple[Path, Kind]]:
+        """Return the data files of the index by data type and number.
+
+        Where the list of files is missing, those of a type in their order.
+        """
+        meta = self.meta or Meta()
+        entries = np.frombuffer(meta.index, ENTRY)
+        on_disk = _data_files(self.directory, meta)
+        found: dict[tuple[int, int], tuple[Path, Kind]] = {}
+        for bit in map(int, np.unique(entries["data_type"])):
+            kind = KIND_OF_TYPE.get(bit)
+            if kind is None:
+                continue
+            same = [path for path, other in on_disk.items() if other is kind]
+            numbers = map(int, np.unique(entries["file"][entries["data_type"] == bit]))
+            for at, number in enumerate(numbers):
+                path = self.listed_path(bit, number)
+                if number >= len(meta.files) and at < len(same):
+                    path = same[at]
+                found[bit, number] = path, kind
+        return found
+
+    def listed_path(self, data_type: int, number: int) -> Path:
+        """Return the path of a file by the list of files; without one, a name for reports."""
+        listed = self.meta.files if self.meta is not None else ()
+        if number < len(listed):
+            return self.directory / Path(listed[number]).name
+        kind = KIND_OF_TYPE.get(data_type)
+        return self.directory / (f"{kind.file_prefix}*" if kind else f"of data type {data_type}")
+
+
+def _part(directory: Path, files: dict[Path, Kind] | None = None) -> _Part:
+    """Return a directory with its meta file; ``files``: which are read, None for all."""
+    meta, problem = None, "it is missing"
+    path = directory / META_NAME
+    try:
+        with reading(path):
+            if path.is_file():
+                meta = parse_meta(path.read_bytes())
+    except RecordingError as error:
+        problem = f"it is of no use: {error}"
+    found = _data_files(directory, meta) if files is None else files
+    return _Part(directory=directory, files=found, meta=meta, problem=problem)
+
+
+def data_files(directory: Path) -> dict[Path, Kind]:
+    """Return the data files of a directory: by their names, others by the index."""
+    return _part(directory).files
+
+
+def _data_files(directory: Path, meta: Meta | None) -> dict[Path, Kind]:
+    found = {
+        path: kind for path in directory.iterdir() if (kind := kind_of_file(path.name)) is not None
+    }
+    if meta is not None:
+        listed = [directory / Path(name).name for name in meta.files]
+        others = {at: path for at, path in enumerate(listed) if path not in found}
+        for entry in meta.entries() if others else ():
+            if (kind := _kind_of_entry(entry)) is not None and entry.file in others:
+                found[others.pop(entry.file)] = kind
+    return {path: found[path] for path in sorted(found) if path.is_file()}
+
+
+def _kind_of_entry(entry: Entry) -> Kind | None:
+    return KIND_OF_TYPE.get(entry.data_type) or KIND_OF_TYPE.get(entry.data_type ^ ALL_BITS)
+
+
+def is_vendor_file(path: Path) -> bool:
+    return path.name == META_NAME or kind_of_file(path.name) is not None
+
+
+def _parts_of(path: Path) -> list[_Part]:
+    """Return the directories of a recording in order."""
+    with reading(path):
+        if not path.exists():
+            raise RecordingError(f"there is no recording {path}")
+        kind = kind_of_file(path.name)
+        if path.is_dir():
+            parts = [_part(path)]
+            if not parts[0].files:
+                parts = _split_directories(path)
+        elif kind is not None:
+            parts = [_part(path.parent, {path: kind})]
+        else:
+            parts = _chain(path.parent)
+    if not any(part.files for part in parts):
+        wanted = "xethru_baseband_iq_*.dat, xethru_datafloat_*.dat or the like"
+        raise RecordingError(f"{path} holds no recording this can read; it needs a file {wanted}")
+    return parts
+
+
+def _chain(directory: Path) -> list[_Part]:
+    """Return a directory and those in which its recording goes on, by their meta files."""
+    found = [_part(directory)]
+    while (following := _next_directory(found[-1])) is not None:
+        if following in {part.directory for part in found}:
+            break
+        found.append(_part(following))
+    return found
+
+
+def _next_directory(part: _Part) -> Path | None:
+    match part.meta.next_name.replace("\\", "/").split("/") if part.meta is not None else ():
+        case ["..", name, str(file)] if name not in {"", ".."} and file == META_NAME:
+            following = part.directory.resolve().parent / name
+            return following if following.is_dir() else None
+    return None
+
+
+def _split_directories(path: Path) -> list[_Part]:
+    """Return the directories of recordings in a directory, and in directories of theirs."""
+    parts: list[_Part] = []
+    names = (child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
+    for child in sorted(filter(Path.is_dir, names), key=_by_number):
+        part = _part(child)
+        inner = sorted(child.glob(f"{_DIRECTORY_PREFIX}*/"), key=_by_number)
+        parts += [part] if part.files else map(_part, inner)
+    parts = [part for part in parts if part.files]
+    # Without a session id, two directories cannot be assigned to one radar.
+    sessions = {(part.meta.session_id if part.meta else b"") or part.directory for part in parts}
+    if len(sessions) > 1:
+        raise RecordingError(
+            f"{path} holds {len(parts)} recordings of {len(sessions)} sessions; name one of them"
+        )
+    return parts
+
+
+def _by_number(path: Path) -> list[str | int]:
+    """Sort key of names that end in numbers: 2 comes before 10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
+
+
+# --- all messages -------------------------------------------------------------------------------
 
 
 class _DataFile:
@@ -204,21 +368,17 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     """
     whole = path.is_dir() or path.name == META_NAME  # else one of several files is read
     meta: Meta | None = None
-    for directory, kinds in parts_of(path):
-        meta = None
-        try:
-            meta = read_meta(directory)
-            if meta is None and whole:
-                _report_meta("it is missing, so no message has a time", on_fault)
-        except RecordingError as error:
-            _report_meta(f"it is of no use, so no message has a time: {error}", on_fault)
+    for part in _parts_of(path):
+        meta = part.meta
+        if meta is None and (whole or (part.directory / META_NAME).is_file()):
+            _report_meta(f"{part.problem}; no message has a time", on_fault)
         if meta is not None and not meta.complete and whole:
             reason = "it was never completed: the recorder did not end as it should"
             _report_meta(reason, on_fault)
-        files = [_DataFile(file, kind, on_fault) for file, kind in kinds.items()]
+        files = [_DataFile(file, kind, on_fault) for file, kind in part.files.items()]
         try:
             if meta is not None:
-                file_of = _files_by_entry(directory, meta, files, on_fault, whole=whole)
+                file_of = _files_by_entry(part, files, on_fault, whole=whole)
                 yield from _along_index(meta, file_of)
             for file in files:
                 yield from _rest(file)
@@ -270,12 +430,7 @@ def _rest(file: _DataFile) -> Iterator[Timed]:
 
 
 def _files_by_entry(
-    directory: Path,
-    meta: Meta,
-    files: list[_DataFile],
-    on_fault: FaultHandler | None,
-    *,
-    whole: bool,
+    part: _Part, files: list[_DataFile], on_fault: FaultHandler | None, *, whole: bool
 ) -> Callable[[Entry], _DataFile | None]:
     """Return a function from an entry to its file: by the list of files, else by type and order.
 
@@ -283,14 +438,14 @@ def _files_by_entry(
     """
     by_path = {file.path: file for file in files}
     found: dict[tuple[int, int], _DataFile | None] = {}
-    known = files_by_number(directory, meta)
+    known = part.files_by_number()
 
     def file_of(entry: Entry) -> _DataFile | None:
         kind = _kind_of_entry(entry)
         key = (kind.data_type if kind else entry.data_type, entry.file)
         if key in found:
             return found[key]
-        path = known[key][0] if key in known else _listed_path(directory, meta, key)
+        path = known[key][0] if key in known else part.listed_path(*key)
         found[key] = by_path.get(path)
         if found[key] is None and whole:
             problem = "it is missing" if kind is not None else "its layout is not known"
@@ -301,46 +456,11 @@ def _files_by_entry(
     return file_of
 
 
-def files_by_number(directory: Path, meta: Meta) -> dict[tuple[int, int], tuple[Path, Kind]]:
-    """Return the data files of an index by data type and number.
-
-    Where the list of files is missing, those of a type in their order.
-    """
-    entries = np.frombuffer(meta.index, ENTRY)
-    on_disk = data_files(directory)
-    found: dict[tuple[int, int], tuple[Path, Kind]] = {}
-    for bit in map(int, np.unique(entries["data_type"])):
-        kind = KIND_OF_TYPE.get(bit)
-        if kind is None:
-            continue
-        same = [path for path, other in on_disk.items() if other is kind]
-        numbers = map(int, np.unique(entries["file"][entries["data_type"] == bit]))
-        for at, number in enumerate(numbers):
-            path = _listed_path(directory, meta, (bit, number))
-            if number >= len(meta.files) and at < len(same):
-                path = same[at]
-            found[bit, number] = path, kind
-    return found
-
-
-def _listed_path(directory: Path, meta: Meta, key: tuple[int, int]) -> Path:
-    """Return the path of a file by the list of files; without one, a name for reports."""
-    data_type, number = key
-    if number < len(meta.files):
-        return directory / Path(meta.files[number]).name
-    kind = KIND_OF_TYPE.get(data_type)
-    return directory / (f"{kind.file_prefix}*" if kind else f"of data type {data_type}")
-
-
-def _kind_of_entry(entry: Entry) -> Kind | None:
-    return KIND_OF_TYPE.get(entry.data_type) or KIND_OF_TYPE.get(entry.data_type ^ ALL_BITS)
-
-
 def vendor_facts(path: Path) -> RecordingFacts:
-    (directory, _), *rest = parts_of(path)
-    meta = _usable_meta(directory)
-    last = _usable_meta(rest[-1][0]) if rest else meta
-    parameters = directory / PARAMETER_FILE_NAME
+    first, *rest = _parts_of(path)
+    meta = first.meta
+    last = rest[-1].meta if rest else meta
+    parameters = first.directory / PARAMETER_FILE_NAME
     with reading(parameters):
         parameter_file = parameters.read_bytes() if parameters.is_file() else None
     if meta is None:
@@ -352,14 +472,10 @@ def vendor_facts(path: Path) -> RecordingFacts:
         session_id=meta.session_id.decode("utf-8", "replace"),
         profile_id=meta.profile_id or None,
         parameter_file=parameter_file,
-        user_header=_user_header(directory, meta),
+        user_header=_user_header(first.directory, meta),
         stopped_ns=_time_ns(ended, max(stops)) if ended and stops else None,
         closed_ns=_time_ns(ended, ended.duration_ms) if ended else None,
     )
-
-
-def is_vendor_file(path: Path) -> bool:
-    return path.name == META_NAME or kind_of_file(path.name) is not None
 
 
 def _time_ns(meta: Meta, since_start_ms: int) -> int:
@@ -379,95 +495,248 @@ def _user_header(directory: Path, meta: Meta) -> bytes:
     return b""
 
 
-_Part = tuple[Path, dict[Path, Kind]]
-"""A directory, and the data files to read in it."""
+# --- single records -----------------------------------------------------------------------------
 
 
-def parts_of(path: Path) -> list[_Part]:
-    """Return the directories of a recording in order."""
-    with reading(path):
-        if not path.exists():
-            raise RecordingError(f"there is no recording {path}")
-        kind = kind_of_file(path.name)
-        if path.is_dir():
-            parts = [(path, data_files(path))]
-            if not parts[0][1]:
-                parts = _split_directories(path)
-        elif kind is not None:
-            parts = [(path.parent, {path: kind})]
-        else:
-            parts = [(directory, data_files(directory)) for directory in _chain(path.parent)]
-    if not any(files for _, files in parts):
-        wanted = "xethru_baseband_iq_*.dat, xethru_datafloat_*.dat or the like"
-        raise RecordingError(f"{path} holds no recording this can read; it needs a file {wanted}")
-    return parts
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """A record: the message, when it came [ns since 1970], its bytes as stored.
+
+    ``position`` is where it begins in the recording, counted over all files and headers.
+    """
+
+    message: Response
+    t_ns: int
+    data: bytes
+    position: int
 
 
-def data_files(directory: Path) -> dict[Path, Kind]:
-    """Return the data files of a directory: by their names, others by the index."""
-    found = {
-        path: kind for path in directory.iterdir() if (kind := kind_of_file(path.name)) is not None
-    }
-    meta = _usable_meta(directory)
-    if meta is not None:
-        listed = [directory / Path(name).name for name in meta.files]
-        others = {at: path for at, path in enumerate(listed) if path not in found}
-        for entry in meta.entries() if others else ():
-            if (kind := _kind_of_entry(entry)) is not None and entry.file in others:
-                found[others.pop(entry.file)] = kind
-    return {path: found[path] for path in sorted(found) if path.is_file()}
+class RecordingReader:
+    """Reads a recording of the vendor's format record by record; a context manager.
 
+    As long as the files are there, records may be read in any order; iterating goes on where
+    `read` or a seek left off. User headers and lines of titles are skipped.
 
-def _chain(directory: Path) -> list[Path]:
-    """Return a directory and those in which its recording goes on, by their meta files."""
-    found = [directory]
-    while (following := _next_directory(found[-1])) is not None and following not in found:
-        found.append(following)
-    return found
+    Parameters
+    ----------
+    path
+        A directory, or a meta file, which is read with those that follow it. RecordingError if
+        there is no usable meta file: `read_recording` does without.
 
+    Attributes
+    ----------
+    start_ns, duration_ns
+        When the recording begins [ns since 1970], and how long it was on.
+    size_bytes, largest_record_bytes
+        Of all records, headers included, and of the largest.
+    session_id, profile_id, meta_version
+        As stored; profile 0 is unknown.
 
-def _next_directory(directory: Path) -> Path | None:
-    meta = _usable_meta(directory)
-    match meta.next_name.replace("\\", "/").split("/") if meta is not None else ():
-        case ["..", name, str(file)] if name not in {"", ".."} and file == META_NAME:
-            following = directory.resolve().parent / name
-            return following if following.is_dir() else None
-    return None
+    Examples
+    --------
+    ::
 
+        with RecordingReader("rec") as reader:
+            reader.set_filter(DataFloat)
+            reader.seek_ms(60_000)
+            for record in reader:
+                print(record.t_ns, record.message.info)
+    """
 
-def _split_directories(path: Path) -> list[_Part]:
-    """Return the directories of recordings in a directory, and in directories of theirs."""
-    parts: list[_Part] = []
-    names = (child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
-    for child in sorted(filter(Path.is_dir, names), key=_by_number):
-        files = data_files(child)
-        inner = sorted(child.glob(f"{_DIRECTORY_PREFIX}*/"), key=_by_number) if not files else ()
-        parts += [(child, files)] if files else [(part, data_files(part)) for part in inner]
-    parts = [(directory, files) for directory, files in parts if files]
-    # Without a session id, two directories cannot be assigned to one radar.
-    metas = ((directory, _usable_meta(directory)) for directory, _ in parts)
-    sessions = {(meta.session_id if meta else b"") or directory for directory, meta in metas}
-    if len(sessions) > 1:
-        raise RecordingError(
-            f"{path} holds {len(parts)} recordings of {len(sessions)} sessions; name one of them"
+    meta_version = VERSION
+
+    def __init__(self, path: Path | str) -> None:
+        path = Path(path)
+        metas: list[Meta] = []
+        self._files: list[dict[tuple[int, int], tuple[Path, Kind]]] = []
+        parts = _parts_of(path)
+        for part in parts:
+            if part.meta is None:
+                raise RecordingError(
+                    f"{part.directory} has no {META_NAME} to read by, {part.problem}; "
+                    "read_recording does without"
+                )
+            metas.append(part.meta)
+            self._files.append(part.files_by_number())
+        first, last = metas[0], metas[-1]
+        self.start_ns = first.start_ms * MS_NS
+        self.session_id = first.session_id.decode("utf-8", "replace")
+        self.profile_id = first.profile_id
+        self._build_index([part.directory for part in parts], metas)
+        end_ms = last.start_ms + last.duration_ms
+        if not last.complete and len(self._t_ms):  # its recorder was killed
+            end_ms = int(self._t_ms[-1])
+        self.duration_ns = end_ms * MS_NS - self.start_ns
+        self._wanted: npt.NDArray[np.bool_] | None = None  # by record; None for all
+        self._filter: frozenset[type[Response]] = frozenset()
+        self._next = 0
+        self._streams: dict[Path, BinaryIO] = {}
+        self._exits = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; calling it again does nothing."""
+        self._exits.close()
+        self._streams.clear()
+
+    def __len__(self) -> int:
+        """Return the number of records, those that the filter leaves out included."""
+        return len(self._t_ms)
+
+    def __iter__(self) -> Iterator[Record]:
+        while not self.at_end:
+            yield self.read()
+
+    @property
+    def kinds(self) -> frozenset[type[Response]]:
+        """Types of the messages that the recording holds."""
+        return frozenset(KIND_OF_TYPE[int(bit)].message for bit in np.unique(self._data_type))
+
+    @property
+    def filter(self) -> frozenset[type[Response]]:
+        """Types of the messages that are read; empty for all."""
+        return self._filter
+
+    def set_filter(self, *kinds: type[Response]) -> None:
+        """Read only messages of these types from here on; none given: all.
+
+        RecordingError for a type that no recording holds.
+        """
+        for kind in kinds:
+            if kind not in KIND_OF_MESSAGE:
+                raise RecordingError(f"a recording holds no {kind.__name__}")
+        bits = [KIND_OF_MESSAGE[kind].data_type for kind in kinds]
+        self._wanted = np.isin(self._data_type, bits) if kinds else None
+        self._filter = frozenset(kinds)
+
+    @property
+    def at_end(self) -> bool:
+        """Whether nothing more can be read."""
+        return self._following() >= len(self)
+
+    def peek(self) -> Record:
+        """Return the next record and stay before it; RecordingError at the end or if damaged."""
+        return self._record(self._following())
+
+    def read(self) -> Record:
+        """Return the next record and go behind it; RecordingError at the end or if damaged."""
+        at = self._following()
+        self._next = min(at + 1, len(self))
+        return self._record(at)
+
+    def seek_ms(self, position_ms: float) -> None:
+        """Go to the first record at or after a time since the start.
+
+        RecordingError before the start and beyond the duration.
+        """
+        if not 0 <= position_ms * MS_NS <= self.duration_ns:
+            raise RecordingError(
+                f"{position_ms:g} ms lies outside the recording, 0 ... "
+                f"{self.duration_ns // MS_NS} ms"
+            )
+        start_ms = self.start_ns // MS_NS
+        self._next = int(np.searchsorted(self._latest_ms, start_ms + position_ms))
+
+    def seek_byte(self, position: int) -> None:
+        """Go to the record that holds a byte, or behind the header that does.
+
+        RecordingError before the start and beyond the end.
+        """
+        if not 0 <= position <= self.size_bytes:
+            raise RecordingError(
+                f"byte {position} lies outside the recording, 0 ... {self.size_bytes}"
+            )
+        self._next = int(np.searchsorted(self._end, position, side="right"))
+
+    def _following(self) -> int:
+        """Return the number of the next record that the filter lets pass."""
+        if self._wanted is None or self._next >= len(self):
+            return self._next
+        found = int(np.argmax(self._wanted[self._next :]))
+        return self._next + found if self._wanted[self._next + found] else len(self)
+
+    def _build_index(self, directories: list[Path], metas: list[Meta]) -> None:
+        """Join the indexes of all meta files: records in order, without headers."""
+        columns: list[tuple[npt.NDArray[np.int64], ...]] = []
+        self.size_bytes = 0
+        self.largest_record_bytes = 0
+        for part, meta in enumerate(metas):
+            all_of = np.frombuffer(meta.index, ENTRY)
+            records = all_of[all_of["kind"] == RECORD]
+            if (np.maximum(records["begin"], records["end"]) > _FURTHEST).any():
+                raise RecordingError(
+                    f"the index of {directories[part]} is damaged: it has a record beyond "
+                    f"byte {_FURTHEST}; read_recording does without"
+                )
+            known = np.isin(records["data_type"], list(KIND_OF_TYPE))
+            known &= ~_are_titles(records)
+            kept = records[known]
+            end = kept["end"].astype(np.int64) + self.size_bytes
+            columns.append(
+                (
+                    kept["ms"].astype(np.int64) + meta.start_ms,
+                    kept["data_type"].astype(np.int64),
+                    kept["file"].astype(np.int64),
+                    kept["begin"].astype(np.int64),
+                    kept["size"].astype(np.int64),
+                    end,
+                    np.full(len(kept), part),
+                )
+            )
+            if len(records):
+                self.size_bytes += int(records["end"].max())
+                self.largest_record_bytes = max(
+                    self.largest_record_bytes, int(records["size"].max())
+                )
+        joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
+        (self._t_ms, self._data_type, self._file, self._begin, self._size, self._end,
+         self._in_part) = joined  # fmt: skip
+        self._latest_ms = np.maximum.accumulate(self._t_ms)
+
+    def _record(self, at: int) -> Record:
+        if at >= len(self):
+            raise RecordingError("the recording is at its end; look at at_end before you read")
+        data_type, size = int(self._data_type[at]), int(self._size[at])
+        path, kind = self._files[int(self._in_part[at])][data_type, int(self._file[at])]
+        with reading(path):
+            stream = self._streams.get(path)
+            if stream is None:
+                stream = self._streams[path] = self._exits.enter_context(path.open("rb"))
+            stream.seek(int(self._begin[at]))
+            data = stream.read(size)
+        return Record(
+            message=_message(path, kind, data, size),
+            t_ns=int(self._t_ms[at]) * MS_NS,
+            data=data,
+            position=int(self._end[at]) - size,
         )
-    return parts
 
 
-def _by_number(path: Path) -> list[str | int]:
-    """Sort key of names that end in numbers: 2 comes before 10."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
+def _message(path: Path, kind: Kind, data: bytes, size: int) -> Response:
+    """Return the message of a record; RecordingError if it is not what the index says."""
+    if len(data) < size:
+        raise RecordingError(f"{path} is cut: a record of {size} bytes is not there whole")
+    if isinstance(kind, TextKind):
+        try:
+            return kind.parse(data.decode("latin-1"))[0]
+        except (ValueError, OverflowError, LocalProtocolError) as error:
+            raise RecordingError(f"{path}: a line cannot be read: {error}") from None
+    header = data[: kind.header.itemsize]
+    if len(header) < kind.header.itemsize or kind.record_size(header) != size:
+        raise RecordingError(f"{path}: a record is damaged: the index gives it {size} bytes")
+    return decode_response(kind.prefix + data)
 
 
-def _usable_meta(directory: Path) -> Meta | None:
-    try:
-        return read_meta(directory)
-    except RecordingError:
-        return None
-
-
-def read_meta(directory: Path) -> Meta | None:
-    """Return the meta file of a directory; None if there is none, RecordingError if unusable."""
-    path = directory / META_NAME
-    with reading(path):
-        return parse_meta(path.read_bytes()) if path.is_file() else None
+def _are_titles(records: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+    """Tell lines of titles: the first records of text files, shape (len(records),)."""
+    is_title = np.zeros(len(records), bool)
+    for bit, kind in KIND_OF_TYPE.items():
+        if isinstance(kind, TextKind):
+            (rows,) = np.nonzero(records["data_type"] == bit)
+            is_title[rows[np.unique(records["file"][rows], return_index=True)[1]]] = True
+    return is_title
