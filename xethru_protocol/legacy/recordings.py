@@ -85,6 +85,20 @@ class PreferredSplitSize:
         return found[0] if found else self.InvalidType
 
 
+def _option(
+    name: str, default: Any, kept: Callable[[Any], Any]
+) -> tuple[Callable[["RecordingOptions", Any], None], Callable[["RecordingOptions"], Any]]:
+    """Return setter and getter of an option; both make a copy by ``kept``."""
+
+    def set_(self: "RecordingOptions", value: Any) -> None:
+        self._values[name] = kept(value)
+
+    def get(self: "RecordingOptions") -> Any:
+        return kept(self._values.get(name, default))
+
+    return set_, get
+
+
 class RecordingOptions:
     """Options of `DataRecorder.start_recording`."""
 
@@ -93,11 +107,10 @@ class RecordingOptions:
 
     def writer_options(self) -> WriterOptions:
         """Return the same for a `RecordingWriter`; the vendor's limit of the rate is in ms."""
-        found = self._values
         options: WriterOptions = {
-            "session_id": found.get("session_id"),
-            "user_header": bytes(found.get("user_header", b"")),
-            "flush_on_write": bool(found.get("flush_on_write", False)),
+            "session_id": self.get_session_id(),
+            "user_header": bytes(self.get_user_header()),
+            "flush_on_write": self.get_flush_on_write(),
             "split": self.get_file_split_size().split,
             "split_directories": self.get_directory_split_size().split,
         }
@@ -105,41 +118,14 @@ class RecordingOptions:
             options["interval_s"] = limit_ms / 1000
         return options
 
-    def set_session_id(self, id: str) -> None:
-        self._values["session_id"] = id
-
-    def get_session_id(self) -> str:
-        return str(self._values.get("session_id", ""))
-
-    def set_file_split_size(self, size: PreferredSplitSize) -> None:
-        self._values["file_split_size"] = PreferredSplitSize(size)
-
-    def get_file_split_size(self) -> PreferredSplitSize:
-        return PreferredSplitSize(self._values.get("file_split_size"))
-
-    def set_directory_split_size(self, size: PreferredSplitSize) -> None:
-        self._values["directory_split_size"] = PreferredSplitSize(size)
-
-    def get_directory_split_size(self) -> PreferredSplitSize:
-        return PreferredSplitSize(self._values.get("directory_split_size"))
-
-    def set_data_rate_limit(self, limit: int) -> None:
-        self._values["data_rate_limit"] = limit
-
-    def get_data_rate_limit(self) -> int:
-        return int(self._values.get("data_rate_limit", -1))
-
-    def set_user_header(self, header: Any) -> None:
-        self._values["user_header"] = Vector(header)
-
-    def get_user_header(self) -> Vector:
-        return Vector(self._values.get("user_header", ()))
-
-    def set_flush_on_write(self, do_flush: bool) -> None:
-        self._values["flush_on_write"] = bool(do_flush)
-
-    def get_flush_on_write(self) -> bool:
-        return bool(self._values.get("flush_on_write", False))
+    set_session_id, get_session_id = _option("session_id", "", str)
+    set_file_split_size, get_file_split_size = _option("file_split", None, PreferredSplitSize)
+    set_directory_split_size, get_directory_split_size = _option(
+        "directory_split", None, PreferredSplitSize
+    )
+    set_data_rate_limit, get_data_rate_limit = _option("data_rate_limit", -1, int)
+    set_user_header, get_user_header = _option("user_header", (), Vector)
+    set_flush_on_write, get_flush_on_write = _option("flush_on_write", False, bool)
 
 
 # --- DataRecorder -------------------------------------------------------------------------------
