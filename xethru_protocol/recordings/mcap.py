@@ -26,6 +26,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
@@ -33,10 +34,10 @@ import lz4.frame
 import numpy as np
 import numpy.typing as npt
 import zstandard
-from mcap.data_stream import RecordBuilder
-from mcap.exceptions import McapError
+from mcap import records as records  # repair reads them, too
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex, Statistics
 from mcap.writer import CompressionType, Writer
 
 from xethru_protocol.driver.frames import FrameGeometry
@@ -154,11 +155,21 @@ def _body(data: bytes) -> bytes:
 
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-MESSAGE_INDEX, ATTACHMENT, STATISTICS, METADATA, DATA_END = 7, 9, 11, 12, 15
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 2, 3, 4, 5, 6
+_HEADER, _MESSAGE_INDEX, _ATTACHMENT, _STATISTICS, _DATA_END = 1, 7, 9, 11, 15
 _IN_CHUNKS = (SCHEMA, CHANNEL, MESSAGE)
-_OF_SUMMARY = (8, 10, STATISTICS, 13, 14)  # indexes and statistics, behind the data
+_OF_SUMMARY = (8, 10, _STATISTICS, 13, 14)  # indexes and statistics, behind the data
 _CODES = range(1, 16)  # private ones, from 128 on, are taken for damage
+_CONTENTS: Mapping[int, type[Any]] = {
+    _HEADER: records.Header,
+    FOOTER: records.Footer,
+    SCHEMA: records.Schema,
+    CHANNEL: records.Channel,
+    _ATTACHMENT: records.Attachment,
+    _STATISTICS: records.Statistics,
+    12: records.Metadata,
+    _DATA_END: records.DataEnd,
+}
 
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -171,10 +182,10 @@ _NAMES = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 _LONGEST_NAME_BYTES = 8
 _NAME_AT = _HEAD.size + _CHUNK.size
 _PIECE_BYTES = 1 << 20
-_FOOTER_BYTES, _DATA_END_BYTES = 20, 4
+_FOOTER_BYTES = 20
 _TAIL_BYTES = _HEAD.size + _FOOTER_BYTES + len(MAGIC)
-_MOST_ADDED_BYTES = 255
-_END_TIME_AT = 34  # in statistics, behind six counts and the time of the first message
+_CHECKSUM_BYTES = 4  # at the end of an attachment, which may do without
+_MOST_ADDED_BYTES = 255  # by versions to come
 _MOST_INDEX_BYTES = 1 << 26
 
 DAMAGES = (struct.error, ValueError, RuntimeError, KeyError, zstandard.ZstdError)
@@ -189,6 +200,29 @@ class Record:
     code: int
     body: bytes
     is_in_chunk: bool = False  # whose checksum is right, if it has one
+
+    def content(self) -> records.McapRecord | None:
+        """Return the content as mcap reads it; None of messages, chunks and most indexes.
+
+        ValueError for bytes that mcap would not write: it takes a text that is cut for a whole one.
+        """
+        kind = _CONTENTS.get(self.code)
+        if kind is None:
+            return None
+        try:
+            content: records.McapRecord = kind.read(ReadDataStream(BytesIO(self.body)))
+        except EndOfFile:
+            raise ValueError("a record ends before its content") from None
+        builder = RecordBuilder()
+        content.write(builder)
+        written: bytes = builder.end()[_HEAD.size :]  # type: ignore[no-untyped-call]  # mcap annotates in part
+        added = len(self.body) - len(written)
+        if kind is records.Attachment:
+            written = written[:-_CHECKSUM_BYTES]
+        most = 0 if self.code in (FOOTER, _DATA_END) else _MOST_ADDED_BYTES
+        if not self.body.startswith(written) or not 0 <= added <= most:
+            raise ValueError("the record there is not what it says")
+        return content
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,46 +292,39 @@ class RecordReader:
                 if code == CHUNK:
                     yield from _records_in(at, _content(body))
                 else:
-                    self._check(at, code, body)
-                    yield Record(at, code, body)
+                    record = Record(at, code, body)
+                    self._check(record)
+                    yield record
             except DAMAGES as error:
                 following = self._behind_damage(at, code, body)
                 yield self._damage(at, following, str(error))
                 at = following
                 continue
-            self._is_data_over |= code == DATA_END
+            self._is_data_over |= code == _DATA_END
             at = None if code == FOOTER else end
 
     def _damage(self, at: int, until: int | None, reason: str) -> Damage:
         return Damage(at, self._size if until is None else until, reason)
 
-    def _check(self, at: int, code: int, body: bytes) -> None:
+    def _check(self, record: Record) -> None:
         """Raise ValueError where a record does not fit its opcode.
 
         One flipped bit there would hide a chunk, or end the file.
         """
-        end = at + _HEAD.size + len(body)
-        if code == HEADER:
-            fits = at == len(MAGIC) and _is_filled(body, text_at(body, text_at(body, 0)[1])[1])
-        elif code == METADATA:
-            fits = _is_filled(body, table_at(body, text_at(body, 0)[1])[1])
+        code, body = record.code, record.body
+        end = record.at + _HEAD.size + len(body)
+        if code == _HEADER:
+            fits = record.at == len(MAGIC)
         elif code == FOOTER:
-            fits = len(body) == _FOOTER_BYTES and end + len(MAGIC) >= self._size
-        elif code == DATA_END:
-            fits = len(body) == _DATA_END_BYTES
-        elif code == MESSAGE_INDEX:
+            fits = end + len(MAGIC) >= self._size
+        elif code == _MESSAGE_INDEX:
             fits = len(body) >= 6 and struct.unpack_from("<I", body, 2)[0] == len(body) - 6
-        elif code == ATTACHMENT:
-            at_media = text_at(body, 16)[1]
-            at_data = text_at(body, at_media)[1]
-            (size,) = struct.unpack_from("<Q", body, at_data)
-            fits = len(body) == at_data + 8 + size + 4
-        elif code in _OF_SUMMARY:
-            fits = self._is_data_over
         else:
-            fits = True
+            fits = code not in _OF_SUMMARY or self._is_data_over
         if not fits:
             raise ValueError("the record there is not what it says")
+        if code not in _IN_CHUNKS:
+            record.content()
 
     def _behind_damage(self, at: int, code: int, body: bytes) -> int | None:
         """Return where reading goes on behind a damaged record.
@@ -357,51 +384,26 @@ class RecordReader:
         return True
 
 
-def _is_filled(body: bytes, end: int) -> bool:
-    """Whether a record ends about where its content does: versions to come may add some."""
-    return len(body) - end <= _MOST_ADDED_BYTES
-
-
-def text_at(body: bytes, at: int) -> tuple[str, int]:
-    """Return a text with its length before it, and the position after it."""
-    data, end = bytes_at(body, at)
-    return data.decode(), end
-
-
-def bytes_at(body: bytes, at: int) -> tuple[bytes, int]:
-    """Return bytes with their 32-bit length before them, and the position after them."""
-    (length,) = struct.unpack_from("<I", body, at)
-    start = at + 4
-    if start + length > len(body):
-        raise ValueError("a text reaches beyond its record")
-    return body[start : start + length], start + length
-
-
-def table_at(body: bytes, at: int) -> tuple[dict[str, str], int]:
-    """Return a table of texts with its length in bytes before it, and the position after it."""
-    (length,) = struct.unpack_from("<I", body, at)
-    at, end = at + 4, at + 4 + length
-    table = {}
-    while at < end:
-        key, at = text_at(body, at)
-        table[key], at = text_at(body, at)
-    return table, end
+def _packed(body: bytes) -> tuple[str, int, bytes]:
+    """Return how a chunk is compressed, the bytes that it claims to hold, and those it holds."""
+    (length,) = _U32.unpack_from(body, _CHUNK.size)
+    at = _CHUNK.size + _U32.size + length
+    (size,) = struct.unpack_from("<Q", body, at)
+    return body[at - length : at].decode(), size, body[at + 8 :]
 
 
 def _is_length_right(body: bytes) -> bool:
     try:
-        _, at = text_at(body, _CHUNK.size)
-        return int(struct.unpack_from("<Q", body, at)[0]) == len(body) - at - 8
+        _, size, packed = _packed(body)
     except DAMAGES:
         return False
+    return size == len(packed)
 
 
 def _content(body: bytes) -> bytes:
     """Decompress a whole chunk; raises one of `DAMAGES`."""
     _start, _end, size, checksum = _CHUNK.unpack_from(body)
-    name, at = text_at(body, _CHUNK.size)
-    (packed_size,) = struct.unpack_from("<Q", body, at)
-    packed = body[at + 8 :]
+    name, packed_size, packed = _packed(body)
     if len(packed) != packed_size or size > _MOST_BYTES:
         raise ValueError("the chunk's lengths do not fit together")
     content = _unpacked(name, packed, size)
@@ -414,8 +416,8 @@ def _content_before_cut(body: bytes) -> bytes:
     """Decompress what there is of a cut chunk, possibly nothing."""
     try:
         size = _CHUNK.unpack_from(body)[2]
-        name, at = text_at(body, _CHUNK.size)
-        return _unpacked(name, body[at + 8 :], min(size, _MOST_BYTES))
+        name, _, packed = _packed(body)
+        return _unpacked(name, packed, min(size, _MOST_BYTES))
     except DAMAGES:
         return b""
 
@@ -505,7 +507,7 @@ def read_entries(
         if not isinstance(found, Record):
             yield found
             continue
-        if found.code == DATA_END:
+        if found.code == _DATA_END:
             return
         try:
             entry = _entry(found, schemas, channels)
@@ -517,30 +519,24 @@ def read_entries(
 
 
 def _entry(record: Record, schemas: dict[int, str], channels: dict[int, Channel]) -> Entry | None:
-    body = record.body
     if record.code == MESSAGE:
-        number, sequence, t_ns, publish_ns = MESSAGE_HEAD.unpack_from(body)
+        number, sequence, t_ns, publish_ns = MESSAGE_HEAD.unpack_from(record.body)
         return Message(
             channel=channels[number],
             sequence=sequence,
             t_ns=t_ns,
             publish_ns=publish_ns,
-            data=body[MESSAGE_HEAD.size :],
+            data=record.body[MESSAGE_HEAD.size :],
         )
-    if record.code == SCHEMA:
-        (number,) = struct.unpack_from("<H", body)
-        schemas[number] = text_at(body, 2)[0]
-    elif record.code == CHANNEL:
-        number, schema = struct.unpack_from("<HH", body)
-        topic, at = text_at(body, 4)
-        at = text_at(body, at)[1]  # behind the encoding of its messages
-        channels[number] = Channel(
-            topic=topic, message_type=schemas.get(schema, ""), metadata=table_at(body, at)[0]
-        )
-        return channels[number]
-    elif record.code == METADATA:
-        name, at = text_at(body, 0)
-        return Metadata(name=name, values=table_at(body, at)[0])
+    match record.content():
+        case records.Schema(id=number, name=name):
+            schemas[number] = name
+        case records.Channel(id=number, topic=topic, schema_id=schema, metadata=table):
+            channel = Channel(topic=topic, message_type=schemas.get(schema, ""), metadata=table)
+            channels[number] = channel
+            return channel
+        case records.Metadata(name=name, metadata=table):
+            return Metadata(name=name, values=table)
     return None
 
 
@@ -644,7 +640,7 @@ class McapWriter(Writer):
     def _pack_index(self) -> None:
         """Turn the entry of the newest chunk, which the writer keeps to the end, into bytes."""
         chunks = self._Writer__chunk_indices  # type: ignore[attr-defined]  # private as well
-        if chunks and isinstance(chunks[-1], ChunkIndex):
+        if chunks and isinstance(chunks[-1], records.ChunkIndex):
             chunks[-1] = _PackedIndex(chunks[-1])
 
     def finish(self) -> None:
@@ -659,7 +655,7 @@ class _PackedIndex:
 
     __slots__ = ("_record",)
 
-    def __init__(self, index: ChunkIndex) -> None:
+    def __init__(self, index: records.ChunkIndex) -> None:
         builder = RecordBuilder()
         index.write(builder)
         self._record: bytes = builder.end()  # type: ignore[no-untyped-call]  # mcap annotates in part
@@ -691,18 +687,15 @@ def end_time_of(stream: BinaryIO, size: int) -> int | None:
     while at + _HEAD.size <= size - _TAIL_BYTES:
         stream.seek(at)
         code, length = _HEAD.unpack(stream.read(_HEAD.size))
-        if code == STATISTICS and _END_TIME_AT + 8 <= length <= size - at:
-            (end_ns,) = struct.unpack("<Q", stream.read(_END_TIME_AT + 8)[_END_TIME_AT:])
-            return int(end_ns)
+        if code == _STATISTICS and length <= size - at:
+            with suppress(ValueError):
+                if isinstance(
+                    found := Record(at, code, stream.read(length)).content(), records.Statistics
+                ):
+                    return found.message_end_time
+            return None
         at += _HEAD.size + length
     return None
-
-
-def message_counts(statistics: bytes) -> dict[int, int]:
-    """Return the messages by channel in the body of a statistics record."""
-    (length,) = struct.unpack_from("<I", statistics, _END_TIME_AT + 8)
-    table = statistics[_END_TIME_AT + 12 :][:length]
-    return dict(struct.iter_unpack("<HQ", table))
 
 
 def is_magic(head: bytes) -> bool:
@@ -710,7 +703,7 @@ def is_magic(head: bytes) -> bool:
     return len(head) == len(MAGIC) and sum(a != b for a, b in zip(head, MAGIC, strict=True)) <= 1
 
 
-def statistics_of(path: Path) -> Statistics:
+def statistics_of(path: Path) -> records.Statistics:
     """Return the statistics in the index of a finished file, read by mcap's own reader.
 
     ValueError if the file cannot be read, or has no index.

@@ -30,11 +30,9 @@ Row = TypeVar("Row")
 KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""
 
-_ATTACHMENT = struct.Struct("<QQ")
-_FOOTER = struct.Struct("<QQI")
 _PIECE_BYTES = 1 << 20
-_FOOTER_HEAD_BYTES = 9  # code and length
-_CHECKED_FOOTER_BYTES = 16  # of its body, that its checksum covers
+_FOOTER_BYTES = 29  # with code and length
+_FOOTER_CHECKSUM_BYTES = 4
 
 
 @dataclass(slots=True, kw_only=True)
@@ -79,8 +77,8 @@ class Repair:
     has_right_data: bool = True
     profile: str = ""
     library: str = ""
-    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
-    channels: dict[int, tuple[int, str, str, dict[str, str]]] = field(default_factory=dict)
+    schemas: dict[int, mcap.records.Schema] = field(default_factory=dict)
+    channels: dict[int, mcap.records.Channel] = field(default_factory=dict)
     head: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, str] | None = None
     gaps: dict[int, Gap] = field(default_factory=dict)
@@ -108,7 +106,7 @@ class Repair:
     @property
     def is_session(self) -> bool:
         """Whether a run of `uwb-slam` wrote it, whatever is left of what describes it."""
-        topics = {topic for _, topic, *_ in self.channels.values()}
+        topics = {channel.topic for channel in self.channels.values()}
         return "/scan" in topics or SESSION_TOPIC in topics or self.metadata is not None
 
     def table(self) -> dict[str, str] | None:
@@ -266,9 +264,9 @@ def _survey(path: Path, stop: StopFlag) -> Repair:
         if not survey.damages and survey.checksum:
             survey.has_right_data = _checksum(*opened, survey.data_end, stop) == survey.checksum
     topics = {
-        number: topic
-        for number, (_, topic, _, table) in survey.channels.items()
-        if not mcap.is_latched(table)
+        number: channel.topic
+        for number, channel in survey.channels.items()
+        if not mcap.is_latched(channel.metadata)
     }
     if survey.is_session:
         if survey.message_counts:
@@ -305,42 +303,32 @@ def _checksum(stream: BinaryIO, size: int, end: int, stop: StopFlag) -> int:
 
 
 def _note(survey: Repair, finder: GapFinder, path: Path, record: mcap.Record) -> None:
-    body = record.body
-    if record.code == mcap.HEADER:
-        survey.profile, at = mcap.text_at(body, 0)
-        survey.library, _ = mcap.text_at(body, at)
-    elif record.code == mcap.SCHEMA:
-        (number,) = struct.unpack_from("<H", body)
-        name, at = mcap.text_at(body, 2)
-        encoding, at = mcap.text_at(body, at)
-        data, _ = mcap.bytes_at(body, at)
-        _define(survey.schemas, record, number, (name, encoding, data))
-    elif record.code == mcap.CHANNEL:
-        number, schema = struct.unpack_from("<HH", body)
-        topic, at = mcap.text_at(body, 4)
-        encoding, at = mcap.text_at(body, at)
-        table, _ = mcap.table_at(body, at)
-        _define(survey.channels, record, number, (schema, topic, encoding, table))
-    elif record.code == mcap.MESSAGE:
-        _note_message(survey, finder, body)
-    elif record.code == mcap.METADATA:
-        name, at = mcap.text_at(body, 0)
-        if name == METADATA_NAME:
-            survey.metadata = mcap.table_at(body, at)[0]
-    elif record.code == mcap.DATA_END:
-        survey.data_end = record.at
-        (survey.checksum,) = struct.unpack_from("<I", body)
-        finder.end_data()
-    elif record.code == mcap.STATISTICS:
-        survey.message_counts = mcap.message_counts(body)
-    elif record.code == mcap.FOOTER:
-        survey.has_index = _is_index_right(path, record)
+    if record.code == mcap.MESSAGE:
+        _note_message(survey, finder, record.body)
+        return
+    match record.content():
+        case mcap.records.Header(profile=profile, library=library):
+            survey.profile, survey.library = profile, library
+        case mcap.records.Schema() as schema:
+            _define(survey.schemas, record, schema.id, schema)
+        case mcap.records.Channel() as channel:
+            _define(survey.channels, record, channel.id, channel)
+        case mcap.records.Metadata(name=name, metadata=table) if name == METADATA_NAME:
+            survey.metadata = table
+        case mcap.records.DataEnd(data_section_crc=checksum):
+            survey.data_end, survey.checksum = record.at, checksum
+            finder.end_data()
+        case mcap.records.Statistics(channel_message_counts=counts):
+            survey.message_counts = counts
+        case mcap.records.Footer() as footer:
+            survey.has_index = _is_index_right(path, record.at, footer)
 
 
 def _note_message(survey: Repair, finder: GapFinder, body: bytes) -> None:
     survey.n_messages += 1
     number, sequence, t_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
-    topic = survey.channels.get(number, (0, "", "", {}))[1]
+    channel = survey.channels.get(number)
+    topic = "" if channel is None else channel.topic
     if topic == SESSION_TOPIC:
         finder.count(sequence)
     if topic == SESSION_TOPIC or RADAR_INFO.fullmatch(topic):
@@ -354,16 +342,15 @@ def _define(table: dict[int, Row], record: mcap.Record, number: int, row: Row) -
         table[number] = row
 
 
-def _is_index_right(path: Path, footer: mcap.Record) -> bool:
-    """Whether the index before the footer is there and what its checksum says."""
-    start, _, checksum = _FOOTER.unpack(footer.body)
+def _is_index_right(path: Path, at: int, footer: mcap.records.Footer) -> bool:
+    """Whether the index before the footer at a place is there and what its checksum says."""
+    start, end = footer.summary_start, at + _FOOTER_BYTES
     with path.open("rb") as stream:
         stream.seek(start)
-        checked = footer.at + _FOOTER_HEAD_BYTES + _CHECKED_FOOTER_BYTES - start
-        index = stream.read(max(checked, 0))
-        stream.seek(footer.at + _FOOTER_HEAD_BYTES + _FOOTER.size)
+        index = stream.read(max(end - _FOOTER_CHECKSUM_BYTES - start, 0))
+        stream.seek(end)
         ends_well = stream.read() == mcap.MAGIC
-    return ends_well and start != 0 and checksum in (0, zlib.crc32(index))
+    return ends_well and start != 0 and footer.summary_crc in (0, zlib.crc32(index))
 
 
 def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
@@ -397,12 +384,15 @@ class _Copy:
 
     def __init__(self, writer: mcap.McapWriter, survey: Repair) -> None:
         self._writer, self._survey = writer, survey
-        schemas = {0: 0} | {
-            number: writer.register_schema(*row) for number, row in survey.schemas.items()
+        schemas = {
+            number: writer.register_schema(one.name, one.encoding, one.data)
+            for number, one in survey.schemas.items()
         }
         self._channels = {
-            number: writer.register_channel(topic, encoding, schemas.get(schema, 0), table)
-            for number, (schema, topic, encoding, table) in survey.channels.items()
+            number: writer.register_channel(
+                one.topic, one.message_encoding, schemas.get(one.schema_id, 0), one.metadata
+            )
+            for number, one in survey.channels.items()
         }
         self._gaps: int | None = None
         self._pending_bytes = 0
@@ -430,25 +420,22 @@ class _Copy:
         )
 
     def write(self, record: mcap.Record) -> None:
-        body = record.body
         if record.code == mcap.MESSAGE:
-            self._message(body)
-        elif record.code == mcap.METADATA:
-            name, at = mcap.text_at(body, 0)
-            if not self._survey.is_session or name != METADATA_NAME:
-                self._writer.add_metadata(name, mcap.table_at(body, at)[0])
-        elif record.code == mcap.ATTACHMENT:
-            log_ns, created_ns = _ATTACHMENT.unpack_from(body)
-            name, at = mcap.text_at(body, _ATTACHMENT.size)
-            media_type, at = mcap.text_at(body, at)
-            (size,) = struct.unpack_from("<Q", body, at)
-            data = body[at + 8 : at + 8 + size]
-            self._writer.add_attachment(created_ns, log_ns, name, media_type, data)
+            self._message(record.body)
+            return
+        match record.content():
+            case mcap.records.Metadata(name=name, metadata=table):
+                if not self._survey.is_session or name != METADATA_NAME:
+                    self._writer.add_metadata(name, table)
+            case mcap.records.Attachment() as one:
+                self._writer.add_attachment(
+                    one.create_time, one.log_time, one.name, one.media_type, one.data
+                )
 
     def _message(self, body: bytes, *, is_head: bool = False) -> None:
         number, sequence, t_ns, publish_ns = mcap.MESSAGE_HEAD.unpack_from(body)
         data = body[mcap.MESSAGE_HEAD.size :]
-        if self._survey.is_session and mcap.is_latched(self._survey.channels[number][3]):
+        if self._survey.is_session and mcap.is_latched(self._survey.channels[number].metadata):
             if self._latched.get(number) == (t_ns, data):
                 return  # a copy; the writer makes its own
             self._latched[number] = t_ns, data
