@@ -7,18 +7,16 @@ them, and have its time: that of the chunk that completed the packet, of the chu
 is unknown, 0 if none is known.
 """
 
-import re
 import struct
 from pathlib import Path
 
 from xethru_protocol.recordings.records import FaultHandler, writing
 from xethru_protocol.recordings.wire_capture import Chunk, Way, read_chunks
-from xethru_protocol.wire.framing import Direction, Framing, NeedData, Packet, PacketReader
+from xethru_protocol.wire.framing import Direction, NeedData, Packet, PacketReader
 
 SUFFIX = ".pcap"
 _HEAD = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262144, 147)
 _RECORD = struct.Struct("<IIII")
-_NORMAL = re.compile(rb"\x7d(?:[^\x7d-\x7f]|\x7f.)*\x7e", re.DOTALL)
 _MARKS: dict[Way, bytes] = {"rx": b"<", "tx": b">"}
 _LONGEST = 65536  # of bytes that belong to no packet
 
@@ -45,11 +43,7 @@ class _Side:
         while not isinstance(packet := self._reader.next_packet(), NeedData):
             if isinstance(packet, Packet):
                 found += self._cut(packet.offset - self._begin)
-                size = 9 + len(packet.payload)
-                if packet.framing is Framing.NORMAL:
-                    match = _NORMAL.match(self._bytes)
-                    size = match.end() if match else 0
-                found += self._cut(size)
+                found += self._cut(len(self._bytes) - self._reader.buffered)
         return found
 
     def _cut(self, size: int) -> list[bytes]:
