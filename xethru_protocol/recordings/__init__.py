@@ -7,7 +7,6 @@ any to any. The rest is in the modules of this package: layouts and meta file of
 first.
 """
 
-from xethru_protocol.recordings.arrays import RadarArrays, Recording, TextColumn, load
 from xethru_protocol.recordings.conversion import Conversion, convert
 from xethru_protocol.recordings.formats import (
     RecordingFormat,
@@ -19,6 +18,7 @@ from xethru_protocol.recordings.formats import (
     recording_radars,
 )
 from xethru_protocol.recordings.frame_layout import FrameLayout
+from xethru_protocol.recordings.loading import RadarArrays, Recording, TextColumn, load
 from xethru_protocol.recordings.recorder import Recorder, SessionRecorder
 from xethru_protocol.recordings.records import (
     RadarFacts,

@@ -17,7 +17,6 @@ from pathlib import Path
 
 from xethru_protocol.recordings import pcap, wire_capture
 from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file, write_array_file
-from xethru_protocol.recordings.arrays import load
 from xethru_protocol.recordings.formats import (
     message_name,
     optional_packages,
@@ -27,6 +26,7 @@ from xethru_protocol.recordings.formats import (
     recording_format,
     refuse_name,
 )
+from xethru_protocol.recordings.loading import load
 from xethru_protocol.recordings.records import (
     RecordingError,
     RecordingFacts,

@@ -483,7 +483,7 @@ def test_samples_larger_than_memory_name_the_remedy(
     def full(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("xethru_protocol.recordings.arrays.np.empty", full)
+    monkeypatch.setattr("xethru_protocol.recordings.loading.np.empty", full)
     with pytest.raises(RecordingError, match=r"a\.npz: its 3 frames .* blocks\(\)"):
         _ = recording.iq
 
