@@ -211,7 +211,7 @@ class Record:
             return None
         try:
             content: records.McapRecord = kind.read(ReadDataStream(BytesIO(self.body)))
-        except EndOfFile:
+        except (EndOfFile, OverflowError):  # it wants more bytes than there are
             raise ValueError("a record ends before its content") from None
         builder = RecordBuilder()
         content.write(builder)
