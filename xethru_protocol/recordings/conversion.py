@@ -79,10 +79,10 @@ def convert(
     """
     source, target = Path(source), Path(target)
     faults: list[RecordingFault] = []
-    of_arrays = is_array_file(source)
-    if target.suffix in SUFFIXES:
-        if target.exists():
-            raise RecordingError(f"{target} exists already")
+    suffix = "" if target.is_dir() else target.suffix
+    if suffix and target.exists():
+        raise RecordingError(f"{target} exists already")
+    if suffix in SUFFIXES:
         loaded = load(source, faults.append, area_m=area_m, downconversion=downconversion)
         frames = (loaded.radar if radar is None else loaded.named(radar)).frames
         write_array_file(target, frames)
@@ -90,22 +90,20 @@ def convert(
             on_progress(frames.n_frames)
         skipped = {f"lines of {name}": len(text.lines) for name, text in loaded.texts.items()}
         return Conversion(messages=frames.n_frames, skipped=skipped, faults=tuple(faults))
-    if of_arrays:
+    if is_array_file(source):
         raise RecordingError(
             f"{source} holds arrays and no messages; it converts to {', '.join(SUFFIXES)}"
         )
-    if target.suffix == pcap.SUFFIX:
+    if suffix == pcap.SUFFIX:
         if recording_format(source) != "wire":
             raise RecordingError(
                 f"{source} has no raw bytes, which {target} needs; record them with"
                 " 'xethru record --wire', or take them out of a session with 'uwb-slam convert'"
             )
         refuse_name(source, radar)
-        if target.exists():
-            raise RecordingError(f"{target} exists already")
         packets = pcap.write_pcap(source, target, faults.append)
         return Conversion(messages=packets, skipped={}, faults=tuple(faults))
-    write = _writer(target)
+    write = _writer(target, suffix)
     facts = recording_facts(source)
     n_messages = 0
 
@@ -129,28 +127,22 @@ def convert(
 _Writer = Callable[[Path, TimedMessages, RecordingFacts], dict[str, int] | None]
 
 
-def _writer(target: Path) -> _Writer:
+def _writer(target: Path, suffix: str) -> _Writer:
     """Return what writes ``target``; it returns by name how many messages it left out, if any."""
-    if target.is_dir() or not target.suffix:
-        return _write_vendor
-    writer: _Writer
-    match target.suffix:
+    match suffix:
+        case "":
+            return _write_vendor
         case ".mcap":
             with optional_packages():
                 from xethru_protocol.recordings.mcap import write_mcap
 
-            writer = write_mcap
+            return write_mcap
         case wire_capture.SUFFIX:
-            writer = _write_wire
-        case unknown:
-            raise RecordingError(
-                f"{target}: no format has the suffix {unknown}; known are .mcap,"
-                f" {wire_capture.SUFFIX}, {pcap.SUFFIX}, {', '.join(SUFFIXES)}, and none for a"
-                " directory of ModuleConnector"
-            )
-    if target.exists():
-        raise RecordingError(f"{target} exists already")
-    return writer
+            return _write_wire
+    raise RecordingError(
+        f"{target}: no format has the suffix {suffix}; known are .mcap, {wire_capture.SUFFIX},"
+        f" {pcap.SUFFIX}, {', '.join(SUFFIXES)}, and none for a directory of ModuleConnector"
+    )
 
 
 def _write_vendor(target: Path, messages: TimedMessages, facts: RecordingFacts) -> dict[str, int]:

@@ -816,12 +816,7 @@ class RadarTopics:
 
 
 def write_mcap(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> None:
-    """Write messages to a new file, which is there when it is whole.
-
-    RecordingError if it exists or cannot be written.
-    """
-    if path.exists():
-        raise RecordingError(f"{path} exists already")
+    """Write messages to a file, which is there when it is whole; RecordingError if that fails."""
     with writing(path), written_whole(path) as fresh, fresh.open("wb") as stream:
         writer = McapWriter(stream)
         writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
