@@ -12,6 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hil_tests.property.message_strategies import messages, of_type
+from hil_tests.unit.xethru_protocol.recordings.messages import MS
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingFacts,
@@ -32,7 +33,6 @@ from xethru_protocol.wire.rows import RESPONSES
 
 STORED = [kind.message for kind in KINDS]
 """Message types that the vendor's format has a place for."""
-MS = 1_000_000
 TIMES_MS = st.integers(0, 2**31)
 
 

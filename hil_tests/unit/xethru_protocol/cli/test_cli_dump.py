@@ -10,16 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.test_playback_control import samples, write_session
-from hil_tests.unit.xethru_protocol.recordings.messages import dumped, write_capture
+from hil_tests.unit.xethru_protocol.recordings.messages import RECORDINGS, dumped, write_capture
 from hil_tests.unit.xethru_protocol.scripted import framed
 from xethru_protocol.cli import main
 from xethru_protocol.recordings import RecordingError, convert, read_recording
 from xethru_protocol.wire import messages as m
 
 Capture = pytest.CaptureFixture[str]
-RECORDINGS = FIXTURES / "recordings"
 IQ = RECORDINGS / "iq"
 IQ_FILE = "xethru_baseband_iq_20261121_003557.dat"
 

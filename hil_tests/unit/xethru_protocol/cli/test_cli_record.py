@@ -15,6 +15,7 @@ import pytest
 from hil_tests.unit.full_disk import child_on_full_disk
 from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
+from hil_tests.unit.xethru_protocol.recordings.messages import counters
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
@@ -37,14 +38,6 @@ from xethru_protocol.wire.codes import (
 
 Capture = pytest.CaptureFixture[str]
 PRESENCE = m.PresenceSingle(counter=3, state=1, distance_m=1.5, direction=0, signal_quality=7)
-
-
-def counters(path: Path) -> list[int]:
-    found = []
-    for message, _ in read_recording(path):
-        if isinstance(message, m.DataFloat):
-            found.append(message.info)
-    return found
 
 
 def test_count_is_kept_to_the_message(module: PtyModule, tmp_path: Path, capsys: Capture) -> None:

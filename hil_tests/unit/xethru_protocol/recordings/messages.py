@@ -1,4 +1,4 @@
-"""Small messages, and recordings read with their faults."""
+"""What tests of recordings share: small messages, the vendor's recordings, and reading them."""
 
 import json
 from collections.abc import Iterable
@@ -8,10 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil_tests.paths import FIXTURES
 from xethru_protocol.cli import main
 from xethru_protocol.recordings import RecordingFault, WireCapture, read_recording
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role
+
+RECORDINGS = FIXTURES / "recordings"
+META = "xethru_recording_meta.dat"
+MS = 1_000_000  # ns
 
 
 def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
@@ -40,6 +45,12 @@ def xethru(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 def dumped(capsys: pytest.CaptureFixture[str], path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in xethru(capsys, "dump", path, "--json").splitlines()]
+
+
+def counters(path: Path) -> list[int]:
+    """Return the counters of the radar frames in a recording."""
+    messages = [message for message, _ in read_recording(path)]
+    return [message.info for message in messages if isinstance(message, m.DataFloat)]
 
 
 def read_with_faults(

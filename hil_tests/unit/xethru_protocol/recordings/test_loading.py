@@ -18,8 +18,8 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from emulator import emulated_port
-from hil_tests.paths import FIXTURES, real_raw_recording, real_recording, shared_data
-from hil_tests.unit.xethru_protocol.recordings.messages import frame, write_capture
+from hil_tests.paths import real_raw_recording, real_recording, shared_data
+from hil_tests.unit.xethru_protocol.recordings.messages import MS, RECORDINGS, frame, write_capture
 from xethru_protocol import Frame, FrameGeometry, load
 from xethru_protocol.cli import main
 from xethru_protocol.recordings import (
@@ -31,9 +31,6 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
-
-RECORDINGS = FIXTURES / "recordings"
-MS = 1_000_000
 
 
 def baseband(counter: int, n_bins: int, start_m: float = 0.5) -> m.BasebandIq:

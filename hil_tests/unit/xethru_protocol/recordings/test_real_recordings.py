@@ -14,13 +14,12 @@ import numpy.typing as npt
 import pytest
 
 from hil_tests.paths import real_raw_recording, real_recording
-from hil_tests.unit.xethru_protocol.recordings.messages import xethru
+from hil_tests.unit.xethru_protocol.recordings.messages import META, xethru
 from xethru_protocol.recordings import RecordingReader, read_recording, recording_facts
 from xethru_protocol.recordings.frame_layout import FrameLayouts
 from xethru_protocol.wire import messages as m
 
 Floats = npt.NDArray[np.float64]
-META = "xethru_recording_meta.dat"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,9 +12,9 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
-from hil_tests.paths import FIXTURES
 from hil_tests.unit.slam.app.sessions import scan, session_info
 from hil_tests.unit.xethru_protocol.recordings.messages import (
+    RECORDINGS,
     frame,
     read_with_faults,
     write_capture,
@@ -37,7 +37,6 @@ from xethru_protocol.recordings import (
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 
-RECORDINGS = FIXTURES / "recordings"
 TARGETS = ("a.mcap", "c.xtwire", "vendor")
 
 

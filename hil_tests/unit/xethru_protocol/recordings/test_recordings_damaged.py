@@ -14,9 +14,15 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds
-from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence, read_with_faults
+from hil_tests.unit.xethru_protocol.recordings.messages import (
+    META,
+    MS,
+    RECORDINGS,
+    frame,
+    presence,
+    read_with_faults,
+)
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingWriter,
@@ -26,10 +32,7 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.wire import messages as m
 
-RECORDINGS = FIXTURES / "recordings"
-META = "xethru_recording_meta.dat"
 PARAMETERS = "xethru_parameter_file.par"
-MS = 1_000_000
 
 
 def copy_of(name: str, tmp_path: Path) -> Path:

@@ -12,8 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.paths import FIXTURES
 from hil_tests.unit.xethru_protocol.recordings.messages import (
+    META,
+    MS,
+    RECORDINGS,
+    counters,
     frame,
     presence,
     read_with_faults,
@@ -30,20 +33,11 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.wire import messages as m
 
-RECORDINGS = FIXTURES / "recordings"
-META = "xethru_recording_meta.dat"
-MS = 1_000_000
-
 
 def session_bytes(meta: Path) -> bytes:
     """Return the session id of a meta file with its NUL: from byte 0x59 on, of length at 0x55."""
     content = meta.read_bytes()
     return content[0x59 : 0x59 + int.from_bytes(content[0x55:0x59], "little")]
-
-
-def counters(path: Path) -> list[int]:
-    messages = [message for message, _ in read_recording(path)]
-    return [message.info for message in messages if isinstance(message, m.DataFloat)]
 
 
 @pytest.mark.parametrize("given", [None, ""])

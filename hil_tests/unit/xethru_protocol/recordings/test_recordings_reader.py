@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.paths import FIXTURES
-from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence
+from hil_tests.unit.xethru_protocol.recordings.messages import META, MS, RECORDINGS, frame, presence
 from xethru_protocol.recordings import (
     Record,
     RecordingError,
@@ -24,10 +23,7 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.wire import messages as m
 
-RECORDINGS = FIXTURES / "recordings"
 EVERY_KIND = RECORDINGS / "every_kind"
-META = "xethru_recording_meta.dat"
-MS = 1_000_000
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.paths import FIXTURES, real_recording, shared_data
-from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence
+from hil_tests.paths import real_recording, shared_data
+from hil_tests.unit.xethru_protocol.recordings.messages import META, MS, RECORDINGS, frame, presence
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingWriter,
@@ -19,10 +19,6 @@ from xethru_protocol.recordings import (
     recording_facts,
 )
 from xethru_protocol.wire import messages as m
-
-RECORDINGS = FIXTURES / "recordings"
-META = "xethru_recording_meta.dat"
-MS = 1_000_000
 
 
 def write_again(source: Path, target: Path) -> None:
