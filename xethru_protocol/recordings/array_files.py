@@ -60,10 +60,6 @@ DTYPES: Mapping[Kind, np.dtype[Any]] = {
     "iq": np.dtype(np.complex64),
 }
 SUFFIXES = (".csv", ".mat", ".npz")
-ONLY_MESSAGES = (
-    "is an archive of messages, which are kept in .mcap now; 'xethru convert' of version 0.2 turns "
-    "it into one"
-)
 _AT_ONCE = 256  # frames of a file that are read together
 _LINES_AT_ONCE = 8  # a number as text is ten times as large
 
@@ -259,7 +255,9 @@ def _write_npz(fresh: Path, frames: Frames, kind: Kind) -> None:
 def _read_npz(path: Path) -> Frames:
     with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
         if "message_payload" in archive.files and not {"iq", "rf"} & {*archive.files}:
-            raise RecordingError(f"{path} {ONLY_MESSAGES}")
+            raise RecordingError(
+                f"{path} holds messages; they are kept in .mcap now, 'xethru convert' 0.2 makes one"
+            )
         kind = _kind_in(archive.files)
         shape, dtype = _declared(archive.zip, kind)
         names = [name for name in (*_VECTORS, "settings") if name in archive.files]
