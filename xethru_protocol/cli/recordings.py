@@ -3,7 +3,7 @@
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -361,6 +361,17 @@ def files_to_replace(targets: Iterable[Path], *, replace: bool) -> list[Path]:
     if old and not replace:
         raise RecordingError(f"there is a recording already: {old[0]}; --force replaces it")
     return old
+
+
+def remove_older(targets: Sequence[Path], *, replace: bool) -> None:
+    """Remove what `files_to_replace` finds, with the directories that are empty then."""
+    for path in files_to_replace(targets, replace=replace):
+        try:
+            path.unlink()
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
+    for target in targets:
+        remove_empty_directories(target)
 
 
 def is_part_of(source: Path, target: Path) -> bool:

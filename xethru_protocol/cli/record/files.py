@@ -13,7 +13,7 @@ from xethru_protocol.cli.output import (
 from xethru_protocol.cli.record.modes import ANSWERS
 from xethru_protocol.cli.recordings import (
     files_to_replace,
-    remove_empty_directories,
+    remove_older,
     remove_unfinished,
 )
 from xethru_protocol.driver.radar import X4M300
@@ -95,13 +95,7 @@ class RecordingFiles:
 
     def open(self, parameter_file: bytes | None = None) -> None:
         """Remove older files if that is allowed, and make new ones; RecordingError if not."""
-        for path in files_to_replace(self.paths, replace=self._arguments.force):
-            try:
-                path.unlink()
-            except OSError as error:
-                raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
-        for path in self.paths:
-            remove_empty_directories(path)
+        remove_older(self.paths, replace=self._arguments.force)
         self._were_there = {path: path.exists() for path in self.paths}
         if self._directory is not None:
             options = self._options.copy()

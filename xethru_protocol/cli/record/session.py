@@ -24,15 +24,11 @@ from xethru_protocol.cli.output import (
 )
 from xethru_protocol.cli.record.files import writer_options
 from xethru_protocol.cli.record.modes import ANSWERS, POLL_S, Listen
-from xethru_protocol.cli.recordings import (
-    files_to_replace,
-    remove_unfinished,
-)
+from xethru_protocol.cli.recordings import files_to_replace, remove_older, remove_unfinished
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
     SessionRecorder,
 )
-from xethru_protocol.recordings.records import writing
 from xethru_protocol.system import StopFlag
 from xethru_protocol.transport import open_line
 from xethru_protocol.wire.errors import (
@@ -269,9 +265,7 @@ def record_session(arguments: Namespace, mode: Listen) -> int:
             _opened_module(opened, name, port, arguments, copy(mode))
             for name, port in arguments.ports
         ]
-        for old in files_to_replace((path,), replace=arguments.force):
-            with writing(old):
-                old.unlink()
+        remove_older((path,), replace=arguments.force)
         session = _Session(path, arguments.count, modules)
         try:
             for name, port, baudrate in arguments.text:
