@@ -1,11 +1,13 @@
 """Every kind of recording: which kind a path is, its messages, its summary."""
 
+import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from xethru_protocol.extras import what_is_missing
 from xethru_protocol.recordings import wire_capture
@@ -24,6 +26,7 @@ from xethru_protocol.recordings.records import (
 from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
 from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
+from xethru_protocol.wire.x4 import RF_BIN_M
 
 RecordingFormat = Literal["vendor", "wire", "mcap"]
 
@@ -143,13 +146,26 @@ def refuse_name(path: Path, radar: str | None) -> None:
 
 def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
     """Return the radars of a recording; only a session (MCAP) has several, and names them."""
-    path = Path(path)
     if recording_format(path) != "mcap":
         return (RadarFacts(),)
-    with optional_packages():
-        from xethru_protocol.recordings.mcap import mcap_radars
+    return tuple(starmap(_radar_facts, recording_content(path).radars.items()))
 
-    return mcap_radars(path)
+
+def _radar_facts(name: str, info: Mapping[str, Any]) -> RadarFacts:
+    """Read the description of a radar in MCAP; facts without content if it is invalid."""
+    try:
+        start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
+        # the read-back of baseband ends at the last bin, that of RF one behind it
+        steps = int(info["n_bins"]) - (bin_m > 4 * RF_BIN_M)
+        area_m = start_m, start_m + bin_m * steps
+    except (KeyError, ValueError, TypeError, OverflowError):
+        return RadarFacts(name=name)
+    serial = info.get("serial")
+    return RadarFacts(
+        name=name,
+        serial=serial if isinstance(serial, str) and serial else None,
+        area_m=area_m if all(map(math.isfinite, area_m)) else None,
+    )
 
 
 def recording_content(path: Path | str) -> RecordingContent:

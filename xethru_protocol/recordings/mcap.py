@@ -18,7 +18,6 @@ Specification of the format: https://mcap.dev/spec
 """
 
 import json
-import math
 import os
 import re
 import struct
@@ -45,7 +44,6 @@ from xethru_protocol.recordings.frame_layout import FrameGeometries
 from xethru_protocol.recordings.records import (
     MODULE_METRES,
     FaultHandler,
-    RadarFacts,
     RecordingContent,
     RecordingError,
     RecordingFacts,
@@ -65,7 +63,6 @@ from xethru_protocol.wire.messages import (
     DataFloat,
 )
 from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
-from xethru_protocol.wire.x4 import RF_BIN_M
 
 FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"
 DOUBLE_ARRAY = "std_msgs/msg/Float64MultiArray"
@@ -870,11 +867,6 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
         raise RecordingError(f"{path} holds no topic /radar/<name>/frame or .../payload")
 
 
-def mcap_radars(path: Path) -> tuple[RadarFacts, ...]:
-    """Return the radars of a file in the order of their first topics; damage is ignored."""
-    return tuple(_radar_facts(name, info) for name, info in mcap_content(path).radars.items())
-
-
 def mcap_content(path: Path) -> RecordingContent:
     """Return radars in the order of their first topics, and texts; damage is ignored."""
     radars: dict[str, Mapping[str, Any]] = {}
@@ -900,24 +892,7 @@ def mcap_content(path: Path) -> RecordingContent:
 
 
 def _names(path: Path) -> str:
-    return ", ".join(sorted(facts.name or "" for facts in mcap_radars(path)))
-
-
-def _radar_facts(name: str, info: Mapping[str, Any]) -> RadarFacts:
-    """Read a latched info; facts without content if it is invalid."""
-    try:
-        start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
-        # the read-back of baseband ends at the last bin, that of RF one behind it
-        steps = int(info["n_bins"]) - (bin_m > 4 * RF_BIN_M)
-        area_m = start_m, start_m + bin_m * steps
-    except (KeyError, ValueError, TypeError, OverflowError):
-        return RadarFacts(name=name)
-    serial = info.get("serial")
-    return RadarFacts(
-        name=name,
-        serial=serial if isinstance(serial, str) and serial else None,
-        area_m=area_m if all(map(math.isfinite, area_m)) else None,
-    )
+    return ", ".join(sorted(mcap_content(path).radars))
 
 
 def mcap_facts(path: Path) -> RecordingFacts:
