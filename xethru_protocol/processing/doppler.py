@@ -96,12 +96,12 @@ def range_doppler(
     length = _transform_length(len(frames), n_frequencies)
     window = hann(len(frames))
     weighted = frames * (window / window.sum())[:, np.newaxis]
-    power = _power(np.fft.fftshift(np.fft.fft(weighted, length, axis=0), axes=0))
+    spectrum = np.fft.fftshift(np.fft.fft(weighted, length, axis=0), axes=0)
     frequencies_hz = np.fft.fftshift(np.fft.fftfreq(length, 1 / frame_rate_hz))
     return RangeDoppler(
-        power=power,
+        power=np.asarray(spectrum.real**2 + spectrum.imag**2, dtype=np.float64),
         frequencies_hz=frequencies_hz,
-        velocities_mps=_velocities_mps(frequencies_hz, carrier_hz),
+        velocities_mps=frequencies_hz * (SPEED_OF_LIGHT_MPS / (2 * carrier_hz)),
     )
 
 
@@ -169,11 +169,3 @@ def _transform_length(n_frames: int, n_frequencies: int | None) -> int:
     if length < n_frames:
         raise ValueError(f"n_frequencies {length}: must be at least the {n_frames} frames")
     return length
-
-
-def _power(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-    return np.asarray(spectrum.real**2 + spectrum.imag**2, dtype=np.float64)
-
-
-def _velocities_mps(frequencies_hz: NDArray[np.float64], carrier_hz: float) -> NDArray[np.float64]:
-    return frequencies_hz * (SPEED_OF_LIGHT_MPS / (2 * carrier_hz))
