@@ -219,14 +219,15 @@ class RadarArrays:
         if not self._all:
             return
         frames = self.frames
-        self._of_kind_known()
+        if frames.kind is None:
+            self._of_kind("iq")  # which raises
         begin = 0
         for samples in self._blocks(n_frames):
             rows = slice(begin, begin + len(samples))
             begin = rows.stop
             block = replace(
                 frames,
-                chunks=partial(_once, samples),
+                chunks=partial(iter, (samples,)),
                 n_frames=len(samples),
                 counter=None if frames.counter is None else frames.counter[rows],
                 t_ns=None if frames.t_ns is None else frames.t_ns[rows],
@@ -235,10 +236,6 @@ class RadarArrays:
             made = _of(self.name, block, self._nothing)
             made._samples = samples
             yield made
-
-    def _of_kind_known(self) -> None:
-        if self.frames.kind is None:
-            self._of_kind("iq")
 
     def _blocks(self, n_frames: int) -> Iterator[Samples]:
         """Yield arrays of ``n_frames`` rows, the last one shorter; one of none without frames."""
@@ -265,10 +262,6 @@ class RadarArrays:
             raise RecordingError(f"{self._nothing} has changed since it was loaded; load it again")
         if not frames.n_frames:
             yield block
-
-
-def _once(samples: Samples) -> Iterator[Samples]:
-    yield samples
 
 
 def _of(name: str, frames: Frames, nothing: str) -> RadarArrays:
