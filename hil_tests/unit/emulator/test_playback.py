@@ -14,8 +14,8 @@ from emulator.device import Device
 from emulator.loopback import LoopbackTransport
 from emulator.module.module import LosslessOutbox, Module
 from emulator.playback import PlayStream, played_radars, schedule
+from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
-from hil_tests.unit.xethru_protocol.recordings.messages import RECORDINGS
 from hil_tests.unit.xethru_protocol.scripted import framed
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -29,6 +29,7 @@ from xethru_protocol.recordings import (
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 
+RECORDINGS = FIXTURES / "recordings"
 SECOND = 1_000_000_000
 RECORDS = [m.Pong(value=value) for value in range(5)]
 
