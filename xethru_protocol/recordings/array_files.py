@@ -256,7 +256,8 @@ def _read_npz(path: Path) -> Frames:
     with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
         if "message_payload" in archive.files and not {"iq", "rf"} & {*archive.files}:
             raise RecordingError(
-                f"{path} holds messages; they are kept in .mcap now, 'xethru convert' 0.2 makes one"
+                f"{path} holds messages, which are kept in .mcap now; convert it to that with"
+                " the version that wrote it"
             )
         kind = _kind_in(archive.files)
         shape, dtype = _declared(archive.zip, kind)

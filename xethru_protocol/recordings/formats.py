@@ -81,10 +81,9 @@ def recording_format(path: Path | str) -> RecordingFormat:
         if start.startswith(magic):
             return found
     if path.suffix in SUFFIXES:
-        old = "" if path.suffix != ".npz" else "; of an older .npz 'xethru convert' 0.2 makes one"
         raise RecordingError(
             f"{path} is read for arrays only, by xethru_protocol.load and 'xethru convert';"
-            f" messages are kept in .mcap{old}"
+            f" messages are kept in .mcap"
         )
     raise RecordingError(
         f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
