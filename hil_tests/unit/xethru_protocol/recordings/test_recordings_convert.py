@@ -201,14 +201,14 @@ def test_samples_are_not_held_in_memory(tmp_path: Path) -> None:
     assert names == ["long", "x.mcap", "y.xtwire", "z.npz"]
 
 
-def test_an_archive_of_messages_names_the_version_that_reads_it(tmp_path: Path) -> None:
+def test_an_archive_of_messages_is_refused_in_one_line(tmp_path: Path) -> None:
     """Where its frames had one layout, it holds them as arrays, too."""
     path = tmp_path / "old.npz"
     arrays = {"format": "xethru-hil recording 1", "message_payload": np.zeros(5, np.uint8)}
     np.savez(path, **arrays)  # type: ignore[arg-type]  # of allow_pickle
-    with pytest.raises(RecordingError, match=r"\.mcap.* 0\.2"):
+    with pytest.raises(RecordingError, match=r"\.mcap"):
         _ = load(path).iq
-    with pytest.raises(RecordingError, match=r"\.mcap.* 0\.2"):
+    with pytest.raises(RecordingError, match=r"\.mcap"):
         list(read_recording(path))
     np.savez(path, **arrays, iq=np.ones((2, 3)))  # type: ignore[arg-type]  # as above
     np.testing.assert_array_equal(load(path).iq, np.ones((2, 3)))
