@@ -18,7 +18,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from slam.app.commands.recorded_session import play, refuse_overwriting, session_file
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
@@ -46,6 +45,7 @@ from slam.app.run.pictures import (
     label,
     svg_of,
 )
+from slam.app.run.replay import play, refuse_overwriting, session_file
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M

@@ -42,7 +42,14 @@ from slam.app.run.results import (
     remove_earlier,
     write_smoothed,
 )
-from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, execute, make_slam
+from slam.app.run.runner import (
+    RunRecord,
+    RunSource,
+    StepGivenUpError,
+    WrappedSlam,
+    execute,
+    make_slam,
+)
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
@@ -185,7 +192,7 @@ def _prepare_the_end() -> None:
     atexit.register(gc.freeze)
 
 
-class PromptSlam:
+class PromptSlam(WrappedSlam):
     """SLAM that gives up the step in hand if it takes longer than 0.3 s after a signal.
 
     A step may take seconds on a busy machine, and must not hold up the end of a run in real time.
@@ -193,13 +200,11 @@ class PromptSlam:
     """
 
     def __init__(self, slam: Slam, stop: StopFlag) -> None:
-        self._slam, self._stop = slam, stop
+        super().__init__(slam)
+        self._stop = stop
         self._in_step = False
         self.n_given_up = 0
         self._cleanup = ExitStack()
-        self.config, self.step_detections = slam.config, slam.step_detections
-        self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
-        self.smoothed = slam.smoothed
 
     def __enter__(self) -> Self:
         previous = signal.signal(signal.SIGALRM, self._give_up)

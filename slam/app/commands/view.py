@@ -15,15 +15,15 @@ from pathlib import Path
 
 from PIL import Image
 
-from slam.app.commands.recorded_session import (
+from slam.app.errors import AppError, UsageError, naming
+from slam.app.run.output import print_text
+from slam.app.run.replay import (
     VIEW_NAME,
     is_finished,
     play,
     refuse_overwriting,
     session_file,
 )
-from slam.app.errors import AppError, UsageError, naming
-from slam.app.run.output import print_text
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient

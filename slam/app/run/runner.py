@@ -59,6 +59,16 @@ def make_slam(
     return UwbRadarSlam(config, rig, detector)
 
 
+class WrappedSlam:
+    """Passes everything but `step` on to another pipeline; subclasses define that."""
+
+    def __init__(self, slam: Slam) -> None:
+        self._slam = slam
+        self.config = slam.config
+        self.step_detections, self.flush = slam.step_detections, slam.flush
+        self.wall_spans_m, self.smoothed = slam.wall_spans_m, slam.smoothed
+
+
 def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the truth of a run in the real world: NaN, shape (n, 3)."""
     return np.full((len(stamps_ns), 3), np.nan)
