@@ -141,7 +141,7 @@ def run_demo(
 def _rerun_view() -> Callable[[Path, SessionInfo], SessionObserver] | None:
     """Return what makes the view of a session; None, with a note, if Rerun is not installed."""
     try:
-        from slam.app.view.panels import RerunView
+        from slam.app.view.session_view import RerunView
     except ModuleNotFoundError as error:
         if what_is_missing(error) is None:
             raise

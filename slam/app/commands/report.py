@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,12 +22,11 @@ from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
     POSE_DOF,
+    StateNumbers,
     Summary,
-    band_95,
-    nis_dof,
-    pose_nees,
-    position_errors_m,
+    bands_95,
     smoothed_errors,
+    state_numbers,
     summarise,
     world_from_odom,
 )
@@ -56,35 +54,8 @@ from xethru_protocol.system import StopFlag, each_line, one_line, written_whole
 _KEPT_WARNINGS = 200
 
 
-class _Series(NamedTuple):
-    """Numbers over the states of a run, each of shape (n_states,); NaN if there is none.
-
-    Errors are the position's distance to the truth, from the start pose, not aligned; the NIS is of
-    the gated associations together, the NEES of the pose.
-    """
-
-    t_s: NDArray[np.float64]
-    slam_error_m: NDArray[np.float64]
-    odometry_error_m: NDArray[np.float64]
-    nis_per_dof: NDArray[np.float64]
-    nis_dof: NDArray[np.float64]
-    nees_per_dof: NDArray[np.float64]
-    n_landmarks: NDArray[np.float64]
-
-
-class _Smoothed(NamedTuple):
-    """Errors of the smoothed path, not aligned, and NEES of its poses, shape (n_states,) each."""
-
-    error_m: NDArray[np.float64]
-    nees_per_dof: NDArray[np.float64]
-
-
-def _smoothed(record: RunRecord) -> _Smoothed | None:
-    smoothed = record.whole_smoothed
-    if smoothed is None or not record.states.has_truth:
-        return None
-    errors_m, nees = smoothed_errors(smoothed, record.states.truth, record.world_from_map)
-    return _Smoothed(errors_m, nees / POSE_DOF)
+_Smoothed = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""See `smoothed_errors`."""
 
 
 class _ReportData(SessionObserver):
@@ -107,7 +78,7 @@ class _ReportData(SessionObserver):
         self.n_warnings = 0
         self.start_ns: int | None = None
         self.end_ns = 0
-        self._rows = PackedRows(np.dtype(np.float64), len(_Series._fields))
+        self._rows = PackedRows(np.dtype(np.float64), len(StateNumbers._fields))
         self._odom: NDArray[np.float64] | None = None
 
     @property
@@ -127,17 +98,7 @@ class _ReportData(SessionObserver):
     def on_snapshot(self, snapshot: Snapshot) -> None:
         if self._odom is None:
             self._odom = world_from_odom(snapshot)
-        nis = float(np.mean(snapshot.nis_per_dof)) if snapshot.nis_per_dof else math.nan
-        self._rows.append(
-            (
-                self.seconds(snapshot.t_ns),
-                *position_errors_m(snapshot, self._odom),
-                nis,
-                float(nis_dof(snapshot) or math.nan),
-                pose_nees(snapshot) / POSE_DOF,
-                float(len(snapshot.landmark_ids)),
-            )
-        )
+        self._rows.append(state_numbers(snapshot, self._odom))
 
     def on_log(self, line: LogLine) -> None:
         self._note(self.links.on_log(line))
@@ -149,8 +110,8 @@ class _ReportData(SessionObserver):
     def close(self) -> None:
         self._note(self.links.end(self.end_ns))
 
-    def series(self) -> _Series:
-        return _Series(*self._rows.rows.T)
+    def numbers(self) -> StateNumbers:
+        return StateNumbers(*self._rows.rows.T)
 
     def _note(self, changes: Iterable[LinkChange]) -> None:
         self.changes += [(self.seconds(change.t_ns), change) for change in changes]
@@ -269,50 +230,50 @@ _BAR = 0.7
 _TIME = "time since the first scan [s]"
 
 
-def _draw_errors(figure: Figure, series: _Series, smoothed: _Smoothed | None) -> None:
+def _draw_errors(
+    figure: Figure, t_s: NDArray[np.float64], numbers: StateNumbers, smoothed: _Smoothed | None
+) -> None:
     """Draw the position errors in mm, where the truth is known, and the number of landmarks."""
-    has_truth = bool(np.isfinite(series.slam_error_m).any())
+    has_truth = bool(np.isfinite(numbers.slam_error_m).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
     if has_truth:
         axes = panels[0]
-        axes.plot(series.t_s, 1e3 * series.odometry_error_m, color=ODOMETRY, label="wheel odometry")
-        axes.plot(series.t_s, 1e3 * series.slam_error_m, color=ESTIMATE, label="radar SLAM")
+        axes.plot(t_s, 1e3 * numbers.odometry_error_m, color=ODOMETRY, label="wheel odometry")
+        axes.plot(t_s, 1e3 * numbers.slam_error_m, color=ESTIMATE, label="radar SLAM")
         if smoothed is not None:
-            smoothed_mm = 1e3 * smoothed.error_m
-            axes.plot(series.t_s, smoothed_mm, color=SMOOTHED, label="smoothed at the end")
+            axes.plot(t_s, 1e3 * smoothed[0], color=SMOOTHED, label="smoothed at the end")
         label(axes, "Position error, from the start pose, not aligned", "", "error [mm]")
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False, loc="upper left")
-    panels[-1].step(series.t_s, series.n_landmarks, color=LANDMARK, where="post")
+    panels[-1].step(t_s, numbers.n_landmarks, color=LANDMARK, where="post")
     label(panels[-1], "Landmarks on the map", _TIME, "number [1]")
     panels[-1].set_ylim(bottom=0.0)
     panels[-1].yaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _draw_consistency(figure: Figure, series: _Series, smoothed: _Smoothed | None) -> None:
+def _draw_consistency(
+    figure: Figure, t_s: NDArray[np.float64], numbers: StateNumbers, smoothed: _Smoothed | None
+) -> None:
     """Draw NIS and NEES over their degrees of freedom, with the 95 % band of each state."""
-    has_truth = bool(np.isfinite(series.nees_per_dof).any())
+    has_truth = bool(np.isfinite(numbers.nees_per_dof).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
-    known = np.isfinite(series.nis_dof)
-    bands = np.array([band_95(int(dof)) for dof in series.nis_dof[known]]).reshape(-1, 2)
-    bands /= np.maximum(series.nis_dof[known], 1.0)[:, None]
-    _draw_band(panels[0], series.t_s[known], bands)
+    known = np.isfinite(numbers.nis_dof)
+    _draw_band(panels[0], t_s[known], bands_95(numbers.nis_dof[known]))
     panels[0].plot(
-        series.t_s, series.nis_per_dof, linestyle="none", marker=".", markersize=2, color=ESTIMATE
+        t_s, numbers.nis_per_dof, linestyle="none", marker=".", markersize=2, color=ESTIMATE
     )
     label(panels[0], "NIS of associations inside the gate / dof, 95 % band", "", "NIS / dof [1]")
-    _scale(panels[0], series.nis_per_dof)
+    _scale(panels[0], numbers.nis_per_dof)
     if has_truth:
-        bound = np.array(band_95(POSE_DOF)) / POSE_DOF
-        _draw_band(panels[1], series.t_s, np.tile(bound, (len(series.t_s), 1)))
-        lines = [(series.nees_per_dof, ESTIMATE, "radar SLAM")]
+        _draw_band(panels[1], t_s, bands_95(np.full(len(t_s), POSE_DOF)))
+        lines = [(numbers.nees_per_dof, ESTIMATE, "radar SLAM")]
         if smoothed is not None:
-            lines.append((smoothed.nees_per_dof, SMOOTHED, "smoothed at the end"))
+            lines.append((smoothed[1], SMOOTHED, "smoothed at the end"))
         for values, colour, name in lines:
-            panels[1].plot(series.t_s, values, color=colour, linewidth=1.0, label=name)
+            panels[1].plot(t_s, values, color=colour, linewidth=1.0, label=name)
         panels[1].legend(frameon=False, loc="upper left", ncols=2)
         label(panels[1], "NEES of the pose in the start frame / 3, 95 % band", "", "NEES / 3 [1]")
-        _scale(panels[1], series.nees_per_dof)
+        _scale(panels[1], numbers.nees_per_dof)
     panels[-1].set_xlabel(_TIME)
 
 
@@ -392,7 +353,13 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
             "has no NIS of true associations, no band of the NIS and no walls."
         )
     _write_numbers(page, info, data, record, summary)
-    series, smoothed = data.series(), _smoothed(record)
+    states, whole = record.states, record.whole_smoothed
+    t_s = np.maximum(states.t_ns - record.start_ns, 0) / NS_PER_S
+    smoothed = (
+        smoothed_errors(whole, states.truth, record.world_from_map)
+        if whole is not None and states.has_truth
+        else None
+    )
     page.heading("Map and trajectory")
     page.picture(
         "map with paths and landmarks",
@@ -407,7 +374,8 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     page.picture(
         "position errors and number of landmarks over time",
         _draw_errors,
-        series,
+        t_s,
+        data.numbers(),
         smoothed,
         height_in=4.4,
         narrow_height_in=4.6,
@@ -420,7 +388,8 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     page.picture(
         "NIS and NEES over time with their bands",
         _draw_consistency,
-        series,
+        t_s,
+        data.numbers(),
         smoothed,
         height_in=4.4,
         narrow_height_in=4.4,

@@ -170,7 +170,7 @@ def run_view(
 
 def _write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
     """Write a session as an .rrd file, which replaces an earlier one when it is whole."""
-    from slam.app.view.panels import RerunView  # half a second, loaded only if needed
+    from slam.app.view.session_view import RerunView  # half a second, loaded only if needed
 
     with naming(path), written_whole(path) as fresh:
         fresh.open("wb").close()  # Rerun's own message would not name the remedy

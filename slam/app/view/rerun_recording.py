@@ -84,6 +84,11 @@ class Stamps:
     counters: list[int] = field(default_factory=list)
     host_ns: list[int | None] = field(default_factory=list)
 
+    @classmethod
+    def of(cls, t_ns: int, counter: int, host_ns: int | None) -> Stamps:
+        """Return the stamps of one row."""
+        return cls(t_ns=[t_ns], counters=[counter], host_ns=[host_ns])
+
     def __len__(self) -> int:
         return len(self.t_ns)
 

@@ -18,7 +18,7 @@ from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample, format_t
 from slam.app.records import Scan, SessionObserver
 from slam.app.run.runner import run_slam
 from slam.app.session.log import SessionLog
-from slam.app.view.panels import RerunView
+from slam.app.view.session_view import RerunView
 from slam.frames import RadarFrame
 from slam.results import Belief, PoseAt, StepResult, UpdateReport
 

@@ -7,7 +7,6 @@ of adjacent versions only.
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -22,23 +21,16 @@ from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
     POSE_DOF,
-    band_95,
-    nis_dof,
-    pose_nees,
-    position_errors_m,
+    StateNumbers,
+    bands_95,
     smoothed_errors,
+    state_numbers,
     world_from_odom,
 )
 from slam.app.run.pictures import LINK_COLOURS, half_axes_95_m
 from slam.app.run.runner import LinkChange, LinkStates
-from slam.app.view.layers import (
-    BLOCK_FRAMES,
-    TRAIL_STATES,
-    FrameLayer,
-    Ground,
-    MapLayer,
-    known_world_m,
-)
+from slam.app.view.frames import BLOCK_FRAMES, FrameLayer
+from slam.app.view.map import TRAIL_STATES, Ground, MapLayer, known_world_m
 from slam.app.view.rerun_recording import (
     BAND_RGB,
     DEVICE_TIME,
@@ -370,68 +362,45 @@ def send_numbers(
     recording: Recording, rows: Sequence[Snapshot], stamps: Stamps, odom: NDArray[np.float64]
 ) -> None:
     """Send the curves of some states, finite values only; `odom` is the first `world_from_odom`."""
-    errors_m = [position_errors_m(row, odom) for row in rows]
-    nees = [pose_nees(row) / POSE_DOF for row in rows]
-    curves: dict[str, Sequence[float]] = {
-        "error/slam": [slam_m for slam_m, _ in errors_m],
-        "error/odometry": [wheels_m for _, wheels_m in errors_m],
-        "landmarks/count": [float(len(row.landmark_ids)) for row in rows],
-        "consistency/nis/value": [
-            float(np.mean(row.nis_per_dof)) if row.nis_per_dof else math.nan for row in rows
-        ],
-        "consistency/nees/value": nees,
+    numbers = StateNumbers(*np.array([state_numbers(row, odom) for row in rows]).T)
+    curves = {
+        "error/slam": numbers.slam_error_m,
+        "error/odometry": numbers.odometry_error_m,
+        "landmarks/count": numbers.n_landmarks,
+        "consistency/nis/value": numbers.nis_per_dof,
+        "consistency/nees/value": numbers.nees_per_dof,
     }
     for entity, values in curves.items():
-        finite = [row for row, value in enumerate(values) if math.isfinite(value)]
-        if finite:
-            columns = rr.Scalars.columns(scalars=np.array([values[row] for row in finite]))
-            recording.rows(entity, stamps.at(finite), columns)
+        send_curve(recording, entity, values, stamps)
     believed_m = half_axes_95_m(np.array([row.pose_covariance[:2, :2] for row in rows]))[:, 1]
-    bands: dict[str, Sequence[tuple[float, float]]] = {
-        "error/believed": [(0.0, float(radius_m)) for radius_m in believed_m],
-        "consistency/nis/band": [_band(nis_dof(row)) for row in rows],
-        "consistency/nees/band": [
-            _band(POSE_DOF) if math.isfinite(value) else (math.nan, math.nan) for value in nees
-        ],
+    bands = {
+        "error/believed": np.column_stack([np.zeros(len(rows)), believed_m]),
+        "consistency/nis/band": bands_95(numbers.nis_dof),
+        "consistency/nees/band": bands_95(
+            np.where(np.isfinite(numbers.nees_per_dof), POSE_DOF, np.nan)
+        ),
     }
     for entity, bounds in bands.items():
-        low, high = np.array(bounds).T
-        (finite_rows,) = np.nonzero(np.isfinite(high))
-        if len(finite_rows):
+        (known,) = np.nonzero(np.isfinite(bounds[:, 1]))
+        if len(known):
+            low, high = bounds[known].T
             # Rerun shades one standard deviation on either side of a value
-            middle, half = (high + low)[finite_rows] / 2, (high - low)[finite_rows] / 2
-            columns = rr.Measurements.columns(values=middle, variances=half**2)
-            recording.rows(entity, stamps.at(finite_rows.tolist()), columns)
+            columns = rr.Measurements.columns(
+                values=(high + low) / 2, variances=((high - low) / 2) ** 2
+            )
+            recording.rows(entity, stamps.at(known.tolist()), columns)
             # the view's axis holds values only, and would cut the shade off
-            edge = rr.Scalars.columns(scalars=high[finite_rows])
-            recording.rows(f"{entity}/edge", stamps.at(finite_rows.tolist()), edge)
+            send_curve(recording, f"{entity}/edge", bounds[:, 1], stamps)
 
 
-def send_smoothed_numbers(
-    recording: Recording,
-    smoothed: SmoothedRun,
-    truth: NDArray[np.float64],
-    world_from_map: NDArray[np.float64],
-    stamps: Stamps,
+def send_curve(
+    recording: Recording, entity: str, values: NDArray[np.float64], stamps: Stamps
 ) -> None:
-    """Send the errors and NEES of smoothed poses, where the truth, (n, 3), is known."""
-    errors_m, nees = smoothed_errors(smoothed, truth, world_from_map)
-    (known,) = np.nonzero(np.isfinite(nees))
+    """Send the finite ones of some values, shape (n,), at their stamps."""
+    (known,) = np.nonzero(np.isfinite(values))
     if len(known):
-        of_known = stamps.at(known.tolist())
-        for entity, values in (
-            ("error/smoothed", errors_m),
-            ("consistency/nees/smoothed", nees / POSE_DOF),
-        ):
-            recording.rows(entity, of_known, rr.Scalars.columns(scalars=values[known]))
-
-
-def _band(dof: int | None) -> tuple[float, float]:
-    """Return the 95 % band of a chi-square divided by its degrees of freedom."""
-    if not dof:
-        return math.nan, math.nan
-    low, high = band_95(dof)
-    return low / dof, high / dof
+        columns = rr.Scalars.columns(scalars=values[known])
+        recording.rows(entity, stamps.at(known.tolist()), columns)
 
 
 _BLOCK_STATES = 128
@@ -567,9 +536,9 @@ class RerunView(SessionObserver):
         stamps = Stamps()
         for t_ns, counter, host_ns in times.tolist():
             stamps.add(t_ns, counter, None if host_ns < 0 else host_ns)
-        send_smoothed_numbers(
-            self._recording, smoothed, self._truth.rows, self._world_from_map, stamps
-        )
+        errors_m, nees = smoothed_errors(smoothed, self._truth.rows, self._world_from_map)
+        send_curve(self._recording, "error/smoothed", errors_m, stamps)
+        send_curve(self._recording, "consistency/nees/smoothed", nees, stamps)
 
     def _send_states(self) -> None:
         rows, self._waiting = self._waiting, []
