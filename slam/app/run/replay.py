@@ -270,12 +270,8 @@ def _samples(
         stop.check()
         if isinstance(record, TumSample):
             yield record
-        elif isinstance(record, Snapshot) and comparison is not None:
+        elif comparison is not None and isinstance(record, Snapshot | SmoothedRun | Gap):
             comparison.expect(record)
-        elif isinstance(record, SmoothedRun) and comparison is not None:
-            comparison.expect_smoothed(record)
-        elif isinstance(record, Gap) and comparison is not None:
-            comparison.expect_gap(record)
 
 
 _DIGEST_BYTES = 16
@@ -299,17 +295,16 @@ class Comparison(SessionObserver):
         self._smoothed: tuple[int, bytes] | None = None
         self._smoothed_again: tuple[int, bytes] | None = None
 
-    def expect(self, snapshot: Snapshot) -> None:
-        self._expected.put(snapshot.t_ns, (_digest(state_row(snapshot)), False))
-
-    def expect_smoothed(self, smoothed: SmoothedRun) -> None:
-        self._smoothed = int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))
-
-    def expect_gap(self, gap: Gap) -> None:
-        """Take it that what is expected from now on was recorded behind a gap."""
-        self._gaps.append(gap)
-        if self._n_before_gap is None:
-            self._n_before_gap = len(self._expected)
+    def expect(self, record: Snapshot | SmoothedRun | Gap) -> None:
+        """Take what was recorded; what comes after a gap was recorded behind it."""
+        if isinstance(record, Snapshot):
+            self._expected.put(record.t_ns, (_digest(state_row(record)), False))
+        elif isinstance(record, SmoothedRun):
+            self._smoothed = _smoothed_digest(record)
+        else:
+            self._gaps.append(record)
+            if self._n_before_gap is None:
+                self._n_before_gap = len(self._expected)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         expected = self._expected.at(snapshot.t_ns)
@@ -321,7 +316,7 @@ class Comparison(SessionObserver):
             self._first_other_ns = snapshot.t_ns
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        self._smoothed_again = int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))
+        self._smoothed_again = _smoothed_digest(smoothed)
 
     def verdict(self) -> str:
         """Return one line: how many states came again, and why others did not."""
@@ -381,3 +376,7 @@ _MOST_SHOWN = 10
 
 def _digest(row: NDArray[np.float64]) -> bytes:
     return hashlib.blake2b(row.tobytes(), digest_size=_DIGEST_BYTES).digest()
+
+
+def _smoothed_digest(smoothed: SmoothedRun) -> tuple[int, bytes]:
+    return int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))

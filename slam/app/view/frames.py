@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 import pyarrow as pa
@@ -53,7 +55,7 @@ BLOCK_FRAMES = 128
 
 _DETECTION_WIDTH_M = 0.03
 _ONE_VALUE = np.zeros(1, dtype=np.float32)
-_NO_DETECTIONS = _ONE_VALUE
+_NO_DETECTION = (0.0, 0.0)
 """A chart needs a bar: one without height at the antenna stands for none."""
 
 
@@ -63,7 +65,7 @@ class FrameLayer:
     def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
         self._recording = recording
         self._radars = tuple(radars)
-        self._blocks = [_FrameBlock(radar.name) for radar in radars]
+        self._blocks = [_FrameBlock(entity=f"radar/{part(radar.name)}") for radar in radars]
         for index, radar in enumerate(radars):
             colour = RADAR_RGB[index % len(RADAR_RGB)]
             recording.static(f"radar/{part(radar.name)}/frame", chart_style(color=colour))
@@ -93,26 +95,22 @@ class FrameLayer:
     def send_detections(self, snapshots: Sequence[Snapshot], stamps: Stamps) -> None:
         """Send the detections of some states."""
         known = [row for row, snapshot in enumerate(snapshots) if snapshot.step is not None]
-        steps = [snapshots[row].step for row in known]
-        rows = [step.detections for step in steps if step is not None]
-        if not rows:
+        steps = [step for snapshot in snapshots if (step := snapshot.step) is not None]
+        if not steps:
             return
         for index, radar in enumerate(self._radars):
-            of_radar = [[d for d in row if d.radar == index] for row in rows]
             # Where the echo lies in the frame: with the offset that ranges are freed of.
-            labels_m = [
-                np.array([d.range_m + radar.range_offset_m for d in row], dtype=np.float32)
-                if row
-                else _NO_DETECTIONS
-                for row in of_radar
+            bars = [
+                [
+                    (d.range_m + radar.range_offset_m, d.amplitude)
+                    for d in step.detections
+                    if d.radar == index
+                ]
+                or [_NO_DETECTION]
+                for step in steps
             ]
-            heights = [
-                np.array([d.amplitude for d in row], dtype=np.float32) if row else _NO_DETECTIONS
-                for row in of_radar
-            ]
-            widths = [np.full(len(row), _DETECTION_WIDTH_M, dtype=np.float32) for row in labels_m]
             entity = f"radar/{part(radar.name)}/detections"
-            self._recording.rows(entity, stamps.at(known), _charts(heights, labels_m, widths))
+            self._recording.rows(entity, stamps.at(known), _bars(bars))
 
     def _send_frames(self, block: _FrameBlock) -> None:
         if not block.frames:
@@ -147,15 +145,15 @@ class FrameLayer:
         block.stamps, block.frames = Stamps(), []
 
 
+@dataclass(slots=True, kw_only=True)
 class _FrameBlock:
     """Frames of one radar that wait to be sent together."""
 
-    def __init__(self, name: str) -> None:
-        self.entity = f"radar/{part(name)}"
-        self.axis: tuple[float, float, int] | None = None
-        self.shown: deque[RadarFrame] = deque(maxlen=BLOCK_FRAMES)
-        self.stamps = Stamps()
-        self.frames: list[RadarFrame] = []
+    entity: str
+    axis: tuple[float, float, int] | None = None
+    shown: deque[RadarFrame] = field(default_factory=lambda: deque(maxlen=BLOCK_FRAMES))
+    stamps: Stamps = field(default_factory=Stamps)
+    frames: list[RadarFrame] = field(default_factory=list)
 
 
 def send_charts(
@@ -205,20 +203,22 @@ def chart_style(
     return [b for b in batches if b.component_descriptor().component != "BarChart:values"]
 
 
-def _charts(
-    heights: Sequence[NDArray[np.float32]],
-    places: Sequence[NDArray[np.float32]],
-    widths: Sequence[NDArray[np.float32]],
-) -> list[rr.ComponentColumn]:
-    """Make bar charts with bars at given places, one per row, rows of any length."""
-    sizes = np.array([len(row) for row in heights])
-    every_width = rr.BarChart(_ONE_VALUE, widths=np.concatenate(widths)).as_component_batches()
-    (width,) = (b for b in every_width if b.component_descriptor().component == "BarChart:widths")
+def _bars(rows: Sequence[Sequence[tuple[float, float]]]) -> list[rr.ComponentColumn]:
+    """Make bar charts, one per row, of any number of bars, each a place and a height."""
+    sizes = np.array([len(row) for row in rows])
+    places, heights = np.array(list(chain(*rows)), dtype=np.float32).T
+    widths = np.full(len(places), _DETECTION_WIDTH_M, dtype=np.float32)
+    width = _component(rr.BarChart(_ONE_VALUE, widths=widths), "BarChart:widths")
     return [
-        chart_values("BarChart:values", np.concatenate(heights), sizes),
-        chart_values("BarChart:abscissa", np.concatenate(places), sizes),
+        chart_values("BarChart:values", heights, sizes),
+        chart_values("BarChart:abscissa", places, sizes),
         rr.ComponentColumn(width.component_descriptor(), width).partition(sizes),
     ]
+
+
+def _component(chart: rr.BarChart, name: str) -> rr.DescribedComponentBatch:
+    batches = chart.as_component_batches()
+    return next(b for b in batches if b.component_descriptor().component == name)
 
 
 def chart_values(
@@ -229,8 +229,7 @@ def chart_values(
     rr.BarChart has no working `columns`, and one log call per frame costs half a millisecond. So
     the arrow array of n one-dimensional tensors is built here, without copying the samples.
     """
-    batches = rr.BarChart(_ONE_VALUE, abscissa=_ONE_VALUE).as_component_batches()
-    (template,) = (b for b in batches if b.component_descriptor().component == component)
+    template = _component(rr.BarChart(_ONE_VALUE, abscissa=_ONE_VALUE), component)
     tensor = template.as_arrow_array().type
     shape, names, buffer = (tensor.field(name).type for name in ("shape", "names", "buffer"))
     kinds = [buffer.field(index) for index in range(buffer.num_fields)]

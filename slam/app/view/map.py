@@ -39,7 +39,6 @@ from slam.app.view.rerun_recording import (
     Recording,
     Rgb,
     Stamps,
-    lengths,
     part,
     rr,
     screen,
@@ -249,8 +248,8 @@ class MapLayer:
             )
         ]
         ellipses = strips_column(screen(np.array(spread)))
-        one_each = np.ones(len(rows), dtype=np.int64)
-        self._recording.rows("map/estimate/ellipse", stamps, [ellipses.partition(one_each)])
+        columns = [ellipses.partition([1] * len(rows))]
+        self._recording.rows("map/estimate/ellipse", stamps, columns)
         known = [k for k, row in enumerate(rows) if row.step is not None]
         if known:
             self._send_echoes([rows[k] for k in known], stamps.at(known), world[known])
@@ -376,14 +375,14 @@ class MapLayer:
                 self._trails[name].append(transform(pose, own))
                 shown.append(np.concatenate(self._trails[name]))
             columns = rr.Points2D.columns(positions=screen(np.concatenate(shown)))
-            self._recording.rows(f"map/{name}", stamps, columns.partition(lengths(shown)))
+            self._recording.rows(f"map/{name}", stamps, columns.partition([*map(len, shown)]))
 
     def _send_arcs(
         self, entity: str, stamps: Stamps, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]
     ) -> None:
         every_m = np.array([range_m for row in ranges_m for range_m in row], dtype=np.float64)
         strips = strips_column(screen(arcs(self._field, radar, every_m)))
-        self._recording.rows(entity, stamps, [strips.partition(lengths(ranges_m))])
+        self._recording.rows(entity, stamps, [strips.partition([*map(len, ranges_m)])])
 
     def _send_landmarks(self, snapshot: Snapshot, stamps: Stamps) -> None:
         points = transform(snapshot.world_from_map, snapshot.landmarks_m)

@@ -17,7 +17,7 @@ os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
 
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
@@ -322,8 +322,3 @@ def strips_column(strips: NDArray[np.float32]) -> rr.ComponentColumn:
 def part(name: str) -> str:
     """Return a user's name as one part of an entity's path, whatever characters are in it."""
     return rr.escape_entity_path_part(name)
-
-
-def lengths(rows: Sequence[Sized]) -> NDArray[np.int64]:
-    """Return how many instances each row has, for `partition`."""
-    return np.array([len(row) for row in rows], dtype=np.int64)

@@ -441,9 +441,8 @@ class RerunView(SessionObserver):
         self._flushed_s = clock_s()
         self._began = False
         self._waiting: list[Snapshot] = []
+        # of all states
         self._stamps = Stamps()
-        # of all states: session time, counter and host time (-1: unknown); truth
-        self._times = PackedRows(np.dtype(np.int64), 3)
         self._truth = PackedRows(np.dtype(np.float64), 3)
         self._world_from_map = np.zeros(3)
         self._smoothed: SmoothedRun | None = None
@@ -484,8 +483,6 @@ class RerunView(SessionObserver):
             self._odom = world_from_odom(snapshot)
         self._map.on_snapshot(snapshot, self._host_ns, self._odom)
         self._waiting.append(snapshot)
-        host_ns = -1 if self._host_ns is None else self._host_ns
-        self._times.append((snapshot.t_ns, snapshot.counter, host_ns))
         self._truth.append(snapshot.truth)
         self._world_from_map = snapshot.world_from_map
         self._stamps.add(snapshot.t_ns, snapshot.counter, self._host_ns)
@@ -530,19 +527,17 @@ class RerunView(SessionObserver):
 
     def _send_smoothed_numbers(self) -> None:
         """Send the curves of the whole run: those of a part of it would be there twice."""
-        smoothed, times = self._smoothed, self._times.rows
-        if smoothed is None or not np.array_equal(smoothed.t_ns, times[:, 0]):
+        smoothed, stamps = self._smoothed, self._stamps
+        if smoothed is None or not np.array_equal(smoothed.t_ns, stamps.t_ns):
             return
-        stamps = Stamps()
-        for t_ns, counter, host_ns in times.tolist():
-            stamps.add(t_ns, counter, None if host_ns < 0 else host_ns)
         errors_m, nees = smoothed_errors(smoothed, self._truth.rows, self._world_from_map)
         send_curve(self._recording, "error/smoothed", errors_m, stamps)
         send_curve(self._recording, "consistency/nees/smoothed", nees, stamps)
 
     def _send_states(self) -> None:
         rows, self._waiting = self._waiting, []
-        stamps, self._stamps = self._stamps, Stamps()
+        n_states = len(self._stamps)
+        stamps = self._stamps.at(range(n_states - len(rows), n_states))
         if rows and self._odom is not None:
             self._map.send(rows, stamps)
             send_numbers(self._recording, rows, stamps, self._odom)

@@ -133,7 +133,7 @@ def compared(comparison: Comparison, *, other_from: int, n_states: int = 10) -> 
 def expecting(comparison: Comparison, gap_at: int | None = None, n_states: int = 10) -> Comparison:
     for counter in range(n_states):
         if counter == gap_at:
-            comparison.expect_gap(GAP)
+            comparison.expect(GAP)
         comparison.expect(snapshot(counter))
     return comparison
 
@@ -176,8 +176,8 @@ def test_the_last_smoothed_path_is_compared_where_it_ends_at_the_same_state(
     n_again: int, is_same: bool, verdict: str
 ) -> None:
     comparison = expecting(Comparison())
-    comparison.expect_smoothed(smoothed_run(4))
-    comparison.expect_smoothed(smoothed_run(10))
+    comparison.expect(smoothed_run(4))
+    comparison.expect(smoothed_run(10))
     again = smoothed_run(n_again)
     comparison.on_smoothed(again if is_same else replace(again, poses=again.poses + 1e-13))
     same = "all 10 recorded states came again, to the last bit"
