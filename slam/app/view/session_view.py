@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -217,10 +218,8 @@ class LinkLayer:
         self._recording = recording
         self._states = LinkStates(tuple(radars))
         self._lines: deque[LogLine] = deque()
-        self._changes: list[tuple[LinkChange, int, int | None]] = []
-        self._losses: dict[str, tuple[Stamps, list[int]]] = {
-            radar.name: (Stamps(), []) for radar in radars
-        }
+        # of each kind of row and name
+        self._rows: dict[tuple[str, str], tuple[Stamps, list[Any]]] = {}
         self._counter = self._t_ns = 0
         self._host_ns: int | None = None
         for index, radar in enumerate(radars):
@@ -245,79 +244,67 @@ class LinkLayer:
         self._follow_log()
         self._counter, self._t_ns, self._host_ns = scan.counter, scan.t_ns, host_ns
         before = {name: count.lost for name, count in self._states.counts.items()}
-        self._note(self._states.on_scan(scan))
+        self._add_changes(self._states.on_scan(scan))
         for name, count in self._states.counts.items():
-            stamps, values = self._losses[name]
             # A step, so also where it starts; a line that never moves needs its ends only.
             if count.lost != before[name] or count.frames == 1:
-                stamps.add(scan.t_ns, scan.counter, host_ns)
-                values.append(count.lost)
+                self._add("lost", name, scan.t_ns, count.lost)
 
     def on_log(self, line: LogLine) -> None:
         self._lines.append(line)
 
     def send(self) -> None:
         self._follow_log()
-        changes, self._changes = self._changes, []
-        for radar in self._states.radars:
-            stamps = Stamps()
-            states = []
-            for change, counter, host_ns in changes:
-                if change.radar == radar.name:
-                    stamps.add(change.t_ns, counter, host_ns)
-                    states.append(str(change.state))
-            if states:
-                columns = rr.StateChange.columns(state=states)
-                self._recording.rows(f"link/state/{part(radar.name)}", stamps, columns)
-            losses, values = self._losses[radar.name]
-            self._losses[radar.name] = Stamps(), []
-            if values:
-                scalars = rr.Scalars.columns(scalars=np.array(values, dtype=np.float64))
-                self._recording.rows(f"link/lost/{part(radar.name)}", losses, scalars)
+        self._send("state", lambda states: rr.StateChange.columns(state=states))
+        self._send("lost", _scalars)
 
     def finish(self) -> None:
         """Send what waits, and end every link."""
         self._follow_log()
-        self._note(self._states.end(self._t_ns))
+        self._add_changes(self._states.end(self._t_ns))
         for name, count in self._states.counts.items():
-            stamps, values = self._losses[name]
-            stamps.add(self._t_ns, self._counter, self._host_ns)
-            values.append(count.lost)
+            self._add("lost", name, self._t_ns, count.lost)
         self.send()
 
-    def _note(self, changes: Iterable[LinkChange]) -> None:
-        self._changes += [(change, self._counter, self._host_ns) for change in changes]
+    def _add(self, kind: str, name: str, t_ns: int, value: object) -> None:
+        """Add a row of the newest scan to those that wait."""
+        stamps, values = self._rows.setdefault((kind, name), (Stamps(), []))
+        stamps.add(t_ns, self._counter, self._host_ns)
+        values.append(value)
+
+    def _add_changes(self, changes: Iterable[LinkChange]) -> None:
+        for change in changes:
+            self._add("state", change.radar, change.t_ns, str(change.state))
 
     def _follow_log(self) -> None:
         """Send the lines that came meanwhile, and update the states."""
-        lines = []
         while self._lines:  # not a swap: another thread may add while this runs
-            lines.append(self._lines.popleft())
-        for line in lines:
-            self._note(self._states.on_log(line))
-        for name in dict.fromkeys(line.radar for line in lines):
-            self._send_lines(name, [line for line in lines if line.radar == name])
+            line = self._lines.popleft()
+            self._add_changes(self._states.on_log(line))
+            self._add("log", line.radar, line.t_ns, line)
+            if line.warning and line.radar in self._states.counts:
+                # The number of the fault, so that a burst of them is a steep stair.
+                count = self._states.counts[line.radar].faults
+                self._add("faults", line.radar, line.t_ns, count)
+        self._send("log", _log_columns)
+        self._send("faults", _scalars)
 
-    def _send_lines(self, name: str, lines: Sequence[LogLine]) -> None:
-        stamps = self._stamps_of(lines)
-        columns = rr.TextLog.columns(
-            text=[line.text for line in lines],
-            level=["WARN" if line.warning else "INFO" for line in lines],
-        )
-        self._recording.rows(f"link/log/{part(name)}", stamps, columns)
-        faults = [line for line in lines if line.warning]
-        if faults and name in self._states.counts:
-            # The number of the fault, so that a burst of them is a steep stair.
-            last = self._states.counts[name].faults
-            numbers = np.arange(last - len(faults) + 1, last + 1, dtype=np.float64)
-            scalars = rr.Scalars.columns(scalars=numbers)
-            self._recording.rows(f"link/faults/{part(name)}", self._stamps_of(faults), scalars)
+    def _send(self, kind: str, columns_of: Callable[[list[Any]], rr.ComponentColumnList]) -> None:
+        """Send the rows of one kind that wait."""
+        for key in [key for key in self._rows if key[0] == kind]:
+            stamps, values = self._rows.pop(key)
+            self._recording.rows(f"link/{kind}/{part(key[1])}", stamps, columns_of(values))
 
-    def _stamps_of(self, lines: Sequence[LogLine]) -> Stamps:
-        stamps = Stamps()
-        for line in lines:
-            stamps.add(line.t_ns, self._counter, self._host_ns)
-        return stamps
+
+def _scalars(values: Sequence[float] | NDArray[np.float64]) -> rr.ComponentColumnList:
+    return rr.Scalars.columns(scalars=np.array(values, dtype=np.float64))
+
+
+def _log_columns(lines: Sequence[LogLine]) -> rr.ComponentColumnList:
+    return rr.TextLog.columns(
+        text=[line.text for line in lines],
+        level=["WARN" if line.warning else "INFO" for line in lines],
+    )
 
 
 # Entity, name in the legend, colour, line width in points.
@@ -399,8 +386,7 @@ def send_curve(
     """Send the finite ones of some values, shape (n,), at their stamps."""
     (known,) = np.nonzero(np.isfinite(values))
     if len(known):
-        columns = rr.Scalars.columns(scalars=values[known])
-        recording.rows(entity, stamps.at(known.tolist()), columns)
+        recording.rows(entity, stamps.at(known.tolist()), _scalars(values[known]))
 
 
 _BLOCK_STATES = 128
