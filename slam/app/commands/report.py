@@ -44,6 +44,7 @@ from slam.app.run.pictures import (
     svg_of,
 )
 from slam.app.run.replay import play, refuse_overwriting, session_file
+from slam.app.run.results import REPORT
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
@@ -321,7 +322,7 @@ def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
 def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
     """Write the report of a session; beside the session if `out` is None."""
     recorded = open_session(session_file(session), stop)
-    page = out or recorded.path.with_name("report.html")
+    page = out or recorded.path.with_name(REPORT)
     refuse_overwriting(recorded.path, page)
     text = _report_text(recorded, stop)
     with naming(page), written_whole(page) as fresh:

@@ -35,8 +35,11 @@ from slam.app.run.live_source import (
 )
 from slam.app.run.output import Progress, Row, note
 from slam.app.run.results import (
+    REPORT,
     RESULTS,
+    SESSION,
     SMOOTHED,
+    VIEW,
     finish,
     hold_folder,
     remove_earlier,
@@ -59,8 +62,7 @@ from slam.frames import RadarFrame
 from slam.results import PoseAt, Slam, SmoothedRun, StepResult
 from xethru_protocol.system import StopFlag, StopRequestedError
 
-_SESSION = "session.mcap"
-_STALE = ("session.rrd", "report.html")
+_STALE = (VIEW, REPORT)
 """Made from a session by other commands; those of an earlier session would mislead."""
 _STEP_LIMIT_S = 0.3
 
@@ -100,7 +102,7 @@ def run_rig(
     live_odometry = LiveOdometry(line_source.name, parse_clock(clock, line_source))
     inbox = Inbox()
     with ExitStack() as held:
-        if (out / _SESSION).exists():
+        if (out / SESSION).exists():
             raise AppError(
                 f"{out}: holds the session of an earlier drive, which cannot be repeated; "
                 "choose another --out, or move it away"
@@ -163,7 +165,7 @@ def run_rig(
                 smoothing_asked=requests.asked,
             )
             remove_earlier(out, (*RESULTS, *_STALE))
-            session_log = SessionLog(out / _SESSION, info, start_ns=start_ns, drawn=not lean)
+            session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [

@@ -18,12 +18,12 @@ from PIL import Image
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.run.output import print_text
 from slam.app.run.replay import (
-    VIEW_NAME,
     is_finished,
     play,
     refuse_overwriting,
     session_file,
 )
+from slam.app.run.results import VIEW
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
@@ -159,7 +159,7 @@ def run_view(
         print_text(one_line(str(out)))
     elif screenshot is not None:
         with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
-            made = Path(folder) / VIEW_NAME
+            made = Path(folder) / VIEW
             _write_view(recorded, made, stop)
             _take_screenshot(made, screenshot, at_s, stop)
     else:

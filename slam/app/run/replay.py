@@ -21,7 +21,7 @@ from slam.app.errors import AppError, OdometryError, UsageError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress, note
-from slam.app.run.results import finish, hold_folder, saying_what_is_left
+from slam.app.run.results import SESSION, VIEW, finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import (
     LinkLog,
     LostFrames,
@@ -43,7 +43,6 @@ from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.system import StopFlag
 from xethru_protocol.validation import problem_text
 
-SESSION_NAME, VIEW_NAME = "session.mcap", "session.rrd"
 _END = b"FOOT"
 """Ends a finished file, with four bytes behind it."""
 
@@ -57,12 +56,12 @@ def session_file(given: Path, *, allow_view: bool = False) -> Path:
         if not given.exists():
             raise AppError(f"{given}: no such file")
         return given
-    session, view = given / SESSION_NAME, given / VIEW_NAME
+    session, view = given / SESSION, given / VIEW
     if allow_view and view.is_file() and (is_finished(view) or not session.is_file()):
         return view
     if session.is_file():
         return session
-    names = f"{VIEW_NAME} nor {SESSION_NAME}" if allow_view else SESSION_NAME
+    names = f"{VIEW} nor {SESSION}" if allow_view else SESSION
     raise AppError(f"{given}: holds no {names}; name a session.mcap")
 
 

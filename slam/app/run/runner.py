@@ -37,6 +37,7 @@ from slam.results import Slam, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.conversation import ProtocolRecord
+from xethru_protocol.driver.frames import Frame
 
 _NO_LANDMARKS_M = np.empty((0, 2))
 
@@ -451,7 +452,7 @@ def snapshot_of_step(
     )
 
 
-def frames_between(last: RadarFrame, frame: RadarFrame) -> int:
+def frames_between(last: RadarFrame | Frame, frame: RadarFrame | Frame) -> int:
     """Return how many frames of a radar are missing between two; 0 if a new stream began.
 
     Sessions of older versions hold no numbers of streams: a counter that falls is a new stream.
