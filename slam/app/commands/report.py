@@ -6,7 +6,7 @@ import base64
 import html
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
@@ -65,36 +65,23 @@ class _ReportData(SessionObserver):
     Attributes
     ----------
     links, changes
-        The links, and every change of their states with its time since the first scan [s].
+        The links, and every change of their states.
     warnings, n_warnings
         The first warnings of the log, and how many there were.
-    start_ns, end_ns
-        Session time of first and last scan; None and 0 before any.
     """
 
     def __init__(self, info: SessionInfo) -> None:
         self.links = LinkStates(info.radars)
-        self.changes: list[tuple[float, LinkChange]] = []
+        self.changes: list[LinkChange] = []
         self.warnings: list[LogLine] = []
         self.n_warnings = 0
-        self.start_ns: int | None = None
-        self.end_ns = 0
+        self._end_ns = 0
         self._rows = PackedRows(np.dtype(np.float64), len(StateNumbers._fields))
         self._odom: NDArray[np.float64] | None = None
 
-    @property
-    def duration_s(self) -> float:
-        return 0.0 if self.start_ns is None else (self.end_ns - self.start_ns) / NS_PER_S
-
-    def seconds(self, t_ns: int) -> float:
-        """Return a session time as time since the first scan; what was before it counts as 0."""
-        return 0.0 if self.start_ns is None else max(t_ns - self.start_ns, 0) / NS_PER_S
-
     def on_scan(self, scan: Scan) -> None:
-        if self.start_ns is None:
-            self.start_ns = scan.t_ns
-        self.end_ns = scan.t_ns
-        self._note(self.links.on_scan(scan))
+        self._end_ns = scan.t_ns
+        self.changes += self.links.on_scan(scan)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         if self._odom is None:
@@ -102,20 +89,22 @@ class _ReportData(SessionObserver):
         self._rows.append(state_numbers(snapshot, self._odom))
 
     def on_log(self, line: LogLine) -> None:
-        self._note(self.links.on_log(line))
+        self.changes += self.links.on_log(line)
         if line.warning:
             self.n_warnings += 1
             if len(self.warnings) < _KEPT_WARNINGS:
                 self.warnings.append(line)
 
     def close(self) -> None:
-        self._note(self.links.end(self.end_ns))
+        self.changes += self.links.end(self._end_ns)
 
     def numbers(self) -> StateNumbers:
         return StateNumbers(*self._rows.rows.T)
 
-    def _note(self, changes: Iterable[LinkChange]) -> None:
-        self.changes += [(self.seconds(change.t_ns), change) for change in changes]
+
+def _seconds(record: RunRecord, t_ns: ArrayLike) -> NDArray[np.float64]:
+    """Return session times as times since the first scan; what was before it counts as 0."""
+    return np.asarray(np.maximum(np.asarray(t_ns) - record.start_ns, 0) / NS_PER_S)
 
 
 _STYLE = """\
@@ -279,12 +268,17 @@ def _draw_consistency(
 
 
 def _draw_links(
-    figure: Figure, names: Sequence[str], changes: Sequence[tuple[float, LinkChange]], end_s: float
+    figure: Figure,
+    names: Sequence[str],
+    changes: Sequence[LinkChange],
+    t_s: NDArray[np.float64],
+    end_s: float,
 ) -> None:
     """Draw a bar per radar, coloured by the state of its link."""
     axes = figure.add_subplot()
     for row, name in enumerate(names):
-        own = [(at_s, change.state) for at_s, change in changes if change.radar == name]
+        times = zip(t_s.tolist(), changes, strict=True)
+        own = [(at_s, change.state) for at_s, change in times if change.radar == name]
         ends = [*(at_s for at_s, _ in own[1:]), end_s]
         for (start_s, state), stop_s in zip(own, ends, strict=True):
             if state is not LinkState.ENDED:
@@ -297,7 +291,7 @@ def _draw_links(
     axes.set_xlim(0.0, max(end_s, 1e-3))
     label(axes, "State of each link", _TIME, "")
     axes.grid(visible=False)
-    shown = {change.state for _, change in changes}
+    shown = {change.state for change in changes}
     for state, colour in LINK_COLOURS.items():
         if state in shown and state is not LinkState.ENDED:
             axes.plot([], [], linewidth=6, color=colour, label=str(state))
@@ -347,7 +341,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     seed = "" if info.seed is None else f", seed {info.seed}"
     page = _Page(f"{info.scene}, preset {info.preset}{seed}")
     page.note("simulated data" if info.simulated else "measured data", kind="origin")
-    page.note(_what_it_is(session, data))
+    page.note(_what_it_is(session, record))
     if record.last.step is None:
         page.note(
             "It was recorded by a version that did not keep what led to the states, so the report "
@@ -355,7 +349,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         )
     _write_numbers(page, info, data, record, summary)
     states, whole = record.states, record.whole_smoothed
-    t_s = np.maximum(states.t_ns - record.start_ns, 0) / NS_PER_S
+    t_s = _seconds(record, states.t_ns)
     smoothed = (
         smoothed_errors(whole, states.truth, record.world_from_map)
         if whole is not None and states.has_truth
@@ -396,7 +390,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         narrow_height_in=4.4,
     )
     _write_landmarks(page, info, record.last)
-    _write_links(page, info, data)
+    _write_links(page, info, data, record)
     _write_parameters(page, info)
     return page.text()
 
@@ -451,7 +445,7 @@ def _write_landmarks(page: _Page, info: SessionInfo, last: Snapshot) -> None:
     page.table(names, rows)
 
 
-def _write_links(page: _Page, info: SessionInfo, data: _ReportData) -> None:
+def _write_links(page: _Page, info: SessionInfo, data: _ReportData, record: RunRecord) -> None:
     page.heading("Links")
     rows = []
     for radar in info.radars:
@@ -479,13 +473,14 @@ def _write_links(page: _Page, info: SessionInfo, data: _ReportData) -> None:
         _draw_links,
         names,
         data.changes,
-        data.duration_s,
+        _seconds(record, [change.t_ns for change in data.changes]),
+        record.duration_ns / NS_PER_S,
         height_in=height_in,
         narrow_height_in=height_in + 0.4,
     )
     if data.warnings:
         lines = [
-            f"{data.seconds(line.t_ns):10.3f} s  {line.radar:<14} {line.text}"
+            f"{_seconds(record, line.t_ns):10.3f} s  {line.radar:<14} {line.text}"
             for line in data.warnings
         ]
         more = data.n_warnings - len(lines)
@@ -522,11 +517,12 @@ def _write_parameters(page: _Page, info: SessionInfo) -> None:
         page.details(name, "\n".join(_lines_of(values)))
 
 
-def _what_it_is(session: RecordedSession, data: _ReportData) -> str:
+def _what_it_is(session: RecordedSession, record: RunRecord) -> str:
     info = session.info
-    parts = [f"{session.path.name}: {data.duration_s:.1f} s of {len(info.radars)} radars"]
+    lasted_s = record.duration_ns / NS_PER_S
+    parts = [f"{session.path.name}: {lasted_s:.1f} s of {len(info.radars)} radars"]
     if info.started_unix_ns is not None:
-        first_ns = info.started_unix_ns + (data.start_ns or 0)
+        first_ns = info.started_unix_ns + record.start_ns
         began = datetime.fromtimestamp(first_ns / NS_PER_S, UTC)
         parts.append(f"begun {began:%Y-%m-%d %H:%M:%S} UTC")
     if info.odometry_clock:
