@@ -23,7 +23,7 @@ from slam.app.run.results import finish
 from slam.app.run.runner import execute, make_slam
 from slam.app.session.log import SessionLog
 from slam.app.sweep.run import loopback_source
-from slam.app.view.panels import RerunView
+from slam.app.view.session_view import RerunView
 from xethru_protocol.system import StopFlag
 
 BYTES_PER_MB = 1_000_000

@@ -6,17 +6,19 @@ Nothing heavy is imported before a command runs, so `--help` answers at once.
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
 from slam.app.experiments.benchmarks import BENCHMARKS
 from slam.app.sweep import FAMILIES, STRESSES
+from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
 from xethru_protocol.cli.version import add_version
 from xethru_protocol.extras import what_is_missing
 from xethru_protocol.system import (
@@ -130,23 +132,108 @@ class _Command(NamedTuple):
         function(stop, **options)
 
 
+def _folder(text: str) -> Path:
+    """Return a path to write to; it must be UTF-8, which Rerun's writer requires."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {shown(text)}") from None
+    return Path(text)
+
+
+def _whole_number(text: str, *, least: int) -> int:
+    if not text.isascii() or not text.isdigit() or not least <= int(text) < 2**63:
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number, {least} or more, not {shown(text)}"
+        )
+    return int(text)
+
+
+_seed, _count = partial(_whole_number, least=0), partial(_whole_number, least=1)
+"""Of a random generator; how many of something."""
+
+
+def _seconds(text: str) -> float:
+    """Return a time in seconds, finite, 0 or more."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f"must be seconds, 0 or more, not {shown(text)}")
+    return value
+
+
+def _setting(text: str) -> tuple[str, tuple[str, ...]]:
+    key, _, values = text.partition("=")
+    named = tuple(value.strip() for value in values.split(","))
+    if not key or not all(named):
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {shown(text)}")
+    return key.strip(), named
+
+
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`, which prints an object instead of lines."""
+    parser.add_argument("--json", dest="as_json", action="store_true", help="print one JSON object")
+
+
+def _add_out(parser: argparse.ArgumentParser, default: str) -> None:
+    """Add `--out` of a command that writes several files."""
+    parser.add_argument("--out", type=_folder, default=Path(default), help="folder for the results")
+
+
+def _add_preset(parser: argparse.ArgumentParser) -> None:
+    """Add `--preset` of a command that runs SLAM with one of them."""
+    parser.add_argument(
+        "--preset", default="robust", help="settings of SLAM (default: %(default)s)"
+    )
+
+
+def _add_session_options(parser: argparse.ArgumentParser) -> None:
+    """Add what a run records, and whether it is shown: `--wire`, `--lean` and `--rerun`."""
+    parser.add_argument(
+        "--wire", action="store_true", help="keep the raw bytes of all ports in the session, too"
+    )
+    parser.add_argument(
+        "--lean",
+        action="store_true",
+        help="leave out of the session what only other viewers draw: B-scans, paths, ellipses",
+    )
+    parser.add_argument(
+        "--rerun",
+        type=_rerun_target,
+        metavar="WHERE",
+        help="watch live: spawn (a window), serve-web (a page for a browser), connect (a viewer "
+        f"at {DEFAULT_VIEWER_URL}), or the address of another viewer",
+    )
+
+
+def _rerun_target(text: str) -> str:
+    if text in {SPAWN, SERVE_WEB}:
+        return text
+    if text == CONNECT:
+        return DEFAULT_VIEWER_URL
+    if text.startswith(("rerun+http://", "rerun+https://")) and text.endswith("/proxy"):
+        return text
+    raise argparse.ArgumentTypeError(
+        f"must be {SPAWN}, {CONNECT}, {SERVE_WEB}, or an address like {DEFAULT_VIEWER_URL}, "
+        f"not {shown(text)}"
+    )
+
+
 def _add_demo(demo: argparse.ArgumentParser) -> None:
-    demo.add_argument("--out", type=folder, default=Path("out/demo"), help="folder for the results")
+    _add_out(demo, "out/demo")
     demo.add_argument(
         "--seed",
-        type=seed,
+        type=_seed,
         default=_TYPICAL_SEED,
         help="seed of noise and odometry drift (default: %(default)s, a typical run)",
     )
     demo.add_argument(
         "--scene", default="lab", help="name of a scene or a random room (pillars:3), or a file"
     )
-    demo.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")
-    demo.add_argument(
-        "--wire", action="store_true", help="keep the raw bytes of all ports in the session, too"
-    )
-    add_lean(demo)
-    add_rerun(demo)
+    _add_preset(demo)
+    _add_session_options(demo)
 
 
 def _add_view(view: argparse.ArgumentParser) -> None:
@@ -155,14 +242,14 @@ def _add_view(view: argparse.ArgumentParser) -> None:
     )
     where = view.add_mutually_exclusive_group()
     where.add_argument("--web", action="store_true", help="serve a page for a browser")
-    where.add_argument("--out", type=folder, metavar="FILE.rrd", help="write a file, show nothing")
+    where.add_argument("--out", type=_folder, metavar="FILE.rrd", help="write a file, show nothing")
     where.add_argument(
-        "--screenshot", type=folder, metavar="FILE.png", help="write a picture, no window needed"
+        "--screenshot", type=_folder, metavar="FILE.png", help="write a picture, no window needed"
     )
     view.add_argument(
         "--at",
         dest="at_s",
-        type=seconds,
+        type=_seconds,
         metavar="S",
         help="when the screenshot is taken, since the first scan (default: the end)",
     )
@@ -173,7 +260,7 @@ def _add_report(report: argparse.ArgumentParser) -> None:
         "session", type=Path, metavar="SESSION", help="a session.mcap, or a run's folder"
     )
     report.add_argument(
-        "--out", type=folder, metavar="FILE.html", help="(default: report.html beside the session)"
+        "--out", type=_folder, metavar="FILE.html", help="(default: report.html beside the session)"
     )
 
 
@@ -207,36 +294,28 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         help="the modules' ports, such as /dev/ttyACM0 or tcp://HOST:PORT "
         "(default: those of the rig file, or look for them)",
     )
-    run.add_argument("--out", type=folder, default=Path("out/run"), help="folder for the results")
-    run.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")
-    run.add_argument("--fps", type=count, default=5, help="frames/s (default: %(default)s)")
+    _add_out(run, "out/run")
+    _add_preset(run)
+    run.add_argument("--fps", type=_count, default=5, help="frames/s (default: %(default)s)")
     run.add_argument(
         "--duration",
         dest="duration_s",
-        type=count,
+        type=_count,
         metavar="S",
         help="end after so many seconds",
     )
-    run.add_argument("--wire", action="store_true", help="record every byte of the ports, too")
-    add_lean(run)
-    add_rerun(run)
+    _add_session_options(run)
 
 
 def _add_replay(replay: argparse.ArgumentParser) -> None:
     replay.add_argument("session", type=Path, metavar="SESSION", help="a session.mcap")
-    replay.add_argument(
-        "--out", type=folder, default=Path("out/replay"), help="folder for the results"
-    )
+    _add_out(replay, "out/replay")
 
 
 def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     evaluate.add_argument("estimate", type=Path, metavar="EST", help="TUM file to judge")
     evaluate.add_argument("reference", type=Path, metavar="REF", help="TUM file to judge by")
     _add_json(evaluate)
-
-
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", dest="as_json", action="store_true", help="print one JSON object")
 
 
 def _add_repair(repair: argparse.ArgumentParser) -> None:
@@ -273,7 +352,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         "--rate",
         dest="rate_hz",
         metavar="RATE",
-        type=count,
+        type=_count,
         default=5,
         help="states/s of a .mat, which has no stamps (default: 5)",
     )
@@ -316,19 +395,19 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
         "--seeds",
         dest="n_seeds",
         metavar="SEEDS",
-        type=count,
+        type=_count,
         default=20,
         help="number of runs of each scene, each with a seed of its own (default: %(default)s)",
     )
     sweep.add_argument(
         "--first-seed",
-        type=seed,
+        type=_seed,
         default=0,
         metavar="SEED",
         help="the first of the seeds; a random room adds its number (default: %(default)s)",
     )
     sweep.add_argument(
-        "--laps", type=count, help="drive the first laps of each scene only, so many"
+        "--laps", type=_count, help="drive the first laps of each scene only, so many"
     )
     sweep.add_argument(
         "--set",
@@ -356,7 +435,7 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
         help="compute on each run's data what is possible with the true associations (GTSAM)",
     )
     where = sweep.add_mutually_exclusive_group()
-    where.add_argument("--jobs", type=count, help="processes (default: one per core)")
+    where.add_argument("--jobs", type=_count, help="processes (default: one per core)")
     where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
     sweep.add_argument(
         "--json", dest="out", type=Path, required=True, metavar="OUT", help="result file"
@@ -386,9 +465,7 @@ def _add_experiment(experiment: argparse.ArgumentParser) -> None:
         ),
     ):
         parser = names.add_parser(name, help=text, description=text)
-        parser.add_argument(
-            "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
-        )
+        _add_out(parser, "out/experiments")
         parser.add_argument(
             "--sweep",
             type=Path,
@@ -408,18 +485,8 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     benchmark.add_argument(
         "--data", type=Path, required=True, metavar="DIR", help="folder with the files"
     )
-    benchmark.add_argument(
-        "--out", type=folder, default=Path("out/benchmarks"), help="folder for the results"
-    )
+    _add_out(benchmark, "out/benchmarks")
     _add_json(benchmark)
-
-
-def _setting(text: str) -> tuple[str, tuple[str, ...]]:
-    key, _, values = text.partition("=")
-    named = tuple(value.strip() for value in values.split(","))
-    if not key or not all(named):
-        raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {shown(text)}")
-    return key.strip(), named
 
 
 _COMMANDS = (

@@ -25,7 +25,7 @@ from slam.app.rig.emulated import (
 from slam.app.run.runner import execute, run_slam
 from slam.app.session.log import SessionLog
 from slam.app.sweep.run import make_case, source_of
-from slam.app.view.panels import RerunView
+from slam.app.view.session_view import RerunView
 from slam.paper.pipeline import UwbRadarSlam
 from xethru_protocol.system import StopFlag
 

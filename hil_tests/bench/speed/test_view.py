@@ -13,7 +13,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
 from slam.app.records import Scan, Snapshot
-from slam.app.view.panels import RerunView
+from slam.app.view.session_view import RerunView
 from slam.frames import Detection
 from slam.paper.ekf import start
 from slam.results import StepResult

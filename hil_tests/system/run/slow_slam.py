@@ -9,18 +9,12 @@ from unittest.mock import patch
 
 from slam.app.cli import main
 from slam.app.commands import run
-from slam.app.run.runner import make_slam
+from slam.app.run.runner import WrappedSlam, make_slam
 from slam.frames import RadarFrame
 from slam.results import PoseAt, Slam, StepResult
 
 
-class SlowSlam:
-    def __init__(self, slam: Slam) -> None:
-        self._slam = slam
-        self.config, self.step_detections = slam.config, slam.step_detections
-        self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
-        self.smoothed = slam.smoothed
-
+class SlowSlam(WrappedSlam):
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:

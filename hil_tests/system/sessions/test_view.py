@@ -24,9 +24,8 @@ from hil_tests.system.recorded_session import (
     write_shorter_scene,
 )
 from slam.app.cli import main
-from slam.app.commands.recorded_session import is_finished, session_file
 from slam.app.errors import AppError
-from slam.app.run.replay import recorded_source
+from slam.app.run.replay import is_finished, recorded_source, session_file
 from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording

@@ -27,7 +27,7 @@ from slam.app.rig.emulated import (
 )
 from slam.app.rig.sources import RigSource
 from slam.app.run.output import Progress, note
-from slam.app.run.results import RESULTS, finish, hold_folder, remove_earlier
+from slam.app.run.results import REPORT, RESULTS, SESSION, VIEW, finish, hold_folder, remove_earlier
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
@@ -38,7 +38,7 @@ from slam.config import BackEnd
 from xethru_protocol.extras import install_command, what_is_missing
 from xethru_protocol.system import StopFlag, StopRequestedError
 
-_OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
+_OUTPUTS = (SESSION, VIEW, REPORT, *RESULTS)
 
 
 def run_demo(
@@ -111,14 +111,14 @@ def run_demo(
             )
             stop.check()
             remove_earlier(out, _OUTPUTS)
-            path = out / "session.mcap"
+            path = out / SESSION
             log = SessionLog(path, info, odometry, truth_at=trajectory.poses, drawn=not lean)
             stack.callback(log.close)
             sinks: list[SessionObserver] = [
                 Progress(info, source.lost_frames, end_ns=trajectory.duration_ns),
                 log,  # closed before the views: the record must not wait for them
                 *([live.observer(info)] if live is not None else []),
-                *([make_view(out / "session.rrd", info)] if make_view is not None else []),
+                *([make_view(out / VIEW, info)] if make_view is not None else []),
             ]
             for row in early_bytes:
                 log.on_wire(*row)
@@ -141,7 +141,7 @@ def run_demo(
 def _rerun_view() -> Callable[[Path, SessionInfo], SessionObserver] | None:
     """Return what makes the view of a session; None, with a note, if Rerun is not installed."""
     try:
-        from slam.app.view.panels import RerunView
+        from slam.app.view.session_view import RerunView
     except ModuleNotFoundError as error:
         if what_is_missing(error) is None:
             raise

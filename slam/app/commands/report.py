@@ -6,30 +6,27 @@ import base64
 import html
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from slam.app.commands.recorded_session import play, refuse_overwriting, session_file
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
     POSE_DOF,
+    StateNumbers,
     Summary,
-    band_95,
-    nis_dof,
-    pose_nees,
-    position_errors_m,
+    bands_95,
     smoothed_errors,
+    state_numbers,
     summarise,
     world_from_odom,
 )
@@ -46,6 +43,8 @@ from slam.app.run.pictures import (
     label,
     svg_of,
 )
+from slam.app.run.replay import play, refuse_overwriting, session_file
+from slam.app.run.results import REPORT
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
@@ -56,35 +55,8 @@ from xethru_protocol.system import StopFlag, each_line, one_line, written_whole
 _KEPT_WARNINGS = 200
 
 
-class _Series(NamedTuple):
-    """Numbers over the states of a run, each of shape (n_states,); NaN if there is none.
-
-    Errors are the position's distance to the truth, from the start pose, not aligned; the NIS is of
-    the gated associations together, the NEES of the pose.
-    """
-
-    t_s: NDArray[np.float64]
-    slam_error_m: NDArray[np.float64]
-    odometry_error_m: NDArray[np.float64]
-    nis_per_dof: NDArray[np.float64]
-    nis_dof: NDArray[np.float64]
-    nees_per_dof: NDArray[np.float64]
-    n_landmarks: NDArray[np.float64]
-
-
-class _Smoothed(NamedTuple):
-    """Errors of the smoothed path, not aligned, and NEES of its poses, shape (n_states,) each."""
-
-    error_m: NDArray[np.float64]
-    nees_per_dof: NDArray[np.float64]
-
-
-def _smoothed(record: RunRecord) -> _Smoothed | None:
-    smoothed = record.whole_smoothed
-    if smoothed is None or not record.states.has_truth:
-        return None
-    errors_m, nees = smoothed_errors(smoothed, record.states.truth, record.world_from_map)
-    return _Smoothed(errors_m, nees / POSE_DOF)
+_Smoothed = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""See `smoothed_errors`."""
 
 
 class _ReportData(SessionObserver):
@@ -93,67 +65,46 @@ class _ReportData(SessionObserver):
     Attributes
     ----------
     links, changes
-        The links, and every change of their states with its time since the first scan [s].
+        The links, and every change of their states.
     warnings, n_warnings
         The first warnings of the log, and how many there were.
-    start_ns, end_ns
-        Session time of first and last scan; None and 0 before any.
     """
 
     def __init__(self, info: SessionInfo) -> None:
         self.links = LinkStates(info.radars)
-        self.changes: list[tuple[float, LinkChange]] = []
+        self.changes: list[LinkChange] = []
         self.warnings: list[LogLine] = []
         self.n_warnings = 0
-        self.start_ns: int | None = None
-        self.end_ns = 0
-        self._rows = PackedRows(np.dtype(np.float64), len(_Series._fields))
+        self._end_ns = 0
+        self._rows = PackedRows(np.dtype(np.float64), len(StateNumbers._fields))
         self._odom: NDArray[np.float64] | None = None
 
-    @property
-    def duration_s(self) -> float:
-        return 0.0 if self.start_ns is None else (self.end_ns - self.start_ns) / NS_PER_S
-
-    def seconds(self, t_ns: int) -> float:
-        """Return a session time as time since the first scan; what was before it counts as 0."""
-        return 0.0 if self.start_ns is None else max(t_ns - self.start_ns, 0) / NS_PER_S
-
     def on_scan(self, scan: Scan) -> None:
-        if self.start_ns is None:
-            self.start_ns = scan.t_ns
-        self.end_ns = scan.t_ns
-        self._note(self.links.on_scan(scan))
+        self._end_ns = scan.t_ns
+        self.changes += self.links.on_scan(scan)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         if self._odom is None:
             self._odom = world_from_odom(snapshot)
-        nis = float(np.mean(snapshot.nis_per_dof)) if snapshot.nis_per_dof else math.nan
-        self._rows.append(
-            (
-                self.seconds(snapshot.t_ns),
-                *position_errors_m(snapshot, self._odom),
-                nis,
-                float(nis_dof(snapshot) or math.nan),
-                pose_nees(snapshot) / POSE_DOF,
-                float(len(snapshot.landmark_ids)),
-            )
-        )
+        self._rows.append(state_numbers(snapshot, self._odom))
 
     def on_log(self, line: LogLine) -> None:
-        self._note(self.links.on_log(line))
+        self.changes += self.links.on_log(line)
         if line.warning:
             self.n_warnings += 1
             if len(self.warnings) < _KEPT_WARNINGS:
                 self.warnings.append(line)
 
     def close(self) -> None:
-        self._note(self.links.end(self.end_ns))
+        self.changes += self.links.end(self._end_ns)
 
-    def series(self) -> _Series:
-        return _Series(*self._rows.rows.T)
+    def numbers(self) -> StateNumbers:
+        return StateNumbers(*self._rows.rows.T)
 
-    def _note(self, changes: Iterable[LinkChange]) -> None:
-        self.changes += [(self.seconds(change.t_ns), change) for change in changes]
+
+def _seconds(record: RunRecord, t_ns: ArrayLike) -> NDArray[np.float64]:
+    """Return session times as times since the first scan; what was before it counts as 0."""
+    return np.asarray(np.maximum(np.asarray(t_ns) - record.start_ns, 0) / NS_PER_S)
 
 
 _STYLE = """\
@@ -269,60 +220,65 @@ _BAR = 0.7
 _TIME = "time since the first scan [s]"
 
 
-def _draw_errors(figure: Figure, series: _Series, smoothed: _Smoothed | None) -> None:
+def _draw_errors(
+    figure: Figure, t_s: NDArray[np.float64], numbers: StateNumbers, smoothed: _Smoothed | None
+) -> None:
     """Draw the position errors in mm, where the truth is known, and the number of landmarks."""
-    has_truth = bool(np.isfinite(series.slam_error_m).any())
+    has_truth = bool(np.isfinite(numbers.slam_error_m).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
     if has_truth:
         axes = panels[0]
-        axes.plot(series.t_s, 1e3 * series.odometry_error_m, color=ODOMETRY, label="wheel odometry")
-        axes.plot(series.t_s, 1e3 * series.slam_error_m, color=ESTIMATE, label="radar SLAM")
+        axes.plot(t_s, 1e3 * numbers.odometry_error_m, color=ODOMETRY, label="wheel odometry")
+        axes.plot(t_s, 1e3 * numbers.slam_error_m, color=ESTIMATE, label="radar SLAM")
         if smoothed is not None:
-            smoothed_mm = 1e3 * smoothed.error_m
-            axes.plot(series.t_s, smoothed_mm, color=SMOOTHED, label="smoothed at the end")
+            axes.plot(t_s, 1e3 * smoothed[0], color=SMOOTHED, label="smoothed at the end")
         label(axes, "Position error, from the start pose, not aligned", "", "error [mm]")
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False, loc="upper left")
-    panels[-1].step(series.t_s, series.n_landmarks, color=LANDMARK, where="post")
+    panels[-1].step(t_s, numbers.n_landmarks, color=LANDMARK, where="post")
     label(panels[-1], "Landmarks on the map", _TIME, "number [1]")
     panels[-1].set_ylim(bottom=0.0)
     panels[-1].yaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _draw_consistency(figure: Figure, series: _Series, smoothed: _Smoothed | None) -> None:
+def _draw_consistency(
+    figure: Figure, t_s: NDArray[np.float64], numbers: StateNumbers, smoothed: _Smoothed | None
+) -> None:
     """Draw NIS and NEES over their degrees of freedom, with the 95 % band of each state."""
-    has_truth = bool(np.isfinite(series.nees_per_dof).any())
+    has_truth = bool(np.isfinite(numbers.nees_per_dof).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
-    known = np.isfinite(series.nis_dof)
-    bands = np.array([band_95(int(dof)) for dof in series.nis_dof[known]]).reshape(-1, 2)
-    bands /= np.maximum(series.nis_dof[known], 1.0)[:, None]
-    _draw_band(panels[0], series.t_s[known], bands)
+    known = np.isfinite(numbers.nis_dof)
+    _draw_band(panels[0], t_s[known], bands_95(numbers.nis_dof[known]))
     panels[0].plot(
-        series.t_s, series.nis_per_dof, linestyle="none", marker=".", markersize=2, color=ESTIMATE
+        t_s, numbers.nis_per_dof, linestyle="none", marker=".", markersize=2, color=ESTIMATE
     )
     label(panels[0], "NIS of associations inside the gate / dof, 95 % band", "", "NIS / dof [1]")
-    _scale(panels[0], series.nis_per_dof)
+    _scale(panels[0], numbers.nis_per_dof)
     if has_truth:
-        bound = np.array(band_95(POSE_DOF)) / POSE_DOF
-        _draw_band(panels[1], series.t_s, np.tile(bound, (len(series.t_s), 1)))
-        lines = [(series.nees_per_dof, ESTIMATE, "radar SLAM")]
+        _draw_band(panels[1], t_s, bands_95(np.full(len(t_s), POSE_DOF)))
+        lines = [(numbers.nees_per_dof, ESTIMATE, "radar SLAM")]
         if smoothed is not None:
-            lines.append((smoothed.nees_per_dof, SMOOTHED, "smoothed at the end"))
+            lines.append((smoothed[1], SMOOTHED, "smoothed at the end"))
         for values, colour, name in lines:
-            panels[1].plot(series.t_s, values, color=colour, linewidth=1.0, label=name)
+            panels[1].plot(t_s, values, color=colour, linewidth=1.0, label=name)
         panels[1].legend(frameon=False, loc="upper left", ncols=2)
         label(panels[1], "NEES of the pose in the start frame / 3, 95 % band", "", "NEES / 3 [1]")
-        _scale(panels[1], series.nees_per_dof)
+        _scale(panels[1], numbers.nees_per_dof)
     panels[-1].set_xlabel(_TIME)
 
 
 def _draw_links(
-    figure: Figure, names: Sequence[str], changes: Sequence[tuple[float, LinkChange]], end_s: float
+    figure: Figure,
+    names: Sequence[str],
+    changes: Sequence[LinkChange],
+    t_s: NDArray[np.float64],
+    end_s: float,
 ) -> None:
     """Draw a bar per radar, coloured by the state of its link."""
     axes = figure.add_subplot()
     for row, name in enumerate(names):
-        own = [(at_s, change.state) for at_s, change in changes if change.radar == name]
+        times = zip(t_s.tolist(), changes, strict=True)
+        own = [(at_s, change.state) for at_s, change in times if change.radar == name]
         ends = [*(at_s for at_s, _ in own[1:]), end_s]
         for (start_s, state), stop_s in zip(own, ends, strict=True):
             if state is not LinkState.ENDED:
@@ -335,7 +291,7 @@ def _draw_links(
     axes.set_xlim(0.0, max(end_s, 1e-3))
     label(axes, "State of each link", _TIME, "")
     axes.grid(visible=False)
-    shown = {change.state for _, change in changes}
+    shown = {change.state for change in changes}
     for state, colour in LINK_COLOURS.items():
         if state in shown and state is not LinkState.ENDED:
             axes.plot([], [], linewidth=6, color=colour, label=str(state))
@@ -360,7 +316,7 @@ def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
 def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
     """Write the report of a session; beside the session if `out` is None."""
     recorded = open_session(session_file(session), stop)
-    page = out or recorded.path.with_name("report.html")
+    page = out or recorded.path.with_name(REPORT)
     refuse_overwriting(recorded.path, page)
     text = _report_text(recorded, stop)
     with naming(page), written_whole(page) as fresh:
@@ -385,14 +341,20 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     seed = "" if info.seed is None else f", seed {info.seed}"
     page = _Page(f"{info.scene}, preset {info.preset}{seed}")
     page.note("simulated data" if info.simulated else "measured data", kind="origin")
-    page.note(_what_it_is(session, data))
+    page.note(_what_it_is(session, record))
     if record.last.step is None:
         page.note(
             "It was recorded by a version that did not keep what led to the states, so the report "
             "has no NIS of true associations, no band of the NIS and no walls."
         )
     _write_numbers(page, info, data, record, summary)
-    series, smoothed = data.series(), _smoothed(record)
+    states, whole = record.states, record.whole_smoothed
+    t_s = _seconds(record, states.t_ns)
+    smoothed = (
+        smoothed_errors(whole, states.truth, record.world_from_map)
+        if whole is not None and states.has_truth
+        else None
+    )
     page.heading("Map and trajectory")
     page.picture(
         "map with paths and landmarks",
@@ -407,7 +369,8 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     page.picture(
         "position errors and number of landmarks over time",
         _draw_errors,
-        series,
+        t_s,
+        data.numbers(),
         smoothed,
         height_in=4.4,
         narrow_height_in=4.6,
@@ -420,13 +383,14 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     page.picture(
         "NIS and NEES over time with their bands",
         _draw_consistency,
-        series,
+        t_s,
+        data.numbers(),
         smoothed,
         height_in=4.4,
         narrow_height_in=4.4,
     )
     _write_landmarks(page, info, record.last)
-    _write_links(page, info, data)
+    _write_links(page, info, data, record)
     _write_parameters(page, info)
     return page.text()
 
@@ -481,7 +445,7 @@ def _write_landmarks(page: _Page, info: SessionInfo, last: Snapshot) -> None:
     page.table(names, rows)
 
 
-def _write_links(page: _Page, info: SessionInfo, data: _ReportData) -> None:
+def _write_links(page: _Page, info: SessionInfo, data: _ReportData, record: RunRecord) -> None:
     page.heading("Links")
     rows = []
     for radar in info.radars:
@@ -509,13 +473,14 @@ def _write_links(page: _Page, info: SessionInfo, data: _ReportData) -> None:
         _draw_links,
         names,
         data.changes,
-        data.duration_s,
+        _seconds(record, [change.t_ns for change in data.changes]),
+        record.duration_ns / NS_PER_S,
         height_in=height_in,
         narrow_height_in=height_in + 0.4,
     )
     if data.warnings:
         lines = [
-            f"{data.seconds(line.t_ns):10.3f} s  {line.radar:<14} {line.text}"
+            f"{_seconds(record, line.t_ns):10.3f} s  {line.radar:<14} {line.text}"
             for line in data.warnings
         ]
         more = data.n_warnings - len(lines)
@@ -552,11 +517,12 @@ def _write_parameters(page: _Page, info: SessionInfo) -> None:
         page.details(name, "\n".join(_lines_of(values)))
 
 
-def _what_it_is(session: RecordedSession, data: _ReportData) -> str:
+def _what_it_is(session: RecordedSession, record: RunRecord) -> str:
     info = session.info
-    parts = [f"{session.path.name}: {data.duration_s:.1f} s of {len(info.radars)} radars"]
+    lasted_s = record.duration_ns / NS_PER_S
+    parts = [f"{session.path.name}: {lasted_s:.1f} s of {len(info.radars)} radars"]
     if info.started_unix_ns is not None:
-        first_ns = info.started_unix_ns + (data.start_ns or 0)
+        first_ns = info.started_unix_ns + record.start_ns
         began = datetime.fromtimestamp(first_ns / NS_PER_S, UTC)
         parts.append(f"begun {began:%Y-%m-%d %H:%M:%S} UTC")
     if info.odometry_clock:

@@ -35,14 +35,24 @@ from slam.app.run.live_source import (
 )
 from slam.app.run.output import Progress, Row, note
 from slam.app.run.results import (
+    REPORT,
     RESULTS,
+    SESSION,
     SMOOTHED,
+    VIEW,
     finish,
     hold_folder,
     remove_earlier,
     write_smoothed,
 )
-from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, execute, make_slam
+from slam.app.run.runner import (
+    RunRecord,
+    RunSource,
+    StepGivenUpError,
+    WrappedSlam,
+    execute,
+    make_slam,
+)
 from slam.app.session.constants import slam_constants
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
@@ -52,8 +62,7 @@ from slam.frames import RadarFrame
 from slam.results import PoseAt, Slam, SmoothedRun, StepResult
 from xethru_protocol.system import StopFlag, StopRequestedError
 
-_SESSION = "session.mcap"
-_STALE = ("session.rrd", "report.html")
+_STALE = (VIEW, REPORT)
 """Made from a session by other commands; those of an earlier session would mislead."""
 _STEP_LIMIT_S = 0.3
 
@@ -93,7 +102,7 @@ def run_rig(
     live_odometry = LiveOdometry(line_source.name, parse_clock(clock, line_source))
     inbox = Inbox()
     with ExitStack() as held:
-        if (out / _SESSION).exists():
+        if (out / SESSION).exists():
             raise AppError(
                 f"{out}: holds the session of an earlier drive, which cannot be repeated; "
                 "choose another --out, or move it away"
@@ -156,7 +165,7 @@ def run_rig(
                 smoothing_asked=requests.asked,
             )
             remove_earlier(out, (*RESULTS, *_STALE))
-            session_log = SessionLog(out / _SESSION, info, start_ns=start_ns, drawn=not lean)
+            session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [
@@ -185,7 +194,7 @@ def _prepare_the_end() -> None:
     atexit.register(gc.freeze)
 
 
-class PromptSlam:
+class PromptSlam(WrappedSlam):
     """SLAM that gives up the step in hand if it takes longer than 0.3 s after a signal.
 
     A step may take seconds on a busy machine, and must not hold up the end of a run in real time.
@@ -193,13 +202,11 @@ class PromptSlam:
     """
 
     def __init__(self, slam: Slam, stop: StopFlag) -> None:
-        self._slam, self._stop = slam, stop
+        super().__init__(slam)
+        self._stop = stop
         self._in_step = False
         self.n_given_up = 0
         self._cleanup = ExitStack()
-        self.config, self.step_detections = slam.config, slam.step_detections
-        self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
-        self.smoothed = slam.smoothed
 
     def __enter__(self) -> Self:
         previous = signal.signal(signal.SIGALRM, self._give_up)

@@ -15,15 +15,15 @@ from pathlib import Path
 
 from PIL import Image
 
-from slam.app.commands.recorded_session import (
-    VIEW_NAME,
+from slam.app.errors import AppError, UsageError, naming
+from slam.app.run.output import print_text
+from slam.app.run.replay import (
     is_finished,
     play,
     refuse_overwriting,
     session_file,
 )
-from slam.app.errors import AppError, UsageError, naming
-from slam.app.run.output import print_text
+from slam.app.run.results import VIEW
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
@@ -159,7 +159,7 @@ def run_view(
         print_text(one_line(str(out)))
     elif screenshot is not None:
         with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
-            made = Path(folder) / VIEW_NAME
+            made = Path(folder) / VIEW
             _write_view(recorded, made, stop)
             _take_screenshot(made, screenshot, at_s, stop)
     else:
@@ -170,7 +170,7 @@ def run_view(
 
 def _write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
     """Write a session as an .rrd file, which replaces an earlier one when it is whole."""
-    from slam.app.view.panels import RerunView  # half a second, loaded only if needed
+    from slam.app.view.session_view import RerunView  # half a second, loaded only if needed
 
     with naming(path), written_whole(path) as fresh:
         fresh.open("wb").close()  # Rerun's own message would not name the remedy

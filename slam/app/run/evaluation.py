@@ -7,10 +7,10 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from slam.app.odometry.track import NS_PER_S
@@ -98,22 +98,17 @@ _TAIL = 0.025
 """On either side of a 95 % band."""
 
 
-@lru_cache(maxsize=512)
-def band_95(dof: int) -> tuple[float, float]:
-    """Return the bounds between which 95 % of a chi-square of so many degrees of freedom lie.
+def bands_95(dof: ArrayLike) -> NDArray[np.float64]:
+    """Return the bounds between which 95 % of a chi-square over its degrees of freedom lie.
 
-    >>> [round(bound, 2) for bound in band_95(3)]
-    [0.22, 9.35]
+    Of ``dof``, shape (n,), the bounds have shape (n, 2); NaN where it is NaN.
+
+    >>> bands_95([3.0]).round(3)
+    array([[0.072, 3.116]])
     """
-    return float(chdtri(dof, 1.0 - _TAIL)), float(chdtri(dof, _TAIL))
-
-
-def nis_dof(snapshot: Snapshot) -> int | None:
-    """Return the degrees of freedom of a state's NIS; None if unknown."""
-    if not snapshot.nis_per_dof or snapshot.step is None:
-        return None
-    report = snapshot.step.report
-    return _FIX_DOF * len(snapshot.nis_per_dof) if report is None else report.dof
+    degrees = np.asarray(dof, dtype=np.float64)
+    bounds = np.stack([chdtri(degrees, 1.0 - _TAIL), chdtri(degrees, _TAIL)], axis=-1)
+    return np.asarray(bounds / degrees[:, None])
 
 
 def world_from_odom(first: Snapshot) -> NDArray[np.float64]:
@@ -129,20 +124,43 @@ def world_from_odom(first: Snapshot) -> NDArray[np.float64]:
     return compose(start, between(first.odometry, np.zeros(3)))
 
 
-def position_errors_m(snapshot: Snapshot, odom: NDArray[np.float64]) -> tuple[float, float]:
-    """Return how far estimate and odometry are from the truth, not aligned; NaN without truth.
+class StateNumbers(NamedTuple):
+    """Numbers over the states of a run, each of shape (n,); NaN where there is none.
 
-    `odom` is the `world_from_odom` of the first state.
+    Errors are the position's distance to the truth, from the start pose, not aligned; the NIS is of
+    the associations inside the gate together, the NEES of the pose in the start frame.
     """
+
+    slam_error_m: NDArray[np.float64]
+    odometry_error_m: NDArray[np.float64]
+    nis_per_dof: NDArray[np.float64]
+    nis_dof: NDArray[np.float64]
+    nees_per_dof: NDArray[np.float64]
+    n_landmarks: NDArray[np.float64]
+
+
+def state_numbers(snapshot: Snapshot, odom: NDArray[np.float64]) -> tuple[float, ...]:
+    """Return the `StateNumbers` of one state; `odom` is the `world_from_odom` of the first one."""
     place, truth = snapshot.world_from_map, snapshot.truth[:2]
     return (
         float(np.linalg.norm(transform(place, snapshot.estimate[:2]) - truth)),
         float(np.linalg.norm(transform(odom, snapshot.odometry[:2]) - truth)),
+        float(np.mean(snapshot.nis_per_dof)) if snapshot.nis_per_dof else math.nan,
+        _nis_dof(snapshot),
+        _pose_nees(snapshot) / POSE_DOF,
+        float(len(snapshot.landmark_ids)),
     )
 
 
-def pose_nees(snapshot: Snapshot) -> float:
-    """Return the NEES of the pose in the start frame, 3 dof; NaN without truth or certainty."""
+def _nis_dof(snapshot: Snapshot) -> float:
+    if not snapshot.nis_per_dof or snapshot.step is None:
+        return math.nan
+    report = snapshot.step.report
+    dof = _FIX_DOF * len(snapshot.nis_per_dof) if report is None else report.dof
+    return float(dof or math.nan)
+
+
+def _pose_nees(snapshot: Snapshot) -> float:
     if not np.isfinite(snapshot.truth).all():
         return math.nan
     truth: NDArray[np.float64] = between(snapshot.world_from_map, snapshot.truth)
@@ -155,7 +173,7 @@ def pose_nees(snapshot: Snapshot) -> float:
 def smoothed_errors(
     smoothed: SmoothedRun, truth: NDArray[np.float64], world_from_map: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return distances to the truth, not aligned [m], and NEES of the poses, shape (n,) each.
+    """Return distances to the truth, not aligned [m], and NEES over 3 of the poses, (n,) each.
 
     `truth` has shape (n, 3), world frame; NaN where it is unknown.
     """
@@ -165,7 +183,7 @@ def smoothed_errors(
     for row in np.flatnonzero(np.isfinite(truth).all(axis=1)).tolist():
         true_pose = between(world_from_map, truth[row])
         nees[row] = nees_pose(smoothed.poses[row], smoothed.pose_covariances[row], true_pose)
-    return errors_m, nees
+    return errors_m, nees / POSE_DOF
 
 
 NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)

@@ -35,7 +35,7 @@ from slam.app.odometry.live import MOST_STAMP_NS, LineSource, LiveOdometry, read
 from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, Snapshot
 from slam.app.rig.sources import RadarLink, radar_frame
-from slam.app.run.runner import LinkLog
+from slam.app.run.runner import LinkLog, frames_between
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
 from slam.results import SmoothedRun
@@ -640,8 +640,7 @@ class LiveSource:
 
     def _take_frame(self, radar: int, frame: Frame) -> None:
         last = self._last_frames[radar]
-        if last is not None and frame.stream == last.stream and frame.counter > last.counter:
-            self.lost_frames += frame.counter - last.counter - 1
+        self.lost_frames += 0 if last is None else frames_between(last, frame)
         self._last_frames[radar] = frame
         taken_ns = self.clocks[radar].stamp_ns(frame.counter, frame.arrival_ns, frame.stream)
         if not self._odometry.has_pose:

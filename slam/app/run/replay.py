@@ -1,8 +1,8 @@
-"""`uwb-slam replay`: a recorded session through SLAM again, with the same numbers.
+"""A recorded session again: all of it for sinks (`play`), or its frames through SLAM (`replay`).
 
-Frames come with the stamps that the run used, odometry as the floats it parsed, settings, rig and
-wheels as they were: every number but the speed is the run's own, to the last bit. The states that
-the run recorded are compared on the way.
+For a replay, frames come with the stamps that the run used, odometry as the floats it parsed,
+settings, rig and wheels as they were: every number but the speed is the run's own, to the last bit.
+The states that the run recorded are compared on the way.
 """
 
 from __future__ import annotations
@@ -17,36 +17,167 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from slam.app.errors import AppError, OdometryError
+from slam.app.errors import AppError, OdometryError, UsageError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import Gap, SessionObserver, Snapshot
+from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress, note
-from slam.app.run.recorded import RecordedScans
-from slam.app.run.results import finish, hold_folder, saying_what_is_left
-from slam.app.run.runner import RunSource, execute, make_slam
+from slam.app.run.results import SESSION, VIEW, finish, hold_folder, saying_what_is_left
+from slam.app.run.runner import (
+    LinkLog,
+    LostFrames,
+    RunRecord,
+    RunRecorder,
+    RunSource,
+    WrappedSlam,
+    execute,
+    make_slam,
+)
 from slam.app.session.constants import different_constants, recorded_rules
 from slam.app.session.messages import smoothed_row, state_row
-from slam.app.session.reader import RecordedSession, open_session
+from slam.app.session.reader import RecordedScan, RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
 from slam.packed import RowsByTime
 from slam.results import PoseAt, Slam, SmoothedRun, StepResult
+from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.system import StopFlag
 from xethru_protocol.validation import problem_text
 
+_END = b"FOOT"
+"""Ends a finished file, with four bytes behind it."""
 
-class _RecordedSlam:
+
+def session_file(given: Path, *, allow_view: bool = False) -> Path:
+    """Return a file as it is, or the session of a run's folder.
+
+    `allow_view` prefers the .rrd of a folder, which is drawn already, if it was closed.
+    """
+    if not given.is_dir():
+        if not given.exists():
+            raise AppError(f"{given}: no such file")
+        return given
+    session, view = given / SESSION, given / VIEW
+    if allow_view and view.is_file() and (is_finished(view) or not session.is_file()):
+        return view
+    if session.is_file():
+        return session
+    names = f"{VIEW} nor {SESSION}" if allow_view else SESSION
+    raise AppError(f"{given}: holds no {names}; name a session.mcap")
+
+
+def refuse_overwriting(recorded: Path, out: Path | None) -> None:
+    """Raise UsageError if a result would replace its own session or another recording."""
+    if out is None or not out.is_file():
+        return
+    if out.samefile(recorded):
+        raise UsageError(f"{out}: is the session itself; write to another file")
+    with out.open("rb") as stream:
+        is_recording = stream.read(len(MAGIC)) == MAGIC
+    if is_recording:
+        raise UsageError(f"{out}: is a recording, which cannot be repeated; write to another file")
+
+
+def is_finished(path: Path) -> bool:
+    """Return whether a recording was closed; that of a killed program lacks its last rows."""
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - len(_END) - 4, 0))
+        return stream.read().startswith(_END)
+
+
+class RecordedScans:
+    """The scans of a session, with the truth and the log lines between them."""
+
+    def __init__(self, session: RecordedSession, stop: StopFlag) -> None:
+        self._session, self._stop = session, stop
+        self._truth = RowsByTime(np.dtype(np.float64), 3)
+        self.lost = LostFrames()
+        self.link_log = LinkLog()
+
+    def truth_at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.array([self._truth.at(t_ns) for t_ns in stamps_ns.tolist()]).reshape(-1, 3)
+
+    def __iter__(self) -> Iterator[Scan]:
+        for record in self._session.played():
+            self._stop.check()
+            if isinstance(record, LogLine):
+                self.link_log.pass_on(record)
+            elif isinstance(record, RecordedScan):
+                scan, truth = record.scan, record.truth
+                self._truth.put(scan.t_ns, np.full(3, np.nan) if truth is None else truth)
+                self.lost.on_scan(scan)
+                yield scan
+
+
+def play_states(
+    session: RecordedSession, sinks: Sequence[SessionObserver], stop: StopFlag
+) -> RunRecord:
+    """Give recorded scans, log lines, states and smoothed runs to sinks in the order of the file.
+
+    The sinks are closed in their order at the end, also after a failure. Of a file without
+    `/slam/step`, states have no `step` and no walls.
+
+    Raises
+    ------
+    AppError
+        The file is damaged other than by being cut at its end.
+    """
+    recorder = RunRecorder(session.info.true_landmarks_m)
+    with ExitStack() as closing:
+        for sink in reversed(sinks):
+            closing.enter_context(sink)
+        for record in session.played():
+            stop.check()
+            for sink in (recorder, *sinks):
+                if isinstance(record, RecordedScan):
+                    sink.on_scan(record.scan)
+                elif isinstance(record, Snapshot):
+                    sink.on_snapshot(record)
+                elif isinstance(record, SmoothedRun):
+                    sink.on_smoothed(record)
+                elif isinstance(record, LogLine):
+                    sink.on_log(record)
+    return recorder.record()
+
+
+def play(session: RecordedSession, sinks: Sequence[SessionObserver], stop: StopFlag) -> RunRecord:
+    """Give what was recorded to sinks, with a progress line.
+
+    A session without a state, such as an imported one, goes through SLAM first.
+
+    Raises
+    ------
+    AppError
+        The file is damaged other than by being cut, or has no state and cannot be replayed.
+    """
+    lost = LostFrames()
+    progress = Progress(session.info, lambda: lost.n_lost, end_ns=session.end_ns)
+    if _has_state(session, stop):
+        record = play_states(session, [lost, progress, *sinks], stop)
+    else:
+        note(f"{session.path} holds no state of SLAM, so SLAM runs over its frames")
+        record = execute(recorded_source(session, stop), [lost, progress, *sinks])
+    if session.cut_at_byte is not None:
+        note(f"{session.path} was cut at byte {session.cut_at_byte}; this is what is left of it")
+    return record
+
+
+def _has_state(session: RecordedSession, stop: StopFlag) -> bool:
+    for record in session.records():
+        stop.check()
+        if isinstance(record, Snapshot):
+            return True
+    return False
+
+
+class _RecordedSlam(WrappedSlam):
     """Steps a pipeline with recorded detections instead of frames.
 
     They are by the time of the scan [ns]; a scan without entry has none.
     """
 
     def __init__(self, slam: Slam, detections: Mapping[int, Sequence[Detection]]) -> None:
+        super().__init__(slam)
         self._detections = detections
-        self.config = slam.config
-        self.step_detections = slam.step_detections
-        self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
-        self.smoothed = slam.smoothed
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
@@ -138,12 +269,8 @@ def _samples(
         stop.check()
         if isinstance(record, TumSample):
             yield record
-        elif isinstance(record, Snapshot) and comparison is not None:
+        elif comparison is not None and isinstance(record, Snapshot | SmoothedRun | Gap):
             comparison.expect(record)
-        elif isinstance(record, SmoothedRun) and comparison is not None:
-            comparison.expect_smoothed(record)
-        elif isinstance(record, Gap) and comparison is not None:
-            comparison.expect_gap(record)
 
 
 _DIGEST_BYTES = 16
@@ -167,17 +294,16 @@ class Comparison(SessionObserver):
         self._smoothed: tuple[int, bytes] | None = None
         self._smoothed_again: tuple[int, bytes] | None = None
 
-    def expect(self, snapshot: Snapshot) -> None:
-        self._expected.put(snapshot.t_ns, (_digest(state_row(snapshot)), False))
-
-    def expect_smoothed(self, smoothed: SmoothedRun) -> None:
-        self._smoothed = int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))
-
-    def expect_gap(self, gap: Gap) -> None:
-        """Take it that what is expected from now on was recorded behind a gap."""
-        self._gaps.append(gap)
-        if self._n_before_gap is None:
-            self._n_before_gap = len(self._expected)
+    def expect(self, record: Snapshot | SmoothedRun | Gap) -> None:
+        """Take what was recorded; what comes after a gap was recorded behind it."""
+        if isinstance(record, Snapshot):
+            self._expected.put(record.t_ns, (_digest(state_row(record)), False))
+        elif isinstance(record, SmoothedRun):
+            self._smoothed = _smoothed_digest(record)
+        else:
+            self._gaps.append(record)
+            if self._n_before_gap is None:
+                self._n_before_gap = len(self._expected)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         expected = self._expected.at(snapshot.t_ns)
@@ -189,7 +315,7 @@ class Comparison(SessionObserver):
             self._first_other_ns = snapshot.t_ns
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        self._smoothed_again = int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))
+        self._smoothed_again = _smoothed_digest(smoothed)
 
     def verdict(self) -> str:
         """Return one line: how many states came again, and why others did not."""
@@ -249,3 +375,7 @@ _MOST_SHOWN = 10
 
 def _digest(row: NDArray[np.float64]) -> bytes:
     return hashlib.blake2b(row.tobytes(), digest_size=_DIGEST_BYTES).digest()
+
+
+def _smoothed_digest(smoothed: SmoothedRun) -> tuple[int, bytes]:
+    return int(smoothed.t_ns[-1]), _digest(smoothed_row(smoothed))

@@ -28,6 +28,7 @@ from xethru_protocol.system import (
     written_whole,
 )
 
+SESSION, VIEW, REPORT = "session.mcap", "session.rrd", "report.html"
 SMOOTHED = "smoothed.tum"
 RESULTS = ("map.png", "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "odometry.tum")
 

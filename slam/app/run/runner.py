@@ -37,6 +37,7 @@ from slam.results import Slam, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.conversation import ProtocolRecord
+from xethru_protocol.driver.frames import Frame
 
 _NO_LANDMARKS_M = np.empty((0, 2))
 
@@ -57,6 +58,16 @@ def make_slam(
         compile_kernels()  # so that the first scans need not wait
         return RobustSlam(config, rig, wheels, detector, rules)
     return UwbRadarSlam(config, rig, detector)
+
+
+class WrappedSlam:
+    """Passes everything but `step` on to another pipeline; subclasses define that."""
+
+    def __init__(self, slam: Slam) -> None:
+        self._slam = slam
+        self.config = slam.config
+        self.step_detections, self.flush = slam.step_detections, slam.flush
+        self.wall_spans_m, self.smoothed = slam.wall_spans_m, slam.smoothed
 
 
 def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -441,7 +452,7 @@ def snapshot_of_step(
     )
 
 
-def frames_between(last: RadarFrame, frame: RadarFrame) -> int:
+def frames_between(last: RadarFrame | Frame, frame: RadarFrame | Frame) -> int:
     """Return how many frames of a radar are missing between two; 0 if a new stream began.
 
     Sessions of older versions hold no numbers of streams: a counter that falls is a new stream.

@@ -17,7 +17,7 @@ os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
 
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
@@ -83,6 +83,11 @@ class Stamps:
     t_ns: list[int] = field(default_factory=list)
     counters: list[int] = field(default_factory=list)
     host_ns: list[int | None] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, t_ns: int, counter: int, host_ns: int | None) -> Stamps:
+        """Return the stamps of one row."""
+        return cls(t_ns=[t_ns], counters=[counter], host_ns=[host_ns])
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -317,8 +322,3 @@ def strips_column(strips: NDArray[np.float32]) -> rr.ComponentColumn:
 def part(name: str) -> str:
     """Return a user's name as one part of an entity's path, whatever characters are in it."""
     return rr.escape_entity_path_part(name)
-
-
-def lengths(rows: Sequence[Sized]) -> NDArray[np.int64]:
-    """Return how many instances each row has, for `partition`."""
-    return np.array([len(row) for row in rows], dtype=np.int64)

@@ -110,7 +110,7 @@ class LiveView:
 
     def observer(self, info: SessionInfo) -> SessionObserver:
         """Return an observer that shows a run."""
-        from slam.app.view.panels import RerunView  # loads Rerun, half a second
+        from slam.app.view.session_view import RerunView  # loads Rerun, half a second
 
         self._has_shown = True
         view = RerunView(

@@ -1,20 +1,22 @@
 """A made-up session for the tests of logs and viewers: known frames, poses and landmarks."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
+from numpy.typing import NDArray
 
 from slam.app.cli import main
 from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.runner import RunRecord, RunRecorder, snapshot_of_step
 from slam.app.session.log import SessionLog
-from slam.frames import RadarFrame
-from slam.results import SmoothedRun, StepResult
+from slam.config import load_preset
+from slam.frames import Detection, RadarFrame
+from slam.results import PoseAt, SmoothedRun, StepResult
 
 FRAME_NS = 199_261_498
 N_BINS = 1431
@@ -141,6 +143,31 @@ class Listener(SessionObserver):
 
     def on_log(self, line: LogLine) -> None:
         self.lines.append(line)
+
+
+class NoSlam:
+    """A pipeline that estimates nothing; tests define what they need of it."""
+
+    config = load_preset("robust")
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        return ()
+
+    def step_detections(
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        return ()
+
+    def flush(self) -> tuple[StepResult, ...]:
+        return ()
+
+    def smoothed(self) -> SmoothedRun | None:
+        return None
+
+    def wall_spans_m(self) -> NDArray[np.float64]:
+        return np.empty((0, 2, 2))
 
 
 def feed(observer: SessionObserver, n_scans: int) -> None:

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from hil_tests.patience import seconds
-from hil_tests.unit.slam.app.sessions import Listener, scan, session_info, smoothed_run
+from hil_tests.unit.slam.app.sessions import Listener, NoSlam, scan, session_info, smoothed_run
 from slam.app.cli import CSV_TO_TUM, main
 from slam.app.commands import run
 from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
@@ -27,8 +26,7 @@ from slam.app.session import messages as ros
 from slam.app.session.cdr import wheel_odometry
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
-from slam.config import load_preset
-from slam.frames import Detection, RadarFrame
+from slam.frames import RadarFrame
 from slam.results import PoseAt, SmoothedRun
 from xethru_protocol.system import StopFlag
 
@@ -143,13 +141,12 @@ def test_a_unix_clock_shows_the_seconds_since_1970(monkeypatch: pytest.MonkeyPat
     assert clock.nominal_ns(105_000_000_000) == 1_700_000_105_000_000_007
 
 
-class StubbornSlam:
+class StubbornSlam(NoSlam):
     """SLAM whose second step takes so long, and which has a state left at the end."""
 
     def __init__(self, slow_s: float) -> None:
         self._slow_s = slow_s
         self.n_steps = self.n_flushed = 0
-        self.config = load_preset("robust")
 
     def step(self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int) -> tuple[()]:
         self.n_steps += 1
@@ -158,20 +155,9 @@ class StubbornSlam:
             time.sleep(self._slow_s)
         return ()
 
-    def step_detections(
-        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
-    ) -> tuple[()]:
-        return ()
-
     def flush(self) -> tuple[()]:
         self.n_flushed += 1
         return ()
-
-    def smoothed(self) -> SmoothedRun | None:
-        return None
-
-    def wall_spans_m(self) -> NDArray[np.float64]:
-        return np.empty((0, 2, 2))
 
 
 def test_sigusr1_writes_the_path_smoothed_so_far(

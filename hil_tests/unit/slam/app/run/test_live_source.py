@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,24 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.scene.scene import Scene, load_scene
+from emulator.scene.scene import load_scene
 from hil_tests.patience import seconds
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.run.virtual_rig import (
+    Drive,
     Timed,
     VirtualInbox,
     Words,
-    delays,
     drifting,
-    odometry_events,
-    radar_events,
+    drive_through,
 )
 from hil_tests.unit.slam.app.sessions import Listener
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.errors import AppError
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry, parse_source
-from slam.app.records import RadarInfo, Scan
+from slam.app.records import Scan
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import RadarLink, sampler_limits
 from slam.app.run import live_source as run_readers
@@ -362,29 +361,14 @@ def test_a_clock_set_from_1970_costs_no_time() -> None:
 
 PPM = (80.0, -50.0, 5.0, -120.0)
 SKEW_MS = (0.0, 190.0, 100.0, 50.0)
-JITTER_MS = 16.0
-SEED = 3
 END_S = 24.0
-
-
-@dataclass
-class Drive:
-    """A scene as four radars and wheels told it: events to be changed by a test."""
-
-    scene: Scene
-    infos: tuple[RadarInfo, ...]
-    events: list[Timed]
 
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    """Four radars and wheels on a scene's path: events to be changed by a test."""
     scene = load_scene(write_short_scene(tmp_path_factory.mktemp("scene")))
-    scene = drifting(scene, PPM, SKEW_MS)
-    end_s = scene.trajectory().duration_ns / NS_PER_S
-    infos, events = radar_events(scene, SEED, end_s, delays(1, JITTER_MS))
-    return Drive(
-        scene=scene, infos=infos, events=events + odometry_events(scene, SEED, delays(2, JITTER_MS))
-    )
+    return drive_through(drifting(scene, PPM, SKEW_MS))
 
 
 def source_of(

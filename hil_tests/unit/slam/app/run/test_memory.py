@@ -5,13 +5,12 @@ import tracemalloc
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hil_tests.unit.slam.app.sessions import FRAME_NS, scan, session_info
+from hil_tests.unit.slam.app.sessions import FRAME_NS, NoSlam, scan, session_info
 from slam.app.commands.report import _ReportData
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry
@@ -19,9 +18,8 @@ from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample, format_t
 from slam.app.records import Scan, SessionObserver
 from slam.app.run.runner import run_slam
 from slam.app.session.log import SessionLog
-from slam.app.view.panels import RerunView
+from slam.app.view.session_view import RerunView
 from slam.frames import RadarFrame
-from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Belief, PoseAt, StepResult, UpdateReport
 
 BLOCK = 128
@@ -29,7 +27,7 @@ BLOCK = 128
 N_BINS = 64
 
 
-class FullMap:
+class FullMap(NoSlam):
     """Estimates a state with a map of so many landmarks at every scan."""
 
     def __init__(self, n_landmarks: int) -> None:
@@ -50,15 +48,6 @@ class FullMap:
         return (
             StepResult(t_ns=t_ns, odometry_pose=pose, belief=belief, detections=(), report=report),
         )
-
-    def flush(self) -> tuple[StepResult, ...]:
-        return ()
-
-    def smoothed(self) -> None:
-        return None
-
-    def wall_spans_m(self) -> NDArray[np.float64]:
-        return np.empty((0, 2, 2))
 
 
 def along_x(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -100,7 +89,7 @@ def test_what_a_run_keeps_of_a_state_does_not_grow_with_the_map(
     if n_landmarks < 50:  # drawing more takes long, and keeps no more
         sinks.append(RerunView(tmp_path / "session.rrd", info))
     try:
-        record = run_slam(scans(), track, cast(UwbRadarSlam, FullMap(n_landmarks)), along_x, sinks)
+        record = run_slam(scans(), track, FullMap(n_landmarks), along_x, sinks)
     finally:
         tracemalloc.stop()
     for sink in sinks:
@@ -150,13 +139,6 @@ def test_a_sample_of_odometry_costs_six_numbers() -> None:
 
 def test_a_parked_robot_costs_a_run_next_to_nothing() -> None:
     """SLAM estimates no state then, and the scans' counters wait for one."""
-
-    class Parked(FullMap):
-        def step(
-            self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
-        ) -> tuple[StepResult, ...]:
-            return ()
-
     track = OdometryTrack.from_lines([format_tum_line(t, np.zeros(3)) for t in (0, 10**13)])
     one = scan(0, 1, N_BINS)
     sizes: list[int] = []
@@ -169,7 +151,7 @@ def test_a_parked_robot_costs_a_run_next_to_nothing() -> None:
 
     tracemalloc.start()
     try:
-        run_slam(scans(), track, cast(UwbRadarSlam, Parked(0)), along_x)
+        run_slam(scans(), track, NoSlam(), along_x)
     finally:
         tracemalloc.stop()
     early, late = sizes

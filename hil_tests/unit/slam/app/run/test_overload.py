@@ -10,26 +10,25 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from emulator.scene.scene import Scene, load_scene
+from emulator.scene.scene import load_scene
 from hil_tests.patience import seconds
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.run.virtual_rig import (
     NS_PER_S,
+    Drive,
     Timed,
     VirtualInbox,
-    delays,
-    odometry_events,
-    radar_events,
+    drive_through,
 )
 from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry
-from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo
+from slam.app.records import LogLine, Scan, SessionInfo
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import sampler_limits
 from slam.app.run.live_source import Event, Inbox, LiveLog, LiveSource
 from slam.app.run.replay import Comparison, recorded_source
-from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
+from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute, make_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.session.reader import open_session
@@ -38,40 +37,21 @@ from slam.frames import RadarFrame
 from slam.results import PoseAt, Slam, StepResult
 from xethru_protocol.system import StopFlag, StopRequestedError
 
-SEED = 3
 MOST_WAIT_S = 2.0
 PERIOD_S = 0.2
 
 
-@dataclass(frozen=True)
-class Drive:
-    scene: Scene
-    infos: tuple[RadarInfo, ...]
-    events: list[Timed]
-
-    def arrivals_ns(self) -> dict[tuple[int, int], int]:
-        """When each frame came, virtual host time, by radar and counter."""
-        events = (row.event for row in self.events)
-        return {(e[1], e[2].counter): e[2].arrival_ns for e in events if e[0] == "frame"}
-
-
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    scene = load_scene(write_short_scene(tmp_path_factory.mktemp("scene")))
-    end_s = scene.trajectory().duration_ns / NS_PER_S
-    infos, events = radar_events(scene, SEED, end_s, delays(1, 16.0))
-    return Drive(scene, infos, events + odometry_events(scene, SEED, delays(2, 16.0)))
+    return drive_through(load_scene(write_short_scene(tmp_path_factory.mktemp("scene"))))
 
 
-class SlowSlam:
+class SlowSlam(WrappedSlam):
     """SLAM whose every step takes so much longer, of virtual time."""
 
     def __init__(self, slam: Slam, inbox: VirtualInbox, more_s: float) -> None:
-        self._slam, self._inbox, self._more_ns = slam, inbox, round(more_s * NS_PER_S)
-        self.config = slam.config
-        self.step_detections = slam.step_detections
-        self.flush, self.wall_spans_m = slam.flush, slam.wall_spans_m
-        self.smoothed = slam.smoothed
+        super().__init__(slam)
+        self._inbox, self._more_ns = inbox, round(more_s * NS_PER_S)
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int

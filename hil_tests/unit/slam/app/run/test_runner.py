@@ -5,26 +5,31 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hil_tests.unit.slam.app.sessions import FRAME_NS, Listener, scan, session_info, snapshot
+from hil_tests.unit.slam.app.sessions import (
+    FRAME_NS,
+    Listener,
+    NoSlam,
+    scan,
+    session_info,
+    snapshot,
+)
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine
 from slam.app.run.output import Progress
 from slam.app.run.runner import LinkStates, run_slam, unknown_truth
 from slam.frames import RadarFrame
-from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Belief, PoseAt, StepResult
 
 COUNTERS = (5, 6, 8, 11, 12)
 LAG = 2
 
 
-class LateSlam:
+class LateSlam(NoSlam):
     """Believes odometry, two scans late; what is left at the end comes from `flush`."""
 
     def __init__(self) -> None:
@@ -48,9 +53,6 @@ class LateSlam:
     def flush(self) -> tuple[StepResult, ...]:
         return tuple(self.waiting)
 
-    def smoothed(self) -> None:
-        return None
-
     def wall_spans_m(self) -> NDArray[np.float64]:
         return np.array([[[0.0, 1.0], [2.0, 1.0]]])
 
@@ -69,7 +71,7 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
     record = run_slam(
         map(scan, COUNTERS),
         OdometryTrack(ends),
-        cast(UwbRadarSlam, LateSlam()),
+        LateSlam(),
         truth_at,
         [listener],
     )
@@ -97,8 +99,7 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     ends = [TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0) for t_ns in (0, 20 * FRAME_NS)]
     listener = Listener()
     scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
-    slam = cast(UwbRadarSlam, LateSlam())
-    record = run_slam(scans, OdometryTrack(ends), slam, unknown_truth, [listener])
+    record = run_slam(scans, OdometryTrack(ends), LateSlam(), unknown_truth, [listener])
     assert tuple(scan.counter for scan in listener.scans) == COUNTERS
     assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
     assert record.n_frames == 2 * 3
@@ -126,7 +127,7 @@ def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
     run_slam(
         [made],
         OdometryTrack(ends),
-        cast(UwbRadarSlam, Hearing()),
+        Hearing(),
         unknown_truth,
         gains_db=[0.0, 20.0 * math.log10(2.0)],
     )

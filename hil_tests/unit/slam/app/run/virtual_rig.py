@@ -23,6 +23,8 @@ from slam.app.run.live_source import Event, Inbox, LiveLog
 from xethru_protocol.driver.radar import X4M300
 
 NS_PER_S = 1_000_000_000
+SEED = 3
+JITTER_MS = 16.0
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,26 @@ class Timed:
 
     t_ns: int
     event: Event
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A scene as four radars and wheels told it."""
+
+    scene: Scene
+    infos: tuple[RadarInfo, ...]
+    events: list[Timed]
+
+    def arrivals_ns(self) -> dict[tuple[int, int], int]:
+        """When each frame came, virtual host time, by radar and counter."""
+        events = (row.event for row in self.events)
+        return {(e[1], e[2].counter): e[2].arrival_ns for e in events if e[0] == "frame"}
+
+
+def drive_through(scene: Scene) -> Drive:
+    end_s = scene.trajectory().duration_ns / NS_PER_S
+    infos, events = radar_events(scene, SEED, end_s, delays(1, JITTER_MS))
+    return Drive(scene, infos, events + odometry_events(scene, SEED, delays(2, JITTER_MS)))
 
 
 class VirtualInbox(Inbox):

@@ -22,7 +22,7 @@ from hil_tests.unit.slam.app.sessions import (
 from slam.app.errors import AppError
 from slam.app.odometry.track import TumSample
 from slam.app.records import LogLine, Scan, Snapshot
-from slam.app.run.recorded import play_states
+from slam.app.run.replay import play_states
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
     settings_text,

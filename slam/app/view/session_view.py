@@ -7,12 +7,12 @@ of adjacent versions only.
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +22,16 @@ from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
     POSE_DOF,
-    band_95,
-    nis_dof,
-    pose_nees,
-    position_errors_m,
+    StateNumbers,
+    bands_95,
     smoothed_errors,
+    state_numbers,
     world_from_odom,
 )
 from slam.app.run.pictures import LINK_COLOURS, half_axes_95_m
 from slam.app.run.runner import LinkChange, LinkStates
-from slam.app.view.layers import (
-    BLOCK_FRAMES,
-    TRAIL_STATES,
-    FrameLayer,
-    Ground,
-    MapLayer,
-    known_world_m,
-)
+from slam.app.view.frames import BLOCK_FRAMES, FrameLayer
+from slam.app.view.map import TRAIL_STATES, Ground, MapLayer, known_world_m
 from slam.app.view.rerun_recording import (
     BAND_RGB,
     DEVICE_TIME,
@@ -225,10 +218,8 @@ class LinkLayer:
         self._recording = recording
         self._states = LinkStates(tuple(radars))
         self._lines: deque[LogLine] = deque()
-        self._changes: list[tuple[LinkChange, int, int | None]] = []
-        self._losses: dict[str, tuple[Stamps, list[int]]] = {
-            radar.name: (Stamps(), []) for radar in radars
-        }
+        # of each kind of row and name
+        self._rows: dict[tuple[str, str], tuple[Stamps, list[Any]]] = {}
         self._counter = self._t_ns = 0
         self._host_ns: int | None = None
         for index, radar in enumerate(radars):
@@ -253,79 +244,67 @@ class LinkLayer:
         self._follow_log()
         self._counter, self._t_ns, self._host_ns = scan.counter, scan.t_ns, host_ns
         before = {name: count.lost for name, count in self._states.counts.items()}
-        self._note(self._states.on_scan(scan))
+        self._add_changes(self._states.on_scan(scan))
         for name, count in self._states.counts.items():
-            stamps, values = self._losses[name]
             # A step, so also where it starts; a line that never moves needs its ends only.
             if count.lost != before[name] or count.frames == 1:
-                stamps.add(scan.t_ns, scan.counter, host_ns)
-                values.append(count.lost)
+                self._add("lost", name, scan.t_ns, count.lost)
 
     def on_log(self, line: LogLine) -> None:
         self._lines.append(line)
 
     def send(self) -> None:
         self._follow_log()
-        changes, self._changes = self._changes, []
-        for radar in self._states.radars:
-            stamps = Stamps()
-            states = []
-            for change, counter, host_ns in changes:
-                if change.radar == radar.name:
-                    stamps.add(change.t_ns, counter, host_ns)
-                    states.append(str(change.state))
-            if states:
-                columns = rr.StateChange.columns(state=states)
-                self._recording.rows(f"link/state/{part(radar.name)}", stamps, columns)
-            losses, values = self._losses[radar.name]
-            self._losses[radar.name] = Stamps(), []
-            if values:
-                scalars = rr.Scalars.columns(scalars=np.array(values, dtype=np.float64))
-                self._recording.rows(f"link/lost/{part(radar.name)}", losses, scalars)
+        self._send("state", lambda states: rr.StateChange.columns(state=states))
+        self._send("lost", _scalars)
 
     def finish(self) -> None:
         """Send what waits, and end every link."""
         self._follow_log()
-        self._note(self._states.end(self._t_ns))
+        self._add_changes(self._states.end(self._t_ns))
         for name, count in self._states.counts.items():
-            stamps, values = self._losses[name]
-            stamps.add(self._t_ns, self._counter, self._host_ns)
-            values.append(count.lost)
+            self._add("lost", name, self._t_ns, count.lost)
         self.send()
 
-    def _note(self, changes: Iterable[LinkChange]) -> None:
-        self._changes += [(change, self._counter, self._host_ns) for change in changes]
+    def _add(self, kind: str, name: str, t_ns: int, value: object) -> None:
+        """Add a row of the newest scan to those that wait."""
+        stamps, values = self._rows.setdefault((kind, name), (Stamps(), []))
+        stamps.add(t_ns, self._counter, self._host_ns)
+        values.append(value)
+
+    def _add_changes(self, changes: Iterable[LinkChange]) -> None:
+        for change in changes:
+            self._add("state", change.radar, change.t_ns, str(change.state))
 
     def _follow_log(self) -> None:
         """Send the lines that came meanwhile, and update the states."""
-        lines = []
         while self._lines:  # not a swap: another thread may add while this runs
-            lines.append(self._lines.popleft())
-        for line in lines:
-            self._note(self._states.on_log(line))
-        for name in dict.fromkeys(line.radar for line in lines):
-            self._send_lines(name, [line for line in lines if line.radar == name])
+            line = self._lines.popleft()
+            self._add_changes(self._states.on_log(line))
+            self._add("log", line.radar, line.t_ns, line)
+            if line.warning and line.radar in self._states.counts:
+                # The number of the fault, so that a burst of them is a steep stair.
+                count = self._states.counts[line.radar].faults
+                self._add("faults", line.radar, line.t_ns, count)
+        self._send("log", _log_columns)
+        self._send("faults", _scalars)
 
-    def _send_lines(self, name: str, lines: Sequence[LogLine]) -> None:
-        stamps = self._stamps_of(lines)
-        columns = rr.TextLog.columns(
-            text=[line.text for line in lines],
-            level=["WARN" if line.warning else "INFO" for line in lines],
-        )
-        self._recording.rows(f"link/log/{part(name)}", stamps, columns)
-        faults = [line for line in lines if line.warning]
-        if faults and name in self._states.counts:
-            # The number of the fault, so that a burst of them is a steep stair.
-            last = self._states.counts[name].faults
-            numbers = np.arange(last - len(faults) + 1, last + 1, dtype=np.float64)
-            scalars = rr.Scalars.columns(scalars=numbers)
-            self._recording.rows(f"link/faults/{part(name)}", self._stamps_of(faults), scalars)
+    def _send(self, kind: str, columns_of: Callable[[list[Any]], rr.ComponentColumnList]) -> None:
+        """Send the rows of one kind that wait."""
+        for key in [key for key in self._rows if key[0] == kind]:
+            stamps, values = self._rows.pop(key)
+            self._recording.rows(f"link/{kind}/{part(key[1])}", stamps, columns_of(values))
 
-    def _stamps_of(self, lines: Sequence[LogLine]) -> Stamps:
-        stamps = Stamps()
-        for line in lines:
-            stamps.add(line.t_ns, self._counter, self._host_ns)
-        return stamps
+
+def _scalars(values: Sequence[float] | NDArray[np.float64]) -> rr.ComponentColumnList:
+    return rr.Scalars.columns(scalars=np.array(values, dtype=np.float64))
+
+
+def _log_columns(lines: Sequence[LogLine]) -> rr.ComponentColumnList:
+    return rr.TextLog.columns(
+        text=[line.text for line in lines],
+        level=["WARN" if line.warning else "INFO" for line in lines],
+    )
 
 
 # Entity, name in the legend, colour, line width in points.
@@ -370,68 +349,44 @@ def send_numbers(
     recording: Recording, rows: Sequence[Snapshot], stamps: Stamps, odom: NDArray[np.float64]
 ) -> None:
     """Send the curves of some states, finite values only; `odom` is the first `world_from_odom`."""
-    errors_m = [position_errors_m(row, odom) for row in rows]
-    nees = [pose_nees(row) / POSE_DOF for row in rows]
-    curves: dict[str, Sequence[float]] = {
-        "error/slam": [slam_m for slam_m, _ in errors_m],
-        "error/odometry": [wheels_m for _, wheels_m in errors_m],
-        "landmarks/count": [float(len(row.landmark_ids)) for row in rows],
-        "consistency/nis/value": [
-            float(np.mean(row.nis_per_dof)) if row.nis_per_dof else math.nan for row in rows
-        ],
-        "consistency/nees/value": nees,
+    numbers = StateNumbers(*np.array([state_numbers(row, odom) for row in rows]).T)
+    curves = {
+        "error/slam": numbers.slam_error_m,
+        "error/odometry": numbers.odometry_error_m,
+        "landmarks/count": numbers.n_landmarks,
+        "consistency/nis/value": numbers.nis_per_dof,
+        "consistency/nees/value": numbers.nees_per_dof,
     }
     for entity, values in curves.items():
-        finite = [row for row, value in enumerate(values) if math.isfinite(value)]
-        if finite:
-            columns = rr.Scalars.columns(scalars=np.array([values[row] for row in finite]))
-            recording.rows(entity, stamps.at(finite), columns)
+        send_curve(recording, entity, values, stamps)
     believed_m = half_axes_95_m(np.array([row.pose_covariance[:2, :2] for row in rows]))[:, 1]
-    bands: dict[str, Sequence[tuple[float, float]]] = {
-        "error/believed": [(0.0, float(radius_m)) for radius_m in believed_m],
-        "consistency/nis/band": [_band(nis_dof(row)) for row in rows],
-        "consistency/nees/band": [
-            _band(POSE_DOF) if math.isfinite(value) else (math.nan, math.nan) for value in nees
-        ],
+    bands = {
+        "error/believed": np.column_stack([np.zeros(len(rows)), believed_m]),
+        "consistency/nis/band": bands_95(numbers.nis_dof),
+        "consistency/nees/band": bands_95(
+            np.where(np.isfinite(numbers.nees_per_dof), POSE_DOF, np.nan)
+        ),
     }
     for entity, bounds in bands.items():
-        low, high = np.array(bounds).T
-        (finite_rows,) = np.nonzero(np.isfinite(high))
-        if len(finite_rows):
+        (known,) = np.nonzero(np.isfinite(bounds[:, 1]))
+        if len(known):
+            low, high = bounds[known].T
             # Rerun shades one standard deviation on either side of a value
-            middle, half = (high + low)[finite_rows] / 2, (high - low)[finite_rows] / 2
-            columns = rr.Measurements.columns(values=middle, variances=half**2)
-            recording.rows(entity, stamps.at(finite_rows.tolist()), columns)
+            columns = rr.Measurements.columns(
+                values=(high + low) / 2, variances=((high - low) / 2) ** 2
+            )
+            recording.rows(entity, stamps.at(known.tolist()), columns)
             # the view's axis holds values only, and would cut the shade off
-            edge = rr.Scalars.columns(scalars=high[finite_rows])
-            recording.rows(f"{entity}/edge", stamps.at(finite_rows.tolist()), edge)
+            send_curve(recording, f"{entity}/edge", bounds[:, 1], stamps)
 
 
-def send_smoothed_numbers(
-    recording: Recording,
-    smoothed: SmoothedRun,
-    truth: NDArray[np.float64],
-    world_from_map: NDArray[np.float64],
-    stamps: Stamps,
+def send_curve(
+    recording: Recording, entity: str, values: NDArray[np.float64], stamps: Stamps
 ) -> None:
-    """Send the errors and NEES of smoothed poses, where the truth, (n, 3), is known."""
-    errors_m, nees = smoothed_errors(smoothed, truth, world_from_map)
-    (known,) = np.nonzero(np.isfinite(nees))
+    """Send the finite ones of some values, shape (n,), at their stamps."""
+    (known,) = np.nonzero(np.isfinite(values))
     if len(known):
-        of_known = stamps.at(known.tolist())
-        for entity, values in (
-            ("error/smoothed", errors_m),
-            ("consistency/nees/smoothed", nees / POSE_DOF),
-        ):
-            recording.rows(entity, of_known, rr.Scalars.columns(scalars=values[known]))
-
-
-def _band(dof: int | None) -> tuple[float, float]:
-    """Return the 95 % band of a chi-square divided by its degrees of freedom."""
-    if not dof:
-        return math.nan, math.nan
-    low, high = band_95(dof)
-    return low / dof, high / dof
+        recording.rows(entity, stamps.at(known.tolist()), _scalars(values[known]))
 
 
 _BLOCK_STATES = 128
@@ -472,9 +427,8 @@ class RerunView(SessionObserver):
         self._flushed_s = clock_s()
         self._began = False
         self._waiting: list[Snapshot] = []
+        # of all states
         self._stamps = Stamps()
-        # of all states: session time, counter and host time (-1: unknown); truth
-        self._times = PackedRows(np.dtype(np.int64), 3)
         self._truth = PackedRows(np.dtype(np.float64), 3)
         self._world_from_map = np.zeros(3)
         self._smoothed: SmoothedRun | None = None
@@ -515,8 +469,6 @@ class RerunView(SessionObserver):
             self._odom = world_from_odom(snapshot)
         self._map.on_snapshot(snapshot, self._host_ns, self._odom)
         self._waiting.append(snapshot)
-        host_ns = -1 if self._host_ns is None else self._host_ns
-        self._times.append((snapshot.t_ns, snapshot.counter, host_ns))
         self._truth.append(snapshot.truth)
         self._world_from_map = snapshot.world_from_map
         self._stamps.add(snapshot.t_ns, snapshot.counter, self._host_ns)
@@ -561,19 +513,17 @@ class RerunView(SessionObserver):
 
     def _send_smoothed_numbers(self) -> None:
         """Send the curves of the whole run: those of a part of it would be there twice."""
-        smoothed, times = self._smoothed, self._times.rows
-        if smoothed is None or not np.array_equal(smoothed.t_ns, times[:, 0]):
+        smoothed, stamps = self._smoothed, self._stamps
+        if smoothed is None or not np.array_equal(smoothed.t_ns, stamps.t_ns):
             return
-        stamps = Stamps()
-        for t_ns, counter, host_ns in times.tolist():
-            stamps.add(t_ns, counter, None if host_ns < 0 else host_ns)
-        send_smoothed_numbers(
-            self._recording, smoothed, self._truth.rows, self._world_from_map, stamps
-        )
+        errors_m, nees = smoothed_errors(smoothed, self._truth.rows, self._world_from_map)
+        send_curve(self._recording, "error/smoothed", errors_m, stamps)
+        send_curve(self._recording, "consistency/nees/smoothed", nees, stamps)
 
     def _send_states(self) -> None:
         rows, self._waiting = self._waiting, []
-        stamps, self._stamps = self._stamps, Stamps()
+        n_states = len(self._stamps)
+        stamps = self._stamps.at(range(n_states - len(rows), n_states))
         if rows and self._odom is not None:
             self._map.send(rows, stamps)
             send_numbers(self._recording, rows, stamps, self._odom)

@@ -1,4 +1,4 @@
-"""What is drawn in Rerun: of every radar the frames, their detections and B-scan; and the map."""
+"""The map in Rerun: paths, the robot with its echoes, landmarks, and the ground below them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import RadarInfo, Scan, SessionInfo, Snapshot
-from slam.app.rig.echoes import arcs, envelope_db, wedge
+from slam.app.records import RadarInfo, SessionInfo, Snapshot
+from slam.app.rig.echoes import arcs, wedge
 from slam.app.run.pictures import (
     ellipse_95,
     ellipse_text,
@@ -23,13 +22,11 @@ from slam.app.run.pictures import (
 )
 from slam.app.view.rerun_recording import (
     ESTIMATE_RGB,
-    FAULT_RGB,
     FIX_RGB,
     GRID_RGB,
     KEPT_RGB,
     LANDMARK_RGB,
     ODOMETRY_RGB,
-    RADAR_RGB,
     REJECTED_RGB,
     ROBOT_RGB,
     SMOOTHED_RGB,
@@ -42,246 +39,14 @@ from slam.app.view.rerun_recording import (
     Recording,
     Rgb,
     Stamps,
-    arrow_column,
-    lengths,
     part,
     rr,
     screen,
     strips_column,
 )
-from slam.frames import RadarFrame
 from slam.geometry import compose, transform
 from slam.packed import PackedRows
 from slam.results import Fix, Observation, SmoothedRun, StepResult
-
-# What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
-# sample, so an envelope of -62 dB) to a near rod.
-_SHOWN_RANGE_M = 3.0
-_FLOOR_DB, _TOP_DB = -62.0, -30.0
-
-
-def bscan_picture(
-    frames: NDArray[np.float32], range_start_m: float, bin_length_m: float
-) -> NDArray[np.uint8]:
-    """Draw echoes as grey levels: constant part removed, envelope, decibels.
-
-    `frames` is raw RF, shape (n_frames, n_bins), slow time downwards, with true metres of the first
-    bin and between two bins. The result has shape (n_frames, n_shown - 2), up to 3 m of range; 0 is
-    -62 dB of full scale or less, 255 is -30 dB or more.
-    """
-    n_wanted = int((_SHOWN_RANGE_M - range_start_m) / bin_length_m)
-    n_shown = min(frames.shape[1], max(n_wanted, 3))
-    echoes = frames[:, :n_shown] - frames[:, :n_shown].mean(axis=0)
-    level_db = envelope_db(echoes, bin_length_m)
-    scaled = (level_db - _FLOOR_DB) / (_TOP_DB - _FLOOR_DB)
-    picture: NDArray[np.uint8] = (np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return picture
-
-
-BLOCK_FRAMES = 128
-"""Rows of one B-scan picture; as many frames are sent at once to a file."""
-
-_DETECTION_WIDTH_M = 0.03
-_ONE_VALUE = np.zeros(1, dtype=np.float32)
-_NO_DETECTIONS = _ONE_VALUE
-"""A chart needs a bar: one without height at the antenna stands for none."""
-
-
-class FrameLayer:
-    """Collects frames and sends them in blocks; sends detections."""
-
-    def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
-        self._recording = recording
-        self._radars = tuple(radars)
-        self._blocks = [_FrameBlock(radar.name) for radar in radars]
-        for index, radar in enumerate(radars):
-            colour = RADAR_RGB[index % len(RADAR_RGB)]
-            recording.static(f"radar/{part(radar.name)}/frame", chart_style(color=colour))
-            recording.static(f"radar/{part(radar.name)}/detections", chart_style(color=FAULT_RGB))
-
-    def on_scan(self, scan: Scan) -> None:
-        """Take the frames of one tick; a full block goes out at once."""
-        host = scan.host_ns or (None,) * len(scan.frames)
-        for frame, host_ns in zip(scan.frames, host, strict=True):
-            block = self._blocks[frame.radar]
-            block.stamps.add(frame.t_ns, scan.counter, host_ns)
-            block.frames.append(frame)
-            if len(block.frames) == BLOCK_FRAMES:
-                self._send_frames(block)
-
-    def send(self) -> None:
-        """Send the frames that wait."""
-        for block in self._blocks:
-            self._send_frames(block)
-
-    def send_older(self, t_ns: int) -> None:
-        """Send the frames of radars of which one from `t_ns` or before still waits."""
-        for block in self._blocks:
-            if block.frames and block.stamps.t_ns[0] <= t_ns:
-                self._send_frames(block)
-
-    def send_detections(self, snapshots: Sequence[Snapshot], stamps: Stamps) -> None:
-        """Send the detections of some states."""
-        known = [row for row, snapshot in enumerate(snapshots) if snapshot.step is not None]
-        steps = [snapshots[row].step for row in known]
-        rows = [step.detections for step in steps if step is not None]
-        if not rows:
-            return
-        for index, radar in enumerate(self._radars):
-            of_radar = [[d for d in row if d.radar == index] for row in rows]
-            # Where the echo lies in the frame: with the offset that ranges are freed of.
-            labels_m = [
-                np.array([d.range_m + radar.range_offset_m for d in row], dtype=np.float32)
-                if row
-                else _NO_DETECTIONS
-                for row in of_radar
-            ]
-            heights = [
-                np.array([d.amplitude for d in row], dtype=np.float32) if row else _NO_DETECTIONS
-                for row in of_radar
-            ]
-            widths = [np.full(len(row), _DETECTION_WIDTH_M, dtype=np.float32) for row in labels_m]
-            entity = f"radar/{part(radar.name)}/detections"
-            self._recording.rows(entity, stamps.at(known), _charts(heights, labels_m, widths))
-
-    def _send_frames(self, block: _FrameBlock) -> None:
-        if not block.frames:
-            return
-        samples = np.stack([frame.samples for frame in block.frames])
-        n_frames, n_bins = samples.shape
-        newest = block.frames[-1]
-        if block.axis != (axis := (newest.range_start_m, newest.bin_length_m, n_bins)):
-            block.axis = axis
-            labels_m = (axis[0] + axis[1] * np.arange(n_bins)).astype(np.float32)
-            style = chart_style(abscissa=labels_m, bar_m=newest.bin_length_m)
-            self._recording.static(f"{block.entity}/frame", style)
-        charts = chart_values("BarChart:values", samples.ravel(), np.full(n_frames, n_bins))
-        self._recording.rows(f"{block.entity}/frame", block.stamps, [charts])
-        block.shown.extend(block.frames)
-        # Stamped with its first frame, so that the cursor is inside the picture it shows; where
-        # blocks come early, because someone watches, the picture is of the newest frames.
-        shown = samples
-        if n_frames < BLOCK_FRAMES:
-            shown = np.stack([frame.samples for frame in block.shown])
-        picture = bscan_picture(shown, newest.range_start_m, newest.bin_length_m)
-        # A tensor's view has no scale: the names of its axes say where they begin and end. The
-        # envelope lacks the first bin and the last.
-        ends_m = newest.range_start_m + newest.bin_length_m * np.array([1, picture.shape[1]])
-        lasted_s = (newest.t_ns - block.shown[-len(shown)].t_ns) / NS_PER_S
-        names = (f"time {lasted_s:.1f} s", f"range {ends_m[0]:.2f} .. {ends_m[1]:.2f} m")
-        self._recording.row(
-            f"{block.entity}/bscan",
-            block.stamps,
-            rr.Tensor(picture, dim_names=names, value_range=(0.0, 255.0)),
-        )
-        block.stamps, block.frames = Stamps(), []
-
-
-class _FrameBlock:
-    """Frames of one radar that wait to be sent together."""
-
-    def __init__(self, name: str) -> None:
-        self.entity = f"radar/{part(name)}"
-        self.axis: tuple[float, float, int] | None = None
-        self.shown: deque[RadarFrame] = deque(maxlen=BLOCK_FRAMES)
-        self.stamps = Stamps()
-        self.frames: list[RadarFrame] = []
-
-
-def chart_style(
-    *,
-    color: Rgb | None = None,
-    abscissa: NDArray[np.float32] | None = None,
-    bar_m: float | None = None,
-) -> list[rr.DescribedComponentBatch]:
-    """Return a bar chart without its values; `BarChart.from_fields` cannot leave them out."""
-    widths = None if abscissa is None or bar_m is None else np.full(len(abscissa), bar_m)
-    chart = rr.BarChart(_ONE_VALUE, color=color, abscissa=abscissa, widths=widths)
-    batches = chart.as_component_batches()
-    return [b for b in batches if b.component_descriptor().component != "BarChart:values"]
-
-
-def _charts(
-    heights: Sequence[NDArray[np.float32]],
-    places: Sequence[NDArray[np.float32]],
-    widths: Sequence[NDArray[np.float32]],
-) -> list[rr.ComponentColumn]:
-    """Make bar charts with bars at given places, one per row, rows of any length."""
-    sizes = np.array([len(row) for row in heights])
-    every_width = rr.BarChart(_ONE_VALUE, widths=np.concatenate(widths)).as_component_batches()
-    (width,) = (b for b in every_width if b.component_descriptor().component == "BarChart:widths")
-    return [
-        chart_values("BarChart:values", np.concatenate(heights), sizes),
-        chart_values("BarChart:abscissa", np.concatenate(places), sizes),
-        rr.ComponentColumn(width.component_descriptor(), width).partition(sizes),
-    ]
-
-
-def chart_values(
-    component: str, values: NDArray[np.float32], sizes: NDArray[np.int64]
-) -> rr.ComponentColumn:
-    """Make a column of one-dimensional tensors, one per row, of the sizes given.
-
-    rr.BarChart has no working `columns`, and one log call per frame costs half a millisecond. So
-    the arrow array of n one-dimensional tensors is built here, without copying the samples.
-    """
-    batches = rr.BarChart(_ONE_VALUE, abscissa=_ONE_VALUE).as_component_batches()
-    (template,) = (b for b in batches if b.component_descriptor().component == component)
-    tensor = template.as_arrow_array().type
-    shape, names, buffer = (tensor.field(name).type for name in ("shape", "names", "buffer"))
-    kinds = [buffer.field(index) for index in range(buffer.num_fields)]
-    n_rows = len(sizes)
-    row_ends = np.arange(n_rows + 1, dtype=np.int32)
-    value_ends = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
-    float32 = [kind.name for kind in kinds].index("F32")
-    children = [pa.array([], type=kind.type) for kind in kinds]
-    children[float32] = pa.ListArray.from_arrays(
-        pa.array(value_ends), pa.array(values), type=kinds[float32].type
-    )
-    codes = np.full(n_rows, float32, dtype=np.int8)
-    union = pa.Array.from_buffers(
-        buffer,
-        n_rows,
-        [None, pa.py_buffer(codes), pa.py_buffer(row_ends[:-1].copy())],
-        children=children,
-    )
-    lengths = pa.array(sizes.astype(np.uint64))
-    column = pa.StructArray.from_arrays(
-        [
-            pa.ListArray.from_arrays(pa.array(row_ends), lengths, type=shape),
-            pa.nulls(n_rows, names),
-            union,
-        ],
-        fields=[tensor.field(name) for name in ("shape", "names", "buffer")],
-    )
-    return arrow_column(template.component_descriptor(), column)
-
-
-def used_detections(step: StepResult) -> tuple[bool, ...]:
-    """Return for each detection of a state whether it moved the estimate.
-
-    Under the robust back end: it continued the track of a landmark. Under the paper's: it is part
-    of a fix of an observation that the outlier filter let through.
-    """
-    if step.report is None:
-        inside = {
-            id(detection)
-            for observation in step.observations
-            for fix in observation.fixes
-            for detection in fix.detections
-        }
-        return tuple(id(detection) in inside for detection in step.detections)
-    continued = {(radar, index) for radar, index, _ in step.report.continued}
-    given = dict.fromkeys((detection.radar for detection in step.detections), 0)
-    flags = []
-    for detection, sigma_m in zip(step.detections, step.range_sigmas_m, strict=True):
-        if not math.isfinite(sigma_m):  # the back end was not given this one, so does not count it
-            flags.append(False)
-            continue
-        flags.append((detection.radar, given[detection.radar]) in continued)
-        given[detection.radar] += 1
-    return tuple(flags)
-
 
 Array = NDArray[np.float64]
 
@@ -316,6 +81,32 @@ _POINTS: tuple[tuple[str, Rgb, float, float], ...] = (
     ("fixes/found", FIX_RGB, 0.012, 42.0),
     ("fixes/rejected", REJECTED_RGB, 0.015, 43.0),
 )
+
+
+def used_detections(step: StepResult) -> tuple[bool, ...]:
+    """Return for each detection of a state whether it moved the estimate.
+
+    Under the robust back end: it continued the track of a landmark. Under the paper's: it is part
+    of a fix of an observation that the outlier filter let through.
+    """
+    if step.report is None:
+        inside = {
+            id(detection)
+            for observation in step.observations
+            for fix in observation.fixes
+            for detection in fix.detections
+        }
+        return tuple(id(detection) in inside for detection in step.detections)
+    continued = {(radar, index) for radar, index, _ in step.report.continued}
+    given = dict.fromkeys((detection.radar for detection in step.detections), 0)
+    flags = []
+    for detection, sigma_m in zip(step.detections, step.range_sigmas_m, strict=True):
+        if not math.isfinite(sigma_m):  # the back end was not given this one, so does not count it
+            flags.append(False)
+            continue
+        flags.append((detection.radar, given[detection.radar]) in continued)
+        given[detection.radar] += 1
+    return tuple(flags)
 
 
 def known_world_m(info: SessionInfo) -> Array:
@@ -394,7 +185,7 @@ class MapLayer:
         self._has_fixes = False
         self._first_ns: int | None = None
         self._next_map_ns = self._next_path_ns = 0
-        self._last: tuple[Snapshot, int | None] | None = None
+        self._last: tuple[Snapshot, Stamps] | None = None
         world_m = known_world_m(info)
         self._grows = not len(world_m)  # the layout shows all of a known world and no more
         self._ground = Ground.around(np.zeros((1, 2)) if self._grows else world_m)
@@ -404,7 +195,8 @@ class MapLayer:
         """Add a state to the paths; `odom` is `world_from_odom` of the first one."""
         if self._first_ns is None:
             self._first_ns = snapshot.t_ns
-        self._last = snapshot, host_ns
+        stamps = Stamps.of(snapshot.t_ns, snapshot.counter, host_ns)
+        self._last = snapshot, stamps
         place = snapshot.world_from_map
         self._paths["odometry"].append(transform(odom, snapshot.odometry[:2]))
         self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
@@ -414,20 +206,18 @@ class MapLayer:
             self._paths["truth"].append(snapshot.truth[:2])
         if snapshot.t_ns >= self._next_map_ns:
             self._next_map_ns = snapshot.t_ns + _MAP_PERIOD_NS
-            self._send_landmarks(snapshot, host_ns)
+            self._send_landmarks(snapshot, stamps)
         if snapshot.t_ns >= self._next_path_ns:
             # Sent whole, as a view shows the newest row only; ever rarer, so the sum stays small.
             lasted_ns = snapshot.t_ns - self._first_ns
             self._next_path_ns = snapshot.t_ns + max(_PATH_PERIOD_NS, lasted_ns // 100)
-            self._send_paths(snapshot, host_ns)
+            self._send_paths(stamps)
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         """Send the solution over all states so far, at the last one."""
         if self._last is None:
             return
-        snapshot, host_ns = self._last
-        stamps = Stamps()
-        stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+        snapshot, stamps = self._last
         place = snapshot.world_from_map
         path = transform(place, smoothed.poses[:, :2])
         thinned = screen(np.concatenate([path[::_PATH_STEP], path[-1:]]))
@@ -458,8 +248,8 @@ class MapLayer:
             )
         ]
         ellipses = strips_column(screen(np.array(spread)))
-        one_each = np.ones(len(rows), dtype=np.int64)
-        self._recording.rows("map/estimate/ellipse", stamps, [ellipses.partition(one_each)])
+        columns = [ellipses.partition([1] * len(rows))]
+        self._recording.rows("map/estimate/ellipse", stamps, columns)
         known = [k for k, row in enumerate(rows) if row.step is not None]
         if known:
             self._send_echoes([rows[k] for k in known], stamps.at(known), world[known])
@@ -467,8 +257,9 @@ class MapLayer:
     def send_last(self) -> None:
         """Send the map of the last state."""
         if self._last is not None:
-            self._send_landmarks(*self._last)
-            self._send_paths(*self._last)
+            snapshot, stamps = self._last
+            self._send_landmarks(snapshot, stamps)
+            self._send_paths(stamps)
 
     def _send_statics(self, info: SessionInfo) -> None:
         static = self._recording.static
@@ -584,18 +375,16 @@ class MapLayer:
                 self._trails[name].append(transform(pose, own))
                 shown.append(np.concatenate(self._trails[name]))
             columns = rr.Points2D.columns(positions=screen(np.concatenate(shown)))
-            self._recording.rows(f"map/{name}", stamps, columns.partition(lengths(shown)))
+            self._recording.rows(f"map/{name}", stamps, columns.partition([*map(len, shown)]))
 
     def _send_arcs(
         self, entity: str, stamps: Stamps, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]
     ) -> None:
         every_m = np.array([range_m for row in ranges_m for range_m in row], dtype=np.float64)
         strips = strips_column(screen(arcs(self._field, radar, every_m)))
-        self._recording.rows(entity, stamps, [strips.partition(lengths(ranges_m))])
+        self._recording.rows(entity, stamps, [strips.partition([*map(len, ranges_m)])])
 
-    def _send_landmarks(self, snapshot: Snapshot, host_ns: int | None) -> None:
-        stamps = Stamps()
-        stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+    def _send_landmarks(self, snapshot: Snapshot, stamps: Stamps) -> None:
         points = transform(snapshot.world_from_map, snapshot.landmarks_m)
         covariances = rotate_covariances(
             snapshot.world_from_map[2], snapshot.landmark_covariances_m2
@@ -638,9 +427,7 @@ class MapLayer:
         )
         self._recording.row("map/landmarks/legend", stamps, legend)
 
-    def _send_paths(self, snapshot: Snapshot, host_ns: int | None) -> None:
-        stamps = Stamps()
-        stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+    def _send_paths(self, stamps: Stamps) -> None:
         for name, colour, radius_m, order in _PATHS:
             points = self._paths[name]
             if not points:
