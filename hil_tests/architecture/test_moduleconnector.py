@@ -156,6 +156,8 @@ class Checker:
         if isinstance(owner, ModuleType | type):
             return getattr(owner, name)
         found = inspect.getattr_static(owner.cls if isinstance(owner, Instance) else owner, name, 0)
+        if isinstance(found, link.Method):
+            found = found.__get__(None, X4M300)
         if found == 0:  # set by a method
             cls = owner.cls if isinstance(owner, Instance) else type(owner)
             assert re.search(rf"self\.{name}\b[^\n]*=", inspect.getsource(cls)), name

@@ -5,12 +5,26 @@ the steps out on a line that blocks, `AsyncX4M300` on one that is awaited. `raw_
 `files` and `reconnect` hold more such generators.
 """
 
+import functools
+import inspect
 import math
 from collections import deque
-from collections.abc import Awaitable, Callable, Generator, Sequence
+from collections.abc import Callable, Coroutine, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from typing import Concatenate, NamedTuple, ParamSpec, Protocol, SupportsFloat, TypeAlias, TypeVar
+from typing import (
+    Any,
+    Concatenate,
+    Generic,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    SupportsFloat,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    overload,
+)
 
 from xethru_protocol.driver.conversation import (
     BOOTLOADER_ERRORS,
@@ -719,35 +733,79 @@ class Link:
 
 
 Procedure: TypeAlias = Callable[Concatenate[Link, P], Steps[T]]
+"""What carries a procedure out is a driver, from its arguments but for the link."""
 
 
-class Call(Protocol):
-    """Carries a procedure of the link out and returns its result."""
-
-    def __call__(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T: ...
+class Blocking:
+    """Marks a driver, and its parts, whose methods return when they are done."""
 
 
-class AsyncCall(Protocol):
-    """Carries a procedure of the link out; its result is awaited."""
-
-    def __call__(
-        self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs
-    ) -> Awaitable[T]: ...
+class Awaited:
+    """Marks a driver, and its parts, whose methods are coroutines."""
 
 
-class Part:
-    """Something that a blocking driver consists of."""
-
-    __slots__ = ("_call",)
-
-    def __init__(self, call: Call) -> None:
-        self._call = call
+KindT = TypeVar("KindT")
 
 
-class AsyncPart:
-    """Something that an asyncio driver consists of."""
+class Part(Generic[KindT]):
+    """A driver, or something that it consists of."""
 
-    __slots__ = ("_call",)
+    __slots__ = ("_driver",)
 
-    def __init__(self, call: AsyncCall) -> None:
-        self._call = call
+    def __init__(self, driver: "Part[KindT]") -> None:
+        self._driver: Any = driver
+        """Has `_call`, `_call_once` and `_listen`, which carry procedures out."""
+
+
+class Method(Generic[P, T]):
+    """A procedure as a method of both drivers or of a part of both, with its docstring.
+
+    ``carry_out`` is the driver's method that carries it out.
+    """
+
+    def __init__(self, procedure: Procedure[P, T], carry_out: str) -> None:
+        def blocking(self: Part[Blocking], *args: P.args, **kwargs: P.kwargs) -> T:
+            result: T = getattr(self._driver, carry_out)(procedure, *args, **kwargs)
+            return result
+
+        async def awaited(self: Part[Awaited], *args: P.args, **kwargs: P.kwargs) -> T:
+            result: T = await getattr(self._driver, carry_out)(procedure, *args, **kwargs)
+            return result
+
+        signature = inspect.signature(procedure)
+        link, *others = signature.parameters.values()
+        parameters = [link.replace(name="self", annotation=link.empty), *others]
+        *_, result = get_args(signature.return_annotation)  # of its steps
+        signature = signature.replace(parameters=parameters, return_annotation=result)
+        functions: list[Any] = [blocking, awaited]
+        for function in functions:
+            functools.update_wrapper(function, procedure)
+            function.__signature__ = signature
+            function.__annotations__ = {one.name: one.annotation for one in others}
+            function.__annotations__["return"] = result
+        self._blocking, self._awaited = blocking, awaited
+
+    @overload
+    def __get__(self, part: None, owner: type) -> Callable[Concatenate[Any, P], Any]: ...
+    @overload
+    def __get__(self, part: Part[Blocking], owner: type) -> Callable[P, T]: ...
+    @overload
+    def __get__(self, part: Part[Awaited], owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, part: Part[Any] | None, owner: type) -> Any:
+        is_awaited = getattr(owner if part is None else part._driver, "_is_awaited", False)
+        return (self._awaited if is_awaited else self._blocking).__get__(part, owner)
+
+
+def sends(procedure: Procedure[P, T]) -> Method[P, T]:
+    """Make a method of a procedure that sends commands; it is repeated after a reconnect."""
+    return Method(procedure, "_call")
+
+
+def sends_once(procedure: Procedure[P, T]) -> Method[P, T]:
+    """Make a method of a procedure that sends commands; a broken line raises `Disconnected`."""
+    return Method(procedure, "_call_once")
+
+
+def receives(procedure: Procedure[P, T]) -> Method[P, T]:
+    """Make a method of a procedure that only receives, perhaps beside one that sends."""
+    return Method(procedure, "_listen")

@@ -8,8 +8,8 @@ import pytest
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, frame
 from xethru_protocol.driver.async_radar import AsyncX4M300
-from xethru_protocol.driver.files import AsyncFiles, Files
-from xethru_protocol.driver.profiles import AsyncProfile, Profile
+from xethru_protocol.driver.files import Files
+from xethru_protocol.driver.profiles import Profile
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode
@@ -87,7 +87,7 @@ def test_methods_are_documented_as_they_are_called(radar: type) -> None:
     assert str(inspect.signature(radar.start)) == "(self, fps: float) -> float"  # type: ignore[attr-defined] # both
     assert inspect.getdoc(radar.start).startswith("Start frames")  # type: ignore[attr-defined, union-attr] # both
     members = inspect.getmembers(radar, inspect.isfunction)
-    for cls in (Profile, AsyncProfile, Files, AsyncFiles):
+    for cls in (Profile, Files):
         members += inspect.getmembers(cls, inspect.isfunction)
     for name, method in members:
         parameters = inspect.signature(method).parameters
