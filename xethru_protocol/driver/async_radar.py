@@ -22,7 +22,6 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Any, Literal, Self
 
 from xethru_protocol.driver import raw_mode, reconnect
-from xethru_protocol.driver.conversation import Observer
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
@@ -39,6 +38,7 @@ from xethru_protocol.driver.link import (
     T,
     Write,
 )
+from xethru_protocol.driver.matching import Observer
 from xethru_protocol.driver.profiles import (
     MESSAGE_TIMEOUT_S,
     MessageT,

@@ -247,7 +247,7 @@ def enter(link: Link, timeout_s: float = reconnect.RESTART_S) -> Steps[str]:
             f"at {link.path} neither a firmware nor a bootloader answers; is a module there, and "
             "powered? 'xethru doctor' finds out more"
         ) from None
-    link.conversation.answer_owed = True  # this error may have been an earlier request's
+    link.conversation.matcher.answer_owed = True  # this error may have been an earlier request's
     core_id = yield from _core_id(link)
     yield from _leave_application(link)
     banner = ""
@@ -371,7 +371,7 @@ def _write_page(link: Link, number: int, data: bytes, attempts: int) -> Steps[by
             if not damaged or attempt == attempts - 1:
                 raise
             link.warn(f"page {number} is written again: {error}")
-            link.conversation.answer_owed = True  # more reports of the damage may follow
+            link.conversation.matcher.answer_owed = True  # more reports of the damage may follow
     raise AssertionError("the last attempt returns or raises")
 
 

@@ -26,7 +26,8 @@ from typing import (
     overload,
 )
 
-from xethru_protocol.driver.conversation import (
+from xethru_protocol.driver.frames import Frame, FrameQueue, Lattice
+from xethru_protocol.driver.matching import (
     BOOTLOADER_ERRORS,
     FRAMES,
     Conversation,
@@ -34,7 +35,6 @@ from xethru_protocol.driver.conversation import (
     bootloader_error,
     summary,
 )
-from xethru_protocol.driver.frames import Frame, FrameQueue, Lattice
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
@@ -53,7 +53,7 @@ from xethru_protocol.wire.errors import (
     RemoteProtocolError,
     ResponseTimeout,
 )
-from xethru_protocol.wire.rows import ROWS, Command, Response, Row
+from xethru_protocol.wire.rows import ROWS, Command, Response
 from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, Firmware, needed_by
 
 
@@ -242,13 +242,6 @@ class ModuleInfo:
 
 
 _BOOTLOADER_REPLIES = ((m.BootloaderSuccess,), (m.BootloaderEchoed,))
-# The module answers PINGs that waited for it one right after the other; a PONG that does
-# not come within this time of the last one was probably never sent.
-_SETTLED_NS = 250_000_000
-# Part of the timeout for which the right answer is waited for after a wrong one.
-_AFTER_A_WRONG_ONE = 0.25
-# Information that every firmware has; two items, so that no late answer is taken for another.
-_TOKENS = (InfoItem.XTID_SSIC_VERSION, InfoItem.XTID_SSIC_BUILD)
 
 
 class Plan(Protocol):
@@ -317,9 +310,6 @@ class Link:
         self.raw_mode = False
         self.closed = False
         self._version_list: tuple[tuple[int, int], str | None] | None = None  # and of which start
-        self._tokens = deque(_TOKENS)
-        self._tokens_out = 0  # asked for and not answered, or answered too late
-        self._token_at: int | None = None  # PINGs before the first token that is out
         self._warned = False  # of frames whose geometry is not known
 
     def _take(self, message: Response, arrival_ns: int) -> None:
@@ -357,7 +347,7 @@ class Link:
     # --- commands ---------------------------------------------------------------------------------
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
-        if self.conversation.answer_owed and not isinstance(command, m.Ping):
+        if self.conversation.matcher.answer_owed and not isinstance(command, m.Ping):
             yield from self._catch_up(command, timeout_s)
         yield from self._check_version(command)
         reply = yield from self._exchange(command, timeout_s)
@@ -366,53 +356,40 @@ class Link:
 
     def _catch_up(self, command: Command[Response], timeout_s: float) -> Steps[None]:
         """Receive until answers to an abandoned request can no longer come."""
-        conversation = self.conversation
+        matcher = self.conversation.matcher
         if ROWS[type(command)].replies in _BOOTLOADER_REPLIES:  # the bootloader does not have PING
             echo = m.BootloaderEcho(data=self.clock().to_bytes(8, "little"))
             with suppress(DeviceError):  # it is the application that answers
                 yield from self._exchange(echo, timeout_s)
-            return
-        if not conversation.pongs_possible:
+        elif matcher.pongs_possible:
+            yield from self._exchange(matcher.token(), timeout_s, as_token=True)
+        else:
             yield from self._exchange(m.Ping(), timeout_s)
-            return
-        # PONGs do not say which PING they answer, so with one due they prove nothing. This answer
-        # names what was asked: all that was asked before is answered, or never will be.
-        token = m.SystemGetInfo(item=self._tokens[0])
-        if self._token_at is None:
-            self._token_at = conversation.pings
-        self._tokens_out += 1
-        yield from self._exchange(token, timeout_s, catching_up=True)
-        self._tokens_out -= 1
-        # it may be the answer to an earlier one: PINGs behind that one are not answered yet
-        behind = conversation.pings - self._token_at
-        conversation.pongs_possible = min(conversation.pongs_possible, behind)
-        conversation.pongs_owed = min(conversation.pongs_owed, behind)
-        self._token_at = None
-        self._tokens.rotate()
 
     def _exchange(
-        self, command: Command[Response], timeout_s: float, *, catching_up: bool = False
+        self, command: Command[Response], timeout_s: float, *, as_token: bool = False
     ) -> Steps[Response]:
-        """Ask and return the answer; while ``catching_up``, others are of earlier commands."""
         yield from self.take_stale_input()
-        conversation = self.conversation
-        row = ROWS[type(command)]
-        deadline_ns = conversation.deadline_ns(timeout_s)
-        answer: Response | None
+        conversation, matcher = self.conversation, self.conversation.matcher
         try:
-            yield Write(conversation.ask(command))
-            if isinstance(command, m.Ping):
-                answer = yield from self._pong(deadline_ns)
-            else:
-                answer = yield from self._answer(command, row, timeout_s, catching_up)
+            yield Write(conversation.ask(command, timeout_s, as_token=as_token))
+            deadline_ns = until_ns = conversation.deadline_ns(timeout_s)
+            while True:
+                patience_s = matcher.match()
+                if patience_s is not None:
+                    until_ns = min(deadline_ns, conversation.deadline_ns(patience_s))
+                left_s = self.left_s(until_ns)
+                if left_s <= 0:
+                    break
+                yield Read(left_s)
         finally:  # also after a cancellation or an interrupt
-            conversation.expected = ()
+            matcher.expected = ()
+        answer = matcher.answer
         if answer is None:
             raise conversation.unanswered(command, timeout_s)
-        if not isinstance(command, m.Ping) or not conversation.pongs_possible:
-            conversation.answer_owed = False
+        matcher.settle()
         if isinstance(answer, m.Error):
-            meaning = error_name(answer.code, row.errors)
+            meaning = error_name(answer.code, ROWS[type(command)].errors)
             raise DeviceError(answer.code, summary(command), meaning)
         if isinstance(answer, BOOTLOADER_ERRORS):
             raise bootloader_error(answer, command)
@@ -431,74 +408,6 @@ class Link:
             case m.X4DriverSet(setting=X4Setting.FPS, value=SupportsFloat() as value):
                 rate = float(value)  # also of whole numbers and numpy's
                 self.frames.rate_hz = x4.real_frame_rate(rate) if rate > 0 else 0.0
-
-    def _answer(
-        self, command: Command[Response], row: Row, timeout_s: float, catching_up: bool
-    ) -> Steps[Response | None]:
-        conversation = self.conversation
-        content_id = row.content_id(command) if row.content_id else None
-        item = command.item if isinstance(command, m.SystemGetInfo) else None
-        echoed = command.data if isinstance(command, m.BootloaderEcho) else None
-        until_ns = conversation.deadline_ns(timeout_s)
-        late_pongs = conversation.pongs_possible
-        while True:
-            while conversation.answers:
-                answer = conversation.answers.popleft()
-                if isinstance(answer, m.Error) and not catching_up:
-                    return answer
-                if isinstance(answer, BOOTLOADER_ERRORS):
-                    if echoed is None:
-                        return answer
-                    conversation.stray_count += 1  # an ECHO has no errors: it is an earlier one's
-                    continue
-                if (
-                    isinstance(answer, row.replies)
-                    and (content_id is None or getattr(answer, "content_id", None) == content_id)
-                    and (item is None or getattr(answer, "info", None) == item)
-                    and (echoed is None or getattr(answer, "data", None) == echoed)
-                ):
-                    return answer
-                conversation.stray_count += 1
-                if isinstance(answer, m.Pong) and late_pongs:
-                    late_pongs -= 1
-                elif isinstance(answer, m.ReplyString) and self._tokens_out:
-                    self._tokens_out -= 1
-                elif conversation.unexpected is None and not catching_up:
-                    conversation.unexpected = answer
-                    grace_ns = conversation.deadline_ns(timeout_s * _AFTER_A_WRONG_ONE)
-                    until_ns = min(until_ns, grace_ns)
-            left_s = self.left_s(until_ns)
-            if left_s <= 0:
-                return None
-            yield Read(left_s)
-
-    def _pong(self, deadline_ns: int) -> Steps[m.Pong | None]:
-        """Return the last PONG that is due: a late one describes an earlier state.
-
-        PONGs do not echo the seed. So the PONGs due are counted, and one is taken for the last
-        if no other follows soon, since a module that was off does not answer PINGs of that time.
-        """
-        conversation = self.conversation
-        pong: m.Pong | None = None
-        until_ns = deadline_ns
-        while True:
-            while conversation.answers:
-                answer = conversation.answers.popleft()
-                if isinstance(answer, m.Pong):
-                    conversation.stray_count += pong is not None
-                    pong = answer
-                    until_ns = min(deadline_ns, self.clock() + _SETTLED_NS)
-                else:  # PING has no errors: those are of another command, too
-                    conversation.stray_count += 1
-                    if not conversation.answer_owed:
-                        conversation.unexpected = conversation.unexpected or answer
-            left_s = self.left_s(until_ns)
-            if left_s <= 0 or (pong is not None and conversation.pongs_owed == 0):
-                break
-            yield Read(left_s)
-        if pong is not None:
-            conversation.pongs_owed = 0
-        return pong
 
     def take_stale_input(self) -> Steps[None]:
         for _ in range(_STALE_READS):

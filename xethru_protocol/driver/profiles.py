@@ -17,8 +17,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from xethru_protocol.driver.conversation import FRAMES
 from xethru_protocol.driver.link import SLOW_TIMEOUT_S, KindT, Link, Part, Steps, receives, sends
+from xethru_protocol.driver.matching import FRAMES
 from xethru_protocol.driver.reconnect import await_restart
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (

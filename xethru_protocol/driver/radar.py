@@ -16,7 +16,6 @@ from typing import ClassVar, Self
 from xethru_protocol.driver import profiles, raw_mode, reconnect
 from xethru_protocol.driver.board import Diagnostics, Pins
 from xethru_protocol.driver.chip import X4, Postprocessing, Registers
-from xethru_protocol.driver.conversation import Listener, Observer, RawListener
 from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.firmware import Firmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
@@ -45,6 +44,7 @@ from xethru_protocol.driver.link import (
     sends,
     sends_once,
 )
+from xethru_protocol.driver.matching import Listener, Observer, RawListener
 from xethru_protocol.driver.profiles import MESSAGE_TIMEOUT_S, MessageT
 from xethru_protocol.transport import (
     AsyncTransport,
@@ -241,7 +241,7 @@ class RadarState(Part[KindT]):
     @property
     def stray_count(self) -> int:
         """Answers seen that belong to no request."""
-        return self._link.conversation.stray_count
+        return self._link.conversation.matcher.stray_count
 
     @property
     def reboots(self) -> int:
