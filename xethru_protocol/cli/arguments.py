@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from xethru_protocol.cli.version import add_version
 from xethru_protocol.validation import shown
+from xethru_protocol.wire.codes import POWER_UP_BAUD
 
 if TYPE_CHECKING:
     from xethru_protocol.driver.link import RawConfig
@@ -123,7 +124,7 @@ def text_source(text: str) -> tuple[str, str, int]:
     source, at, rate = found[2].rpartition("@")
     if at and rate.isdecimal():
         return found[1], source, int(baud_rate(rate))
-    return found[1], found[2], 115200
+    return found[1], found[2], POWER_UP_BAUD
 
 
 def base_name(text: str) -> tuple[str, str]:
@@ -163,7 +164,7 @@ def _add_baudrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--baudrate",
         type=baud_rate,
-        default=115200,
+        default=POWER_UP_BAUD,
         metavar="RATE",
         help="of a module on a UART (default 115200); without meaning on USB, at tcp:// and for "
         "emulators",

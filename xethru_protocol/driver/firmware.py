@@ -12,7 +12,6 @@ from typing import Self
 
 from xethru_protocol.driver import reconnect
 from xethru_protocol.driver.link import (
-    POWER_UP_BAUD,
     SLOW_TIMEOUT_S,
     TIMEOUT_S,
     KindT,
@@ -27,6 +26,7 @@ from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import (
+    POWER_UP_BAUD,
     BootloaderKey,
     BootloaderReply,
     ErrorCode,

@@ -38,6 +38,8 @@ from xethru_protocol.driver.matching import (
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
+    BAUD_RATES,
+    POWER_UP_BAUD,
     ErrorCode,
     InfoItem,
     PongCode,
@@ -48,6 +50,7 @@ from xethru_protocol.wire.codes import (
 )
 from xethru_protocol.wire.errors import (
     DeviceError,
+    Disconnected,
     LocalProtocolError,
     OldFirmwareError,
     RemoteProtocolError,
@@ -106,10 +109,6 @@ ReplyT = TypeVar("ReplyT", bound=Response)
 
 TIMEOUT_S = 2.0
 SLOW_TIMEOUT_S = 10.0  # mode changes and chip restarts
-BAUD_RATES = (
-    *(9600, 19200, 38400, 115200, 230400, 460800, 500000, 576000, 921600),
-    *(1000000, 2000000, 3000000, 4000000),
-)
 
 _STALE_READS = 64  # more than any port buffers; a bound, since a fast module never pauses
 # The module changes its rate 500 ms after its ACK and hears nothing until then (Protocol
@@ -117,7 +116,10 @@ _STALE_READS = 64  # more than any port buffers; a bound, since a fast module ne
 _BAUD_SETTLE_S = (0.1, 0.45)
 _BAUD_PROBE_S = 0.3  # one PING at a rate that may not be the module's
 _BAUD_PROBES_NEW, _BAUD_PROBES_OLD = 7, 3
-POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
+_LIKELIEST_RATES = (
+    *(115200, 921600, 460800, 230400, 1000000, 2000000, 3000000, 4000000),
+    *(500000, 576000, 38400, 19200, 9600),
+)
 _WARNINGS = 1000  # kept; a radar may run for months
 _MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
 
@@ -588,6 +590,18 @@ class Link:
             f"{baudrate}. Can line and adapter carry that? A module that is switched off and on "
             f"answers at {POWER_UP_BAUD}"
         )
+
+    def find_baud_rate(self) -> Steps[int | None]:
+        for baudrate in _LIKELIEST_RATES:
+            with suppress(Disconnected):  # the adapter does not have this rate
+                yield SetLineRate(baudrate)
+                self.conversation.new_line(self.path)  # what came at a wrong rate means nothing
+                self.baudrate = baudrate
+                if (yield from self._probe(1)):
+                    return baudrate
+        yield SetLineRate(POWER_UP_BAUD)
+        self.baudrate = POWER_UP_BAUD
+        return None
 
     def _probe(self, times: int) -> Steps[bool]:
         """Whether the module answers one of some PINGs, of which it may not hear the first."""

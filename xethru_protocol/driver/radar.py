@@ -20,7 +20,6 @@ from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.firmware import Firmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
-    POWER_UP_BAUD,
     TIMEOUT_S,
     Blocking,
     CloseLine,
@@ -54,7 +53,7 @@ from xethru_protocol.transport import (
     open_line,
     set_rate,
 )
-from xethru_protocol.wire.codes import PongCode, SensorMode
+from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, SensorMode
 from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.messages import Command, Response
@@ -352,6 +351,15 @@ class RadarState(Part[KindT]):
         """
         return link.set_baud_rate(baudrate, force=force)
 
+    @sends_once
+    def find_baud_rate(link: Link) -> Steps[int | None]:
+        """Find the rate at which a module on a UART answers, and change this side to it.
+
+        None if it answers at none; this side is at 115200 then. Lines without a rate accept every
+        one without effect.
+        """
+        return link.find_baud_rate()
+
     # --- raw radar mode ---
 
     @sends
@@ -462,7 +470,8 @@ class X4M300(RadarState[Blocking]):
     - raw frames: `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
     - all other messages: `messages`, `read_message`, `messages_waiting`; `listener` is called with
       every one, `raw_listener` with the bytes of both directions
-    - the module and its line: `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`
+    - the module and its line: `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`,
+      `find_baud_rate`
     - any command of the protocol: `request`
 
     The parts, each with a help of its own, such as ``help(radar.x4)``:
