@@ -110,7 +110,7 @@ class AsyncX4M300(RadarState[Awaited]):
         finally:
             self._transport.close()
 
-    # --- any command ----------------------------------------------------------------------------
+    # --- any command, iterators ---
 
     async def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> ReplyT:
         """Send a command and return its reply; see `X4M300.request`."""
@@ -136,7 +136,7 @@ class AsyncX4M300(RadarState[Awaited]):
         for _ in itertools.count() if count is None else range(count):
             yield await self.read_message(Response, timeout_s)
 
-    # --- carrying out steps ---------------------------------------------------------------------
+    # --- carrying out steps ---
 
     async def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that sends commands; again after a reconnect, if that is on."""

@@ -565,7 +565,7 @@ class X4M300(RadarState[Blocking]):
         finally:
             self._transport.close()
 
-    # --- any command ----------------------------------------------------------------------------
+    # --- any command, iterators ---
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> ReplyT:
         """Send a command and return the reply that its row in the message table names.
@@ -581,10 +581,6 @@ class X4M300(RadarState[Blocking]):
         """
         return self._call(Link.request, command, timeout_s)
 
-    # --- the line -------------------------------------------------------------------------------
-
-    # --- raw radar mode -------------------------------------------------------------------------
-
     def frames(self, count: int | None = None, timeout_s: float = TIMEOUT_S) -> Iterator[Frame]:
         """Iterate over frames; ``count`` of them, or without end.
 
@@ -592,8 +588,6 @@ class X4M300(RadarState[Blocking]):
         """
         for _ in itertools.count() if count is None else range(count):
             yield self.read_frame(timeout_s)
-
-    # --- other messages -------------------------------------------------------------------------
 
     def read_message(self, kind: type[MessageT], timeout_s: float = MESSAGE_TIMEOUT_S) -> MessageT:
         """Next message of a class of `xethru_protocol.wire.messages`, such as `DataString`.
@@ -617,7 +611,7 @@ class X4M300(RadarState[Blocking]):
         for _ in itertools.count() if count is None else range(count):
             yield self.read_message(Response, timeout_s)
 
-    # --- carrying out steps ---------------------------------------------------------------------
+    # --- carrying out steps ---
 
     def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that sends commands; again after a reconnect, if that is on."""
