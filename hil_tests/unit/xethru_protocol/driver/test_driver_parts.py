@@ -697,7 +697,7 @@ def test_both_drivers_have_the_same_methods() -> None:
 
 
 @pytest.mark.parametrize("driver", [X4M300, AsyncX4M300])
-def test_methods_of_parts_are_documented_as_they_are_called(
+def test_methods_are_documented_as_they_are_called(
     driver: type[X4M300] | type[AsyncX4M300],
 ) -> None:
     radar: Any = driver(ScriptedTransport(PlainModule()))  # type: ignore[arg-type] # it only has a name
@@ -712,3 +712,7 @@ def test_methods_of_parts_are_documented_as_they_are_called(
         "(start_m: float, end_m: float) -> tuple[float, float]"
     )
     assert (radar.profile.set_zone.__doc__ or "").startswith("Choose the detection zone")
+    for method in public_methods(driver).values():
+        assert "link" not in inspect.signature(method).parameters, method
+    assert str(inspect.signature(driver.start)) == "(self, fps: float) -> float"
+    assert (inspect.getdoc(driver.start) or "").startswith("Start frames")
