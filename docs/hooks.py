@@ -1,15 +1,18 @@
-"""Hooks of mkdocs for what the site shows and `docs/` does not hold as a page.
+"""Hooks of mkdocs and griffe for what the site shows and `docs/` does not hold as a page.
 
 Pages link to files as they lie in the repository, so that they read as well there. A file outside
 `docs/` that a page links to becomes a part of the site, under `repository/`. An example,
-`docs/examples/NN_name.py`, becomes a page: its docstring, then its code. Links follow.
+`docs/examples/NN_name.py`, becomes a page: its docstring, then its code. Links follow. A method
+that a driver makes of a procedure is shown as it is called.
 """
 
 import ast
 import os
 import re
+from copy import copy
 from pathlib import Path
 
+from griffe import Expr, ExprSubscript, Extension, Function, Parameter, Parameters
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files, InclusionLevel
@@ -99,3 +102,26 @@ def _example_page(file: Path) -> str:
     code = "\n".join(source.splitlines()[docstring.end_lineno :]).strip()
     title = f"{file.stem[:2]}. {title.rstrip('.')}"
     return f"# {title}\n{text}\n\n`docs/examples/{file.name}`:\n\n```python\n{code}\n```\n"
+
+
+class DriverMethods(Extension):
+    """Show a procedure that a decorator of `driver.link` makes a method as it is called."""
+
+    _DECORATORS = frozenset(
+        f"xethru_protocol.driver.link.{name}" for name in ("receives", "sends", "sends_once")
+    )
+
+    def on_function(self, *, func: Function, **_: object) -> None:
+        """Leave out the link, and return the result instead of the steps."""
+        if not any(one.callable_path in self._DECORATORS for one in func.decorators):
+            return
+        _, *others = func.parameters
+        func.parameters = Parameters(Parameter("self"), *others)
+        if isinstance(func.returns, ExprSubscript):
+            result = func.returns.slice
+            func.returns = result if isinstance(result, Expr) else str(result)
+        func.decorators = []
+        if func.parent is not None and func.parent.name == "RadarState":  # both drivers have it
+            awaited = copy(func)
+            awaited.labels = {*func.labels, "async"}
+            func.package["driver.async_radar.AsyncX4M300"].set_member(func.name, awaited)

@@ -28,7 +28,7 @@ from xethru_protocol.system import (
     json_text,
     one_line,
 )
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import number, shown
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -566,19 +566,15 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _whole(least: int, most: int, limit: str | None = None) -> Callable[[str], int]:
+def _whole(least: int, most: int, limit: str | None = None) -> Callable[[str], float]:
     """Return the type of an option that takes a whole number within limits."""
+    allowed = f"a whole number in {least}...{limit or most}"
+    return number(int, lambda value: least <= value <= most, allowed)
 
-    def value_of(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{shown(text)} is not a whole number") from None
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"{value} is not in {least}...{limit or most}")
-        return value
 
-    return value_of
+_rate = number(float, lambda value: 0 <= value < math.inf, "a finite number >= 0")
+# longer than any recording
+_seconds = number(float, lambda value: 0 <= value <= 1e9, "seconds in 0...1e9")
 
 
 def _firmware(text: str) -> str:
@@ -607,30 +603,14 @@ def _host(text: str) -> str:
 
 
 def _link(text: str) -> tuple[str, float | None]:
-    kind, colon, number = text.partition(":")
+    kind, colon, rate = text.partition(":")
     if kind not in _LINKS:
         raise argparse.ArgumentTypeError(f"{shown(text)} is neither usb nor uart")
     if not colon:
         return kind, None
     least, most = _LINKS[kind]
-    value = _number_or_nan(number)
-    if not least <= value <= most:  # so not-a-number, too
-        raise argparse.ArgumentTypeError(f"{shown(number)} of {kind} is not in {least}...{most}")
-    return kind, value
-
-
-def _number_or_nan(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
-def _seconds(text: str) -> float:
-    value = _rate(text)
-    if value > 1e9:
-        raise argparse.ArgumentTypeError(f"{text} s is longer than any recording")
-    return value
+    allowed = f"in {least}...{most} after {kind}:"
+    return kind, number(float, lambda value: least <= value <= most, allowed)(rate)
 
 
 def _kind(text: str) -> str:
@@ -641,13 +621,6 @@ def _kind(text: str) -> str:
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return kind
-
-
-def _rate(text: str) -> float:
-    value = _number_or_nan(text)
-    if not (math.isfinite(value) and value >= 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number >= 0")
-    return value
 
 
 if __name__ == "__main__":

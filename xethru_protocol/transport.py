@@ -36,6 +36,7 @@ import serial
 from serial.tools import list_ports
 
 from xethru_protocol.validation import reason_of
+from xethru_protocol.wire.codes import POWER_UP_BAUD
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 _CHUNK_BYTES = 65536
@@ -44,7 +45,6 @@ _WRITE_TIMEOUT_S = 5.0
 _LOOK_AGAIN_S = 0.005  # whether another thread has read what is waited for
 _TURN_S = 0.005  # how long one task of asyncio may read on while data never end
 _LONGEST_WAIT_S = 86400.0  # poll() takes 31 bits of milliseconds; a caller waits again
-_BAUD = 115200  # what a UART module starts with; without meaning on USB and ptys
 _BITS_PER_BYTE = 10  # start and stop bit
 _SHARE = 0.8  # of a UART, for frames
 # Names of ports without a rate of their own: USB CDC and pseudo-terminals.
@@ -195,7 +195,7 @@ class SerialTransport(LineTransport):
     is in use, or may not be opened.
     """
 
-    def __init__(self, path: str, baudrate: int = _BAUD) -> None:
+    def __init__(self, path: str, baudrate: int = POWER_UP_BAUD) -> None:
         try:
             self._port = serial.Serial(path, baudrate, timeout=0, exclusive=True)
         # SerialException is an OSError; no rate can have more than 32 bits
@@ -290,7 +290,7 @@ class Rfc2217Transport(SocketTransport):
     cannot be reached, does not speak RFC 2217, or does not set the rate.
     """
 
-    def __init__(self, url: str, baudrate: int = _BAUD) -> None:
+    def __init__(self, url: str, baudrate: int = POWER_UP_BAUD) -> None:
         super().__init__(url)
         self._held = b""  # an incomplete telnet command
         self._came = b""  # read while an answer about the line was waited for
@@ -447,7 +447,7 @@ def is_network_port(port: str) -> bool:
     return re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", port) is not None
 
 
-def open_line(port: str, baudrate: int = _BAUD) -> LineTransport:
+def open_line(port: str, baudrate: int = POWER_UP_BAUD) -> LineTransport:
     """Open a port by its name: a serial port, ``tcp://``, ``socket://`` or ``rfc2217://``.
 
     ``baudrate`` matters on UARTs, and at ``rfc2217://``. Raises PortUnavailable with what is wrong
@@ -557,7 +557,7 @@ class AsyncTransport(Protocol):
 class AsyncSerialTransport:
     """A port whose descriptor the running event loop watches; ports as of `open_line`."""
 
-    def __init__(self, path: str, baudrate: int = _BAUD) -> None:
+    def __init__(self, path: str, baudrate: int = POWER_UP_BAUD) -> None:
         self.name = path
         self._port = open_line(path, baudrate)
         # Tasks that wait for the descriptor, which must not be watched once it is closed.

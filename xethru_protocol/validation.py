@@ -1,4 +1,4 @@
-"""What is wrong with a file that a person wrote, in one line of plain English.
+"""What is wrong with what a person wrote, a file or an option, in one line of plain English.
 
 Problems are the plain dictionaries of pydantic's ``ValidationError.errors()``, and models are only
 asked for their fields: scenes and settings of SLAM share this, and nothing here needs pydantic.
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from xethru_protocol.system import one_line
@@ -107,6 +108,23 @@ def reason_of(error: Exception) -> str:
         case OSError(strerror=str(reason)):
             return reason
     return str(error) or type(error).__name__
+
+
+def number(
+    kind: Callable[[str], float], is_allowed: Callable[[float], bool], allowed: str
+) -> Callable[[str], float]:
+    """Return the type of an option that takes the ``allowed`` numbers, and refuses others."""
+
+    def read(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not is_allowed(value):
+            raise ArgumentTypeError(f"{shown(text)} must be {allowed}")
+        return value
+
+    return read
 
 
 def _text(problem: Problem, keys: Sequence[str], table: Any) -> str:  # noqa: ANN401 - as above

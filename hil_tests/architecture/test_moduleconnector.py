@@ -23,7 +23,7 @@ import xethru_protocol
 from hil_tests.paths import REPOSITORY
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport
 from xethru_protocol import X4M300, cli, recordings
-from xethru_protocol.driver import board, conversation, files, firmware, link, profiles
+from xethru_protocol.driver import board, files, firmware, link, matching, profiles
 from xethru_protocol.recordings import formats
 from xethru_protocol.wire import codec, codes, messages
 
@@ -109,7 +109,7 @@ NAMES: dict[str, object] = {
     "FileName": files.FileName,
     "FirmwareImage": firmware.FirmwareImage,
     "PinControl": board.PinControl,
-    "ProtocolRecord": conversation.ProtocolRecord,
+    "ProtocolRecord": matching.ProtocolRecord,
     "ZoneLimits": profiles.ZoneLimits,
 }
 INSTANCES = {"recorder": recordings.Recorder, "reader": recordings.RecordingReader}
@@ -156,6 +156,8 @@ class Checker:
         if isinstance(owner, ModuleType | type):
             return getattr(owner, name)
         found = inspect.getattr_static(owner.cls if isinstance(owner, Instance) else owner, name, 0)
+        if isinstance(found, link.Method):
+            found = found.__get__(None, X4M300)
         if found == 0:  # set by a method
             cls = owner.cls if isinstance(owner, Instance) else type(owner)
             assert re.search(rf"self\.{name}\b[^\n]*=", inspect.getsource(cls)), name

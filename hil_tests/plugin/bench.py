@@ -22,12 +22,11 @@ from hil_tests.plugin.radar_targets import (
     scene_radars,
     target_of,
 )
-from xethru_protocol.driver.link import BAUD_RATES, POWER_UP_BAUD
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.system import one_line
-from xethru_protocol.transport import Transport, set_rate
+from xethru_protocol.transport import Transport
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import (
     DeviceError,
     Disconnected,
@@ -284,15 +283,11 @@ class RadarUnderTest:
 
     def _found_at_another_rate(self, line: Transport) -> bool:
         """Find a module that a test left at another baud rate and set it back; False if none."""
-        for baudrate in reversed(BAUD_RATES):
-            set_rate(line, baudrate)
-            stray = self.place.driver(line, self.tap)  # forgets what came at a wrong rate
-            with contextlib.suppress(ResponseTimeout):
-                stray.ping(0.3)
-                stray.set_baud_rate(POWER_UP_BAUD)
-                return True
-        set_rate(line, POWER_UP_BAUD)
-        return False
+        stray = self.place.driver(line, self.tap)
+        if stray.find_baud_rate() is None:
+            return False
+        stray.set_baud_rate(POWER_UP_BAUD)
+        return True
 
 
 class Bench:

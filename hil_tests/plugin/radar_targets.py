@@ -23,6 +23,7 @@ from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import Kind, RadarSpec
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import Transport, capacity_bytes_per_s, find_ports, open_line
+from xethru_protocol.wire.codes import POWER_UP_BAUD
 from xethru_protocol.wire.errors import XeThruError
 
 if TYPE_CHECKING:
@@ -115,8 +116,7 @@ CAPABILITIES: Mapping[str, str] = {
 }
 """What a test may require of a radar, and why one may lack it; ``?has=`` adds others."""
 
-_BAUD = 115200
-_UART_BYTES_PER_S = _BAUD / 10
+_UART_BYTES_PER_S = POWER_UP_BAUD / 10
 _EMPTY_ROOM_RADARS = 4
 
 
@@ -176,7 +176,7 @@ class RadarTarget(ABC):
         """Prepare the radar; called before each test."""
 
     @abstractmethod
-    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+    def open_line(self, path: str | None = None, baudrate: int = POWER_UP_BAUD) -> Transport:
         """Return an open line; ``path`` is where a driver looks for a module that vanished."""
 
     def candidates(self) -> Sequence[str]:
@@ -246,7 +246,7 @@ class InProcessTarget(RadarTarget):
         self.clock_ns = self._line.clock_ns
         self.sleep = self._line.sleep
 
-    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+    def open_line(self, path: str | None = None, baudrate: int = POWER_UP_BAUD) -> Transport:
         from hil_tests.faulty import PATH
 
         return self._line.open(path or PATH, baudrate)
@@ -302,7 +302,7 @@ class ProcessTarget(RadarTarget):
             self._cleanup.close()
             raise
 
-    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+    def open_line(self, path: str | None = None, baudrate: int = POWER_UP_BAUD) -> Transport:
         if self.spec.line == "tcp":
             return open_line(f"tcp://127.0.0.1:{self._served.tcp_ports[self._index]}")
         return open_line(path or self._served.paths[self._index], baudrate)
@@ -376,7 +376,7 @@ class PortTarget(RadarTarget):
         if not math.isinf(self.bytes_per_s):
             self.capabilities |= {"uart"}
 
-    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+    def open_line(self, path: str | None = None, baudrate: int = POWER_UP_BAUD) -> Transport:
         return open_line(path or self._path, baudrate)
 
     def candidates(self) -> Sequence[str]:

@@ -4,11 +4,12 @@ import argparse
 import math
 import re
 from argparse import ArgumentTypeError
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from xethru_protocol.cli.version import add_version
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import number, shown
+from xethru_protocol.wire.codes import POWER_UP_BAUD
 
 if TYPE_CHECKING:
     from xethru_protocol.driver.link import RawConfig
@@ -32,33 +33,16 @@ def utf8_text(text: str) -> str:
     return text
 
 
-def _number(
-    kind: Callable[[str], float], is_allowed: Callable[[float], bool], allowed: str
-) -> Callable[[str], float]:
-    """Return a reader of numbers that refuses others than the ``allowed`` ones."""
-
-    def read(text: str) -> float:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = math.nan
-        if not is_allowed(value):
-            raise ArgumentTypeError(f"{shown(text)} must be {allowed}")
-        return value
-
-    return read
-
-
-frame_rate = _number(float, lambda value: 0 < value < 65536, "a number between 0 and 65536")
-seconds = _number(float, lambda value: 0 < value <= _LONGEST_S, "seconds, more than 0")
+frame_rate = number(float, lambda value: 0 < value < 65536, "a number between 0 and 65536")
+seconds = number(float, lambda value: 0 < value <= _LONGEST_S, "seconds, more than 0")
 # a hundred times what any radar sees
-metres = _number(float, lambda value: -1000 <= value <= 1000, "metres between -1000 and 1000")
-sensitivity = _number(int, lambda value: 0 <= value <= 9, "a whole number from 0 to 9")
-at_least_one = _number(int, lambda value: value >= 1, "a whole number from 1 on")
-playback_rate = _number(float, lambda value: 0 <= value < math.inf, "a number from 0 on")
-window = _number(float, lambda value: 20 <= value <= 600, "seconds, from 20 to 600")
+metres = number(float, lambda value: -1000 <= value <= 1000, "metres between -1000 and 1000")
+sensitivity = number(int, lambda value: 0 <= value <= 9, "a whole number from 0 to 9")
+at_least_one = number(int, lambda value: value >= 1, "a whole number from 1 on")
+playback_rate = number(float, lambda value: 0 <= value < math.inf, "a number from 0 on")
+window = number(float, lambda value: 20 <= value <= 600, "seconds, from 20 to 600")
 # rates that a module could be set to (Protocol reference 4.10)
-baud_rate = _number(
+baud_rate = number(
     int, lambda value: 600 <= value <= 10_000_000, "a whole number from 600 to 10000000"
 )
 
@@ -123,7 +107,7 @@ def text_source(text: str) -> tuple[str, str, int]:
     source, at, rate = found[2].rpartition("@")
     if at and rate.isdecimal():
         return found[1], source, int(baud_rate(rate))
-    return found[1], found[2], 115200
+    return found[1], found[2], POWER_UP_BAUD
 
 
 def base_name(text: str) -> tuple[str, str]:
@@ -163,7 +147,7 @@ def _add_baudrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--baudrate",
         type=baud_rate,
-        default=115200,
+        default=POWER_UP_BAUD,
         metavar="RATE",
         help="of a module on a UART (default 115200); without meaning on USB, at tcp:// and for "
         "emulators",

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from xethru_protocol.cli.output import counted, print_json, print_line, profile_name
 from xethru_protocol.cli.port_probe import (
-    USUAL_BAUDRATE,
     Check,
     Finding,
     Level,
@@ -25,7 +24,7 @@ from xethru_protocol.cli.port_probe import (
 )
 from xethru_protocol.system import one_line
 from xethru_protocol.transport import find_ports, is_private, is_running, run_directory
-from xethru_protocol.wire.codes import PongCode, ProfileId, SensorMode
+from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, ProfileId, SensorMode
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.messages import Ping
 from xethru_protocol.wire.versions import Firmware, lacking
@@ -369,9 +368,9 @@ def _unknown_device(probe: PortProbe) -> str | None:
 )
 def _other_rate(probe: PortProbe) -> str | None:
     rate = probe.contact.baudrate
-    if rate == USUAL_BAUDRATE:
+    if rate == POWER_UP_BAUD:
         return None
-    return f"it answers at {rate} baud, not at {USUAL_BAUDRATE}"
+    return f"it answers at {rate} baud, not at {POWER_UP_BAUD}"
 
 
 @Check(

@@ -23,7 +23,7 @@ from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import LineTransport, is_network_port, open_line
 from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.codes import POWER_UP_BAUD, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import DeviceError, Disconnected, PortUnavailable, XeThruError
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault
@@ -203,12 +203,6 @@ def _read(path: str) -> str:
         return ""
 
 
-USUAL_BAUDRATE = 115200
-# Protocol reference 10, the likeliest first
-_OTHER_BAUDRATES = (
-    *(921600, 460800, 230400, 1000000, 2000000, 3000000, 4000000),
-    *(500000, 576000, 38400, 19200, 9600),
-)
 _ANSWER_LIMIT_S = 1.0
 _LONGEST_FRAME_BYTES = 6163  # Protocol reference 10
 _REPLY_LIMIT_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
@@ -219,7 +213,7 @@ class Contact:
     """What came back over an opened port."""
 
     pong: int | None = None  # answer to PING
-    baudrate: int = USUAL_BAUDRATE  # at which that came
+    baudrate: int = POWER_UP_BAUD  # at which that came
     talks: bool = False  # other messages came
     damaged: bool = False  # bytes came that are not packets
     bootloader: bool = False  # a bootloader answered
@@ -298,12 +292,9 @@ class PortProbe:
         if second.bootloader:
             return second
         if math.isfinite(bytes_per_s) and not first.talks:  # a UART, perhaps of another rate
-            for baudrate in _OTHER_BAUDRATES:
-                if self._reopen(baudrate):
-                    contact = self._ask(m.Ping(), _REPLY_LIMIT_S, baudrate)
-                    if contact.pong is not None:
-                        return contact
-            self._reopen(USUAL_BAUDRATE)
+            baudrate = self.module.find_baud_rate()
+            if baudrate is not None:
+                return self._ask(m.Ping(), _REPLY_LIMIT_S, baudrate)
         return first
 
     @cached_property
@@ -337,18 +328,8 @@ class PortProbe:
             return None
         return int(values[0]) if values else None
 
-    def _reopen(self, baudrate: int) -> bool:
-        """Open the port at another rate; False where the adapter does not know that."""
-        assert self._transport is not None
-        self._transport.close()
-        try:
-            self._transport = open_line(self.path, baudrate)
-        except PortUnavailable:
-            return False
-        return True
-
     def _ask(
-        self, command: Command[Response], timeout_s: float, baudrate: int = USUAL_BAUDRATE
+        self, command: Command[Response], timeout_s: float, baudrate: int = POWER_UP_BAUD
     ) -> Contact:
         """Send a command; return what came until its answer, or until the time was over."""
         assert self._transport is not None

@@ -22,20 +22,14 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Any, Literal, Self
 
 from xethru_protocol.driver import raw_mode, reconnect
-from xethru_protocol.driver.board import AsyncDiagnostics, AsyncPins
-from xethru_protocol.driver.chip import AsyncPostprocessing, AsyncRegisters, AsyncX4
-from xethru_protocol.driver.conversation import Observer
-from xethru_protocol.driver.files import AsyncFiles
-from xethru_protocol.driver.firmware import AsyncFirmware
-from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
+from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
+    Awaited,
     Link,
-    ModuleInfo,
     OpenLine,
     P,
     Procedure,
-    RawConfig,
     Read,
     ReplyT,
     Sleep,
@@ -44,12 +38,10 @@ from xethru_protocol.driver.link import (
     T,
     Write,
 )
+from xethru_protocol.driver.matching import Observer
 from xethru_protocol.driver.profiles import (
     MESSAGE_TIMEOUT_S,
-    AsyncProfile,
     MessageT,
-    messages_waiting,
-    set_mode,
     wait_for_message,
 )
 from xethru_protocol.driver.radar import RadarState, known_ports, reentry
@@ -59,19 +51,19 @@ from xethru_protocol.transport import (
     Transport,
     is_network_port,
 )
-from xethru_protocol.wire.codes import PongCode, SensorMode
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 from xethru_protocol.wire.messages import Command, Response
 
 _LONGEST_WAIT_S = 86400.0
 
 
-class AsyncX4M300(RadarState):
+class AsyncX4M300(RadarState[Awaited]):
     """One module at the other end of a transport of asyncio; all members as of `X4M300`.
 
     A chip setting has coroutines: ``await radar.x4.iterations.get()``, ``.set(8)``.
     """
 
+    _is_awaited = True
     _port_type = staticmethod(AsyncSerialTransport)
     _transport: AsyncTransport
 
@@ -100,14 +92,6 @@ class AsyncX4M300(RadarState):
         self._one_at_a_time = asyncio.Lock()
         self._reading: asyncio.Future[None] | None = None
         self._at_work = False  # never while a task waits
-        self.x4 = AsyncX4(self._call)
-        self.profile = AsyncProfile(self._call, self._listen)
-        self.pins = AsyncPins(self._call)
-        self.files = AsyncFiles(self._call, self._call_once)
-        self.firmware = AsyncFirmware(self._call_once)
-        self.registers = AsyncRegisters(self._call)
-        self.postprocessing = AsyncPostprocessing(self._call)
-        self.diagnostics = AsyncDiagnostics(self._call)
 
     async def __aenter__(self) -> Self:
         return self
@@ -126,59 +110,11 @@ class AsyncX4M300(RadarState):
         finally:
             self._transport.close()
 
-    # --- any command ----------------------------------------------------------------------------
+    # --- any command, iterators ---
 
     async def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> ReplyT:
         """Send a command and return its reply; see `X4M300.request`."""
         return await self._call(Link.request, command, timeout_s)
-
-    async def ping(self, timeout_s: float = TIMEOUT_S) -> PongCode:
-        """Whether the module is ready, not ready, or in safe mode; see `X4M300.ping`."""
-        return await self._call(Link.ping, timeout_s)
-
-    async def info(self) -> ModuleInfo:
-        """Read what the module reports about itself; see `X4M300.info`."""
-        return await self._call(Link.info)
-
-    async def mode(self) -> SensorMode:
-        """Ask for the module's mode; see `X4M300.mode`."""
-        return await self._call(Link.mode)
-
-    async def set_mode(self, mode: SensorMode, parameter: int | None = None) -> None:
-        """Change the module's mode; see `X4M300.set_mode`."""
-        await self._call(set_mode, mode, parameter)
-
-    # --- the line -------------------------------------------------------------------------------
-
-    async def reset(self, *, wait: bool = False, timeout_s: float = reconnect.RESTART_S) -> None:
-        """Restart the module; see `X4M300.reset`."""
-        await self._call_once(reconnect.reset, wait=wait, timeout_s=timeout_s)
-
-    async def reconnect(self, timeout_s: float = reconnect.RESTART_S) -> str:
-        """Find the module again and restore what was configured; see `X4M300.reconnect`."""
-        return await self._call_once(reconnect.reconnect, timeout_s)
-
-    async def set_baud_rate(self, baudrate: int, *, force: bool = False) -> None:
-        """Change the rate of a UART on both sides; see `X4M300.set_baud_rate`."""
-        await self._call_once(Link.set_baud_rate, baudrate, force=force)
-
-    # --- raw radar mode -------------------------------------------------------------------------
-
-    async def configure_raw(self, config: RawConfig | None = None) -> FrameGeometry:
-        """Bring the module to raw radar mode, stopped; see `X4M300.configure_raw`."""
-        return await self._call(raw_mode.configure_raw, config)
-
-    async def start(self, fps: float) -> float:
-        """Start frames at ``fps`` [Hz]; see `X4M300.start`."""
-        return await self._call(raw_mode.start, fps)
-
-    async def stop(self) -> None:
-        """Stop frames; see `X4M300.stop`."""
-        await self._call(raw_mode.stop)
-
-    async def read_frame(self, timeout_s: float = TIMEOUT_S) -> Frame:
-        """Next frame, in order of arrival; see `X4M300.read_frame`."""
-        return await self._listen(Link.next_frame, timeout_s)
 
     async def frames(
         self, count: int | None = None, timeout_s: float = TIMEOUT_S
@@ -186,13 +122,6 @@ class AsyncX4M300(RadarState):
         """Iterate over frames; ``count`` of them, or without end; see `X4M300.frames`."""
         for _ in itertools.count() if count is None else range(count):
             yield await self.read_frame(timeout_s)
-
-    async def frames_waiting(self) -> int:
-        """Count the frames not taken yet; see `X4M300.frames_waiting`."""
-        await self._listen(Link.take_stale_input)
-        return len(self._link.frames)
-
-    # --- other messages -------------------------------------------------------------------------
 
     async def read_message(
         self, kind: type[MessageT], timeout_s: float = MESSAGE_TIMEOUT_S
@@ -207,11 +136,7 @@ class AsyncX4M300(RadarState):
         for _ in itertools.count() if count is None else range(count):
             yield await self.read_message(Response, timeout_s)
 
-    async def messages_waiting(self, kind: type[Response] = Response) -> int:
-        """Count the messages not taken yet; see `X4M300.messages_waiting`."""
-        return await self._listen(messages_waiting, kind)
-
-    # --- carrying out steps ---------------------------------------------------------------------
+    # --- carrying out steps ---
 
     async def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that sends commands; again after a reconnect, if that is on."""

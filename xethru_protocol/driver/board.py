@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncPart, Link, Part, Steps
+from xethru_protocol.driver.link import SLOW_TIMEOUT_S, KindT, Link, Part, Steps, sends
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import InjectMode, IoPinFeature, IoPinSetup, TestCode
 from xethru_protocol.wire.errors import LocalProtocolError, RemoteProtocolError
@@ -36,14 +36,37 @@ class TestResult:
     data: bytes
 
 
-def pin_control(link: Link, pin: int) -> Steps[PinControl]:
-    setup, feature = yield from _numbers(link, m.IoPinGetControl(pin_id=pin), 2)
-    return PinControl(setup=IoPinSetup(setup), feature=feature)
+class Pins(Part[KindT]):
+    """IO pins of a module; ``pin`` is an `IoPin`. Protocol reference 4.8.
 
+    Bare XEP firmware knows the feature PASSIVE only, and does not answer `control`.
+    """
 
-def read_pin(link: Link, pin: int) -> Steps[bool]:
-    (value,) = yield from _numbers(link, m.IoPinGetValue(pin_id=pin), 1)
-    return bool(value)
+    __slots__ = ()
+
+    @sends
+    def set_control(
+        link: Link, pin: int, setup: IoPinSetup, feature: int = IoPinFeature.PASSIVE
+    ) -> Steps[None]:
+        """Choose what a pin does; PASSIVE leaves it to `read` and `write`."""
+        yield from link.request(m.IoPinSetControl(pin_id=pin, pin_setup=setup, pin_feature=feature))
+
+    @sends
+    def control(link: Link, pin: int) -> Steps[PinControl]:
+        """Ask what a pin does."""
+        setup, feature = yield from _numbers(link, m.IoPinGetControl(pin_id=pin), 2)
+        return PinControl(setup=IoPinSetup(setup), feature=feature)
+
+    @sends
+    def write(link: Link, pin: int, high: bool) -> Steps[None]:
+        """Drive an output pin high or low."""
+        yield from link.request(m.IoPinSetValue(pin_id=pin, pin_value=int(high)))
+
+    @sends
+    def read(link: Link, pin: int) -> Steps[bool]:
+        """Ask whether a pin is high."""
+        (value,) = yield from _numbers(link, m.IoPinGetValue(pin_id=pin), 1)
+        return bool(value)
 
 
 def _numbers(link: Link, command: m.Command[m.ReplyInt], wanted: int) -> Steps[tuple[int, ...]]:
@@ -53,116 +76,42 @@ def _numbers(link: Link, command: m.Command[m.ReplyInt], wanted: int) -> Steps[t
     return values
 
 
-class Pins(Part):
-    """IO pins of a module behind an `X4M300`; ``pin`` is an `IoPin`. Protocol reference 4.8.
-
-    Bare XEP firmware knows the feature PASSIVE only, and does not answer `control`.
-    """
+class Diagnostics(Part[KindT]):
+    """Tests of a module, trace output, injected frames."""
 
     __slots__ = ()
 
-    def set_control(self, pin: int, setup: IoPinSetup, feature: int = IoPinFeature.PASSIVE) -> None:
-        """Choose what a pin does; PASSIVE leaves it to `read` and `write`."""
-        self._call(
-            Link.request, m.IoPinSetControl(pin_id=pin, pin_setup=setup, pin_feature=feature)
-        )
-
-    def control(self, pin: int) -> PinControl:
-        """Ask what a pin does."""
-        return self._call(pin_control, pin)
-
-    def write(self, pin: int, high: bool) -> None:
-        """Drive an output pin high or low."""
-        self._call(Link.request, m.IoPinSetValue(pin_id=pin, pin_value=int(high)))
-
-    def read(self, pin: int) -> bool:
-        """Ask whether a pin is high."""
-        return self._call(read_pin, pin)
-
-
-class AsyncPins(AsyncPart):
-    """IO pins of a module behind an `AsyncX4M300`; methods as of `Pins`."""
-
-    __slots__ = ()
-
-    async def set_control(
-        self, pin: int, setup: IoPinSetup, feature: int = IoPinFeature.PASSIVE
-    ) -> None:
-        await self._call(
-            Link.request, m.IoPinSetControl(pin_id=pin, pin_setup=setup, pin_feature=feature)
-        )
-
-    async def control(self, pin: int) -> PinControl:
-        return await self._call(pin_control, pin)
-
-    async def write(self, pin: int, high: bool) -> None:
-        await self._call(Link.request, m.IoPinSetValue(pin_id=pin, pin_value=int(high)))
-
-    async def read(self, pin: int) -> bool:
-        return await self._call(read_pin, pin)
-
-
-# --- diagnostics --------------------------------------------------------------------------------
-
-
-def run_test(link: Link, code: int) -> Steps[TestResult]:
-    reply = yield from link.request(m.SystemTest(code=code), SLOW_TIMEOUT_S)
-    if isinstance(reply, m.Ack):
-        return TestResult(code=code, passed=True, data=b"")
-    if reply.info & 0xFF != code:
-        raise RemoteProtocolError(f"{link.name} answers test {code:02X}h as {reply.info:04X}h")
-    passed = bool(reply.info >> 8 & 1) or code in _WITHOUT_VERDICT
-    return TestResult(code=code, passed=passed, data=reply.values)
-
-
-def inject_frame(link: Link, counter: int, values: Sequence[float]) -> Steps[None]:
-    if len(values) % 2:
-        raise LocalProtocolError(
-            f"an injected frame has two numbers per bin, {len(values)} are none"
-        )
-    samples = tuple(float(value) for value in values)
-    yield from link.request(m.InjectFrame(counter=counter, values=samples), SLOW_TIMEOUT_S)
-
-
-class Diagnostics(Part):
-    """Tests of a module behind an `X4M300`, trace output, injected frames."""
-
-    __slots__ = ()
-
-    def run_test(self, code: int) -> TestResult:
+    @sends
+    def run_test(link: Link, code: int) -> Steps[TestResult]:
         """Run a system test, a `TestCode`; `DeviceError` if the firmware does not have it.
 
         After TX_ONLY and TX_ONLY_TX_OFF the module sleeps until its power is cycled. The two
         CERTIFICATION codes change the mode from the next reset on. Protocol reference 4.10.
         """
-        return self._call(run_test, code)
+        reply = yield from link.request(m.SystemTest(code=code), SLOW_TIMEOUT_S)
+        if isinstance(reply, m.Ack):
+            return TestResult(code=code, passed=True, data=b"")
+        if reply.info & 0xFF != code:
+            raise RemoteProtocolError(f"{link.name} answers test {code:02X}h as {reply.info:04X}h")
+        passed = bool(reply.info >> 8 & 1) or code in _WITHOUT_VERDICT
+        return TestResult(code=code, passed=passed, data=reply.values)
 
-    def set_debug_level(self, level: int) -> None:
+    @sends
+    def set_debug_level(link: Link, level: int) -> Steps[None]:
         """Choose how much trace output comes, a `TraceLevel`; as DATA STRING, in `messages`."""
-        self._call(Link.request, m.DebugLevel(level=level))
+        yield from link.request(m.DebugLevel(level=level))
 
-    def prepare_injection(self, frames: int, bins: int, mode: InjectMode) -> None:
+    @sends
+    def prepare_injection(link: Link, frames: int, bins: int, mode: InjectMode) -> Steps[None]:
         """Announce frames that replace the chip's: how many, and of how many bins."""
-        self._call(Link.request, m.PrepareInjectFrame(frames=frames, bins=bins, mode=mode))
+        yield from link.request(m.PrepareInjectFrame(frames=frames, bins=bins, mode=mode))
 
-    def inject_frame(self, counter: int, values: Sequence[float]) -> None:
+    @sends
+    def inject_frame(link: Link, counter: int, values: Sequence[float]) -> Steps[None]:
         """Give one of the announced frames: two numbers per bin, in an order not documented."""
-        self._call(inject_frame, counter, values)
-
-
-class AsyncDiagnostics(AsyncPart):
-    """Tests of a module behind an `AsyncX4M300`; methods as of `Diagnostics`."""
-
-    __slots__ = ()
-
-    async def run_test(self, code: int) -> TestResult:
-        return await self._call(run_test, code)
-
-    async def set_debug_level(self, level: int) -> None:
-        await self._call(Link.request, m.DebugLevel(level=level))
-
-    async def prepare_injection(self, frames: int, bins: int, mode: InjectMode) -> None:
-        await self._call(Link.request, m.PrepareInjectFrame(frames=frames, bins=bins, mode=mode))
-
-    async def inject_frame(self, counter: int, values: Sequence[float]) -> None:
-        await self._call(inject_frame, counter, values)
+        if len(values) % 2:
+            raise LocalProtocolError(
+                f"an injected frame has two numbers per bin, {len(values)} are none"
+            )
+        samples = tuple(float(value) for value in values)
+        yield from link.request(m.InjectFrame(counter=counter, values=samples), SLOW_TIMEOUT_S)

@@ -8,7 +8,7 @@
     print(await radar.x4.frame_area_m.get())
     chip_id = radar.registers.read("spi", 3)
 
-A setting is one row of `X4Settings` or `PostprocessingSettings`, from which both drivers take it.
+A setting is one row of `X4` or `Postprocessing`.
 """
 
 import operator
@@ -17,7 +17,16 @@ from dataclasses import replace
 from typing import Any, Final, Generic, Literal, Self, TypeVar, overload
 
 from xethru_protocol.driver import raw_mode
-from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncPart, Link, Part, Steps
+from xethru_protocol.driver.link import (
+    SLOW_TIMEOUT_S,
+    Awaited,
+    Blocking,
+    KindT,
+    Link,
+    Part,
+    Steps,
+    sends,
+)
 from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
@@ -41,7 +50,7 @@ _MOVES_BINS: Final = frozenset(
 
 
 class Setting(Generic[V]):
-    """A value in the module: a plain attribute of a `Part`, an `AsyncSetting` of an `AsyncPart`.
+    """A value in the module: an attribute of a part, with an asyncio driver an `AsyncSetting`.
 
     ``of_answer`` makes the value of the module's answer.
     """
@@ -58,18 +67,21 @@ class Setting(Generic[V]):
     @overload
     def __get__(self, part: None, owner: type) -> Self: ...
     @overload
-    def __get__(self, part: Part, owner: type) -> V: ...
+    def __get__(self, part: Part[Blocking], owner: type) -> V: ...
     @overload
-    def __get__(self, part: AsyncPart, owner: type) -> "AsyncSetting[V]": ...
-    def __get__(self, part: Part | AsyncPart | None, owner: type) -> "Self | V | AsyncSetting[V]":
+    def __get__(self, part: Part[Awaited], owner: type) -> "AsyncSetting[V]": ...
+    def __get__(self, part: Part[Any] | None, owner: type) -> "Self | V | AsyncSetting[V]":
         if part is None:
             return self
-        return AsyncSetting(part, self) if isinstance(part, AsyncPart) else part._call(self.read)
+        if part._driver._is_awaited:
+            return AsyncSetting(part, self)
+        value: V = part._driver._call(self.read)
+        return value
 
-    def __set__(self, part: Part, value: V) -> None:
-        if not isinstance(part, Part):
+    def __set__(self, part: Part[Blocking], value: V) -> None:
+        if part._driver._is_awaited:
             raise AttributeError(f"this driver sets {self.name} by: await ... .{self.name}.set()")
-        part._call(self.write, value)
+        part._driver._call(self.write, value)
 
     def read(self, link: Link) -> Steps[V]:
         raise NotImplementedError
@@ -81,17 +93,18 @@ class Setting(Generic[V]):
 class AsyncSetting(Generic[V]):
     """A value in the module, read and set by coroutines."""
 
-    __slots__ = ("_part", "_setting")
+    __slots__ = ("_driver", "_setting")
 
-    def __init__(self, part: AsyncPart, setting: Setting[V]) -> None:
-        self._part = part
+    def __init__(self, part: Part[Awaited], setting: Setting[V]) -> None:
+        self._driver = part._driver
         self._setting = setting
 
     async def get(self) -> V:
-        return await self._part._call(self._setting.read)
+        value: V = await self._driver._call(self._setting.read)
+        return value
 
     async def set(self, value: V) -> None:
-        await self._part._call(self._setting.write, value)
+        await self._driver._call(self._setting.write, value)
 
 
 class X4Row(Setting[V]):
@@ -187,8 +200,23 @@ def _pair(answer: tuple[float, float]) -> tuple[float, float]:
     return answer
 
 
-class X4Settings:
-    """Settings of the X4 chip, for both drivers."""
+def _forget_raw_mode(link: Link) -> None:
+    """Take note that the chip lost its settings."""
+    if isinstance(link.plan, raw_mode.RawPlan):
+        link.plan = None
+    link.frames.geometry = None
+    link.frames.lattice = None
+
+
+class X4(Part[KindT]):
+    """The radar chip: each setting is an attribute.
+
+    With an `X4M300`, ``radar.x4.iterations = 8`` sets one, ``radar.x4.iterations`` asks the module;
+    with an `AsyncX4M300`, ``await radar.x4.iterations.set(8)`` and ``.get()`` do. A value outside
+    the limits raises `LocalProtocolError`, a refusal of the module `DeviceError`. Frames that come
+    are stopped for the change and started again. After a reconnect the driver sets all of them
+    again if `configure_raw` or `start` was called before. Protocol reference 4.9, 9.3 to 9.7.
+    """
 
     __slots__ = ()
 
@@ -249,66 +277,26 @@ class X4Settings:
         "Bins of a frame, complex ones in baseband; cannot be set.",
     )
 
-
-def _forget_raw_mode(link: Link) -> None:
-    """Take note that the chip lost its settings."""
-    if isinstance(link.plan, raw_mode.RawPlan):
-        link.plan = None
-    link.frames.geometry = None
-    link.frames.lattice = None
-
-
-def init_x4(link: Link) -> Steps[None]:
-    yield from link.request(m.X4DriverInit(), SLOW_TIMEOUT_S)
-    _forget_raw_mode(link)
-
-
-def enable_x4(link: Link, on: bool) -> Steps[None]:
-    yield from link.request(m.X4DriverSet(setting=X4Setting.ENABLE, value=int(on)))
-    if not on:
+    @sends
+    def init(link: Link) -> Steps[None]:
+        """Restart the chip with its default settings; frames stop, and count from 1 again."""
+        yield from link.request(m.X4DriverInit(), SLOW_TIMEOUT_S)
         _forget_raw_mode(link)
 
-
-class X4(X4Settings, Part):
-    """The radar chip behind an `X4M300`: each setting is an attribute.
-
-    ``radar.x4.iterations = 8`` sets one, ``radar.x4.iterations`` asks the module. A value outside
-    the limits raises `LocalProtocolError`, a refusal of the module `DeviceError`. Frames that come
-    are stopped for the change and started again. After a reconnect the driver sets all of them
-    again if `configure_raw` or `start` was called before. Protocol reference 4.9, 9.3 to 9.7.
-    """
-
-    __slots__ = ()
-
-    def init(self) -> None:
-        """Restart the chip with its default settings; frames stop, and count from 1 again."""
-        self._call(init_x4)
-
-    def enable(self, on: bool = True) -> None:
+    @sends
+    def enable(link: Link, on: bool = True) -> Steps[None]:
         """Switch the chip on or off; after off, `init` brings it back. It cannot be read."""
-        self._call(enable_x4, on)
+        yield from link.request(m.X4DriverSet(setting=X4Setting.ENABLE, value=int(on)))
+        if not on:
+            _forget_raw_mode(link)
 
-    def settings(self) -> dict[X4Setting, m.X4Value | None]:
+    @sends
+    def settings(link: Link) -> Steps[dict[X4Setting, m.X4Value | None]]:
         """Read every setting that has a getter; None where the module refuses."""
-        return self._call(Link.x4_settings)
+        return link.x4_settings()
 
 
-class AsyncX4(X4Settings, AsyncPart):
-    """The radar chip behind an `AsyncX4M300`: ``await radar.x4.iterations.set(8)``."""
-
-    __slots__ = ()
-
-    async def init(self) -> None:
-        await self._call(init_x4)
-
-    async def enable(self, on: bool = True) -> None:
-        await self._call(enable_x4, on)
-
-    async def settings(self) -> dict[X4Setting, m.X4Value | None]:
-        return await self._call(Link.x4_settings)
-
-
-class PostprocessingSettings:
+class Postprocessing(Part[KindT]):
     """What the module does to frames before it sends them; newer sensor firmware only.
 
     Others answer `DeviceError` 1. The meaning of the values is not documented beyond their names.
@@ -330,83 +318,74 @@ class PostprocessingSettings:
         FramePostprocessing.LEGACY_OUTPUT, "Whether frames come as DATA FLOAT, a byte."
     )
 
-
-def set_phase_noise_correction(link: Link, on: bool, distance_m: float) -> Steps[None]:
-    setting = FramePostprocessing.PHASE_NOISE_CORRECTION
-    yield from link.request(
-        m.FramePostprocessingSet(setting=setting, value=(int(on), float(distance_m)))
-    )
-
-
-def phase_noise_correction_distance(link: Link) -> Steps[float]:
-    return (yield from _postprocessing(link, FramePostprocessing.PHASE_NOISE_CORRECTION))
-
-
-class Postprocessing(PostprocessingSettings, Part):
-    """Post-processing of frames in the module behind an `X4M300`."""
-
-    __slots__ = ()
-
-    def set_phase_noise_correction(self, on: bool, distance_m: float) -> None:
+    @sends
+    def set_phase_noise_correction(link: Link, on: bool, distance_m: float) -> Steps[None]:
         """Switch the correction of phase noise by the echo at a distance [m] on or off."""
-        self._call(set_phase_noise_correction, on, distance_m)
+        setting = FramePostprocessing.PHASE_NOISE_CORRECTION
+        yield from link.request(
+            m.FramePostprocessingSet(setting=setting, value=(int(on), float(distance_m)))
+        )
 
-    def phase_noise_correction_distance(self) -> float:
+    @sends
+    def phase_noise_correction_distance(link: Link) -> Steps[float]:
         """Ask for the distance [m]; whether the correction is on cannot be asked."""
-        return self._call(phase_noise_correction_distance)
+        return _postprocessing(link, FramePostprocessing.PHASE_NOISE_CORRECTION)
 
 
-class AsyncPostprocessing(PostprocessingSettings, AsyncPart):
-    """Post-processing of frames behind an `AsyncX4M300`; methods as of `Postprocessing`."""
+class Registers(Part[KindT]):
+    """Registers of the radar chip. Protocol reference 4.9.
+
+    The firmware does not notice what is written here: read back, settings, geometry and
+    normalisation stay as they were, and a reconnect does not restore it.
+    """
 
     __slots__ = ()
 
-    async def set_phase_noise_correction(self, on: bool, distance_m: float) -> None:
-        await self._call(set_phase_noise_correction, on, distance_m)
+    @sends
+    def read(link: Link, space: RegisterSpace, address: int) -> Steps[int]:
+        """Read one register, 0 ... 255, of the space ``"spi"``, ``"pif"`` or ``"xif"``."""
+        command = m.X4DriverGet(setting=_space(space), address=_byte("address", address))
+        values = (yield from link.request(command)).values
+        if len(values) != 1:
+            raise RemoteProtocolError(
+                f"{link.name} reads {len(values)} values of {space} register {address}, not one"
+            )
+        return int(values[0])
 
-    async def phase_noise_correction_distance(self) -> float:
-        return await self._call(phase_noise_correction_distance)
+    @sends
+    def write(link: Link, space: RegisterSpace, address: int, value: int) -> Steps[None]:
+        """Write one register, 0 ... 255."""
+        wanted = (_byte("address", address), _byte("value", value))
+        yield from link.request(m.X4DriverSet(setting=_space(space), value=wanted))
 
+    @sends
+    def read_burst(link: Link, address: int, length: int) -> Steps[bytes]:
+        """Read 1 ... 6143 bytes, all from the one SPI register, such as the frame FIFO's."""
+        if not 1 <= length <= _LONGEST_READ:
+            raise LocalProtocolError(f"a burst reads 1 ... {_LONGEST_READ} bytes, not {length}")
+        command = m.X4DriverRead(address=_byte("address", address), length=length)
+        return (yield from link.request(command)).values
 
-# --- registers ----------------------------------------------------------------------------------
+    @sends
+    def write_burst(link: Link, address: int, data: bytes) -> Steps[None]:
+        """Write 1 ... 6142 bytes, all into the one SPI register."""
+        if not 1 <= len(data) <= _LONGEST_WRITE:
+            raise LocalProtocolError(
+                f"a burst writes 1 ... {_LONGEST_WRITE} bytes, not {len(data)}"
+            )
+        command = m.X4DriverWrite(address=_byte("address", address), values=bytes(data))
+        yield from link.request(command)
 
+    @sends
+    def read_i2c(link: Link, length: int) -> Steps[bytes]:
+        """Read bytes from the module's I2C device; newer sensor firmware (16)."""
+        return (yield from link.request(m.X4DriverReadI2c(length=length))).values
 
-def read_register(link: Link, space: RegisterSpace, address: int) -> Steps[int]:
-    command = m.X4DriverGet(setting=_space(space), address=_byte("address", address))
-    values = (yield from link.request(command)).values
-    if len(values) != 1:
-        raise RemoteProtocolError(
-            f"{link.name} reads {len(values)} values of {space} register {address}, not one"
-        )
-    return int(values[0])
-
-
-def write_register(link: Link, space: RegisterSpace, address: int, value: int) -> Steps[None]:
-    wanted = (_byte("address", address), _byte("value", value))
-    yield from link.request(m.X4DriverSet(setting=_space(space), value=wanted))
-
-
-def read_burst(link: Link, address: int, length: int) -> Steps[bytes]:
-    if not 1 <= length <= _LONGEST_READ:
-        raise LocalProtocolError(f"a burst reads 1 ... {_LONGEST_READ} bytes, not {length}")
-    command = m.X4DriverRead(address=_byte("address", address), length=length)
-    return (yield from link.request(command)).values
-
-
-def write_burst(link: Link, address: int, data: bytes) -> Steps[None]:
-    if not 1 <= len(data) <= _LONGEST_WRITE:
-        raise LocalProtocolError(f"a burst writes 1 ... {_LONGEST_WRITE} bytes, not {len(data)}")
-    command = m.X4DriverWrite(address=_byte("address", address), values=bytes(data))
-    yield from link.request(command)
-
-
-def read_i2c(link: Link, length: int) -> Steps[bytes]:
-    return (yield from link.request(m.X4DriverReadI2c(length=length))).values
-
-
-def write_i2c(link: Link, address: int, data: bytes) -> Steps[None]:
-    command = m.X4DriverWriteI2c(address=_byte("address", address), values=bytes(data))
-    yield from link.request(command)
+    @sends
+    def write_i2c(link: Link, address: int, data: bytes) -> Steps[None]:
+        """Write bytes to the I2C register ``address``; newer sensor firmware (16)."""
+        command = m.X4DriverWriteI2c(address=_byte("address", address), values=bytes(data))
+        yield from link.request(command)
 
 
 def _space(name: str) -> X4Setting:
@@ -419,61 +398,3 @@ def _byte(what: str, value: int) -> int:
     if not 0 <= value <= 255:
         raise LocalProtocolError(f"a register's {what} is 0 ... 255, not {value}")
     return value
-
-
-class Registers(Part):
-    """Registers of the radar chip behind an `X4M300`. Protocol reference 4.9.
-
-    The firmware does not notice what is written here: read back, settings, geometry and
-    normalisation stay as they were, and a reconnect does not restore it.
-    """
-
-    __slots__ = ()
-
-    def read(self, space: RegisterSpace, address: int) -> int:
-        """Read one register, 0 ... 255, of the space ``"spi"``, ``"pif"`` or ``"xif"``."""
-        return self._call(read_register, space, address)
-
-    def write(self, space: RegisterSpace, address: int, value: int) -> None:
-        """Write one register, 0 ... 255."""
-        self._call(write_register, space, address, value)
-
-    def read_burst(self, address: int, length: int) -> bytes:
-        """Read 1 ... 6143 bytes, all from the one SPI register, such as the frame FIFO's."""
-        return self._call(read_burst, address, length)
-
-    def write_burst(self, address: int, data: bytes) -> None:
-        """Write 1 ... 6142 bytes, all into the one SPI register."""
-        self._call(write_burst, address, data)
-
-    def read_i2c(self, length: int) -> bytes:
-        """Read bytes from the module's I2C device; newer sensor firmware (16)."""
-        return self._call(read_i2c, length)
-
-    def write_i2c(self, address: int, data: bytes) -> None:
-        """Write bytes to the I2C register ``address``; newer sensor firmware (16)."""
-        self._call(write_i2c, address, data)
-
-
-class AsyncRegisters(AsyncPart):
-    """Registers of the radar chip behind an `AsyncX4M300`; methods as of `Registers`."""
-
-    __slots__ = ()
-
-    async def read(self, space: RegisterSpace, address: int) -> int:
-        return await self._call(read_register, space, address)
-
-    async def write(self, space: RegisterSpace, address: int, value: int) -> None:
-        await self._call(write_register, space, address, value)
-
-    async def read_burst(self, address: int, length: int) -> bytes:
-        return await self._call(read_burst, address, length)
-
-    async def write_burst(self, address: int, data: bytes) -> None:
-        await self._call(write_burst, address, data)
-
-    async def read_i2c(self, length: int) -> bytes:
-        return await self._call(read_i2c, length)
-
-    async def write_i2c(self, address: int, data: bytes) -> None:
-        await self._call(write_i2c, address, data)

@@ -4,15 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from xethru_protocol.driver.link import (
-    SLOW_TIMEOUT_S,
-    AsyncCall,
-    AsyncPart,
-    Call,
-    Link,
-    Part,
-    Steps,
-)
+from xethru_protocol.driver.link import SLOW_TIMEOUT_S, KindT, Link, Part, Steps, sends, sends_once
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import FileError
@@ -42,97 +34,155 @@ class FileName:
         return f"{self.file_type:08X}/{self.identifier}"
 
 
-def find_all(link: Link) -> Steps[tuple[FileName, ...]]:
-    values = (yield from link.request(m.FindAllFiles())).values
-    if len(values) % 2:
-        raise RemoteProtocolError(f"{link.path} lists {len(values)} numbers, no pairs, as files")
-    half = len(values) // 2
-    return tuple(
-        FileName(file_type=kind & 0xFFFFFFFF, identifier=number & 0xFFFFFFFF)
-        for kind, number in zip(values[:half], values[half:], strict=True)
-    )
+class Files(Part[KindT]):
+    """The file system of a module. Protocol reference 4.11.
 
+    A transfer is not repeated when the line breaks: it raises `Disconnected`.
+    """
 
-def find(link: Link, file_type: int) -> Steps[tuple[FileName, ...]]:
-    try:
-        values = (yield from link.request(m.SearchFileType(file_type=file_type))).values
-    except DeviceError as error:
-        if error.code != FileError.NOT_FOUND:
+    __slots__ = ()
+
+    @sends
+    def find_all(link: Link) -> Steps[tuple[FileName, ...]]:
+        values = (yield from link.request(m.FindAllFiles())).values
+        if len(values) % 2:
+            raise RemoteProtocolError(
+                f"{link.path} lists {len(values)} numbers, no pairs, as files"
+            )
+        half = len(values) // 2
+        return tuple(
+            FileName(file_type=kind & 0xFFFFFFFF, identifier=number & 0xFFFFFFFF)
+            for kind, number in zip(values[:half], values[half:], strict=True)
+        )
+
+    @sends
+    def find(link: Link, file_type: int) -> Steps[tuple[FileName, ...]]:
+        """List the files of one type; empty if the module answers NOT_FOUND."""
+        try:
+            values = (yield from link.request(m.SearchFileType(file_type=file_type))).values
+        except DeviceError as error:
+            if error.code != FileError.NOT_FOUND:
+                raise
+            values = ()
+        return tuple(FileName(file_type=file_type, identifier=one & 0xFFFFFFFF) for one in values)
+
+    @sends
+    def length(link: Link, file_type: int, identifier: int) -> Steps[int]:
+        """Ask for the size of a file [bytes]."""
+        return _file_length(link, file_type, identifier)
+
+    @sends_once
+    def read(
+        link: Link, file_type: int, identifier: int, on_progress: OnProgress | None = None
+    ) -> Steps[bytes]:
+        """Read a whole file.
+
+        ``on_progress`` is called with the bytes read so far and their total: at the start and after
+        each chunk. Raises `DeviceError`, whose code is a `FileError`, if the file does not exist or
+        the module cannot read it.
+        """
+        total = yield from _file_length(link, file_type, identifier)
+        whole = m.GetFileData(file_type=file_type, identifier=identifier, offset=0, length=total)
+        return (yield from _read(link, whole, on_progress))
+
+    @sends_once
+    def write(
+        link: Link,
+        file_type: int,
+        identifier: int,
+        data: bytes,
+        on_progress: OnProgress | None = None,
+    ) -> Steps[None]:
+        """Create a file and write it; if that fails midway it is deleted again.
+
+        User-defined types begin at 80000000h. ``on_progress`` is called with the bytes written so
+        far and their total: at the start and after each chunk. Raises `LocalProtocolError` if
+        there is nothing to write, `DeviceError` if the file exists already, there is no room, or
+        the module cannot write.
+        """
+        if not data:
+            name = FileName(file_type=file_type, identifier=identifier)
+            raise LocalProtocolError(f"file {name} must have at least one byte")
+        yield from link.request(
+            m.CreateFile(file_type=file_type, identifier=identifier, length=len(data)),
+            SLOW_TIMEOUT_S,
+        )
+        whole = m.SetFileData(file_type=file_type, identifier=identifier, offset=0, data=data)
+        body = _write_chunks(link, whole, on_progress)
+        try:
+            yield from _then_close(link, file_type, identifier, body)
+        except GeneratorExit:
             raise
-        values = ()
-    return tuple(FileName(file_type=file_type, identifier=one & 0xFFFFFFFF) for one in values)
+        except BaseException:
+            yield from _clean_up(link, _delete(link, file_type, identifier))
+            raise
+
+    @sends_once
+    def read_part(
+        link: Link, file_type: int, identifier: int, offset: int, count: int
+    ) -> Steps[bytes]:
+        """Read ``count`` bytes of a file from ``offset`` on."""
+        part = m.GetFileData(
+            file_type=file_type, identifier=identifier, offset=offset, length=count
+        )
+        return _read(link, part)
+
+    @sends_once
+    def write_part(
+        link: Link, file_type: int, identifier: int, offset: int, data: bytes
+    ) -> Steps[None]:
+        """Write into a file that exists, from ``offset`` on; it does not grow."""
+        part = m.SetFileData(file_type=file_type, identifier=identifier, offset=offset, data=data)
+        yield from _open(link, file_type, identifier)
+        body = _write_chunks(link, part, None)
+        yield from _then_close(link, file_type, identifier, body)
+
+    @sends_once
+    def create(link: Link, file_type: int, identifier: int, size: int) -> Steps[None]:
+        """Create an erased file of ``size`` bytes, for `write_part`."""
+        command = m.CreateFile(file_type=file_type, identifier=identifier, length=size)
+        yield from link.request(command, SLOW_TIMEOUT_S)
+        yield from link.request(m.CloseFile(file_type=file_type, identifier=identifier))
+
+    @sends_once
+    def delete(link: Link, file_type: int, identifier: int) -> Steps[None]:
+        return _delete(link, file_type, identifier)
+
+    @sends_once
+    def format_all(link: Link, key: int) -> Steps[None]:
+        """Delete all files, the module's own among them; ``key`` shows that this is meant.
+
+        It is `xethru_protocol.wire.codes.FORMAT_KEY`; the module refuses any other.
+        """
+        yield from link.request(m.FormatFilesystem(key=key), SLOW_TIMEOUT_S)
+
+    @sends_once
+    def crash_dump(link: Link, on_progress: OnProgress | None = None) -> Steps[bytes]:
+        """Read what the firmware left when it crashed last; empty if it did not."""
+        total = yield from _length(link, m.GetCrashDumpLength(), "its crash dump's length")
+        chunk = m.GetCrashDump(offset=0, length=0)
+        return (yield from _read_chunks(link, chunk, total, on_progress))
+
+    @sends_once
+    def clear_crash_dump(link: Link) -> Steps[None]:
+        """Delete the crash dump, if there is one."""
+        yield from link.request(m.ClearCrashDump(), SLOW_TIMEOUT_S)
 
 
-def length(link: Link, file_type: int, identifier: int) -> Steps[int]:
+def _file_length(link: Link, file_type: int, identifier: int) -> Steps[int]:
     command = m.GetFileLength(file_type=file_type, identifier=identifier)
-    return (yield from _length(link, command, "a file's length"))
+    return _length(link, command, "a file's length")
 
 
-def read(
-    link: Link, file_type: int, identifier: int, on_progress: OnProgress | None = None
-) -> Steps[bytes]:
-    total = yield from length(link, file_type, identifier)
-    whole = m.GetFileData(file_type=file_type, identifier=identifier, offset=0, length=total)
-    return (yield from read_part(link, whole, on_progress))
-
-
-def read_part(
-    link: Link, part: m.GetFileData, on_progress: OnProgress | None = None
-) -> Steps[bytes]:
+def _read(link: Link, part: m.GetFileData, on_progress: OnProgress | None = None) -> Steps[bytes]:
     yield from _open(link, part.file_type, part.identifier)
     body = _read_chunks(link, part, part.length, on_progress)
     return (yield from _then_close(link, part.file_type, part.identifier, body))
 
 
-def write(
-    link: Link,
-    file_type: int,
-    identifier: int,
-    data: bytes,
-    on_progress: OnProgress | None = None,
-) -> Steps[None]:
-    if not data:
-        name = FileName(file_type=file_type, identifier=identifier)
-        raise LocalProtocolError(f"file {name} must have at least one byte")
-    yield from link.request(
-        m.CreateFile(file_type=file_type, identifier=identifier, length=len(data)),
-        SLOW_TIMEOUT_S,
-    )
-    whole = m.SetFileData(file_type=file_type, identifier=identifier, offset=0, data=data)
-    body = _write_chunks(link, whole, on_progress)
-    try:
-        yield from _then_close(link, file_type, identifier, body)
-    except GeneratorExit:
-        raise
-    except BaseException:
-        yield from _clean_up(link, delete(link, file_type, identifier))
-        raise
-
-
-def write_part(link: Link, part: m.SetFileData) -> Steps[None]:
-    yield from _open(link, part.file_type, part.identifier)
-    body = _write_chunks(link, part, None)
-    yield from _then_close(link, part.file_type, part.identifier, body)
-
-
-def create(link: Link, file_type: int, identifier: int, size: int) -> Steps[None]:
-    command = m.CreateFile(file_type=file_type, identifier=identifier, length=size)
-    yield from link.request(command, SLOW_TIMEOUT_S)
-    yield from link.request(m.CloseFile(file_type=file_type, identifier=identifier))
-
-
-def delete(link: Link, file_type: int, identifier: int) -> Steps[None]:
+def _delete(link: Link, file_type: int, identifier: int) -> Steps[None]:
     command = m.DeleteFile(file_type=file_type, identifier=identifier)
     yield from link.request(command, SLOW_TIMEOUT_S)
-
-
-def crash_dump(link: Link, on_progress: OnProgress | None = None) -> Steps[bytes]:
-    total = yield from _length(link, m.GetCrashDumpLength(), "its crash dump's length")
-    chunk = m.GetCrashDump(offset=0, length=0)
-    return (yield from _read_chunks(link, chunk, total, on_progress))
-
-
-# --- inside -------------------------------------------------------------------------------------
 
 
 def _length(link: Link, command: m.Command[m.ReplyInt], what: str) -> Steps[int]:
@@ -217,136 +267,3 @@ def _clean_up(link: Link, procedure: Steps[object]) -> Steps[None]:
         yield from procedure
     except XeThruError as error:
         link.warn(f"could not clean up: {error}")
-
-
-class Files(Part):
-    """The file system of a module behind an `X4M300`. Protocol reference 4.11.
-
-    A transfer is not repeated when the line breaks: it raises `Disconnected`.
-    """
-
-    __slots__ = ("_call_once",)
-
-    def __init__(self, call: Call, call_once: Call) -> None:
-        super().__init__(call)
-        self._call_once = call_once
-
-    def find_all(self) -> tuple[FileName, ...]:
-        return self._call(find_all)
-
-    def find(self, file_type: int) -> tuple[FileName, ...]:
-        """List the files of one type; empty if the module answers NOT_FOUND."""
-        return self._call(find, file_type)
-
-    def length(self, file_type: int, identifier: int) -> int:
-        """Ask for the size of a file [bytes]."""
-        return self._call(length, file_type, identifier)
-
-    def read(self, file_type: int, identifier: int, on_progress: OnProgress | None = None) -> bytes:
-        """Read a whole file.
-
-        ``on_progress`` is called with the bytes read so far and their total: at the start and after
-        each chunk. Raises `DeviceError`, whose code is a `FileError`, if the file does not exist or
-        the module cannot read it.
-        """
-        return self._call_once(read, file_type, identifier, on_progress)
-
-    def write(
-        self, file_type: int, identifier: int, data: bytes, on_progress: OnProgress | None = None
-    ) -> None:
-        """Create a file and write it; if that fails midway it is deleted again.
-
-        User-defined types begin at 80000000h. ``on_progress`` is called with the bytes written so
-        far and their total: at the start and after each chunk. Raises `LocalProtocolError` if
-        there is nothing to write, `DeviceError` if the file exists already, there is no room, or
-        the module cannot write.
-        """
-        self._call_once(write, file_type, identifier, data, on_progress)
-
-    def read_part(self, file_type: int, identifier: int, offset: int, count: int) -> bytes:
-        """Read ``count`` bytes of a file from ``offset`` on."""
-        part = m.GetFileData(
-            file_type=file_type, identifier=identifier, offset=offset, length=count
-        )
-        return self._call_once(read_part, part)
-
-    def write_part(self, file_type: int, identifier: int, offset: int, data: bytes) -> None:
-        """Write into a file that exists, from ``offset`` on; it does not grow."""
-        part = m.SetFileData(file_type=file_type, identifier=identifier, offset=offset, data=data)
-        self._call_once(write_part, part)
-
-    def create(self, file_type: int, identifier: int, size: int) -> None:
-        """Create an erased file of ``size`` bytes, for `write_part`."""
-        self._call_once(create, file_type, identifier, size)
-
-    def delete(self, file_type: int, identifier: int) -> None:
-        self._call_once(delete, file_type, identifier)
-
-    def format_all(self, key: int) -> None:
-        """Delete all files, the module's own among them; ``key`` shows that this is meant.
-
-        It is `xethru_protocol.wire.codes.FORMAT_KEY`; the module refuses any other.
-        """
-        self._call_once(Link.request, m.FormatFilesystem(key=key), SLOW_TIMEOUT_S)
-
-    def crash_dump(self, on_progress: OnProgress | None = None) -> bytes:
-        """Read what the firmware left when it crashed last; empty if it did not."""
-        return self._call_once(crash_dump, on_progress)
-
-    def clear_crash_dump(self) -> None:
-        """Delete the crash dump, if there is one."""
-        self._call_once(Link.request, m.ClearCrashDump(), SLOW_TIMEOUT_S)
-
-
-class AsyncFiles(AsyncPart):
-    """The file system of a module behind an `AsyncX4M300`; methods as of `Files`."""
-
-    __slots__ = ("_call_once",)
-
-    def __init__(self, call: AsyncCall, call_once: AsyncCall) -> None:
-        super().__init__(call)
-        self._call_once = call_once
-
-    async def find_all(self) -> tuple[FileName, ...]:
-        return await self._call(find_all)
-
-    async def find(self, file_type: int) -> tuple[FileName, ...]:
-        return await self._call(find, file_type)
-
-    async def length(self, file_type: int, identifier: int) -> int:
-        return await self._call(length, file_type, identifier)
-
-    async def read(
-        self, file_type: int, identifier: int, on_progress: OnProgress | None = None
-    ) -> bytes:
-        return await self._call_once(read, file_type, identifier, on_progress)
-
-    async def write(
-        self, file_type: int, identifier: int, data: bytes, on_progress: OnProgress | None = None
-    ) -> None:
-        await self._call_once(write, file_type, identifier, data, on_progress)
-
-    async def read_part(self, file_type: int, identifier: int, offset: int, count: int) -> bytes:
-        part = m.GetFileData(
-            file_type=file_type, identifier=identifier, offset=offset, length=count
-        )
-        return await self._call_once(read_part, part)
-
-    async def write_part(self, file_type: int, identifier: int, offset: int, data: bytes) -> None:
-        part = m.SetFileData(file_type=file_type, identifier=identifier, offset=offset, data=data)
-        await self._call_once(write_part, part)
-
-    async def create(self, file_type: int, identifier: int, size: int) -> None:
-        await self._call_once(create, file_type, identifier, size)
-
-    async def delete(self, file_type: int, identifier: int) -> None:
-        await self._call_once(delete, file_type, identifier)
-
-    async def format_all(self, key: int) -> None:
-        await self._call_once(Link.request, m.FormatFilesystem(key=key), SLOW_TIMEOUT_S)
-
-    async def crash_dump(self, on_progress: OnProgress | None = None) -> bytes:
-        return await self._call_once(crash_dump, on_progress)
-
-    async def clear_crash_dump(self) -> None:
-        await self._call_once(Link.request, m.ClearCrashDump(), SLOW_TIMEOUT_S)

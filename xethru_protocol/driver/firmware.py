@@ -12,20 +12,21 @@ from typing import Self
 
 from xethru_protocol.driver import reconnect
 from xethru_protocol.driver.link import (
-    POWER_UP_BAUD,
     SLOW_TIMEOUT_S,
     TIMEOUT_S,
-    AsyncPart,
+    KindT,
     Link,
     Part,
     SetLineRate,
     Steps,
+    sends_once,
 )
 from xethru_protocol.system import read_bounded
 from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import (
+    POWER_UP_BAUD,
     BootloaderKey,
     BootloaderReply,
     ErrorCode,
@@ -246,7 +247,7 @@ def enter(link: Link, timeout_s: float = reconnect.RESTART_S) -> Steps[str]:
             f"at {link.path} neither a firmware nor a bootloader answers; is a module there, and "
             "powered? 'xethru doctor' finds out more"
         ) from None
-    link.conversation.answer_owed = True  # this error may have been an earlier request's
+    link.conversation.matcher.answer_owed = True  # this error may have been an earlier request's
     core_id = yield from _core_id(link)
     yield from _leave_application(link)
     banner = ""
@@ -370,7 +371,7 @@ def _write_page(link: Link, number: int, data: bytes, attempts: int) -> Steps[by
             if not damaged or attempt == attempts - 1:
                 raise
             link.warn(f"page {number} is written again: {error}")
-            link.conversation.answer_owed = True  # more reports of the damage may follow
+            link.conversation.matcher.answer_owed = True  # more reports of the damage may follow
     raise AssertionError("the last attempt returns or raises")
 
 
@@ -430,22 +431,26 @@ def _await(
         )
 
 
-class Firmware(Part):
-    """The firmware of a module behind an `X4M300`. Protocol reference 4.12.
+class Firmware(Part[KindT]):
+    """The firmware of a module. Protocol reference 4.12.
 
     A radar stops and forgets its settings when its bootloader starts.
     """
 
     __slots__ = ()
 
-    def start_bootloader(self) -> str:
+    @sends_once
+    def start_bootloader(link: Link) -> Steps[str]:
         """Restart into the bootloader, unless it runs already; returns how it describes itself.
 
         Until something is written, a module that is switched off and on starts its firmware again.
         """
-        return self._call(enter)
+        return enter(link)
 
-    def write(self, image: FirmwareImage, on_progress: OnProgress | None = None) -> None:
+    @sends_once
+    def write(
+        link: Link, image: FirmwareImage, on_progress: OnProgress | None = None
+    ) -> Steps[None]:
         """Write a firmware, have the bootloader compare it with its checksum, and start it.
 
         Works with a module in its bootloader, too. Returns when the new firmware answers.
@@ -466,16 +471,4 @@ class Firmware(Part):
         ResponseTimeout
             If neither firmware nor bootloader answers.
         """
-        self._call(flash, image, on_progress)
-
-
-class AsyncFirmware(AsyncPart):
-    """The firmware of a module behind an `AsyncX4M300`; methods as of `Firmware`."""
-
-    __slots__ = ()
-
-    async def start_bootloader(self) -> str:
-        return await self._call(enter)
-
-    async def write(self, image: FirmwareImage, on_progress: OnProgress | None = None) -> None:
-        await self._call(flash, image, on_progress)
+        return flash(link, image, on_progress)

@@ -5,14 +5,29 @@ the steps out on a line that blocks, `AsyncX4M300` on one that is awaited. `raw_
 `files` and `reconnect` hold more such generators.
 """
 
+import functools
+import inspect
 import math
 from collections import deque
-from collections.abc import Awaitable, Callable, Generator, Sequence
+from collections.abc import Callable, Coroutine, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from typing import Concatenate, NamedTuple, ParamSpec, Protocol, SupportsFloat, TypeAlias, TypeVar
+from typing import (
+    Any,
+    Concatenate,
+    Generic,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    SupportsFloat,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    overload,
+)
 
-from xethru_protocol.driver.conversation import (
+from xethru_protocol.driver.frames import Frame, FrameQueue, Lattice
+from xethru_protocol.driver.matching import (
     BOOTLOADER_ERRORS,
     FRAMES,
     Conversation,
@@ -20,10 +35,11 @@ from xethru_protocol.driver.conversation import (
     bootloader_error,
     summary,
 )
-from xethru_protocol.driver.frames import Frame, FrameQueue, Lattice
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
+    BAUD_RATES,
+    POWER_UP_BAUD,
     ErrorCode,
     InfoItem,
     PongCode,
@@ -34,12 +50,13 @@ from xethru_protocol.wire.codes import (
 )
 from xethru_protocol.wire.errors import (
     DeviceError,
+    Disconnected,
     LocalProtocolError,
     OldFirmwareError,
     RemoteProtocolError,
     ResponseTimeout,
 )
-from xethru_protocol.wire.rows import ROWS, Command, Response, Row
+from xethru_protocol.wire.rows import ROWS, Command, Response
 from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, Firmware, needed_by
 
 
@@ -92,10 +109,6 @@ ReplyT = TypeVar("ReplyT", bound=Response)
 
 TIMEOUT_S = 2.0
 SLOW_TIMEOUT_S = 10.0  # mode changes and chip restarts
-BAUD_RATES = (
-    *(9600, 19200, 38400, 115200, 230400, 460800, 500000, 576000, 921600),
-    *(1000000, 2000000, 3000000, 4000000),
-)
 
 _STALE_READS = 64  # more than any port buffers; a bound, since a fast module never pauses
 # The module changes its rate 500 ms after its ACK and hears nothing until then (Protocol
@@ -103,7 +116,10 @@ _STALE_READS = 64  # more than any port buffers; a bound, since a fast module ne
 _BAUD_SETTLE_S = (0.1, 0.45)
 _BAUD_PROBE_S = 0.3  # one PING at a rate that may not be the module's
 _BAUD_PROBES_NEW, _BAUD_PROBES_OLD = 7, 3
-POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
+_LIKELIEST_RATES = (
+    *(115200, 921600, 460800, 230400, 1000000, 2000000, 3000000, 4000000),
+    *(500000, 576000, 38400, 19200, 9600),
+)
 _WARNINGS = 1000  # kept; a radar may run for months
 _MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
 
@@ -228,13 +244,6 @@ class ModuleInfo:
 
 
 _BOOTLOADER_REPLIES = ((m.BootloaderSuccess,), (m.BootloaderEchoed,))
-# The module answers PINGs that waited for it one right after the other; a PONG that does
-# not come within this time of the last one was probably never sent.
-_SETTLED_NS = 250_000_000
-# Part of the timeout for which the right answer is waited for after a wrong one.
-_AFTER_A_WRONG_ONE = 0.25
-# Information that every firmware has; two items, so that no late answer is taken for another.
-_TOKENS = (InfoItem.XTID_SSIC_VERSION, InfoItem.XTID_SSIC_BUILD)
 
 
 class Plan(Protocol):
@@ -303,9 +312,6 @@ class Link:
         self.raw_mode = False
         self.closed = False
         self._version_list: tuple[tuple[int, int], str | None] | None = None  # and of which start
-        self._tokens = deque(_TOKENS)
-        self._tokens_out = 0  # asked for and not answered, or answered too late
-        self._token_at: int | None = None  # PINGs before the first token that is out
         self._warned = False  # of frames whose geometry is not known
 
     def _take(self, message: Response, arrival_ns: int) -> None:
@@ -343,7 +349,7 @@ class Link:
     # --- commands ---------------------------------------------------------------------------------
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
-        if self.conversation.answer_owed and not isinstance(command, m.Ping):
+        if self.conversation.matcher.answer_owed and not isinstance(command, m.Ping):
             yield from self._catch_up(command, timeout_s)
         yield from self._check_version(command)
         reply = yield from self._exchange(command, timeout_s)
@@ -352,53 +358,40 @@ class Link:
 
     def _catch_up(self, command: Command[Response], timeout_s: float) -> Steps[None]:
         """Receive until answers to an abandoned request can no longer come."""
-        conversation = self.conversation
+        matcher = self.conversation.matcher
         if ROWS[type(command)].replies in _BOOTLOADER_REPLIES:  # the bootloader does not have PING
             echo = m.BootloaderEcho(data=self.clock().to_bytes(8, "little"))
             with suppress(DeviceError):  # it is the application that answers
                 yield from self._exchange(echo, timeout_s)
-            return
-        if not conversation.pongs_possible:
+        elif matcher.pongs_possible:
+            yield from self._exchange(matcher.token(), timeout_s, as_token=True)
+        else:
             yield from self._exchange(m.Ping(), timeout_s)
-            return
-        # PONGs do not say which PING they answer, so with one due they prove nothing. This answer
-        # names what was asked: all that was asked before is answered, or never will be.
-        token = m.SystemGetInfo(item=self._tokens[0])
-        if self._token_at is None:
-            self._token_at = conversation.pings
-        self._tokens_out += 1
-        yield from self._exchange(token, timeout_s, catching_up=True)
-        self._tokens_out -= 1
-        # it may be the answer to an earlier one: PINGs behind that one are not answered yet
-        behind = conversation.pings - self._token_at
-        conversation.pongs_possible = min(conversation.pongs_possible, behind)
-        conversation.pongs_owed = min(conversation.pongs_owed, behind)
-        self._token_at = None
-        self._tokens.rotate()
 
     def _exchange(
-        self, command: Command[Response], timeout_s: float, *, catching_up: bool = False
+        self, command: Command[Response], timeout_s: float, *, as_token: bool = False
     ) -> Steps[Response]:
-        """Ask and return the answer; while ``catching_up``, others are of earlier commands."""
         yield from self.take_stale_input()
-        conversation = self.conversation
-        row = ROWS[type(command)]
-        deadline_ns = conversation.deadline_ns(timeout_s)
-        answer: Response | None
+        conversation, matcher = self.conversation, self.conversation.matcher
         try:
-            yield Write(conversation.ask(command))
-            if isinstance(command, m.Ping):
-                answer = yield from self._pong(deadline_ns)
-            else:
-                answer = yield from self._answer(command, row, timeout_s, catching_up)
+            yield Write(conversation.ask(command, timeout_s, as_token=as_token))
+            deadline_ns = until_ns = conversation.deadline_ns(timeout_s)
+            while True:
+                patience_s = matcher.match()
+                if patience_s is not None:
+                    until_ns = min(deadline_ns, conversation.deadline_ns(patience_s))
+                left_s = self.left_s(until_ns)
+                if left_s <= 0:
+                    break
+                yield Read(left_s)
         finally:  # also after a cancellation or an interrupt
-            conversation.expected = ()
+            matcher.expected = ()
+        answer = matcher.answer
         if answer is None:
             raise conversation.unanswered(command, timeout_s)
-        if not isinstance(command, m.Ping) or not conversation.pongs_possible:
-            conversation.answer_owed = False
+        matcher.settle()
         if isinstance(answer, m.Error):
-            meaning = error_name(answer.code, row.errors)
+            meaning = error_name(answer.code, ROWS[type(command)].errors)
             raise DeviceError(answer.code, summary(command), meaning)
         if isinstance(answer, BOOTLOADER_ERRORS):
             raise bootloader_error(answer, command)
@@ -417,74 +410,6 @@ class Link:
             case m.X4DriverSet(setting=X4Setting.FPS, value=SupportsFloat() as value):
                 rate = float(value)  # also of whole numbers and numpy's
                 self.frames.rate_hz = x4.real_frame_rate(rate) if rate > 0 else 0.0
-
-    def _answer(
-        self, command: Command[Response], row: Row, timeout_s: float, catching_up: bool
-    ) -> Steps[Response | None]:
-        conversation = self.conversation
-        content_id = row.content_id(command) if row.content_id else None
-        item = command.item if isinstance(command, m.SystemGetInfo) else None
-        echoed = command.data if isinstance(command, m.BootloaderEcho) else None
-        until_ns = conversation.deadline_ns(timeout_s)
-        late_pongs = conversation.pongs_possible
-        while True:
-            while conversation.answers:
-                answer = conversation.answers.popleft()
-                if isinstance(answer, m.Error) and not catching_up:
-                    return answer
-                if isinstance(answer, BOOTLOADER_ERRORS):
-                    if echoed is None:
-                        return answer
-                    conversation.stray_count += 1  # an ECHO has no errors: it is an earlier one's
-                    continue
-                if (
-                    isinstance(answer, row.replies)
-                    and (content_id is None or getattr(answer, "content_id", None) == content_id)
-                    and (item is None or getattr(answer, "info", None) == item)
-                    and (echoed is None or getattr(answer, "data", None) == echoed)
-                ):
-                    return answer
-                conversation.stray_count += 1
-                if isinstance(answer, m.Pong) and late_pongs:
-                    late_pongs -= 1
-                elif isinstance(answer, m.ReplyString) and self._tokens_out:
-                    self._tokens_out -= 1
-                elif conversation.unexpected is None and not catching_up:
-                    conversation.unexpected = answer
-                    grace_ns = conversation.deadline_ns(timeout_s * _AFTER_A_WRONG_ONE)
-                    until_ns = min(until_ns, grace_ns)
-            left_s = self.left_s(until_ns)
-            if left_s <= 0:
-                return None
-            yield Read(left_s)
-
-    def _pong(self, deadline_ns: int) -> Steps[m.Pong | None]:
-        """Return the last PONG that is due: a late one describes an earlier state.
-
-        PONGs do not echo the seed. So the PONGs due are counted, and one is taken for the last
-        if no other follows soon, since a module that was off does not answer PINGs of that time.
-        """
-        conversation = self.conversation
-        pong: m.Pong | None = None
-        until_ns = deadline_ns
-        while True:
-            while conversation.answers:
-                answer = conversation.answers.popleft()
-                if isinstance(answer, m.Pong):
-                    conversation.stray_count += pong is not None
-                    pong = answer
-                    until_ns = min(deadline_ns, self.clock() + _SETTLED_NS)
-                else:  # PING has no errors: those are of another command, too
-                    conversation.stray_count += 1
-                    if not conversation.answer_owed:
-                        conversation.unexpected = conversation.unexpected or answer
-            left_s = self.left_s(until_ns)
-            if left_s <= 0 or (pong is not None and conversation.pongs_owed == 0):
-                break
-            yield Read(left_s)
-        if pong is not None:
-            conversation.pongs_owed = 0
-        return pong
 
     def take_stale_input(self) -> Steps[None]:
         for _ in range(_STALE_READS):
@@ -666,6 +591,18 @@ class Link:
             f"answers at {POWER_UP_BAUD}"
         )
 
+    def find_baud_rate(self) -> Steps[int | None]:
+        for baudrate in _LIKELIEST_RATES:
+            with suppress(Disconnected):  # the adapter does not have this rate
+                yield SetLineRate(baudrate)
+                self.conversation.new_line(self.path)  # what came at a wrong rate means nothing
+                self.baudrate = baudrate
+                if (yield from self._probe(1)):
+                    return baudrate
+        yield SetLineRate(POWER_UP_BAUD)
+        self.baudrate = POWER_UP_BAUD
+        return None
+
     def _probe(self, times: int) -> Steps[bool]:
         """Whether the module answers one of some PINGs, of which it may not hear the first."""
         for _ in range(times):
@@ -719,35 +656,79 @@ class Link:
 
 
 Procedure: TypeAlias = Callable[Concatenate[Link, P], Steps[T]]
+"""What carries a procedure out is a driver, from its arguments but for the link."""
 
 
-class Call(Protocol):
-    """Carries a procedure of the link out and returns its result."""
-
-    def __call__(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T: ...
+class Blocking:
+    """Marks a driver, and its parts, whose methods return when they are done."""
 
 
-class AsyncCall(Protocol):
-    """Carries a procedure of the link out; its result is awaited."""
-
-    def __call__(
-        self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs
-    ) -> Awaitable[T]: ...
+class Awaited:
+    """Marks a driver, and its parts, whose methods are coroutines."""
 
 
-class Part:
-    """Something that a blocking driver consists of."""
-
-    __slots__ = ("_call",)
-
-    def __init__(self, call: Call) -> None:
-        self._call = call
+KindT = TypeVar("KindT")
 
 
-class AsyncPart:
-    """Something that an asyncio driver consists of."""
+class Part(Generic[KindT]):
+    """A driver, or something that it consists of."""
 
-    __slots__ = ("_call",)
+    __slots__ = ("_driver",)
 
-    def __init__(self, call: AsyncCall) -> None:
-        self._call = call
+    def __init__(self, driver: "Part[KindT]") -> None:
+        self._driver: Any = driver
+        """Has `_call`, `_call_once` and `_listen`, which carry procedures out."""
+
+
+class Method(Generic[P, T]):
+    """A procedure as a method of both drivers or of a part of both, with its docstring.
+
+    ``carry_out`` is the driver's method that carries it out.
+    """
+
+    def __init__(self, procedure: Procedure[P, T], carry_out: str) -> None:
+        def blocking(self: Part[Blocking], *args: P.args, **kwargs: P.kwargs) -> T:
+            result: T = getattr(self._driver, carry_out)(procedure, *args, **kwargs)
+            return result
+
+        async def awaited(self: Part[Awaited], *args: P.args, **kwargs: P.kwargs) -> T:
+            result: T = await getattr(self._driver, carry_out)(procedure, *args, **kwargs)
+            return result
+
+        signature = inspect.signature(procedure)
+        link, *others = signature.parameters.values()
+        parameters = [link.replace(name="self", annotation=link.empty), *others]
+        *_, result = get_args(signature.return_annotation)  # of its steps
+        signature = signature.replace(parameters=parameters, return_annotation=result)
+        functions: list[Any] = [blocking, awaited]
+        for function in functions:
+            functools.update_wrapper(function, procedure)
+            function.__signature__ = signature
+            function.__annotations__ = {one.name: one.annotation for one in others}
+            function.__annotations__["return"] = result
+        self._blocking, self._awaited = blocking, awaited
+
+    @overload
+    def __get__(self, part: None, owner: type) -> Callable[Concatenate[Any, P], Any]: ...
+    @overload
+    def __get__(self, part: Part[Blocking], owner: type) -> Callable[P, T]: ...
+    @overload
+    def __get__(self, part: Part[Awaited], owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, part: Part[Any] | None, owner: type) -> Any:
+        is_awaited = getattr(owner if part is None else part._driver, "_is_awaited", False)
+        return (self._awaited if is_awaited else self._blocking).__get__(part, owner)
+
+
+def sends(procedure: Procedure[P, T]) -> Method[P, T]:
+    """Make a method of a procedure that sends commands; it is repeated after a reconnect."""
+    return Method(procedure, "_call")
+
+
+def sends_once(procedure: Procedure[P, T]) -> Method[P, T]:
+    """Make a method of a procedure that sends commands; a broken line raises `Disconnected`."""
+    return Method(procedure, "_call_once")
+
+
+def receives(procedure: Procedure[P, T]) -> Method[P, T]:
+    """Make a method of a procedure that only receives, perhaps beside one that sends."""
+    return Method(procedure, "_listen")

@@ -17,16 +17,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from xethru_protocol.driver.conversation import FRAMES
-from xethru_protocol.driver.link import (
-    SLOW_TIMEOUT_S,
-    AsyncCall,
-    AsyncPart,
-    Call,
-    Link,
-    Part,
-    Steps,
-)
+from xethru_protocol.driver.link import SLOW_TIMEOUT_S, KindT, Link, Part, Steps, receives, sends
+from xethru_protocol.driver.matching import FRAMES
 from xethru_protocol.driver.reconnect import await_restart
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
@@ -94,14 +86,280 @@ class ProfilePlan:
             yield from link.request(m.SetMode(mode=self.mode), SLOW_TIMEOUT_S)
 
 
-def load(link: Link, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> Steps[None]:
-    yield from link.wait_until_ready()
-    yield from _load(link, profile_id)
-    link.plan = ProfilePlan(profile_id=profile_id, loaded=True)
-    waiting = keep_messages(link)
-    texts = _texts(waiting)
-    waiting.clear()  # those that wait are of what ran before
-    waiting.extend(texts)
+class Profile(Part[KindT]):
+    """The profile of a module: load, set up, run.
+
+    Presence on an X4M300, respiration and sleep on an X4M200. What it sends comes by
+    `X4M300.messages`, its BASEBAND_IQ by `X4M300.frames`. The module takes settings from `load` on
+    and refuses most of them while the profile runs.
+    """
+
+    __slots__ = ()
+
+    @sends
+    def load(link: Link, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> Steps[None]:
+        """Stop whatever runs and load a profile, not running yet, with its own last settings.
+
+        Raises
+        ------
+        DeviceError
+            If the module does not have it.
+        """
+        yield from link.wait_until_ready()
+        yield from _load(link, profile_id)
+        link.plan = ProfilePlan(profile_id=profile_id, loaded=True)
+        waiting = keep_messages(link)
+        texts = _texts(waiting)
+        waiting.clear()  # those that wait are of what ran before
+        waiting.extend(texts)
+
+    @sends
+    def profile_id(link: Link) -> Steps[int]:
+        """Ask which profile is loaded; 0 if none."""
+        return _profile_id(link)
+
+    # --- settings: after `load`, before `run` ---
+
+    @sends
+    def zone_limits(link: Link) -> Steps[ZoneLimits]:
+        """Ask within which limits a detection zone may lie."""
+        return _zone_limits(link)
+
+    @sends
+    def set_zone(link: Link, start_m: float, end_m: float) -> Steps[tuple[float, float]]:
+        """Choose the detection zone; returns the one the module snapped it to [m].
+
+        Raises
+        ------
+        LocalProtocolError
+            If it is outside the limits the module reports, or smaller than 0.20 m.
+        """
+        limits = yield from _zone_limits(link)
+        if not limits.min_m - _SLACK_M <= start_m < end_m <= limits.max_m + _SLACK_M:
+            raise LocalProtocolError(
+                f"detection zone {start_m:g} ... {end_m:g} m does not lie within "
+                f"{limits.min_m:g} ... {limits.max_m:g} m"
+            )
+        if end_m - start_m < _SMALLEST_ZONE_M - _SLACK_M:
+            raise LocalProtocolError(
+                f"detection zone {start_m:g} ... {end_m:g} m is smaller than {_SMALLEST_ZONE_M} m"
+            )
+        yield from _set(link, m.SetDetectionZone(start_m=start_m, end_m=end_m))
+        return (yield from _zone(link))
+
+    @sends
+    def zone(link: Link) -> Steps[tuple[float, float]]:
+        """Ask for the actual detection zone [m]."""
+        return _zone(link)
+
+    @sends
+    def set_sensitivity(link: Link, sensitivity: int) -> Steps[None]:
+        """Choose how little is enough to detect, 0 ... 9."""
+        if not 0 <= sensitivity <= _MAX_SENSITIVITY:
+            raise LocalProtocolError(
+                f"sensitivity must be 0 ... {_MAX_SENSITIVITY}, not {sensitivity}"
+            )
+        yield from _set(link, m.SetSensitivity(sensitivity=sensitivity))
+
+    @sends
+    def sensitivity(link: Link) -> Steps[int]:
+        return _setting(link, m.GetSensitivity(), "sensitivity")
+
+    @sends
+    def set_band(link: Link, tx_center_frequency: int) -> Steps[None]:
+        """Choose the band: 3 is 7.29 GHz (low), 4 is 8.748 GHz (high)."""
+        if tx_center_frequency not in {3, 4}:
+            raise LocalProtocolError(f"band must be 3 (low) or 4 (high), not {tx_center_frequency}")
+        yield from _set(link, m.SetTxCenterFrequency(tx_center_frequency=tx_center_frequency))
+
+    @sends
+    def band(link: Link) -> Steps[int]:
+        """Ask for the band, 3 or 4."""
+        return _setting(link, m.GetTxCenterFrequency(), "band")
+
+    @sends
+    def set_led(link: Link, mode: LedMode, intensity: int = 0) -> Steps[None]:
+        """Choose what the LED shows; released firmware ignores ``intensity`` 0 ... 100."""
+        return _set(link, m.AppSetLedControl(mode=mode, intensity=intensity))
+
+    @sends
+    def led(link: Link) -> Steps[LedMode]:
+        value = yield from _setting(link, m.AppGetLedControl(), "LED mode")
+        try:
+            return LedMode(value)
+        except ValueError:
+            raise RemoteProtocolError(
+                f"{link.path} reports LED mode {value}, which does not exist"
+            ) from None
+
+    @sends
+    def set_noise_map(link: Link, control: NoiseMapControl) -> Steps[None]:
+        """Choose where the noise map comes from when the profile starts."""
+        return _set(link, m.NoiseMapSetControl(control=control))
+
+    @sends
+    def noise_map(link: Link) -> Steps[NoiseMapControl]:
+        value = yield from _setting(link, m.NoiseMapGetControl(), "noise map control")
+        return NoiseMapControl(value)
+
+    @sends
+    def set_noise_map_interval(link: Link, minutes: int) -> Steps[None]:
+        """Choose how often the running profile stores its noise map [min] (16)."""
+        return _set(link, m.NoiseMapSetPeriodicStore(interval_min=minutes))
+
+    @sends
+    def noise_map_interval(link: Link) -> Steps[int]:
+        """Ask how often the noise map is stored [min]."""
+        return _setting(link, m.NoiseMapGetPeriodicStore(), "noise map interval")
+
+    @sends
+    def store_noise_map(link: Link) -> Steps[None]:
+        """Store the noise map for later starts."""
+        yield from link.request(m.StoreNoiseMap(), SLOW_TIMEOUT_S)
+
+    @sends
+    def load_noise_map(link: Link) -> Steps[None]:
+        """Load the stored noise map; without effect in released firmware."""
+        yield from link.request(m.LoadNoiseMap(), SLOW_TIMEOUT_S)
+
+    @sends
+    def delete_noise_map(link: Link) -> Steps[None]:
+        yield from link.request(m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
+
+    @sends
+    def factory_preset(link: Link) -> Steps[None]:
+        """Set the profile back to its factory settings."""
+        yield from link.request(m.FactoryPreset(), SLOW_TIMEOUT_S)
+        if isinstance(link.plan, ProfilePlan):
+            link.plan = replace(link.plan, settings={})
+
+    @sends
+    def set_output(link: Link, feature: OutputFeature, control: int = 1) -> Steps[None]:
+        """Switch a message on or off.
+
+        Parameters
+        ----------
+        feature
+            BASEBAND_IQ messages come as frames, all others as messages. IQ and AMPLITUDE_PHASE
+            exclude each other, so do FLOAT and BYTE of one matrix.
+        control
+            0 or 1; for pulse-Doppler and noise maps `MatrixControl` bits.
+        """
+        return _set(link, m.OutputSetControl(feature=feature, control=control))
+
+    @sends
+    def output(link: Link, feature: OutputFeature) -> Steps[int]:
+        """Ask whether a message is on: its control bits."""
+        return _output(link, m.OutputGetControl(feature=feature))
+
+    @sends
+    def set_debug_output(link: Link, feature: OutputFeature, control: int = 1) -> Steps[None]:
+        """Switch a message on or off on the module's debug line; as `set_output`."""
+        return _set(link, m.DebugOutputSetControl(feature=feature, control=control))
+
+    @sends
+    def debug_output(link: Link, feature: OutputFeature) -> Steps[int]:
+        """Ask whether a message is on on the debug line: its control bits."""
+        return _output(link, m.DebugOutputGetControl(feature=feature))
+
+    @sends
+    def set_parameter_file(link: Link, name: str, data: str | bytes) -> Steps[None]:
+        """Store the profile's parameter file."""
+        yield from _need_profile(link)
+        yield from link.request(m.SetParameterFile(name=name, data=data), SLOW_TIMEOUT_S)
+
+    @sends
+    def parameter_file(link: Link, name: str) -> Steps[str]:
+        """Read the profile's parameter file, one character per byte.
+
+        Raises
+        ------
+        DeviceError
+            If the module has no parameter file of this name.
+        """
+        yield from _need_profile(link)
+        reply = yield from link.request(m.GetParameterFile(name=name))
+        match reply:
+            case m.ReplyString(text=content) | m.ParameterFile(data=content):
+                pass
+            case m.ReplyByte(values=content):
+                pass
+        text = content if isinstance(content, str) else content.decode("latin-1")
+        return text.rstrip("\0")
+
+    # --- running ---
+
+    @sends
+    def run(link: Link) -> Steps[None]:
+        """Run the loaded profile; the module saves its settings.
+
+        A module that must restart to change its profile is waited for and set up again.
+        """
+        readies = link.conversation.readies
+        try:
+            yield from _set_mode(link, SensorMode.XTID_SM_RUN)
+        except DeviceError as error:
+            plan = link.plan
+            if error.code != ErrorCode.XTS_SPRE_RESTARTING or not isinstance(plan, ProfilePlan):
+                raise
+            link.warn("the module restarts to change its profile")
+            yield from await_restart(link, readies)
+            plan = link.plan = replace(plan, mode=SensorMode.XTID_SM_RUN)
+            yield from plan.restore(link)
+
+    @sends
+    def idle(link: Link) -> Steps[None]:
+        """Pause the profile; `run` resumes it."""
+        return _set_mode(link, SensorMode.XTID_SM_IDLE)
+
+    @sends
+    def stop(link: Link) -> Steps[None]:
+        """Stop and unload the profile."""
+        yield from link.stop_profile()
+        link.plan = None
+
+    @receives
+    def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[m.Response]:
+        """Wait until the profile reports more than that it is starting; returns that message.
+
+        That is one of presence, respiration, sleep or vital signs; an output of one must be on.
+        Other messages that come meanwhile are dropped, but for debug text. Other tasks or threads
+        may send commands meanwhile.
+
+        Parameters
+        ----------
+        timeout_s
+            None: as long as this start may take, 20 s, or 120 s if a noise map must be made.
+
+        Raises
+        ------
+        ResponseTimeout
+            If it is still starting then, or sends nothing for seconds.
+        """
+        limit_s = _starting_time_s(link) if timeout_s is None else timeout_s
+        deadline_ns = link.conversation.deadline_ns(limit_s)
+        waiting = keep_messages(link)
+        texts: list[m.Response] = []
+        try:
+            while (left_s := link.left_s(deadline_ns)) > 0:
+                wait_s = min(left_s, MESSAGE_TIMEOUT_S)
+                if not waiting and not (yield from link.listen(lambda: bool(waiting), wait_s)):
+                    if wait_s == MESSAGE_TIMEOUT_S:
+                        raise _no_message(link, wait_s)
+                    break
+                message = waiting.popleft()
+                if (
+                    isinstance(message, _WITH_STATE)
+                    and message.state != _INITIALIZING[type(message)]
+                ):
+                    return message
+                if isinstance(message, m.DataString):
+                    texts.append(message)
+        finally:
+            waiting.extendleft(reversed(texts))
+        raise link.conversation.silence(
+            "end of the profile's start", limit_s, "does the room keep it from settling?"
+        )
 
 
 def _load(link: Link, profile_id: int) -> Steps[None]:
@@ -110,14 +368,11 @@ def _load(link: Link, profile_id: int) -> Steps[None]:
     link.raw_mode = False
 
 
-def profile_id(link: Link) -> Steps[int]:
+def _profile_id(link: Link) -> Steps[int]:
     return (yield from _value(link, m.GetProfileId(), "profile")) & 0xFFFFFFFF
 
 
-# --- settings: after `load`, before `run` -------------------------------------------------------
-
-
-def zone_limits(link: Link) -> Steps[ZoneLimits]:
+def _zone_limits(link: Link) -> Steps[ZoneLimits]:
     yield from _need_profile(link)
     values = (yield from link.request(m.GetDetectionZoneLimits())).values
     if len(values) != 3:
@@ -125,22 +380,7 @@ def zone_limits(link: Link) -> Steps[ZoneLimits]:
     return ZoneLimits(min_m=values[0], max_m=values[1], step_m=values[2])
 
 
-def set_zone(link: Link, start_m: float, end_m: float) -> Steps[tuple[float, float]]:
-    limits = yield from zone_limits(link)
-    if not limits.min_m - _SLACK_M <= start_m < end_m <= limits.max_m + _SLACK_M:
-        raise LocalProtocolError(
-            f"detection zone {start_m:g} ... {end_m:g} m does not lie within "
-            f"{limits.min_m:g} ... {limits.max_m:g} m"
-        )
-    if end_m - start_m < _SMALLEST_ZONE_M - _SLACK_M:
-        raise LocalProtocolError(
-            f"detection zone {start_m:g} ... {end_m:g} m is smaller than {_SMALLEST_ZONE_M} m"
-        )
-    yield from _set(link, m.SetDetectionZone(start_m=start_m, end_m=end_m))
-    return (yield from zone(link))
-
-
-def zone(link: Link) -> Steps[tuple[float, float]]:
+def _zone(link: Link) -> Steps[tuple[float, float]]:
     yield from _need_profile(link)
     values = (yield from link.request(m.GetDetectionZone())).values
     if len(values) != 2:
@@ -148,76 +388,12 @@ def zone(link: Link) -> Steps[tuple[float, float]]:
     return values[0], values[1]
 
 
-def set_sensitivity(link: Link, sensitivity: int) -> Steps[None]:
-    if not 0 <= sensitivity <= _MAX_SENSITIVITY:
-        raise LocalProtocolError(f"sensitivity must be 0 ... {_MAX_SENSITIVITY}, not {sensitivity}")
-    yield from _set(link, m.SetSensitivity(sensitivity=sensitivity))
-
-
-def set_band(link: Link, tx_center_frequency: int) -> Steps[None]:
-    if tx_center_frequency not in {3, 4}:
-        raise LocalProtocolError(f"band must be 3 (low) or 4 (high), not {tx_center_frequency}")
-    yield from _set(link, m.SetTxCenterFrequency(tx_center_frequency=tx_center_frequency))
-
-
-def led(link: Link) -> Steps[LedMode]:
-    value = yield from _setting(link, m.AppGetLedControl(), "LED mode")
-    try:
-        return LedMode(value)
-    except ValueError:
-        raise RemoteProtocolError(
-            f"{link.path} reports LED mode {value}, which does not exist"
-        ) from None
-
-
-def factory_preset(link: Link) -> Steps[None]:
-    yield from link.request(m.FactoryPreset(), SLOW_TIMEOUT_S)
-    if isinstance(link.plan, ProfilePlan):
-        link.plan = replace(link.plan, settings={})
-
-
-def output(link: Link, question: m.OutputGetControl | m.DebugOutputGetControl) -> Steps[int]:
+def _output(link: Link, question: m.OutputGetControl | m.DebugOutputGetControl) -> Steps[int]:
     what = f"control of output {question.feature:08X}h"
     return (yield from _setting(link, question, what)) & 0xFFFFFFFF
 
 
-def parameter_file(link: Link, name: str) -> Steps[str]:
-    yield from _need_profile(link)
-    reply = yield from link.request(m.GetParameterFile(name=name))
-    match reply:
-        case m.ReplyString(text=content) | m.ParameterFile(data=content):
-            pass
-        case m.ReplyByte(values=content):
-            pass
-    text = content if isinstance(content, str) else content.decode("latin-1")
-    return text.rstrip("\0")
-
-
-def set_parameter_file(link: Link, name: str, data: str | bytes) -> Steps[None]:
-    yield from _need_profile(link)
-    yield from link.request(m.SetParameterFile(name=name, data=data), SLOW_TIMEOUT_S)
-
-
-# --- running ------------------------------------------------------------------------------------
-
-
-def run(link: Link) -> Steps[None]:
-    readies = link.conversation.readies
-    try:
-        yield from _set_mode(link, SensorMode.XTID_SM_RUN)
-    except DeviceError as error:
-        plan = link.plan
-        if error.code != ErrorCode.XTS_SPRE_RESTARTING or not isinstance(plan, ProfilePlan):
-            raise
-        link.warn("the module restarts to change its profile")
-        yield from await_restart(link, readies)
-        plan = link.plan = replace(plan, mode=SensorMode.XTID_SM_RUN)
-        yield from plan.restore(link)
-
-
-def stop(link: Link) -> Steps[None]:
-    yield from link.stop_profile()
-    link.plan = None
+# --- modes and messages -------------------------------------------------------------------------
 
 
 def set_mode(link: Link, mode: SensorMode, parameter: int | None = None) -> Steps[None]:
@@ -252,37 +428,10 @@ def messages_waiting(link: Link, kind: type[m.Response]) -> Steps[int]:
     return sum(isinstance(message, kind) for message in waiting)
 
 
-def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[m.Response]:
-    limit_s = _starting_time_s(link) if timeout_s is None else timeout_s
-    deadline_ns = link.conversation.deadline_ns(limit_s)
-    waiting = keep_messages(link)
-    texts: list[m.Response] = []
-    try:
-        while (left_s := link.left_s(deadline_ns)) > 0:
-            wait_s = min(left_s, MESSAGE_TIMEOUT_S)
-            if not waiting and not (yield from link.listen(lambda: bool(waiting), wait_s)):
-                if wait_s == MESSAGE_TIMEOUT_S:
-                    raise _no_message(link, wait_s)
-                break
-            message = waiting.popleft()
-            if isinstance(message, _WITH_STATE) and message.state != _INITIALIZING[type(message)]:
-                return message
-            if isinstance(message, m.DataString):
-                texts.append(message)
-    finally:
-        waiting.extendleft(reversed(texts))
-    raise link.conversation.silence(
-        "end of the profile's start", limit_s, "does the room keep it from settling?"
-    )
-
-
 def keep_messages(link: Link) -> deque[m.Response]:
     """From now on keep what the profile sends, and return where."""
     link.keeps_messages = True
     return link.messages
-
-
-# --- inside -------------------------------------------------------------------------------------
 
 
 def _waiting(link: Link, kind: type[m.Response]) -> deque[m.Response]:
@@ -340,7 +489,7 @@ def _need_profile(link: Link) -> Steps[None]:
     if isinstance(link.plan, ProfilePlan):
         return
     try:
-        found = yield from profile_id(link)
+        found = yield from _profile_id(link)
     except DeviceError as error:
         raise LocalProtocolError(f"this module has no profiles: {error}") from error
     if found == ProfileId.XTS_ID_APP_NONE:
@@ -358,282 +507,3 @@ def _value(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt], what: str) 
     if not values:
         raise RemoteProtocolError(f"{link.path} reports no value as its {what}")
     return values[0]
-
-
-class Profile(Part):
-    """The profile of a module behind an `X4M300`: load, set up, run.
-
-    Presence on an X4M300, respiration and sleep on an X4M200. What it sends comes by
-    `X4M300.messages`, its BASEBAND_IQ by `X4M300.frames`. The module takes settings from `load` on
-    and refuses most of them while the profile runs.
-    """
-
-    __slots__ = ("_listen",)
-
-    def __init__(self, call: Call, listen: Call) -> None:
-        super().__init__(call)
-        self._listen = listen
-
-    def load(self, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> None:
-        """Stop whatever runs and load a profile, not running yet, with its own last settings.
-
-        Raises
-        ------
-        DeviceError
-            If the module does not have it.
-        """
-        self._call(load, profile_id)
-
-    def profile_id(self) -> int:
-        """Ask which profile is loaded; 0 if none."""
-        return self._call(profile_id)
-
-    # --- settings: after `load`, before `run` ---
-
-    def zone_limits(self) -> ZoneLimits:
-        """Ask within which limits a detection zone may lie."""
-        return self._call(zone_limits)
-
-    def set_zone(self, start_m: float, end_m: float) -> tuple[float, float]:
-        """Choose the detection zone; returns the one the module snapped it to [m].
-
-        Raises
-        ------
-        LocalProtocolError
-            If it is outside the limits the module reports, or smaller than 0.20 m.
-        """
-        return self._call(set_zone, start_m, end_m)
-
-    def zone(self) -> tuple[float, float]:
-        """Ask for the actual detection zone [m]."""
-        return self._call(zone)
-
-    def set_sensitivity(self, sensitivity: int) -> None:
-        """Choose how little is enough to detect, 0 ... 9."""
-        self._call(set_sensitivity, sensitivity)
-
-    def sensitivity(self) -> int:
-        return self._call(_setting, m.GetSensitivity(), "sensitivity")
-
-    def set_band(self, tx_center_frequency: int) -> None:
-        """Choose the band: 3 is 7.29 GHz (low), 4 is 8.748 GHz (high)."""
-        self._call(set_band, tx_center_frequency)
-
-    def band(self) -> int:
-        """Ask for the band, 3 or 4."""
-        return self._call(_setting, m.GetTxCenterFrequency(), "band")
-
-    def set_led(self, mode: LedMode, intensity: int = 0) -> None:
-        """Choose what the LED shows; released firmware ignores ``intensity`` 0 ... 100."""
-        self._call(_set, m.AppSetLedControl(mode=mode, intensity=intensity))
-
-    def led(self) -> LedMode:
-        return self._call(led)
-
-    def set_noise_map(self, control: NoiseMapControl) -> None:
-        """Choose where the noise map comes from when the profile starts."""
-        self._call(_set, m.NoiseMapSetControl(control=control))
-
-    def noise_map(self) -> NoiseMapControl:
-        value = self._call(_setting, m.NoiseMapGetControl(), "noise map control")
-        return NoiseMapControl(value)
-
-    def set_noise_map_interval(self, minutes: int) -> None:
-        """Choose how often the running profile stores its noise map [min] (16)."""
-        self._call(_set, m.NoiseMapSetPeriodicStore(interval_min=minutes))
-
-    def noise_map_interval(self) -> int:
-        """Ask how often the noise map is stored [min]."""
-        return self._call(_setting, m.NoiseMapGetPeriodicStore(), "noise map interval")
-
-    def store_noise_map(self) -> None:
-        """Store the noise map for later starts."""
-        self._call(Link.request, m.StoreNoiseMap(), SLOW_TIMEOUT_S)
-
-    def load_noise_map(self) -> None:
-        """Load the stored noise map; without effect in released firmware."""
-        self._call(Link.request, m.LoadNoiseMap(), SLOW_TIMEOUT_S)
-
-    def delete_noise_map(self) -> None:
-        self._call(Link.request, m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
-
-    def factory_preset(self) -> None:
-        """Set the profile back to its factory settings."""
-        self._call(factory_preset)
-
-    def set_output(self, feature: OutputFeature, control: int = 1) -> None:
-        """Switch a message on or off.
-
-        Parameters
-        ----------
-        feature
-            BASEBAND_IQ messages come as frames, all others as messages. IQ and AMPLITUDE_PHASE
-            exclude each other, so do FLOAT and BYTE of one matrix.
-        control
-            0 or 1; for pulse-Doppler and noise maps `MatrixControl` bits.
-        """
-        self._call(_set, m.OutputSetControl(feature=feature, control=control))
-
-    def output(self, feature: OutputFeature) -> int:
-        """Ask whether a message is on: its control bits."""
-        return self._call(output, m.OutputGetControl(feature=feature))
-
-    def set_debug_output(self, feature: OutputFeature, control: int = 1) -> None:
-        """Switch a message on or off on the module's debug line; as `set_output`."""
-        self._call(_set, m.DebugOutputSetControl(feature=feature, control=control))
-
-    def debug_output(self, feature: OutputFeature) -> int:
-        """Ask whether a message is on on the debug line: its control bits."""
-        return self._call(output, m.DebugOutputGetControl(feature=feature))
-
-    def set_parameter_file(self, name: str, data: str | bytes) -> None:
-        """Store the profile's parameter file."""
-        self._call(set_parameter_file, name, data)
-
-    def parameter_file(self, name: str) -> str:
-        """Read the profile's parameter file, one character per byte.
-
-        Raises
-        ------
-        DeviceError
-            If the module has no parameter file of this name.
-        """
-        return self._call(parameter_file, name)
-
-    # --- running ---
-
-    def run(self) -> None:
-        """Run the loaded profile; the module saves its settings.
-
-        A module that must restart to change its profile is waited for and set up again.
-        """
-        self._call(run)
-
-    def idle(self) -> None:
-        """Pause the profile; `run` resumes it."""
-        self._call(_set_mode, SensorMode.XTID_SM_IDLE)
-
-    def stop(self) -> None:
-        """Stop and unload the profile."""
-        self._call(stop)
-
-    def wait_until_initialized(self, timeout_s: float | None = None) -> m.Response:
-        """Wait until the profile reports more than that it is starting; returns that message.
-
-        That is one of presence, respiration, sleep or vital signs; an output of one must be on.
-        Other messages that come meanwhile are dropped, but for debug text.
-
-        Parameters
-        ----------
-        timeout_s
-            None: as long as this start may take, 20 s, or 120 s if a noise map must be made.
-
-        Raises
-        ------
-        ResponseTimeout
-            If it is still starting then, or sends nothing for seconds.
-        """
-        return self._listen(wait_until_initialized, timeout_s)
-
-
-class AsyncProfile(AsyncPart):
-    """The profile of a module behind an `AsyncX4M300`; methods as of `Profile`."""
-
-    __slots__ = ("_listen",)
-
-    def __init__(self, call: AsyncCall, listen: AsyncCall) -> None:
-        super().__init__(call)
-        self._listen = listen
-
-    async def load(self, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> None:
-        await self._call(load, profile_id)
-
-    async def profile_id(self) -> int:
-        return await self._call(profile_id)
-
-    # --- settings: after `load`, before `run` ---
-
-    async def zone_limits(self) -> ZoneLimits:
-        return await self._call(zone_limits)
-
-    async def set_zone(self, start_m: float, end_m: float) -> tuple[float, float]:
-        return await self._call(set_zone, start_m, end_m)
-
-    async def zone(self) -> tuple[float, float]:
-        return await self._call(zone)
-
-    async def set_sensitivity(self, sensitivity: int) -> None:
-        await self._call(set_sensitivity, sensitivity)
-
-    async def sensitivity(self) -> int:
-        return await self._call(_setting, m.GetSensitivity(), "sensitivity")
-
-    async def set_band(self, tx_center_frequency: int) -> None:
-        await self._call(set_band, tx_center_frequency)
-
-    async def band(self) -> int:
-        return await self._call(_setting, m.GetTxCenterFrequency(), "band")
-
-    async def set_led(self, mode: LedMode, intensity: int = 0) -> None:
-        await self._call(_set, m.AppSetLedControl(mode=mode, intensity=intensity))
-
-    async def led(self) -> LedMode:
-        return await self._call(led)
-
-    async def set_noise_map(self, control: NoiseMapControl) -> None:
-        await self._call(_set, m.NoiseMapSetControl(control=control))
-
-    async def noise_map(self) -> NoiseMapControl:
-        value = await self._call(_setting, m.NoiseMapGetControl(), "noise map control")
-        return NoiseMapControl(value)
-
-    async def set_noise_map_interval(self, minutes: int) -> None:
-        await self._call(_set, m.NoiseMapSetPeriodicStore(interval_min=minutes))
-
-    async def noise_map_interval(self) -> int:
-        return await self._call(_setting, m.NoiseMapGetPeriodicStore(), "noise map interval")
-
-    async def store_noise_map(self) -> None:
-        await self._call(Link.request, m.StoreNoiseMap(), SLOW_TIMEOUT_S)
-
-    async def load_noise_map(self) -> None:
-        await self._call(Link.request, m.LoadNoiseMap(), SLOW_TIMEOUT_S)
-
-    async def delete_noise_map(self) -> None:
-        await self._call(Link.request, m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
-
-    async def factory_preset(self) -> None:
-        await self._call(factory_preset)
-
-    async def set_output(self, feature: OutputFeature, control: int = 1) -> None:
-        await self._call(_set, m.OutputSetControl(feature=feature, control=control))
-
-    async def output(self, feature: OutputFeature) -> int:
-        return await self._call(output, m.OutputGetControl(feature=feature))
-
-    async def set_debug_output(self, feature: OutputFeature, control: int = 1) -> None:
-        await self._call(_set, m.DebugOutputSetControl(feature=feature, control=control))
-
-    async def debug_output(self, feature: OutputFeature) -> int:
-        return await self._call(output, m.DebugOutputGetControl(feature=feature))
-
-    async def set_parameter_file(self, name: str, data: str | bytes) -> None:
-        await self._call(set_parameter_file, name, data)
-
-    async def parameter_file(self, name: str) -> str:
-        return await self._call(parameter_file, name)
-
-    # --- running ---
-
-    async def run(self) -> None:
-        await self._call(run)
-
-    async def idle(self) -> None:
-        await self._call(_set_mode, SensorMode.XTID_SM_IDLE)
-
-    async def stop(self) -> None:
-        await self._call(stop)
-
-    async def wait_until_initialized(self, timeout_s: float | None = None) -> m.Response:
-        """See `Profile.wait_until_initialized`; other tasks may send commands meanwhile."""
-        return await self._listen(wait_until_initialized, timeout_s)

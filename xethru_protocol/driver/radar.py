@@ -13,21 +13,22 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar, Self
 
-from xethru_protocol.driver import raw_mode, reconnect
+from xethru_protocol.driver import profiles, raw_mode, reconnect
 from xethru_protocol.driver.board import Diagnostics, Pins
 from xethru_protocol.driver.chip import X4, Postprocessing, Registers
-from xethru_protocol.driver.conversation import Listener, Observer, RawListener
 from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.firmware import Firmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
-    POWER_UP_BAUD,
     TIMEOUT_S,
+    Blocking,
     CloseLine,
+    KindT,
     Link,
     ModuleInfo,
     OpenLine,
     P,
+    Part,
     Procedure,
     RawConfig,
     Read,
@@ -38,15 +39,12 @@ from xethru_protocol.driver.link import (
     Steps,
     T,
     Write,
+    receives,
+    sends,
+    sends_once,
 )
-from xethru_protocol.driver.profiles import (
-    MESSAGE_TIMEOUT_S,
-    MessageT,
-    Profile,
-    messages_waiting,
-    set_mode,
-    wait_for_message,
-)
+from xethru_protocol.driver.matching import Listener, Observer, RawListener
+from xethru_protocol.driver.profiles import MESSAGE_TIMEOUT_S, MessageT
 from xethru_protocol.transport import (
     AsyncTransport,
     Transport,
@@ -55,7 +53,7 @@ from xethru_protocol.transport import (
     open_line,
     set_rate,
 )
-from xethru_protocol.wire.codes import PongCode, SensorMode
+from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, SensorMode
 from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.messages import Command, Response
@@ -78,8 +76,8 @@ def reentry(name: str) -> LocalProtocolError:
     )
 
 
-class RadarState:
-    """Counters and settings of a driver, blocking or not.
+class RadarState(Part[KindT]):
+    """What both drivers have: methods, counters and settings.
 
     A listener, observer or other callback must not call the driver: `LocalProtocolError`.
 
@@ -90,6 +88,7 @@ class RadarState:
         time [ns]; may be None.
     """
 
+    _is_awaited: ClassVar[bool] = False
     _port_type: "ClassVar[staticmethod[[str, int], Transport | AsyncTransport]]"
     _open_port: Callable[[str, int], Transport | AsyncTransport]
 
@@ -116,6 +115,15 @@ class RadarState:
             reconnect_s=reconnect_s,
             candidates=candidates,
         )
+        super().__init__(self)
+        self.x4: X4[KindT] = X4(self)
+        self.profile: profiles.Profile[KindT] = profiles.Profile(self)
+        self.pins: Pins[KindT] = Pins(self)
+        self.files: Files[KindT] = Files(self)
+        self.firmware: Firmware[KindT] = Firmware(self)
+        self.registers: Registers[KindT] = Registers(self)
+        self.postprocessing: Postprocessing[KindT] = Postprocessing(self)
+        self.diagnostics: Diagnostics[KindT] = Diagnostics(self)
         self._link.bytes_per_s = capacity_bytes_per_s(transport)
 
     def __del__(self) -> None:
@@ -232,7 +240,7 @@ class RadarState:
     @property
     def stray_count(self) -> int:
         """Answers seen that belong to no request."""
-        return self._link.conversation.stray_count
+        return self._link.conversation.matcher.stray_count
 
     @property
     def reboots(self) -> int:
@@ -243,6 +251,181 @@ class RadarState:
     def reconnects(self) -> int:
         """Times the module vanished and was found again."""
         return self._link.reconnects
+
+    # --- the module and its line ---
+
+    @sends
+    def ping(link: Link, timeout_s: float = TIMEOUT_S) -> Steps[PongCode]:
+        """Whether the module is ready, not ready, or in safe mode.
+
+        Raises
+        ------
+        ResponseTimeout
+            If nothing answers: probably no radar.
+        RemoteProtocolError
+            If no XeThru module gives this answer.
+        """
+        return link.ping(timeout_s)
+
+    @sends
+    def info(link: Link) -> Steps[ModuleInfo]:
+        """Read what the module reports about itself."""
+        return link.info()
+
+    @sends
+    def mode(link: Link) -> Steps[SensorMode]:
+        """Ask for the module's mode; `DeviceError` if its firmware has none (bare XEP)."""
+        return link.mode()
+
+    @sends
+    def set_mode(link: Link, mode: SensorMode, parameter: int | None = None) -> Steps[None]:
+        """Change the module's mode. Protocol reference 4.2, 8.3.
+
+        `configure_raw` and the methods of `profile` do so by themselves.
+
+        Parameters
+        ----------
+        parameter
+            Only of the modes NORMAL (`NormalModeParam`) and REG (`RegModeParam`, certification).
+        """
+        return profiles.set_mode(link, mode, parameter)
+
+    @sends_once
+    def reset(
+        link: Link, *, wait: bool = False, timeout_s: float = reconnect.RESTART_S
+    ) -> Steps[None]:
+        """Restart the module; what was configured is gone. Protocol reference 8.1.
+
+        Parameters
+        ----------
+        wait
+            False: return at its ACK; a USB port vanishes 0.5 s later. True: return when it is
+            ready again, on a port of the same or another name.
+
+        Raises
+        ------
+        ResponseTimeout
+            If it keeps its port and does not get ready in time.
+        Disconnected
+            If its port vanishes and it does not come back in time.
+        """
+        return reconnect.reset(link, wait=wait, timeout_s=timeout_s)
+
+    @sends_once
+    def reconnect(link: Link, timeout_s: float = reconnect.RESTART_S) -> Steps[str]:
+        """Find the module again at the same port or another, and restore what was configured.
+
+        Frames that were read before it vanished stay in the queue. Those that come begin a new
+        `Frame.stream`, and `frames_lost` includes those of the time between. Returns the port it
+        was found at.
+
+        Raises
+        ------
+        Disconnected
+            If it does not come back in time.
+        DeviceError
+            If it came back and refuses its settings.
+        """
+        return reconnect.reconnect(link, timeout_s)
+
+    @sends_once
+    def set_baud_rate(link: Link, baudrate: int, *, force: bool = False) -> Steps[None]:
+        """Change the rate of a UART on both sides; lines without a rate accept it without effect.
+
+        The module answers at the old rate and forgets the new one at a restart. Protocol reference
+        4.10, 10, 16.
+
+        Parameters
+        ----------
+        baudrate
+            One of `BAUD_RATES`; any other only with ``force``, since a module acknowledges rates
+            that it does not have.
+
+        Raises
+        ------
+        LocalProtocolError
+            If the module does not list the rate.
+        ResponseTimeout
+            If the module does not answer at the new rate. This side is back at the old rate then
+            if the module answers there, and at the new one if it answers at neither.
+        """
+        return link.set_baud_rate(baudrate, force=force)
+
+    @sends_once
+    def find_baud_rate(link: Link) -> Steps[int | None]:
+        """Find the rate at which a module on a UART answers, and change this side to it.
+
+        None if it answers at none; this side is at 115200 then. Lines without a rate accept every
+        one without effect.
+        """
+        return link.find_baud_rate()
+
+    # --- raw radar mode ---
+
+    @sends
+    def configure_raw(link: Link, config: RawConfig | None = None) -> Steps[FrameGeometry]:
+        """Bring the module from any state to raw radar mode, stopped.
+
+        Every setting is read back. Returns the geometry as the module quantised it. Protocol
+        reference 13.
+
+        Raises
+        ------
+        LocalProtocolError
+            If the settings make no sense.
+        DeviceError
+            If the module refuses one.
+        RemoteProtocolError
+            If it reads back another value than was set; names the setting.
+        ResponseTimeout
+            If the port is not a radar.
+        """
+        return raw_mode.configure_raw(link, config)
+
+    @sends
+    def start(link: Link, fps: float) -> Steps[float]:
+        """Start frames at ``fps`` [Hz]; returns the rate at which the chip really runs.
+
+        Frames of an earlier stream that were not read yet are dropped. Without `configure_raw`, the
+        settings that a module in mode MANUAL has are taken for those that are wanted.
+
+        A rate above what the settings allow or the line carries is tried, with a warning: the
+        firmware does not refuse it (Protocol reference 9.6, 10).
+        """
+        return raw_mode.start(link, fps)
+
+    @sends
+    def stop(link: Link) -> Steps[None]:
+        """Stop frames. One that was already on its way may still come."""
+        return raw_mode.stop(link)
+
+    @receives
+    def read_frame(link: Link, timeout_s: float = TIMEOUT_S) -> Steps[Frame]:
+        """Next frame, in order of arrival.
+
+        Raises
+        ------
+        ResponseTimeout
+            If none comes in time.
+        Disconnected
+            If the line is gone.
+        """
+        return link.next_frame(timeout_s)
+
+    @receives
+    def frames_waiting(link: Link) -> Steps[int]:
+        """Receive what the line has, without waiting, and count the frames not taken yet."""
+        yield from link.take_stale_input()
+        return len(link.frames)
+
+    # --- other messages ---
+
+    @receives
+    def messages_waiting(link: Link, kind: type[Response] = Response) -> Steps[int]:
+        """Receive what the line has, without waiting, and count the messages not taken yet."""
+        return profiles.messages_waiting(link, kind)
+
+    # --- carrying out steps ---
 
     def _use(self, transport: Transport | AsyncTransport) -> None:
         self._transport = transport
@@ -260,7 +443,7 @@ class RadarState:
                 self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
 
 
-class X4M300(RadarState):
+class X4M300(RadarState[Blocking]):
     """One radar module on a port: X4M300, X4M200, or any other with XeThru's X4 firmware.
 
     Raw frames, a sample per range bin::
@@ -287,7 +470,8 @@ class X4M300(RadarState):
     - raw frames: `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
     - all other messages: `messages`, `read_message`, `messages_waiting`; `listener` is called with
       every one, `raw_listener` with the bytes of both directions
-    - the module and its line: `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`
+    - the module and its line: `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`,
+      `find_baud_rate`
     - any command of the protocol: `request`
 
     The parts, each with a help of its own, such as ``help(radar.x4)``:
@@ -360,14 +544,6 @@ class X4M300(RadarState):
         self._reading = False
         self._waiting = 0  # threads that wait for the one that reads
         self._inside: set[int] = set()  # threads in a call of the driver
-        self.x4 = X4(self._call)
-        self.profile = Profile(self._call, self._listen)
-        self.pins = Pins(self._call)
-        self.files = Files(self._call, self._call_once)
-        self.firmware = Firmware(self._call_once)
-        self.registers = Registers(self._call)
-        self.postprocessing = Postprocessing(self._call)
-        self.diagnostics = Diagnostics(self._call)
 
     def __enter__(self) -> Self:
         return self
@@ -389,7 +565,7 @@ class X4M300(RadarState):
         finally:
             self._transport.close()
 
-    # --- any command ----------------------------------------------------------------------------
+    # --- any command, iterators ---
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> ReplyT:
         """Send a command and return the reply that its row in the message table names.
@@ -405,144 +581,6 @@ class X4M300(RadarState):
         """
         return self._call(Link.request, command, timeout_s)
 
-    def ping(self, timeout_s: float = TIMEOUT_S) -> PongCode:
-        """Whether the module is ready, not ready, or in safe mode.
-
-        Raises
-        ------
-        ResponseTimeout
-            If nothing answers: probably no radar.
-        RemoteProtocolError
-            If no XeThru module gives this answer.
-        """
-        return self._call(Link.ping, timeout_s)
-
-    def info(self) -> ModuleInfo:
-        """Read what the module reports about itself."""
-        return self._call(Link.info)
-
-    def mode(self) -> SensorMode:
-        """Ask for the module's mode; `DeviceError` if its firmware has none (bare XEP)."""
-        return self._call(Link.mode)
-
-    def set_mode(self, mode: SensorMode, parameter: int | None = None) -> None:
-        """Change the module's mode. Protocol reference 4.2, 8.3.
-
-        `configure_raw` and the methods of `profile` do so by themselves.
-
-        Parameters
-        ----------
-        parameter
-            Only of the modes NORMAL (`NormalModeParam`) and REG (`RegModeParam`, certification).
-        """
-        self._call(set_mode, mode, parameter)
-
-    # --- the line -------------------------------------------------------------------------------
-
-    def reset(self, *, wait: bool = False, timeout_s: float = reconnect.RESTART_S) -> None:
-        """Restart the module; what was configured is gone. Protocol reference 8.1.
-
-        Parameters
-        ----------
-        wait
-            False: return at its ACK; a USB port vanishes 0.5 s later. True: return when it is
-            ready again, on a port of the same or another name.
-
-        Raises
-        ------
-        ResponseTimeout
-            If it keeps its port and does not get ready in time.
-        Disconnected
-            If its port vanishes and it does not come back in time.
-        """
-        self._call_once(reconnect.reset, wait=wait, timeout_s=timeout_s)
-
-    def reconnect(self, timeout_s: float = reconnect.RESTART_S) -> str:
-        """Find the module again at the same port or another, and restore what was configured.
-
-        Frames that were read before it vanished stay in the queue. Those that come begin a new
-        `Frame.stream`, and `frames_lost` includes those of the time between. Returns the port it
-        was found at.
-
-        Raises
-        ------
-        Disconnected
-            If it does not come back in time.
-        DeviceError
-            If it came back and refuses its settings.
-        """
-        return self._call_once(reconnect.reconnect, timeout_s)
-
-    def set_baud_rate(self, baudrate: int, *, force: bool = False) -> None:
-        """Change the rate of a UART on both sides; lines without a rate accept it without effect.
-
-        The module answers at the old rate and forgets the new one at a restart. Protocol reference
-        4.10, 10, 16.
-
-        Parameters
-        ----------
-        baudrate
-            One of `BAUD_RATES`; any other only with ``force``, since a module acknowledges rates
-            that it does not have.
-
-        Raises
-        ------
-        LocalProtocolError
-            If the module does not list the rate.
-        ResponseTimeout
-            If the module does not answer at the new rate. This side is back at the old rate then
-            if the module answers there, and at the new one if it answers at neither.
-        """
-        self._call_once(Link.set_baud_rate, baudrate, force=force)
-
-    # --- raw radar mode -------------------------------------------------------------------------
-
-    def configure_raw(self, config: RawConfig | None = None) -> FrameGeometry:
-        """Bring the module from any state to raw radar mode, stopped.
-
-        Every setting is read back. Returns the geometry as the module quantised it. Protocol
-        reference 13.
-
-        Raises
-        ------
-        LocalProtocolError
-            If the settings make no sense.
-        DeviceError
-            If the module refuses one.
-        RemoteProtocolError
-            If it reads back another value than was set; names the setting.
-        ResponseTimeout
-            If the port is not a radar.
-        """
-        return self._call(raw_mode.configure_raw, config)
-
-    def start(self, fps: float) -> float:
-        """Start frames at ``fps`` [Hz]; returns the rate at which the chip really runs.
-
-        Frames of an earlier stream that were not read yet are dropped. Without `configure_raw`, the
-        settings that a module in mode MANUAL has are taken for those that are wanted.
-
-        A rate above what the settings allow or the line carries is tried, with a warning: the
-        firmware does not refuse it (Protocol reference 9.6, 10).
-        """
-        return self._call(raw_mode.start, fps)
-
-    def stop(self) -> None:
-        """Stop frames. One that was already on its way may still come."""
-        self._call(raw_mode.stop)
-
-    def read_frame(self, timeout_s: float = TIMEOUT_S) -> Frame:
-        """Next frame, in order of arrival.
-
-        Raises
-        ------
-        ResponseTimeout
-            If none comes in time.
-        Disconnected
-            If the line is gone.
-        """
-        return self._listen(Link.next_frame, timeout_s)
-
     def frames(self, count: int | None = None, timeout_s: float = TIMEOUT_S) -> Iterator[Frame]:
         """Iterate over frames; ``count`` of them, or without end.
 
@@ -550,13 +588,6 @@ class X4M300(RadarState):
         """
         for _ in itertools.count() if count is None else range(count):
             yield self.read_frame(timeout_s)
-
-    def frames_waiting(self) -> int:
-        """Receive what the line has, without waiting, and count the frames not taken yet."""
-        self._listen(Link.take_stale_input)
-        return len(self._link.frames)
-
-    # --- other messages -------------------------------------------------------------------------
 
     def read_message(self, kind: type[MessageT], timeout_s: float = MESSAGE_TIMEOUT_S) -> MessageT:
         """Next message of a class of `xethru_protocol.wire.messages`, such as `DataString`.
@@ -568,7 +599,7 @@ class X4M300(RadarState):
         ResponseTimeout
             If none comes in time.
         """
-        return self._listen(wait_for_message, kind, timeout_s)
+        return self._listen(profiles.wait_for_message, kind, timeout_s)
 
     def messages(
         self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
@@ -580,11 +611,7 @@ class X4M300(RadarState):
         for _ in itertools.count() if count is None else range(count):
             yield self.read_message(Response, timeout_s)
 
-    def messages_waiting(self, kind: type[Response] = Response) -> int:
-        """Receive what the line has, without waiting, and count the messages not taken yet."""
-        return self._listen(messages_waiting, kind)
-
-    # --- carrying out steps ---------------------------------------------------------------------
+    # --- carrying out steps ---
 
     def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that sends commands; again after a reconnect, if that is on."""

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import TypeAlias, TypeVar
 
 from xethru_protocol.driver.link import (
-    POWER_UP_BAUD,
     CloseLine,
     Link,
     OpenLine,
@@ -18,7 +17,7 @@ from xethru_protocol.driver.link import (
     Sleep,
     Steps,
 )
-from xethru_protocol.wire.codes import ErrorCode, InfoItem, PongCode
+from xethru_protocol.wire.codes import POWER_UP_BAUD, ErrorCode, InfoItem, PongCode
 from xethru_protocol.wire.errors import (
     DeviceError,
     Disconnected,

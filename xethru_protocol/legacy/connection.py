@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol, TypeVar
 
-from xethru_protocol.driver.conversation import ProtocolRecord
+from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout, XeThruError
 from xethru_protocol.wire.rows import Response

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Final, NoReturn, Self
 
 import numpy as np
 
-from xethru_protocol.driver.link import BAUD_RATES
 from xethru_protocol.recordings.vendor.layouts import ALL_BITS, KINDS
 from xethru_protocol.wire import codes
 from xethru_protocol.wire import messages as m
@@ -96,7 +95,7 @@ _OTHERS: Final[Mapping[str, int]] = {
     "XTID_CENTER_FREQ_LOWBAND": codes.TxCenterFrequency.LOW_BAND,
     "XTID_CENTER_FREQ_HIGHBAND": codes.TxCenterFrequency.HIGH_BAND,
     "XTID_MCP_ERROR_NOT_RECOGNIZED": codes.ErrorCode.XTS_SPRE_NOT_RECOGNIZED,
-    **{f"XTID_BAUDRATE_{rate}": rate for rate in BAUD_RATES},
+    **{f"XTID_BAUDRATE_{rate}": rate for rate in codes.BAUD_RATES},
 }
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
-from xethru_protocol.driver.conversation import Listener
+from xethru_protocol.driver.matching import Listener
 from xethru_protocol.recordings.formats import optional_packages
 from xethru_protocol.recordings.records import GrowingFile, RecordingError
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE

@@ -11,6 +11,14 @@ PONG. Members without prefix have the reference's own words where it gives no ve
 
 from enum import IntEnum, IntFlag
 
+BAUD_RATES = (
+    *(9600, 19200, 38400, 115200, 230400, 460800, 500000, 576000, 921600),
+    *(1000000, 2000000, 3000000, 4000000),
+)
+"""Rates of a UART. Protocol reference 10."""
+POWER_UP_BAUD = 115200
+"""A UART module's rate after every restart; without meaning on USB and ptys."""
+
 
 class CommandCode(IntEnum):
     """First payload byte host to module. Protocol reference 2."""

@@ -9,7 +9,7 @@ from typing import Any, Self, cast
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.chip import AsyncSetting, Setting
-from xethru_protocol.driver.link import AsyncPart
+from xethru_protocol.driver.link import Part
 from xethru_protocol.driver.radar import X4M300, RadarState
 
 
@@ -51,7 +51,7 @@ class Blocking:
             return lambda *args, **kwargs: self._iterate(value(*args, **kwargs))
         if isinstance(value, AsyncSetting):
             return self.runner.run(value.get())
-        return Blocking(value, self.runner) if isinstance(value, AsyncPart) else value
+        return Blocking(value, self.runner) if isinstance(value, Part) else value
 
     def __setattr__(self, name: str, value: object) -> None:
         if isinstance(getattr(type(self.target), name, None), Setting):
@@ -86,14 +86,14 @@ DriverOn = Callable[..., Scripted]
 @contextlib.contextmanager
 def driver_factory(kind: str) -> Iterator[DriverOn]:
     """Give a maker of drivers; at the end they count as closed, whatever their modules do."""
-    made: list[RadarState] = []
+    made: list[RadarState[Any]] = []
     with asyncio.Runner() as runner:
         yield _maker(kind, runner, made)
     for radar in made:
         radar._link.closed = True
 
 
-def _maker(kind: str, runner: asyncio.Runner, made: list[RadarState]) -> DriverOn:
+def _maker(kind: str, runner: asyncio.Runner, made: list[RadarState[Any]]) -> DriverOn:
     def driver_on(
         answer: Answer | None = None,
         *,

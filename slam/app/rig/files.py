@@ -39,7 +39,7 @@ from slam.app.errors import AppError, UsageError, naming
 from slam.app.rig.sources import RadarLink, RecordObserver
 from slam.config import WheelNoise
 from slam.geometry import Mount, ReceivedPulse, Rig
-from xethru_protocol.driver.conversation import ProtocolRecord
+from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.system import written_whole
 from xethru_protocol.transport import find_ports

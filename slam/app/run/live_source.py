@@ -39,8 +39,8 @@ from slam.app.run.runner import LinkLog, frames_between
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
 from slam.results import SmoothedRun
-from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
+from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError

@@ -36,8 +36,8 @@ from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
-from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
+from xethru_protocol.driver.matching import ProtocolRecord
 
 _NO_LANDMARKS_M = np.empty((0, 2))
 

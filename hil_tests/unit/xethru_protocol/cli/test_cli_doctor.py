@@ -31,7 +31,8 @@ from hil_tests.unit.xethru_protocol.pty_module import (
 )
 from xethru_protocol.cli import main, port_probe
 from xethru_protocol.cli.doctor import MACHINE_CHECKS, PORT_CHECKS
-from xethru_protocol.cli.port_probe import PortProbe, port_users
+from xethru_protocol.cli.port_probe import port_users
+from xethru_protocol.driver import link
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role
@@ -52,6 +53,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait less for modules that never answer, and longer at a rate at which one may."""
     monkeypatch.setattr(port_probe, "_ANSWER_LIMIT_S", 0.3)
     monkeypatch.setattr(port_probe, "_REPLY_LIMIT_S", 1.0)
+    monkeypatch.setattr(link, "_BAUD_PROBE_S", 1.0)
 
 
 def examined(capsys: Capture, *arguments: str) -> tuple[int, list[dict[str, Any]]]:
@@ -230,7 +232,7 @@ def test_only_uarts_are_tried_at_other_rates(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[int] = []
-    monkeypatch.setattr(PortProbe, "_reopen", lambda _, baudrate: tried.append(baudrate))
+    monkeypatch.setattr(SerialTransport, "set_baudrate", lambda _, rate: tried.append(rate))
     for bytes_per_s, is_uart in ((math.inf, False), (11520.0, True)):
         monkeypatch.setattr(SerialTransport, "bytes_per_s", bytes_per_s)
         with PtyModule(silent) as module:

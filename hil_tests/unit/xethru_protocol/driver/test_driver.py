@@ -9,8 +9,8 @@ import pytest
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame, framed
 from xethru_protocol import X4M300, AsyncX4M300
-from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.link import Link, RawConfig
+from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import (

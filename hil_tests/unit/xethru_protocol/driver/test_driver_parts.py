@@ -3,6 +3,7 @@
 The API of `xethru_protocol` itself: its names, lazily imported, and typed.
 """
 
+import asyncio
 import inspect
 import math
 import pydoc
@@ -11,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import assert_type
+from typing import Any, assert_type
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from xethru_protocol import (
     NoiseMapControl,
     RawConfig,
 )
-from xethru_protocol.driver import board, chip, files, firmware, profiles
+from xethru_protocol.driver import board, chip
 from xethru_protocol.driver.link import Part
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
@@ -340,7 +341,7 @@ def test_init_forgets_what_was_configured(raw: Scripted) -> None:
 
 def test_help_of_a_setting_has_units_and_limits() -> None:
     assert (chip.X4.iterations.__doc__ or "").endswith("1 ... 255.")
-    rows = [row for row in vars(chip.X4Settings).values() if isinstance(row, chip.X4Row)]
+    rows = [row for row in vars(chip.X4).values() if isinstance(row, chip.X4Row)]
     shown = pydoc.plain(pydoc.render_doc(chip.X4))
     for row in rows:
         assert f" |  {row.name}\n |      {(row.__doc__ or '')[:20]}" in shown
@@ -361,6 +362,9 @@ def test_type_checkers_know_every_setting() -> None:
         assert_type(await radar.postprocessing.number_format.get(), int)
         await radar.x4.fps.set(17)
         radar.x4.iterations = 8  # type: ignore[arg-type] # it must be awaited
+        assert_type(await radar.profile.set_zone(0.4, 5.0), tuple[float, float])
+        assert_type(await radar.read_frame(timeout_s=1.0), Frame)
+        asyncio.create_task(radar.start(17.0))  # noqa: RUF006 - it never runs
 
     def ask(radar: X4M300) -> None:
         assert_type(radar.x4.iterations, int)
@@ -369,6 +373,9 @@ def test_type_checkers_know_every_setting() -> None:
         assert_type(radar.x4.frame_area_m, tuple[float, float])
         assert_type(radar.read_message(m.DataString), m.DataString)
         radar.x4.iterations = "8"  # type: ignore[assignment] # the mistake
+        assert_type(radar.profile.set_zone(0.4, 5.0), tuple[float, float])
+        assert_type(radar.read_frame(timeout_s=1.0), Frame)
+        radar.start("17")  # type: ignore[arg-type] # the mistake
 
     assert asked.__name__ + ask.__name__  # neither is carried out
 
@@ -675,26 +682,37 @@ def test_ranges_of_a_frame_are_those_of_its_bins(downconversion: bool) -> None:
     assert one.ranges_m[-1] == pytest.approx(last_m, abs=1e-6)
 
 
-PARTS = [
-    (X4M300, AsyncX4M300),
-    (chip.X4, chip.AsyncX4),
-    (chip.Registers, chip.AsyncRegisters),
-    (chip.Postprocessing, chip.AsyncPostprocessing),
-    (profiles.Profile, profiles.AsyncProfile),
-    (board.Pins, board.AsyncPins),
-    (board.Diagnostics, board.AsyncDiagnostics),
-    (files.Files, files.AsyncFiles),
-    (firmware.Firmware, firmware.AsyncFirmware),
-]
+def public_methods(owner: object) -> dict[str, Callable[..., Any]]:
+    cls = owner if isinstance(owner, type) else type(owner)
+    names = [name for name in dir(cls) if not name.startswith("_")]
+    return {name: getattr(owner, name) for name in names if inspect.isroutine(getattr(cls, name))}
 
 
-@pytest.mark.parametrize(("blocking", "awaited"), PARTS)
-def test_both_drivers_have_the_same_methods(blocking: type, awaited: type) -> None:
-    def methods(cls: type) -> dict[str, list[str]]:
-        return {
-            name: list(inspect.signature(method).parameters)
-            for name, method in inspect.getmembers(cls, inspect.isfunction)
-            if not name.startswith("_")
-        }
+def test_both_drivers_have_the_same_methods() -> None:
+    blocking, awaited = public_methods(X4M300), public_methods(AsyncX4M300)
+    assert blocking.keys() == awaited.keys()
+    for name, method in blocking.items():
+        one, other = inspect.signature(method), inspect.signature(awaited[name])
+        assert list(one.parameters) == list(other.parameters), name
 
-    assert methods(blocking) == methods(awaited)
+
+@pytest.mark.parametrize("driver", [X4M300, AsyncX4M300])
+def test_methods_are_documented_as_they_are_called(
+    driver: type[X4M300] | type[AsyncX4M300],
+) -> None:
+    radar: Any = driver(ScriptedTransport(PlainModule()))  # type: ignore[arg-type] # it only has a name
+    parts = [part for part in vars(radar).values() if isinstance(part, Part) and part is not radar]
+    assert len(parts) == 8
+    for method in (each for part in parts for each in public_methods(part).values()):
+        signature = inspect.signature(method)
+        assert "link" not in signature.parameters, method
+        assert "Generator" not in str(signature), method
+        assert inspect.iscoroutinefunction(method) is (driver is AsyncX4M300), method
+    assert str(inspect.signature(radar.profile.set_zone)) == (
+        "(start_m: float, end_m: float) -> tuple[float, float]"
+    )
+    assert (radar.profile.set_zone.__doc__ or "").startswith("Choose the detection zone")
+    for method in public_methods(driver).values():
+        assert "link" not in inspect.signature(method).parameters, method
+    assert str(inspect.signature(driver.start)) == "(self, fps: float) -> float"
+    assert (inspect.getdoc(driver.start) or "").startswith("Start frames")

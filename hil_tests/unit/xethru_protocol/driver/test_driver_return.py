@@ -396,6 +396,19 @@ def test_uart_is_talked_to_at_its_own_rate_again_after_a_reset(driver_on: Driver
     assert (uart.baudrate, radar.ping()) == (921600, PongCode.XTS_SPRP_READY)
 
 
+def test_uart_whose_rate_is_not_known_is_found_at_it(driver_on: DriverOn) -> None:
+    uart = UartModule()
+    uart.baudrate = 38400
+    radar, line = driver_on(uart)
+    uart.connect(line, 115200)
+    assert radar.find_baud_rate() == 38400
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    uart.deaf = True
+    assert radar.find_baud_rate() is None
+    uart.deaf, uart.baudrate = False, 115200  # as after a restart
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+
+
 @pytest.mark.parametrize("rate", [115200, 921600], ids=["restarted", "kept its power"])
 def test_uart_is_found_again_at_either_rate(plugged: DriverOn, machine: Machine, rate: int) -> None:
     uart, back = UartModule(), UartModule()

@@ -13,7 +13,7 @@ from emulator.loopback import LoopbackTransport
 from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import ramp_device
 from hil_tests.unit.xethru_protocol.recordings.messages import frame
-from xethru_protocol.driver.conversation import Listener
+from xethru_protocol.driver.matching import Listener
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
     Recorder,

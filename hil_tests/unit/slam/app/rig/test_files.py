@@ -30,7 +30,7 @@ from slam.app.rig.files import (
 from slam.app.rig.sources import RadarLink
 from slam.config import WheelNoise
 from slam.geometry import ReceivedPulse
-from xethru_protocol.driver.conversation import Observer, ProtocolRecord
+from xethru_protocol.driver.matching import Observer, ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import PortInfo
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable

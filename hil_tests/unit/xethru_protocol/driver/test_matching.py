@@ -1,4 +1,4 @@
-"""Answers that come late, and PONGs that were given up: both drivers on a scripted module.
+"""Answers to questions: the matcher alone, then both drivers on a scripted module.
 
 The module answers in order. Codes and values are those of the protocol reference, 5 and 5.1.
 """
@@ -9,6 +9,7 @@ import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.scripted import READY, frame
+from xethru_protocol.driver.matching import Matcher
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, X4Setting
 from xethru_protocol.wire.errors import DeviceError, ResponseTimeout
@@ -21,6 +22,90 @@ NOT_READY = m.Pong(value=PongCode.XTS_SPRP_NOTREADY)
 
 def silent(command: m.Message) -> Said:
     return []
+
+
+GET = m.X4DriverGet(setting=X4Setting.DACMAX)
+VALUE = m.ReplyInt(content_id=X4Setting.DACMAX, values=(1100,))
+ANOTHER_VALUE = m.ReplyInt(content_id=X4Setting.DACMIN, values=(949,))
+ECHO = m.BootloaderEcho(data=b"now")
+
+
+@pytest.mark.parametrize(
+    ("question", "came", "answer", "strays", "patience_s"),
+    [
+        (GET, [], None, 0, None),
+        (GET, [VALUE], VALUE, 0, 0.0),
+        (GET, [m.Error(code=1)], m.Error(code=1), 0, 0.0),
+        (GET, [m.Ack(), ANOTHER_VALUE, VALUE], VALUE, 2, 0.0),
+        (GET, [ANOTHER_VALUE], None, 1, 0.5),  # a quarter of its two seconds
+        (GET, [m.DataString(text="no answer")], None, 0, None),
+        (ECHO, [m.BootloaderError(code=1)], None, 1, None),
+        (
+            ECHO,
+            [m.BootloaderEchoed(data=b"old"), m.BootloaderEchoed(data=b"now")],
+            m.BootloaderEchoed(data=b"now"),
+            1,
+            0.0,
+        ),
+        (m.Ping(), [NOT_READY], NOT_READY, 0, 0.0),
+        (m.Ping(), [NOT_READY, READY], READY, 1, 0.0),
+        (m.Ping(), [m.Ack()], None, 1, None),
+    ],
+)
+def test_matcher_finds_the_answer(
+    question: m.Command[m.Response],
+    came: list[m.Response],
+    answer: m.Response | None,
+    strays: int,
+    patience_s: float | None,
+) -> None:
+    matcher = Matcher()
+    matcher.ask(question, 2.0)
+    for message in came:
+        assert matcher.take(message) is not isinstance(message, m.DataString)
+    assert matcher.match() == patience_s
+    assert matcher.answer == answer
+    assert matcher.stray_count == strays
+
+
+def test_matcher_waits_a_quarter_second_for_a_pong_that_may_be_due() -> None:
+    matcher = Matcher()
+    for _ in range(2):
+        matcher.ask(m.Ping(), 2.0)
+    matcher.take(NOT_READY)
+    assert matcher.match() == 0.25
+    matcher.take(READY)
+    assert (matcher.match(), matcher.answer) == (0.0, READY)
+    matcher.settle()
+    assert not matcher.pongs_possible
+
+
+def test_a_token_settles_what_was_asked_before_it() -> None:
+    matcher = Matcher()
+    matcher.ask(m.Ping(), 2.0)
+    matcher.ask(GET, 2.0)
+    assert matcher.answer_owed
+    token = matcher.token()
+    matcher.ask(token, 2.0, as_token=True)
+    for late in (READY, VALUE, m.Error(code=1)):
+        matcher.take(late)
+    assert matcher.match() is None
+    matcher.take(m.ReplyString(content_id=0x58, info=token.item, text="1.6.8"))
+    assert matcher.match() == 0.0
+    matcher.settle()
+    assert (matcher.answer_owed, matcher.pongs_possible) == (False, 0)
+    assert matcher.token() != token  # its late answer would be taken for this one's
+
+
+def test_answers_without_a_question_are_counted_and_not_kept() -> None:
+    matcher = Matcher()
+    matcher.take(m.Ack())
+    matcher.ask(m.X4DriverInit(), 2.0)
+    assert matcher.match() is None
+    assert matcher.stray_count == 1
+
+
+# --- drivers ------------------------------------------------------------------------------------
 
 
 def test_answer_behind_a_late_pong_is_not_taken_for_the_next_commands(driver_on: DriverOn) -> None:
