@@ -21,7 +21,8 @@ The receiver guarantees, for any bytes in any chunks:
   it is refuted, by the next unescaped 7D or 7E or at the longest possible packet.
 - A Normal packet of an unknown kind gives way to a plausible NoEscape header inside it: its
   checksum fits by chance in 1 of 256 cases, a header in hardly any. A known one is data throughout.
-- Every byte is searched and parsed a bounded number of times, for any input.
+- Every byte is searched and parsed a bounded number of times, for any input. In a
+  run of damaged packets all within one window are judged, and counted, together.
 - `LinkStatistics` counts every byte: in a packet, junk, or not judged yet.
 
 The last but one rests on one fact. Let a Normal packet started at s be parsed up to its
@@ -32,7 +33,7 @@ the terminator t, and their contents are suffixes of the first's: one scan serve
 
 import re
 import struct
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import Enum
@@ -335,7 +336,9 @@ NEVER: Final = 1 << 62  # a stream offset that is not reached
 
 _NEAR: Final = 256  # in which most packets end: looked at before more is marked
 _WORTH_MARKING: Final = 2048  # fewer bytes are searched faster by a regular expression
+_WORTH_MARKING_DAMAGED: Final = 512  # there the next terminators are near, and many
 _WINDOW: Final = 65536  # most bytes marked at once
+_WINDOW_DAMAGED: Final = 8192  # fewer where most are looked at one by one
 # Greedy, but never tried again: what is in front of an unescaped 7D or 7E, or of a last 7F.
 _CONTENT = re.compile(rb"[^\x7d-\x7f]*(?:\x7f.[^\x7d-\x7f]*)*", re.DOTALL)
 
@@ -375,20 +378,24 @@ class TerminatorFinder:
     and those of a whole window can be marked at once.
 
     ``searched`` is the offset up to which the bytes are known; the byte there is not escaped.
+    ``window`` are the bytes that were marked last.
     """
 
-    __slots__ = ("_found", "_next", "_window", "searched")
+    __slots__ = ("_found", "_next", "searched", "window")
 
     def __init__(self) -> None:
         self._found: list[int] = []  # ascending
         self._next = 0  # index in it of the first behind the last start
-        self._window = _Window(b"", 0, 0)  # where they were found, unless there is only one
+        self.window = _Window(b"", 0, 0, 0)  # where they were found, unless there is only one
         self.searched = 0
 
-    def after(self, buffer: bytes, base: int, start: int, reach: int) -> int:
+    def after(
+        self, buffer: bytes, base: int, start: int, reach: int, *, damaged: bool = False
+    ) -> int:
         """Find the first terminator behind the packet start at ``start``.
 
         -1 if it is not in the buffer, or farther than ``reach`` bytes behind the start.
+        Where the stream is ``damaged``, the next ones are near and many.
         """
         while True:
             self._next = bisect_right(self._found, start, self._next)
@@ -398,17 +405,20 @@ class TerminatorFinder:
             left = len(buffer) - at
             if left <= 0 or base + at > start + reach:
                 return -1
-            stop = at + (left if left < _WORTH_MARKING else _NEAR)
-            content = _CONTENT.match(buffer, at, stop)
-            at = content.end() if content else at  # it always matches
-            self.searched = base + at
-            if at < stop and buffer[at] != ESCAPE:
-                self._found, self._next = [base + at], 0
-                self.searched += 1
-                continue
-            if stop == len(buffer):
-                return -1
-            self._window = window = _Window(buffer, base, at)
+            few = left < (_WORTH_MARKING_DAMAGED if damaged else _WORTH_MARKING)
+            if few or not damaged:
+                stop = at + (left if few else _NEAR)
+                content = _CONTENT.match(buffer, at, stop)
+                at = content.end() if content else at  # it always matches
+                self.searched = base + at
+                if at < stop and buffer[at] != ESCAPE:
+                    self._found, self._next = [base + at], 0
+                    self.searched += 1
+                    continue
+                if stop == len(buffer):
+                    return -1
+            size = _WINDOW_DAMAGED if damaged else _WINDOW
+            self.window = window = _Window(buffer, base, at, size)
             self._found, self._next, self.searched = window.found, 0, window.end
 
     def follower(self, start: int) -> tuple[bytes, int] | None:
@@ -419,13 +429,13 @@ class TerminatorFinder:
         found, end = self._found, self._next + 2
         if end < len(found) and found[end - 1] == start:
             self._next = end
-            return self._window.content(end), found[end]
+            return self.window.content(end), found[end]
         return None
 
     def content(self, buffer: bytes, base: int, start: int) -> bytes:
         """Unescape what lies between ``start`` and the terminator just found behind it."""
         if self._next and self._found[self._next - 1] == start:
-            return self._window.content(self._next)
+            return self.window.content(self._next)
         return unescape(buffer[start + 1 - base : self._found[self._next] - base])
 
 
@@ -458,17 +468,19 @@ class _Window:
     window that is not escaped by it.
     """
 
-    __slots__ = ("_bounds", "_drop", "_places", "_raw", "_rest", "end", "found")
+    __slots__ = ("_base", "_bounds", "_drop", "_judged", "_places", "_raw", "_rest", "end", "found")
 
-    def __init__(self, buffer: bytes, base: int, begin: int) -> None:
-        piece = buffer[begin : begin + _WINDOW]  # a copy: the buffer may be large, and done with
+    def __init__(self, buffer: bytes, base: int, begin: int, size: int) -> None:
+        piece = buffer[begin : begin + size]  # a copy: the buffer may be large, and done with
+        self._base = base + begin
         self._raw = np.frombuffer(piece, np.uint8)
         self._places, self._drop = _mark(self._raw)
         self._rest = b""  # the window without escaping bytes, made when the first packet asks
         self._bounds: list[int] = []  # where the terminators lie in that
-        self.found: list[int] = (self._places + (base + begin)).tolist()
+        self._judged: _Judged | None = None
+        self.found: list[int] = (self._places + self._base).tolist()
         splits = self._drop.size and self._drop[-1] == len(piece) - 1
-        self.end = base + begin + len(piece) - (1 if splits else 0)
+        self.end = self._base + len(piece) - (1 if splits else 0)
 
     def content(self, index: int) -> bytes:
         """Unescape what lies between the terminator before the ``index``-th and that one."""
@@ -476,6 +488,66 @@ class _Window:
             self._rest = _without(self._raw, self._drop)
             self._bounds = (self._places - np.searchsorted(self._drop, self._places)).tolist()
         return self._rest[self._bounds[index - 1] + 1 : self._bounds[index]]
+
+    def judged(self) -> "_Judged":
+        """Judge all starts in the window whose terminators lie in it, too."""
+        if self._judged is None:
+            self._judged = _judge(self._raw, self._places, self._drop, self._base)
+        return self._judged
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Judged:
+    """Packet starts in groups that share a terminator; lists with a value per group.
+
+    ``first`` is the offset of a group's first start, ``resume`` where to go on if all of its
+    starts are rejected, ``kind`` the index in _KINDS of what is reported then, ``resyncs`` the
+    number of starts rejected up to and with this group. ``special`` are the indices of groups
+    that need a closer look: a start that makes a packet, or a very long one. ``good`` are the
+    offsets of all starts that make a packet.
+    """
+
+    first: list[int]
+    resume: list[int]
+    kind: list[int]
+    resyncs: list[int]
+    special: list[int]
+    good: list[int]
+
+
+_KINDS = (None, FaultKind.TRUNCATED, FaultKind.EMPTY, FaultKind.CHECKSUM)  # None: doubled start
+
+
+def _judge(raw: Bytes, places: Places, drop: Places, base: int) -> _Judged:
+    """Judge the packet starts in ``raw``; its terminators and escaping bytes as of _mark()."""
+    content = np.frombuffer(_without(raw, drop), np.uint8)
+    ends = places - np.searchsorted(drop, places)
+    starts = np.flatnonzero(content == START)
+    group = np.searchsorted(ends, starts, side="right")  # the terminator behind each
+    n_starts = int(np.searchsorted(group, ends.size))
+    if not n_starts:
+        return _Judged(first=[], resume=[], kind=[], resyncs=[], special=[], good=[])
+    starts, group = starts[:n_starts], group[:n_starts]
+    offsets = np.flatnonzero(raw == START)[:n_starts] + base  # the same, with escaping bytes
+    end, end_offset = ends[group], places[group] + base
+    size = end - starts - 1
+    folded = np.bitwise_xor.accumulate(content)
+    fits = folded[end - 1] ^ folded[starts] == START  # False without content
+    cut_short = content[end] == START
+    good = fits & ~cut_short & (size > 1)
+    doubled = cut_short & (size == 0)
+    kind = np.where(cut_short, np.where(doubled, 0, 1), np.where(fits | (size == 0), 2, 3))
+    long = end_offset - offsets > MAX_NORMAL_BYTES
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    last = np.append(first[1:], n_starts) - 1
+    return _Judged(
+        first=offsets[first].tolist(),
+        resume=(end_offset + ~cut_short)[first].tolist(),
+        kind=kind[first].tolist(),
+        resyncs=np.cumsum(~doubled)[last].tolist(),
+        special=np.flatnonzero(np.logical_or.reduceat(good | long, first)).tolist(),
+        good=offsets[good].tolist(),
+    )
 
 
 # --- the receiver
@@ -489,8 +561,13 @@ _FRAME_HEADER = struct.Struct("<4sIxBB8xI")
 _ESCAPED = re.compile(rb"\x7f(.)", re.DOTALL)
 _RUN_OF_7C = re.compile(rb"\x7c{9,}")
 _RUN_OF_7D = re.compile(rb"\x7d+")
+_LONGEST_RUN = 1024  # of damaged packets that are reported together
+_SHORT = 256  # bytes of a packet whose starts are judged faster without numpy
 # A NoEscape start whose length may be right, or is not known yet.
 _HEADER_INSIDE = re.compile(rb"\x7c{4}(?:..\x00\x00|.{0,3}\Z)", re.DOTALL)
+_new_fault = object.__new__
+_set_kind = vars(FramingFault)["kind"].__set__
+_set_offset = vars(FramingFault)["offset"].__set__
 
 
 class PacketReader:
@@ -529,6 +606,7 @@ class PacketReader:
         # that share it and have a fitting checksum, ascending; None: not looked for yet
         self._good_starts: list[int] | None = None
         self._swallowed = -1  # a plausible NoEscape header in the packet judged last
+        self._faults: deque[FramingFault] = deque()  # found together, not returned yet
 
     def receive_data(self, data: bytes) -> None:
         """Take bytes as they come from the port, in chunks of any size.
@@ -558,6 +636,8 @@ class PacketReader:
 
     def next_span(self) -> Span | FramingFault | NeedData:
         """Like ``next_packet``, but returns where the payload lies instead of copying it."""
+        if self._faults:
+            return self._faults.popleft()
         while True:
             if self._missing and not self._refill():  # parsing would give nothing new
                 if not self._ended or not self.buffered:
@@ -674,6 +754,36 @@ class PacketReader:
         self._damage_end = max(self._damage_end, covered_end)
         return None if reported else self._fault(kind, first)
 
+    def _reject_run(self, first: int) -> bool:
+        """Give up a run of damaged packets from ``first`` on; False if it is not one."""
+        judged = self._terminators.window.judged()
+        begin = bisect_left(judged.first, first)
+        if begin == len(judged.first) or judged.first[begin] != first:
+            return False
+        stop = bisect_left(judged.special, begin)
+        end = judged.special[stop] if stop < len(judged.special) else len(judged.first)
+        bulk = self._bulk_starts.next(self._buffer, self._base, first, judged.resume[end - 1])
+        end = min(bisect_right(judged.resume, bulk, begin, end), begin + _LONGEST_RUN)
+        if end <= begin:
+            return False
+        self.statistics.resyncs += judged.resyncs[end - 1] - (
+            judged.resyncs[begin - 1] if begin else 0
+        )
+        begin = bisect_left(judged.first, self._damage_end, begin, end)  # those had their fault
+        kinds, append = judged.kind[begin:end], self._faults.append
+        for index, kind in enumerate(_KINDS):
+            if kind is not None:
+                self.statistics.faults[kind] += kinds.count(index)
+        for index, offset in zip(kinds, judged.first[begin:end], strict=True):
+            if index:
+                fault = _new_fault(FramingFault)
+                _set_kind(fault, _KINDS[index])
+                _set_offset(fault, offset)
+                append(fault)
+        self._skip_to(judged.resume[end - 1])
+        self._damage_end = max(self._damage_end, judged.resume[end - 1])
+        return True
+
     def _fault(self, kind: FaultKind, offset: int) -> FramingFault:
         self.statistics.faults[kind] += 1
         return FramingFault(kind=kind, offset=offset)
@@ -747,8 +857,10 @@ class PacketReader:
         self, first: int
     ) -> Span | FramingFault | NeedData | None:
         """Judge the Normal packet at ``first``; None if it was rejected without a report."""
-        finder, reach = self._terminators, MAX_NORMAL_WIRE_BYTES
-        end = finder.after(self._buffer, self._base, first, reach)
+        finder, damaged, reach = self._terminators, self._damage_end >= 0, MAX_NORMAL_WIRE_BYTES
+        end = finder.after(self._buffer, self._base, first, reach, damaged=damaged)
+        if damaged and end >= 0 and self._reject_run(first):
+            return self._faults.popleft() if self._faults else None
         known = end if end >= 0 else finder.searched
         if known - first > reach:
             resume = min(first, known - 2 * reach) + reach
@@ -850,6 +962,9 @@ def _good_starts(packet: bytes, offset: int) -> list[int]:
     ``packet`` lies at ``offset`` in the stream, without its terminator. One pass from the back
     over its escaped bytes, since the content behind each is a suffix of the whole.
     """
+    if len(packet) >= _SHORT:
+        raw = np.frombuffer(packet + b"\x7e", np.uint8)
+        return _judge(raw, *_mark(raw), offset).good
     good = []
     checksum, count, end = 0, 0, len(packet)
     for escaped in reversed(list(_ESCAPED.finditer(packet, 1))):

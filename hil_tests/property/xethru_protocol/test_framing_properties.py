@@ -17,7 +17,10 @@ def marking_windows(size: int) -> AbstractContextManager[object]:
         framing,
         _NEAR=2,
         _WORTH_MARKING=3,
+        _WORTH_MARKING_DAMAGED=3,
         _WINDOW=size,
+        _WINDOW_DAMAGED=size,
+        _SHORT=4,
     )
 
 

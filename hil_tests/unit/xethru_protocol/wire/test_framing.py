@@ -221,7 +221,14 @@ def test_work_grows_with_the_bytes_only(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["7D", "escaped starts", "bad packets of escaped starts without end"]
+    "name",
+    [
+        "7D",
+        "escaped starts",
+        "starts and escaped starts",
+        "bad packets of escaped starts",
+        "bad packets of escaped starts without end",
+    ],
 )
 def test_rejected_starts_cost_little(name: str) -> None:
     """Starts that share their fate are given up together: below three lines of Python per byte."""
@@ -268,8 +275,8 @@ def test_terminators_are_looked_for_once_in_every_byte(
     marked = []
 
     class CountingWindow(framing._Window):
-        def __init__(self, buffer: bytes, base: int, begin: int) -> None:
-            super().__init__(buffer, base, begin)
+        def __init__(self, buffer: bytes, base: int, begin: int, size: int) -> None:
+            super().__init__(buffer, base, begin, size)
             marked.append(self.end - base - begin)
 
     monkeypatch.setattr(framing, "_CONTENT", content)
