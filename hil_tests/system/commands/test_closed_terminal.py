@@ -118,6 +118,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
         yield Robot(rig=rig, odometry=served.odometry, ports=served.paths)
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize(("ignores_hangup", "code"), [(False, 129), THOROUGH(True, 1)])
 def test_a_drive_whose_terminal_closes_has_all_results(
     ignores_hangup: bool, code: int, robot: Robot, tmp_path: Path
@@ -282,6 +283,7 @@ COMMANDS: dict[str, tuple[str, Callable[[Path], bool]]] = {
 }
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize(
     "name", ["convert", *(THOROUGH(name) for name in COMMANDS if name != "convert")]
 )

@@ -49,6 +49,7 @@ def sweep(scene: Path, out: Path, *options: str) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.rare
 def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
     scene = write_shorter_scene(tmp_path)
     alone = sweep(scene, tmp_path / "1.json", "--seeds", "3", "--jobs", "1")
@@ -62,6 +63,7 @@ def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
     assert group["anees_band_95"] == pytest.approx([2.700 / 3, 19.023 / 3], rel=1e-3)
 
 
+@pytest.mark.rare
 def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
     scene = write_shorter_scene(tmp_path)
     command = [
@@ -157,6 +159,7 @@ def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
     raise AssertionError("the scheduler ended without a word")
 
 
+@pytest.mark.rare
 def test_a_cluster_gives_what_one_machine_gives(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     scene, stressed = write_shorter_scene(tmp_path), ("--seeds", "1", "--stress", "dropped")
