@@ -5,15 +5,22 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test test-quick test-all test-install check bench sweep stress scenes failures harm pictures docs clean
+.PHONY: demo test test-quick test-rare test-all test-explore test-install check bench sweep stress scenes failures harm pictures docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
 	$(BIN)/uwb-slam demo --out out/demo
 
 # One process more than cores: many tests wait for a pty.
+ON_ALL_CORES := -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') --dist worksteal
+
 test: $(VENV)/installed-test
-	$(PYTEST) -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') --dist worksteal
+	$(PYTEST) $(ON_ALL_CORES)
+
+# What the default suite shows of one case only, because it takes long and seldom breaks: after a change
+# of documents, of sweeps, benchmarks or the plugin, and before a push.
+test-rare: $(VENV)/installed-test
+	$(PYTEST) $(ON_ALL_CORES) -m 'rare and not thorough'
 
 # About a minute: the bytes of the protocol, the driver and the mathematics of SLAM.
 test-quick: $(VENV)/installed-test
@@ -23,6 +30,14 @@ test-quick: $(VENV)/installed-test
 # And the cases and examples that would take the default suite over five minutes of two cores.
 test-all: $(VENV)/installed-test
 	HYPOTHESIS_PROFILE=thorough $(PYTEST) -n auto -m ''
+
+# New random examples of every property, 2000 where its test has no number of its own. By hand, never
+# in CI. `make test-explore SEED=7` repeats those of a seed, `TESTS=hil_tests/property/slam` limits them.
+test-explore: SEED := $(shell od -An -N4 -tu4 /dev/urandom | tr -d ' ')
+test-explore: TESTS := hil_tests/property hil_tests/unit
+test-explore: $(VENV)/installed-test
+	@echo 'seed $(SEED): make test-explore SEED=$(SEED) repeats these examples'
+	HYPOTHESIS_PROFILE=explore $(PYTEST) -n auto --timeout 3600 -m hypothesis --hypothesis-seed=$(SEED) $(TESTS)
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --no-cache --check .

@@ -22,18 +22,17 @@ SLOW_TIMEOUT_S = 120.0
 
 if importlib.util.find_spec("hypothesis") is not None:
     from hypothesis import HealthCheck, settings
-    from hypothesis.internal.conjecture import providers
 
     # No verdict on speed, which is that of the machine.
     timeless = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-    # CI repeats the same examples; what it finds becomes an @example beside the test.
+    # CI repeats its examples, but for constants, which Hypothesis takes from the modules loaded so
+    # far. What `make test-explore` finds becomes an @example beside the test.
     settings.register_profile("thorough", timeless, derandomize=True, print_blob=True)
     settings.register_profile("ci", settings.get_profile("thorough"), max_examples=60)
-    settings.register_profile("explore", timeless, max_examples=2000)
+    settings.register_profile(
+        "explore", timeless, derandomize=False, print_blob=True, max_examples=2000
+    )
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
-    # Hypothesis also draws constants of the modules loaded so far, hence other examples after other
-    # tests and with another number of workers. It has no setting for that.
-    vars(providers)["is_local_module_file"] = lambda path: False
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

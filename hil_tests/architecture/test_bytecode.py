@@ -68,6 +68,7 @@ def test_the_disk_is_filled_in_one_place() -> None:
     assert named == {"hil_tests/unit/full_disk.py"}
 
 
+@pytest.mark.rare
 @pytest.mark.slow
 def test_the_tests_on_a_full_disk_leave_a_fresh_copy_whole(tmp_path: Path) -> None:
     for package in (*PRODUCT, "hil_tests", "fixtures"):

@@ -8,14 +8,14 @@ from hil_tests.golden.lap_bands import CASES, Band, run_lap, stored_bands
 ROUNDING = 1.001
 
 
-# One of lab and one of classroom are the default.
-DEFAULT = {("lab", 0), ("classroom", 2)}
+# The others are thorough.
+MARKS = {("lab", 0): [], ("classroom", 2): [pytest.mark.rare]}
 LAPS = [
     pytest.param(
         band,
         seed,
         id=f"{band.scene}-{band.preset}-{seed}",
-        marks=() if (band.scene, seed) in DEFAULT else pytest.mark.thorough,
+        marks=MARKS.get((band.scene, seed), [pytest.mark.thorough]),
     )
     for band in stored_bands()
     for seed in range(3)

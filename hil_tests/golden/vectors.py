@@ -6,6 +6,7 @@ reference, for rows and codes that the former do not show.
 """
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,3 +64,21 @@ def load(file: str = "protocol_vectors.json") -> tuple[Vector, ...]:
 
 def load_hand_made() -> tuple[Vector, ...]:
     return load("hand_vectors.json")
+
+
+def for_each(vectors: Sequence[Vector]) -> Callable[[Callable[[Vector], None]], Callable[[], None]]:
+    """Make one test of a function of a vector; a failure names the vector."""
+
+    def decorate(check: Callable[[Vector], None]) -> Callable[[], None]:
+        def test_all() -> None:
+            assert vectors
+            for vector in vectors:
+                try:
+                    check(vector)
+                except Exception as error:
+                    error.add_note(f"with the vector {vector.name}")
+                    raise
+
+        return test_all
+
+    return decorate

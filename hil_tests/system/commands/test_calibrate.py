@@ -27,6 +27,7 @@ def short_drive(folder: Path) -> str:
     return str(path)
 
 
+@pytest.mark.rare
 @pytest.mark.slow
 def test_a_recorded_drive_gives_back_what_the_scene_planted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -3,9 +3,7 @@
 import contextlib
 import io
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil_tests.patience import seconds, wait_until
 from hil_tests.system.recorded_session import write_shorter_scene
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
@@ -49,6 +46,7 @@ def sweep(scene: Path, out: Path, *options: str) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.rare
 def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
     scene = write_shorter_scene(tmp_path)
     alone = sweep(scene, tmp_path / "1.json", "--seeds", "3", "--jobs", "1")
@@ -60,42 +58,6 @@ def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
     assert group["ate_rmse_m"]["p90"] == pytest.approx(np.quantile(errors, 0.9))
     # chi-square with 9 degrees of freedom, 2.5 % and 97.5 % of tables, over 3 runs
     assert group["anees_band_95"] == pytest.approx([2.700 / 3, 19.023 / 3], rel=1e-3)
-
-
-def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
-    scene = write_shorter_scene(tmp_path)
-    command = [
-        *SWEEP,
-        str(scene),
-        "--seeds",
-        "50",
-        "--jobs",
-        "2",
-        "--json",
-        str(tmp_path / "o.json"),
-    ]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
-    )
-    part = tmp_path / "o.json.part"
-
-    def runs_done() -> int:
-        with contextlib.suppress(OSError):  # not there yet
-            return max(part.read_text().count("\n") - 1, 0)
-        return 0
-
-    wait_until(runs_done, process)
-    # to the whole group, as a terminal does
-    os.killpg(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=seconds(60))
-    assert process.returncode == 130
-    done = runs_done()
-    *progress, last = stderr.splitlines()
-    kept = f"; {done} of 50 runs are in {part}, and the same command goes on with them"
-    assert last == f"uwb-slam: stopped by SIGINT{kept}", stderr
-    assert len(progress) == done
-    assert all(f" of 50: {scene.stem}, paper, seed " in line for line in progress)
-    assert not (tmp_path / "o.json").exists()
 
 
 def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
@@ -157,6 +119,7 @@ def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
     raise AssertionError("the scheduler ended without a word")
 
 
+@pytest.mark.rare
 def test_a_cluster_gives_what_one_machine_gives(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     scene, stressed = write_shorter_scene(tmp_path), ("--seeds", "1", "--stress", "dropped")

@@ -49,7 +49,3 @@ def test_its_commands_have_only_options_that_exist(block: Block) -> None:
 def test_an_option_that_does_not_exist_is_found() -> None:
     with pytest.raises(AssertionError):
         check_words(Prompt(command="pytest tests --radar emu --hil-stric", shown=""))
-
-
-def test_the_page_shows_each_way_once() -> None:
-    assert len(BLOCKS) == 5

@@ -55,6 +55,7 @@ from xethru_protocol.cli import main as xethru_main
 README = REPOSITORY / "README.md"
 DOCS = REPOSITORY / "docs"
 PAGES = [README, *sorted(DOCS.glob("*.md"))]
+DEFAULT = {"README"}  # in the default suite; the others are rare
 TEXT = {"text", "bibtex", "mermaid", "yaml", "ini", "lua"}
 
 pytestmark = [
@@ -290,7 +291,13 @@ def _pytest_options() -> set[str]:
     return set(re.findall(r"--[\w-]+", shown))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=() if page.stem in DEFAULT else pytest.mark.rare)
+        for page in PAGES
+    ],
+)
 def test_every_block_does_what_it_shows(
     page: Path,
     module: Served,

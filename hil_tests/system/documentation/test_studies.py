@@ -20,7 +20,7 @@ from slam.geometry import transform
 figure7, outlier_filter, recording, smoke = (
     study(name) for name in ("figure7", "outlier_filter", "recording", "smoke")
 )
-THOROUGH = pytest.mark.thorough
+RARE, THOROUGH = pytest.mark.rare, pytest.mark.thorough
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
 
@@ -238,9 +238,11 @@ def test_a_recording_without_enough_frames_is_one_line(tmp_path: Path) -> None:
     [
         pytest.param("figure7", "figure7", ("--frames", "1"), marks=THOROUGH),
         pytest.param("smoke", "smoke", (), marks=THOROUGH),
-        ("outlier_filter", "filter", ("--scene", "{scene}")),
+        pytest.param("outlier_filter", "filter", ("--scene", "{scene}"), marks=RARE),
         pytest.param("limits", "limits", ("--trials", "10"), marks=THOROUGH),
-        ("recording", "recording", ("--runs", "2", "--recording", "{recording}")),
+        pytest.param(
+            "recording", "recording", ("--runs", "2", "--recording", "{recording}"), marks=RARE
+        ),
     ],
 )
 def test_a_study_makes_its_picture(

@@ -1,4 +1,4 @@
-"""How serve and play start and end, whatever happens around them."""
+"""How serve starts and ends, whatever happens around it; the signals are in `system/ends`."""
 
 import json
 import shlex
@@ -7,19 +7,17 @@ import socket
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from hil_tests.device.serving import emulator, open_radar
-from hil_tests.patience import catches, seconds, wait_until
+from hil_tests.patience import seconds, wait_until
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.codes import PongCode
 
 pytestmark = pytest.mark.slow
-THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)
 
 
 @pytest.fixture(autouse=True)
@@ -39,11 +37,8 @@ def lines_of(path: str | None, most: int) -> list[str]:
     return data.decode().splitlines()
 
 
-@pytest.mark.parametrize(
-    "number", [THOROUGH(signal.SIGINT), THOROUGH(signal.SIGTERM), signal.SIGHUP]
-)
-def test_a_signal_ends_it_with_0_and_nothing_is_left(
-    number: signal.Signals, tmp_path: Path, announcements: Path
+def test_its_links_and_its_announcement_are_there_while_it_runs(
+    tmp_path: Path, announcements: Path
 ) -> None:
     links = tmp_path / "links"
     with emulator("serve", "smoke", "--link-dir", links) as served:
@@ -53,37 +48,9 @@ def test_a_signal_ends_it_with_0_and_nothing_is_left(
         )
         (announced,) = announcements.glob("*.json")
         assert json.loads(announced.read_text())["pid"] == served.process.pid
-        assert served.end(number) == 0
+        assert served.end() == 0
     assert not links.exists()
     assert list(announcements.iterdir()) == []
-
-
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks /proc who catches signals")
-@pytest.mark.parametrize(
-    ("number", "delay_s"),
-    [
-        *((signal.SIGINT, delay_s) for delay_s in (0.0, 0.2, 0.8)),
-        *((signal.SIGTERM, delay_s) for delay_s in (0.05, 0.4)),
-        *(THOROUGH(signal.SIGTERM, delay_s) for delay_s in (0.0, 0.2, 0.8)),
-        *(THOROUGH(signal.SIGINT, delay_s) for delay_s in (0.05, 0.4)),
-    ],
-)
-def test_a_signal_during_the_start_ends_it_with_0(
-    delay_s: float, number: signal.Signals, tmp_path: Path
-) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-m", "emulator.cli", "serve", "smoke", "--link-dir", tmp_path / "l"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        # before that it is the interpreter that starts, and no program can answer
-        wait_until(lambda: catches(process.pid, signal.SIGHUP), process)
-        time.sleep(delay_s)
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=seconds(20))
-    assert (process.returncode, errors) == (0, "")
-    assert not (tmp_path / "l").exists()
 
 
 def test_a_signal_while_streaming_ends_it_too() -> None:

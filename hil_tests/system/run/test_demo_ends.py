@@ -83,6 +83,7 @@ def finished_counters(log: Path) -> list[int]:
         return [message.sequence for _, _, message in reader.iter_messages(topics=topics)]
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize(
     ("which", "times", "code"),
     [
@@ -191,6 +192,7 @@ def test_a_signal_while_it_starts(
     assert leftovers(tmp_path / "tmp") == []
 
 
+@pytest.mark.rare
 def test_kill_9_leaves_a_readable_session_and_no_emulator(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with running_demo(out, tmp_path / "tmp") as demo:
@@ -206,6 +208,7 @@ def test_kill_9_leaves_a_readable_session_and_no_emulator(tmp_path: Path) -> Non
     assert len(counters) > 100
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize("which", [signal.SIGKILL, signal.SIGSTOP])
 def test_the_emulator_dies_or_freezes(which: signal.Signals, tmp_path: Path) -> None:
     out = tmp_path / "out"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2, multivariate_normal
 
-from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, values
+from hil_tests.property.robust_oracles import N_RADARS, random_state, rows_of, seeds, values
 from hil_tests.property.trilateration_oracles import NO_RANGES
 from slam.app.sweep.bound import fix_of_pair
 from slam.geometry import paper_rig
@@ -24,8 +24,10 @@ from slam.robust.association import (
     antennas_of,
     find_known,
     find_points,
+    identity,
     point_view,
     view,
+    weigh_known,
 )
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
@@ -361,6 +363,67 @@ def test_a_point_between_two_landmarks_is_neither(apart_m: float, row: int | Non
     """(0.245 m / 0.1 m)^2 = 6 is the likelihood margin."""
     state, point = sure_point(0.1, (1.0, apart_m), (1.0, 0.0))
     assert match(state, point) == row
+
+
+# --- evidence, in nats, with nothing left out ---------------------------------------------------
+
+
+@few
+@given(seeds, st.integers(1, 4))
+def test_ranges_are_worth_their_density_over_that_of_false_ones(seed: int, n: int) -> None:
+    """In logarithms: N(nu; 0, S) of all ranges together, and Pd / lambda of each."""
+    noise = replace(NOISE, huber_sigmas=math.inf)
+    state = ahead_of_the_left_radars(seed, n)
+    scans = scans_of(sure_ones(state), np.random.default_rng(seed))
+    known = known_of(state, scans, noise)
+    if not len(known.assigned):
+        return
+    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+    radars, indices, places = known.assigned.T
+    rows = rows_of(state, seen, radars, known.rows[places])
+    S = rows.H @ state.P.block(rows.at) @ rows.H.T + noise.sigma_m**2 * np.eye(len(radars))
+    z = np.array([scans[radar].ranges_m[k] for radar, k in zip(radars, indices, strict=True)])
+    expected = float(multivariate_normal.logpdf(z, rows.predicted_m, S))
+    for radar in radars:
+        per_m = len(scans[radar].ranges_m) / (noise.max_range_m - noise.min_range_m)
+        density = max(per_m, noise.clutter_per_m)
+        expected += math.log(noise.detection_probability / density)
+    found = weigh_known(state, known, seen, scans, noise).evidence
+    assert float(found.sum()) == pytest.approx(expected, abs=1e-6)
+
+
+@few
+@given(seeds, st.integers(1, 3), st.floats(0.01, 10.0))
+def test_an_identity_is_worth_its_density_over_that_of_chance_neighbours(
+    seed: int, n: int, per_m2: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((2 * n, 2 * n))
+    S = root @ root.T + 0.1 * np.eye(2 * n)
+    residual = rng.standard_normal(2 * n)
+    judged = identity(tuple((k, k) for k in range(n)), residual, S, per_m2)
+    log_density = float(multivariate_normal.logpdf(residual, np.zeros(2 * n), S))
+    assert judged.evidence == pytest.approx(log_density - n * math.log(per_m2), abs=1e-9)
+    squared = float(residual @ np.linalg.inv(S) @ residual)
+    assert judged.mahalanobis_sq == pytest.approx(squared, rel=1e-9)
+
+
+@pytest.mark.parametrize("sigmas_off", [0.0, 1.0, 2.5])
+def test_a_point_is_worth_its_density_over_that_of_what_is_not_mapped(sigmas_off: float) -> None:
+    """Per metre and radian, as the sensor measures: a square metre is 1 / r of these."""
+    noise = replace(NOISE, sigma_m=0.05, bearing_sigma_rad=0.04, unmapped_per_m2=0.3)
+    state = one_landmark(1e-5 * np.array([[2.0, 1.0], [1.0, 3.0]]))
+    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+    of = point_view(state, seen, 0, np.array([0]))
+    S = of.H[0] @ state.P.block(of.at) @ of.H[0].T
+    S += np.diag([noise.sigma_m**2, noise.bearing_sigma_rad**2])
+    range_m, bearing = (of.predicted[0] + sigmas_off * np.linalg.cholesky(S)[:, 0]).tolist()
+    scan = RangeScan(radar=0, ranges_m=(range_m,), bearings_rad=(bearing,))
+    found = find_points(state, seen, scan, ([0], (), {}), BackEndParameters(ranges=noise))
+    assert found.pairs == ((0, 0),)
+    log_density = float(multivariate_normal.logpdf((range_m, bearing), of.predicted[0], S))
+    new = noise.unmapped_per_m2 * range_m
+    assert found.evidence == pytest.approx((log_density - math.log(new),), abs=1e-9)
 
 
 # --- what is left alone ---------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Tracklets, initialisation from one radar, weights of ranges."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,11 +17,12 @@ from hil_tests.unit.slam.robust.range_world import (
     true_path,
 )
 from slam.config import WheelNoise
-from slam.geometry import paper_rig
+from slam.geometry import compose, paper_rig
 from slam.robust import kernels
 from slam.robust.association import RangeScan, antennas_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
+    Guess,
     Search,
     Tracker,
     Tracklet,
@@ -104,6 +106,80 @@ def test_uncertain_offsets_cost_no_tracklet() -> None:
     true = target[0] - [0.28, 0.0]
     corrected = found.target + found.by_offsets @ offsets
     assert np.hypot(*(corrected - true)) < 0.5 * np.hypot(*(found.target - true))
+
+
+TURNS_RAD = 0.05 * np.arange(12)
+"""Of a robot that turns on the spot, frame by frame."""
+
+
+def range_after(turn_rad: float, radar: int, target: Array) -> float:
+    mount = paper_rig().mounts[radar]
+    antenna = compose(np.array([0.0, 0.0, turn_rad]), np.array([mount.x_m, mount.y_m, 0.0]))
+    return float(np.hypot(*(target - antenna[:2])))
+
+
+def test_ranges_from_before_a_turn_are_less_sure_by_the_drift_per_radian() -> None:
+    """Closed form: of exact ranges, the information of all, each with its own variance."""
+    drift_per_rad_m, prior_m = 0.02, 0.05
+    target = np.array([-0.2, 1.0])
+    unassigned = UnassignedRanges(15, 4, SIGMA_M, 0.0, drift_per_rad_m)
+    step = calibrated_motion(np.array([0.0, 0.0, TURNS_RAD[1]]), np.zeros(3), WheelNoise())
+    for k, turn_rad in enumerate(TURNS_RAD):
+        if k:
+            unassigned.move(step)
+        scans = [
+            RangeScan(radar=radar, ranges_m=(range_after(turn_rad, radar, target),))
+            for radar in LEFT
+        ]
+        unassigned.keep(k, antennas_of(paper_rig(), scans, np.zeros(3)), scans, set())
+    c, s = np.cos(TURNS_RAD[-1]), np.sin(TURNS_RAD[-1])
+    body = np.array([[c, s], [-s, c]]) @ target
+    limits = [1.0, 1.0, 0.1, 9.0, 9.0]
+    found, _, members, _ = unassigned.follow(
+        Guess(target=body, covariance=prior_m**2 * np.eye(2)),
+        SEARCH,
+        np.zeros(4),
+        np.zeros((4, 4)),
+        limits,
+        is_wall=False,
+    )
+    assert len(members) == 2 * len(TURNS_RAD)
+    seen = unassigned.sightings(members, np.zeros(4))
+    since = TURNS_RAD[-1] - TURNS_RAD[seen.poses]
+    variances = SIGMA_M**2 + (drift_per_rad_m * since) ** 2
+    assert seen.variances == pytest.approx(variances, rel=1e-9)
+    away = body - seen.antennas_m
+    u = away / np.hypot(*away.T)[:, np.newaxis]
+    information = np.eye(2) / prior_m**2 + (u / variances[:, np.newaxis]).T @ u
+    (xx, xy), (_, yy) = np.linalg.inv(information)
+    assert found[:2] == pytest.approx(body, abs=1e-9)
+    assert found[2:5] == pytest.approx([xx, xy, yy], rel=1e-6)
+
+
+def test_a_new_landmark_is_worth_the_densities_of_its_ranges_over_those_of_false_ones() -> None:
+    """On the spot and with exact ranges: the logarithms of N(0; 0, S) and Pd / lambda of each."""
+    wheels = WheelNoise(scale_sigma=0.05, walk_lever_m=0.5)
+    back_end = RobustBackEnd(paper_rig(), replace(PARAMETERS, wheels=wheels))
+    per_rad_m = RULE.drift_share * wheels.scale_sigma * wheels.walk_lever_m
+    per_m = max(NOISE.clutter_per_m, 1.0 / (NOISE.max_range_m - NOISE.min_range_m))
+    target = np.array([-0.2, 1.0])
+    for k, turn_rad in enumerate(TURNS_RAD):
+        back_end.predict(np.array([0.0, 0.0, TURNS_RAD[1] if k else 0.0]))
+        report = back_end.update(
+            [
+                RangeScan(radar=radar, ranges_m=(range_after(turn_rad, radar, target),))
+                for radar in LEFT
+            ]
+        )
+        if report.evidence:
+            break
+    ((landmark_id, nats),) = report.evidence
+    assert back_end.state.landmark_ids == [landmark_id]
+    since = turn_rad - TURNS_RAD[: k + 1]
+    variances = np.repeat(SIGMA_M**2 + (per_rad_m * since) ** 2, len(LEFT))
+    expected = -0.5 * np.log(2.0 * math.pi * variances)
+    expected += math.log(NOISE.detection_probability / per_m)
+    assert nats == pytest.approx(float(expected.sum()), abs=1e-3)
 
 
 @pytest.mark.parametrize("dead", [0, 1])

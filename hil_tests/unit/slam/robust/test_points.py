@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 
 from slam.config import WheelNoise
 from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount, Rig, compose, wrap_angle
-from slam.robust.association import RangeScan
+from slam.robust.association import RangeScan, antennas_of, point_view, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Hypotheses
 from slam.robust.parameters import (
@@ -135,6 +135,32 @@ def test_the_map_is_found_and_the_pose_is_as_sure_as_it_says(*, labelled: bool) 
         assert gaps.min(axis=0).max() < 0.4
     total = sum(nees)
     assert chi2.ppf(0.0005, 3 * len(nees)) < total < chi2.ppf(0.9995, 3 * len(nees))
+
+
+def test_a_detection_is_worth_its_density_over_that_of_false_ones() -> None:
+    """In logarithms: N(0; 0, S) of range and bearing where it was expected, and Pd / lambda."""
+    rig = Rig(mounts=(MOUNT,))
+    back_end = RobustBackEnd(rig, PARAMETERS)
+    _, steps = world(1, labelled=False)
+    for _, step in zip(range(STEPS), steps, strict=False):
+        back_end.predict(step.increment)
+        back_end.update([step.scan])
+    back_end.predict(np.zeros(3))
+    state = back_end.state
+    seen = view(state, antennas_of(rig, (), state.calibration, state.mounts_m))
+    (row, *_) = np.flatnonzero(seen.inside(NOISE, -0.2, -0.5)[0])
+    of = point_view(state, seen, 0, np.array([row]))
+    S = of.H[0] @ state.P.block(of.at) @ of.H[0].T
+    S += np.diag([NOISE.sigma_m**2, NOISE.bearing_sigma_rad**2])
+    range_m, bearing = of.predicted[0].tolist()
+    report = back_end.update([RangeScan(radar=0, ranges_m=(range_m,), bearings_rad=(bearing,))])
+    ((_, _, landmark_id),) = report.continued
+    assert landmark_id == state.landmark_ids[row]
+    area = (NOISE.max_range_m - NOISE.min_range_m) * NOISE.field_of_view_rad
+    false = max(NOISE.clutter_per_m / NOISE.field_of_view_rad, 1.0 / area)
+    expected = float(multivariate_normal.logpdf(np.zeros(2), np.zeros(2), S))
+    expected += math.log(NOISE.detection_probability / false)
+    assert dict(report.evidence)[landmark_id] == pytest.approx(expected, abs=1e-6)
 
 
 def drive(

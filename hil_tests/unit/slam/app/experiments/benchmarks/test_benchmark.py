@@ -29,7 +29,10 @@ def write(name: str, folder: Path) -> Path:
     return worlds.write_librsf(folder)
 
 
-@pytest.mark.parametrize("name", BENCHMARKS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n == "plaza" else pytest.mark.rare) for n in BENCHMARKS],
+)
 def test_a_benchmark_is_better_than_dead_reckoning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:

@@ -1,0 +1,1 @@
+"""Programs that are ended from outside: signals, terminals that go away, full disks."""
