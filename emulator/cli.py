@@ -292,13 +292,11 @@ def _failed(text: str, *, exit_code: int = 1) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
     from emulator.module.settings import option_texts
 
     texts = option_texts()
     if arguments.json:
-        _print(json.dumps([asdict(one) for one in texts], indent=2))
+        _print(json.dumps([one._asdict() for one in texts], indent=2))
         return 0
     for one in texts:
         _print(f"{one.name}={one.default}\n    {one.meaning}\n    Values: {one.allowed}.")

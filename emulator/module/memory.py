@@ -8,15 +8,17 @@ Source: protocol reference 4.7, 4.10, 4.11, 5.1, 8.2, 8.5 and 11, row 18.
 
 from __future__ import annotations
 
+from base64 import b64decode, b64encode
 from bisect import bisect_right
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
+from typing import Annotated, Literal, Protocol
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 
 from emulator.chip.chip import Refusal
-from emulator.module.modes import Start
-from emulator.module.settings import ProfileSettings
+from emulator.module.settings import U32, ProfileSettings
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codes import FORMAT_KEY, FileError, InfoItem
 from xethru_protocol.wire.versions import FIRMWARE_ID, Firmware
@@ -105,23 +107,39 @@ class Identity:
         return texts.get(item)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoredFile:
+def _decoded(content: object) -> object:
+    return b64decode(content, validate=True) if isinstance(content, str) else content
+
+
+class StoredFile(BaseModel):
     """A file in the flash.
 
     Attributes
     ----------
-    offset
-        Where it begins behind the table, in bytes; None: wherever there is room.
     data
         Its content; bytes to which the flash does not reach are left out.
+    offset
+        Where it begins behind the table, in bytes; None: wherever there is room.
     length
         Bytes it was created with; None: as many as it has.
     """
 
-    data: bytes
-    offset: int | None = None
-    length: int | None = None
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True)
+
+    type: U32
+    identifier: U32
+    data: Annotated[
+        bytes,
+        BeforeValidator(_decoded),
+        PlainSerializer(lambda data: b64encode(data).decode("ascii"), when_used="json"),
+    ] = Field(alias="base64")
+    # not in states written before files had places
+    offset: U32 | None = None
+    length: U32 | None = None
+
+    @property
+    def key(self) -> FileKey:
+        return self.type, self.identifier
 
 
 @dataclass(slots=True, kw_only=True)
@@ -150,25 +168,29 @@ class FileSystem:
     is counted as a large positive number: both as in the firmware.
     """
 
-    def __init__(
-        self, storage_bytes: int, files: Mapping[FileKey, StoredFile] | None = None
-    ) -> None:
+    def __init__(self, storage_bytes: int, files: Iterable[StoredFile] = ()) -> None:
         self._data_bytes = storage_bytes // BLOCK_BYTES * BLOCK_BYTES - BLOCK_BYTES
         self._files: list[_File] = []  # in the order of their places
         self._open: set[FileKey] = set()
-        for key, file in (files or {}).items():
+        for file in files:
             length = len(file.data) if file.length is None else file.length
             offset = self._gap(_blocks(length)) if file.offset is None else file.offset
             if offset is not None and len(self._files) < MAX_FILES:
-                self._add(key, offset, length).data[: len(file.data)] = file.data
+                self._add(file.key, offset, length).data[: len(file.data)] = file.data
 
     @property
-    def contents(self) -> dict[FileKey, StoredFile]:
+    def contents(self) -> list[StoredFile]:
         """All files, in the order of their places."""
-        return {
-            file.key: StoredFile(data=bytes(file.data), offset=file.offset, length=file.length)
+        return [
+            StoredFile(
+                type=file.key[0],
+                identifier=file.key[1],
+                data=bytes(file.data),
+                offset=file.offset,
+                length=file.length,
+            )
             for file in self._files
-        }
+        ]
 
     def names(self) -> list[FileKey]:
         return [file.key for file in self._files]
@@ -288,25 +310,32 @@ class FileSystem:
             raise Refusal(FileError.NOT_OPEN)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SavedState:
-    """Content of a module's flash.
+class SavedState(BaseModel):
+    """Content of a module's flash, and the document in which it is kept.
 
     Attributes
     ----------
+    start, profile_id
+        What the module begins with: see `emulator.module.modes.Start`.
     profiles
-        Settings of each profile as of its last start, by profile id.
+        Settings of each profile as of its last start.
     files
         Content of the file system; noise maps and the crash dump are files.
     unfinished_update
         Whether the bootloader left the flash unlocked.
     """
 
-    start: Start = field(default_factory=Start)
-    profiles: Mapping[int, ProfileSettings] = field(default_factory=dict)
-    files: Mapping[FileKey, StoredFile] = field(default_factory=dict)
-    parameter_file_name: str = ""
-    certification: bool = False
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: Literal["xethru-emulator state"] = "xethru-emulator state"
+    version: Literal[1] = 1
+    serial: str
+    start: Literal["RUN", "LOADED", "STOPPED"]
+    profile_id: U32
+    profiles: list[ProfileSettings]
+    files: list[StoredFile] = Field(max_length=MAX_FILES)
+    parameter_file_name: str
+    certification: bool
     unfinished_update: bool = False
 
 

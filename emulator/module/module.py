@@ -71,11 +71,19 @@ def _placeholder_noise_maps() -> tuple[bytes, bytes]:
     return b"\x00" * 64, b"\x00" * 64
 
 
-def _as_shipped(options: DeviceOptions) -> SavedState:
+def _as_shipped(identity: Identity, options: DeviceOptions) -> SavedState:
     """Return the flash of a new module: the profile layer has put a parameter file there."""
-    if firmware_named(options.firmware).sensor is None:
-        return SavedState()
-    return SavedState(files={PARAMETER_FILE: StoredFile(data=SHIPPED_PARAMETERS)})
+    kind, identifier = PARAMETER_FILE
+    parameters = StoredFile(type=kind, identifier=identifier, data=SHIPPED_PARAMETERS)
+    return SavedState(
+        serial=identity.serial,
+        start="RUN",
+        profile_id=options.shipped_profile,
+        profiles=[],
+        files=[] if firmware_named(options.firmware).sensor is None else [parameters],
+        parameter_file_name="",
+        certification=False,
+    )
 
 
 class Module:
@@ -129,10 +137,10 @@ class Module:
         self.identity = identity.with_firmware(self.firmware) if named else identity
         self.chip = chip
         self._memory = memory
-        saved = (None if memory is None else memory.load()) or _as_shipped(self.options)
-        self._saved_profiles = {key: value.copy() for key, value in saved.profiles.items()}
-        start = saved.start
-        if start.profile_id not in self.options.profiles:  # as shipped, or of another model
+        saved = (None if memory is None else memory.load()) or _as_shipped(identity, self.options)
+        self._saved_profiles = {one.profile_id: one for one in saved.profiles}
+        start = Start(state=State[saved.start], profile_id=saved.profile_id)
+        if start.profile_id not in self.options.profiles:  # of another model
             start = Start(profile_id=int(self.options.shipped_profile))
         self.modes = ModeMachine(self.options, start)
         self.files = FileSystem(self.options.storage_bytes, saved.files)
@@ -253,14 +261,14 @@ class Module:
         """Change the mode, or raise `Refusal`; starting a profile saves its settings."""
         self.modes.set_mode(mode)
         if self.state is State.RUN:
-            self._saved_profiles[self.modes.profile_id] = self.profile.copy()
+            self._saved_profiles[self.modes.profile_id] = self.profile.model_copy()
             self._noise_map_stored_ns = self.now_ns
         else:
             self.pins.follow(PresenceState.UNKNOWN, PresenceDirection.STILL)
         self.save()
 
     def restore_factory_settings(self) -> None:
-        self.profile = ProfileSettings.shipped(self.options)
+        self.profile = ProfileSettings.shipped(self.modes.profile_id, self.options)
         self._working[self.modes.profile_id] = self.profile
 
     def save(self) -> None:
@@ -268,8 +276,10 @@ class Module:
             return
         self._memory.save(
             SavedState(
-                start=self.modes.start,
-                profiles={key: value.after_reset() for key, value in self._saved_profiles.items()},
+                serial=self.identity.serial,
+                start=self.modes.start.state.name,
+                profile_id=self.modes.start.profile_id,
+                profiles=[one.after_reset() for one in self._saved_profiles.values()],
                 files=self.files.contents,
                 parameter_file_name=self.parameter_file_name,
                 certification=self.certification,
@@ -316,8 +326,11 @@ class Module:
         """Return the settings a profile works with: changed, else saved, else as shipped."""
         if profile_id not in self._working:
             saved = self._saved_profiles.get(profile_id)
-            fresh = ProfileSettings.shipped(self.options) if saved is None else saved.after_reset()
-            self._working[profile_id] = fresh
+            self._working[profile_id] = (
+                ProfileSettings.shipped(profile_id, self.options)
+                if saved is None
+                else saved.after_reset()
+            )
         return self._working[profile_id]
 
 

@@ -6,15 +6,22 @@ and 11, row 5.
 
 from __future__ import annotations
 
-import inspect
 import math
 import os.path
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from operator import itemgetter
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+)
 
 from emulator.chip.chip import Refusal
 from xethru_protocol.wire import x4
@@ -86,98 +93,75 @@ _GRID_TOLERANCE = 1e-3
 """Part of a grid step: float32 values that were read back are on the grid."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceOptions:
+def _known_firmware(name: str) -> str:
+    firmware_named(name)
+    return name
+
+
+class DeviceOptions(BaseModel):
     """How one emulated module behaves where the reference allows more than one answer.
 
     A question that the reference answers has no option. Where it marks a guess, the default is that
     guess; where it reports an observation of hardware, the default is the observation.
-
-    Attributes
-    ----------
-    firmware
-        "sensor": a stock X4M300. "xep": the bare base firmware, which has no profiles and no
-        modes. The newest of each; "sensor-1.5.10" or "xep-3.3.0" plays that version, as far as
-        its place in the table of versions says (17).
-    profiles
-        What LOADAPP accepts (4.3).
-    shipped_profile
-        The profile that runs in a module as shipped (8.2).
-    default_output
-        The message that is on in a module as shipped (15, question 3).
-    port_on_reset
-        Whether a reset keeps the port ("stay") or takes it away until the USB is back ("vanish").
-    bad_value
-        What a profile setting out of its range gets (15, question 1): "refuse" answers
-        `bad_value_error`, "clamp" takes the nearest value.
-    bad_value_error
-        ERROR of a refused value.
-    busy_profile_error
-        ERROR of a profile setting while the profile runs, is paused, or in MANUAL (8.3).
-    no_profile_error
-        ERROR of a profile setting without a loaded profile (8.3).
-    run_without_profile_error
-        ERROR of RUN and IDLE without a loaded profile (8.3).
-    get_without_profile
-        Whether GETs other than of sensitivity and band stay without answer ("silence", as
-        observed) or get ERROR 1 ("error") when no profile is loaded (4.4).
-    presence_output_while_running
-        Whether OUTPUT control takes presence messages while the profile runs; baseband,
-        pulse-Doppler and noise maps are taken in any case (8.3).
-    run_to_manual
-        Whether SETMODE MANUAL is taken from a running profile ("accept") or answered with
-        `busy_profile_error` ("refuse") (8.3).
-    profile_switch
-        "direct", or "restart": RUN of another profile than the last one answers 22h, and the
-        module resets itself (8.2).
-    manual_settings
-        Whether X4 settings survive MANUAL, STOP, MANUAL ("keep") or INIT is carried out on
-        entering MANUAL ("init") (15, question 4).
-    parameter_file_reply
-        As what a parameter file is answered (4.4, 16).
-    baseband_sampling_hz
-        Sampling-frequency field of baseband messages [Hz] (15, question 9).
-    storage_bytes
-        Size of the file storage: 0x48000, or 0x18000 with the small microcontroller (4.11).
-    board_offset_m
-        FRAMEAREAOFFSET stored on the board, which INIT restores [module metres] (9.3). The echoes
-        stay where they are: another value moves their ranges.
-    noise_map_store_ns
-        How long a noise map takes to store; another store meanwhile is refused (4.4).
-    x4_init_ns
-        How long INIT takes to answer (4.9); 0 because emulated time is the host's time too.
-    file_delete_ns
-        How long DELETE_FILE takes to answer (4.11).
-    watchdog_memory_ns
-        Time without fault after which the count of consecutive faults is cleared (8.5).
     """
 
-    firmware: str = "sensor"
-    profiles: frozenset[ProfileId] = X4M300_PROFILES
-    shipped_profile: ProfileId = ProfileId.XTS_ID_APP_PRESENCE_2
-    default_output: OutputFeature = OutputFeature.PRESENCE_SINGLE
-    port_on_reset: Literal["stay", "vanish"] = "stay"
-    bad_value: Literal["refuse", "clamp"] = "refuse"
-    bad_value_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
-    busy_profile_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
-    no_profile_error: ErrorCode = ErrorCode.XTS_SPRE_NOT_RECOGNIZED
-    run_without_profile_error: ErrorCode = ErrorCode.XTS_SPRE_APP_INVALID
-    get_without_profile: Literal["silence", "error"] = "silence"
-    presence_output_while_running: bool = False
-    run_to_manual: Literal["accept", "refuse"] = "accept"
-    profile_switch: Literal["direct", "restart"] = "direct"
-    manual_settings: Literal["keep", "init"] = "keep"
-    parameter_file_reply: Literal["string", "appdata", "byte"] = "string"
-    baseband_sampling_hz: float = 2.916e9
-    storage_bytes: int = 0x48000
-    board_offset_m: float = x4.DEFAULT_OFFSET_M
-    noise_map_store_ns: int = 100_000_000
-    x4_init_ns: int = 0
-    file_delete_ns: int = 100_000_000
-    watchdog_memory_ns: int = 300_000_000_000
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    def __post_init__(self) -> None:
-        firmware_named(self.firmware)
+    firmware: Annotated[str, AfterValidator(_known_firmware)] = "sensor"
+    """"sensor": a stock X4M300. "xep": the bare base firmware, which has no profiles and no modes.
+    The newest of each; "sensor-1.5.10" or "xep-3.3.0" plays that version, as far as its place in
+    the table of versions says (17)."""
+    profiles: frozenset[ProfileId] = X4M300_PROFILES
+    """What LOADAPP accepts (4.3)."""
+    shipped_profile: ProfileId = ProfileId.XTS_ID_APP_PRESENCE_2
+    """The profile that runs in a module as shipped (8.2)."""
+    default_output: OutputFeature = OutputFeature.PRESENCE_SINGLE
+    """The message that is on in a module as shipped (15, question 3)."""
+    port_on_reset: Literal["stay", "vanish"] = "stay"
+    """Whether a reset keeps the port ("stay") or takes it away until the USB is back ("vanish")."""
+    bad_value: Literal["refuse", "clamp"] = "refuse"
+    """What a profile setting out of its range gets (15, question 1): "refuse" answers
+    `bad_value_error`, "clamp" takes the nearest value."""
+    bad_value_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
+    """ERROR of a refused value."""
+    busy_profile_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
+    """ERROR of a profile setting while the profile runs, is paused, or in MANUAL (8.3)."""
+    no_profile_error: ErrorCode = ErrorCode.XTS_SPRE_NOT_RECOGNIZED
+    """ERROR of a profile setting without a loaded profile (8.3)."""
+    run_without_profile_error: ErrorCode = ErrorCode.XTS_SPRE_APP_INVALID
+    """ERROR of RUN and IDLE without a loaded profile (8.3)."""
+    get_without_profile: Literal["silence", "error"] = "silence"
+    """Whether GETs other than of sensitivity and band stay without answer ("silence", as observed)
+    or get ERROR 1 ("error") when no profile is loaded (4.4)."""
+    presence_output_while_running: bool = False
+    """Whether OUTPUT control takes presence messages while the profile runs; baseband,
+    pulse-Doppler and noise maps are taken in any case (8.3)."""
+    run_to_manual: Literal["accept", "refuse"] = "accept"
+    """Whether SETMODE MANUAL is taken from a running profile ("accept") or answered with
+    `busy_profile_error` ("refuse") (8.3)."""
+    profile_switch: Literal["direct", "restart"] = "direct"
+    """"direct", or "restart": RUN of another profile than the last one answers 22h, and the module
+    resets itself (8.2)."""
+    manual_settings: Literal["keep", "init"] = "keep"
+    """Whether X4 settings survive MANUAL, STOP, MANUAL ("keep") or INIT is carried out on entering
+    MANUAL ("init") (15, question 4)."""
+    parameter_file_reply: Literal["string", "appdata", "byte"] = "string"
+    """As what a parameter file is answered (4.4, 16)."""
+    baseband_sampling_hz: float = 2.916e9
+    """Sampling-frequency field of baseband messages [Hz] (15, question 9)."""
+    storage_bytes: int = 0x48000
+    """Size of the file storage: 0x48000, or 0x18000 with the small microcontroller (4.11)."""
+    board_offset_m: float = x4.DEFAULT_OFFSET_M
+    """FRAMEAREAOFFSET stored on the board, which INIT restores [module metres] (9.3). The echoes
+    stay where they are: another value moves their ranges."""
+    noise_map_store_ns: int = 100_000_000
+    """How long a noise map takes to store; another store meanwhile is refused (4.4)."""
+    x4_init_ns: int = 0
+    """How long INIT takes to answer (4.9); 0 because emulated time is the host's time too."""
+    file_delete_ns: int = 100_000_000
+    """How long DELETE_FILE takes to answer (4.11)."""
+    watchdog_memory_ns: int = 300_000_000_000
+    """Time without fault after which the count of consecutive faults is cleared (8.5)."""
 
     @classmethod
     def of_model(cls, model: str, **changes: Any) -> DeviceOptions:  # noqa: ANN401 - of any field
@@ -194,8 +178,7 @@ class DeviceOptions:
 # --- options as text
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OptionText:
+class OptionText(NamedTuple):
     """A field of `DeviceOptions` in words; ``allowed`` are its values."""
 
     name: str
@@ -207,12 +190,12 @@ class OptionText:
 def option_texts() -> list[OptionText]:
     return [
         OptionText(
-            name=one.name,
-            default=_text_of(one.default),
-            allowed=_allowed(_OPTION_TYPES[one.name]),
-            meaning=_MEANINGS.get(one.name, ""),
+            name=name,
+            default=_text_of(field.default),
+            allowed=_allowed(_OPTION_TYPES[name]),
+            meaning=" ".join((field.description or "").split()),
         )
-        for one in fields(DeviceOptions)
+        for name, field in DeviceOptions.model_fields.items()
     ]
 
 
@@ -283,13 +266,9 @@ def _member_names(kind: type[IntEnum]) -> dict[IntEnum, str]:
     return {member: member.name.removeprefix(prefix[: prefix.rfind("_") + 1]) for member in kind}
 
 
-_OPTION_TYPES = get_type_hints(DeviceOptions) | {"firmware": Literal.__getitem__(FIRMWARE_NAMES)}
-_MEANINGS = {
-    name: " ".join(meaning.split())
-    for name, meaning in re.findall(
-        r"^(\w+)\n((?:    .*\n?)+)", inspect.cleandoc(DeviceOptions.__doc__ or ""), re.MULTILINE
-    )
-}
+_OPTION_TYPES: dict[str, Any] = {
+    name: field.annotation for name, field in DeviceOptions.model_fields.items()
+} | {"firmware": Literal.__getitem__(FIRMWARE_NAMES)}
 
 
 # --- bits on the serial line
@@ -392,9 +371,18 @@ def snapped_zone(start_m: float, end_m: float) -> tuple[float, float]:
     return origin_m + first * step_m, origin_m + last * step_m
 
 
-@dataclass(slots=True, kw_only=True)
-class ProfileSettings:
-    """What one profile is set to; as shipped unless changed.
+U32 = Annotated[int, Field(ge=0, lt=1 << 32)]
+ZoneLimit = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
+Outputs = Annotated[
+    dict[U32, U32],
+    BeforeValidator(dict),
+    PlainSerializer(lambda table: list(table.items()), when_used="json"),
+]
+"""Control bits by message id, in documents a list of pairs; what is off is absent."""
+
+
+class ProfileSettings(BaseModel):
+    """What one profile is set to, in the module and in its flash; as shipped unless changed.
 
     Attributes
     ----------
@@ -402,33 +390,31 @@ class ProfileSettings:
         Actual detection zone, start and end, on the grid [module metres].
     noise_map_interval_min
         Interval at which the noise map is stored, 0 for never [min].
-    outputs
-        Control bits by message id; what is off is absent.
     """
 
-    zone_m: tuple[float, float] = snapped_zone(*ZONE_LIMITS_M)
-    sensitivity: int = 5
-    tx_center_frequency: int = int(TxCenterFrequency.LOW_BAND)
-    led: int = int(LedMode.FULL)
-    noise_map_control: int = int(_NOISE_MAP_BITS)
-    noise_map_interval_min: int = 0
-    outputs: dict[int, int] = field(default_factory=lambda: {int(OutputFeature.PRESENCE_SINGLE): 1})
-    debug_outputs: dict[int, int] = field(default_factory=dict)
+    model_config = ConfigDict(extra="forbid")
+
+    profile_id: U32 = int(ProfileId.XTS_ID_APP_PRESENCE_2)
+    zone_m: tuple[ZoneLimit, ZoneLimit] = snapped_zone(*ZONE_LIMITS_M)
+    sensitivity: int = Field(5, ge=0, le=MAX_SENSITIVITY)
+    tx_center_frequency: int = Field(int(TxCenterFrequency.LOW_BAND), ge=3, le=4)
+    led: int = Field(int(LedMode.FULL), ge=0, le=2)
+    noise_map_control: int = Field(int(_NOISE_MAP_BITS), ge=0, le=7)
+    noise_map_interval_min: int = Field(0, ge=0, lt=1 << 31)
+    outputs: Outputs = {int(OutputFeature.PRESENCE_SINGLE): 1}
+    debug_outputs: Outputs = {}
 
     @classmethod
-    def shipped(cls, options: DeviceOptions) -> ProfileSettings:
-        return cls(outputs={int(options.default_output): 1})
-
-    def copy(self) -> ProfileSettings:
-        return replace(self, outputs=dict(self.outputs), debug_outputs=dict(self.debug_outputs))
+    def shipped(cls, profile_id: int, options: DeviceOptions) -> ProfileSettings:
+        return cls(profile_id=profile_id, outputs={int(options.default_output): 1})
 
     def after_reset(self) -> ProfileSettings:
         """Return a copy without the messages that a reset switches off."""
-        return replace(
-            self,
-            outputs=_without_volatile(self.outputs),
-            debug_outputs=_without_volatile(self.debug_outputs),
-        )
+        kept = {
+            "outputs": _without_volatile(self.outputs),
+            "debug_outputs": _without_volatile(self.debug_outputs),
+        }
+        return self.model_copy(update=kept)
 
     def set_zone(self, start_m: float, end_m: float, options: DeviceOptions) -> None:
         """Choose the zone; what was read back of a zone may be written again."""

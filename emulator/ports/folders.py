@@ -17,17 +17,13 @@ import json
 import os
 import shutil
 import tempfile
-from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
-from emulator.module.memory import MAX_FILES, SavedState, StoredFile
-from emulator.module.modes import Start, State
-from emulator.module.settings import ProfileSettings
+from emulator.module.memory import SavedState
 from emulator.ports.pty import LinkError
 from xethru_protocol.system import PathInUseError, locked
 from xethru_protocol.transport import is_private, is_running, run_directory
@@ -155,48 +151,6 @@ def _fits(path: Path) -> bool:
     return len(os.fsencode(path)) <= LONGEST_SOCKET_PATH
 
 
-U32 = Annotated[int, Field(ge=0, lt=1 << 32)]
-
-
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-
-class _Profile(_Document):
-    profile_id: U32
-    zone_m: list[Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]] = Field(
-        min_length=2, max_length=2
-    )
-    sensitivity: int = Field(ge=0, le=9)
-    tx_center_frequency: int = Field(ge=3, le=4)
-    led: int = Field(ge=0, le=2)
-    noise_map_control: int = Field(ge=0, le=7)
-    noise_map_interval_min: int = Field(ge=0, lt=1 << 31)
-    outputs: list[tuple[U32, U32]]
-    debug_outputs: list[tuple[U32, U32]]
-
-
-class _File(_Document):
-    type: U32
-    identifier: U32
-    base64: str
-    offset: U32 | None = None  # not in states written before files had places
-    length: U32 | None = None
-
-
-class _State(_Document):
-    format: Literal["xethru-emulator state"] = "xethru-emulator state"
-    version: Literal[1] = 1
-    serial: str
-    start: Literal["RUN", "LOADED", "STOPPED"]
-    profile_id: U32
-    profiles: list[_Profile]
-    files: list[_File] = Field(max_length=MAX_FILES)
-    parameter_file_name: str
-    certification: bool
-    unfinished_update: bool = False
-
-
 def make_state_directory(directory: Path) -> None:
     """Make a directory of states; `LinkError` now if nothing could be kept there."""
     try:
@@ -229,14 +183,14 @@ class DirectoryMemory:
     def load(self) -> SavedState | None:
         """Return what was saved; None, after one line, if it is unreadable or another's."""
         try:
-            state = _State.model_validate_json(self._path.read_bytes(), strict=False)
+            state = SavedState.model_validate_json(self._path.read_bytes())
             if state.serial != self._serial:
                 raise ValueError(f"it is of module {state.serial}")
-            return _saved(state)
+            return state
         except FileNotFoundError:
             return None
         except ValidationError as error:
-            reason = problem_text(error.errors(), _State)
+            reason = problem_text(error.errors(), SavedState)
         except (OSError, ValueError) as error:
             reason = reason_of(error)
         self._warn(f"{self._path}: not the state of this module, which starts new: {reason}")
@@ -246,7 +200,7 @@ class DirectoryMemory:
         if state == self._last:
             return
         self._last = state
-        text = _document(state, self._serial).model_dump_json(indent=1)
+        text = state.model_dump_json(indent=1, by_alias=True)
         unfinished = self._path.with_name(f".{self._path.name}.{os.getpid()}")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -256,62 +210,3 @@ class DirectoryMemory:
             self._warn(f"{self._path}: the state of the module is not kept: {reason_of(error)}")
             with contextlib.suppress(OSError):
                 unfinished.unlink(missing_ok=True)
-
-
-def _document(state: SavedState, serial: str) -> _State:
-    return _State(
-        serial=serial,
-        start=state.start.state.name,  # type: ignore[arg-type] # the model checks it
-        profile_id=state.start.profile_id,
-        profiles=[
-            _Profile(
-                **asdict(settings)
-                | {
-                    "profile_id": profile_id,
-                    "zone_m": list(settings.zone_m),
-                    "outputs": list(settings.outputs.items()),
-                    "debug_outputs": list(settings.debug_outputs.items()),
-                }
-            )
-            for profile_id, settings in state.profiles.items()
-        ],
-        files=[
-            _File(
-                type=kind,
-                identifier=identifier,
-                base64=b64encode(file.data).decode("ascii"),
-                offset=file.offset,
-                length=file.length,
-            )
-            for (kind, identifier), file in state.files.items()
-        ],
-        parameter_file_name=state.parameter_file_name,
-        certification=state.certification,
-        unfinished_update=state.unfinished_update,
-    )
-
-
-def _saved(state: _State) -> SavedState:
-    return SavedState(
-        start=Start(state=State[state.start], profile_id=state.profile_id),
-        profiles={
-            profile.profile_id: ProfileSettings(
-                **profile.model_dump(exclude={"profile_id"})
-                | {
-                    "zone_m": (profile.zone_m[0], profile.zone_m[1]),
-                    "outputs": dict(profile.outputs),
-                    "debug_outputs": dict(profile.debug_outputs),
-                }
-            )
-            for profile in state.profiles
-        },
-        files={
-            (file.type, file.identifier): StoredFile(
-                data=b64decode(file.base64, validate=True), offset=file.offset, length=file.length
-            )
-            for file in state.files
-        },
-        parameter_file_name=state.parameter_file_name,
-        certification=state.certification,
-        unfinished_update=state.unfinished_update,
-    )

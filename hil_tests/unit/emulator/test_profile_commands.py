@@ -1,6 +1,5 @@
 """Profile settings, noise maps and output control. Protocol reference 4.4 to 4.7, 8.2, 11, 16."""
 
-import dataclasses
 import math
 from typing import Literal
 
@@ -147,7 +146,7 @@ def test_values_out_of_range_are_refused(command: m.Command[m.Ack]) -> None:
 def test_gets_without_a_profile() -> None:
     """4.4: sensitivity and band ERROR 1, several others no reply at all."""
     for silence in ("silence", "error"):
-        options = dataclasses.replace(DeviceOptions(), get_without_profile=silence)
+        options = DeviceOptions(get_without_profile=silence)
         host = BareHost(device(options))
         assert host.ask(STOP) == m.Ack()
         assert host.ask(m.GetSensitivity()) == m.Error(code=1)
@@ -227,7 +226,7 @@ def test_noise_maps_are_files() -> None:
 @pytest.mark.parametrize("form", ["string", "appdata", "byte"])
 def test_parameter_file(form: Literal["string", "appdata", "byte"]) -> None:
     """4.4, 7.6, 16."""
-    options = dataclasses.replace(DeviceOptions(), parameter_file_reply=form)
+    options = DeviceOptions(parameter_file_reply=form)
     host = loaded(options)
     assert host.ask(m.GetParameterFile(name="p.txt")) == m.Error(code=1)
     assert host.ask(m.SetParameterFile(name="p.txt", data="a=1")) == m.Ack()

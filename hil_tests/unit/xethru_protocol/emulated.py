@@ -33,7 +33,7 @@ class EmulatedModule:
 
     @property
     def files(self) -> dict[FileKey, bytes]:
-        return {key: file.data for key, file in self.module.files.contents.items()}
+        return {file.key: file.data for file in self.module.files.contents}
 
     @property
     def open(self) -> set[FileKey]:

@@ -126,9 +126,7 @@ def test_files_are_listed_in_the_order_of_the_flash_and_fill_its_first_gap() -> 
     files.create(user(7), 2 * 8192 + 1)  # one block too long for the gap
     files.create(user(8), 8193)
     assert files.names() == [user(identifier) for identifier in (0, 8, 2, 3, 7)]
-    assert [file.offset for file in files.contents.values()] == [
-        block * 8192 for block in (0, 1, 3, 4, 7)
-    ]
+    assert [file.offset for file in files.contents] == [block * 8192 for block in (0, 1, 3, 4, 7)]
     assert FileSystem(0x48000, files.contents).contents == files.contents
 
 
@@ -152,7 +150,7 @@ def test_the_first_file_is_not_checked_against_the_storage() -> None:
 
 
 def test_what_the_firmware_writes_itself_needs_room_too() -> None:
-    files = FileSystem(4 * 8192, {(1, 0): StoredFile(data=bytes(60))})
+    files = FileSystem(4 * 8192, [StoredFile(type=1, identifier=0, data=bytes(60))])
     files.replace((2, 0), bytes(8193))
     with pytest.raises(Refusal):
         files.replace((2, 0), bytes(2 * 8192 + 1))

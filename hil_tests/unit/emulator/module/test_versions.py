@@ -15,7 +15,7 @@ SECOND = 1_000_000_000
 
 
 def host_with(firmware: str, **options: float) -> BareHost:
-    return host_of(DeviceOptions(firmware=firmware, **options))  # type: ignore[arg-type] # of any field
+    return host_of(DeviceOptions(firmware=firmware, **options))
 
 
 def text(host: BareHost, item: int) -> str:
