@@ -1,4 +1,4 @@
-"""What a module answers to each command: one handler per command, or per group of like ones.
+"""What a module answers to each command, by a row of `HANDLERS`.
 
 A handler is ``(module, command) -> response``; None stands for an ACK. It raises `Refusal` for an
 ERROR and `Silence` for no answer at all. Commands without a handler get ERROR 1, as the firmware
@@ -9,10 +9,11 @@ Source: protocol reference 3, 4, 5, 11 and 16.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from emulator.chip.chip import Refusal, Silence
+from emulator.module.memory import FileKey
 from emulator.module.modes import Group, State, check_permission, group_of
 from emulator.module.module import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
 from emulator.module.settings import ZONE_LIMITS_M
@@ -71,22 +72,127 @@ _POSTPROCESSING_DEFAULTS: dict[int, m.PostprocessingValue] = {
 """Assumed: what leaves frames as chapter 6 describes them."""
 
 Handler = Callable[[Module, Any], m.Response | None]
-HANDLERS: dict[type[m.Message], Handler] = {}
 HandlerT = TypeVar("HandlerT", bound=Handler)
-
-
-def answers(*commands: type[m.Command[Any]]) -> Callable[[HandlerT], HandlerT]:
-    """Enter a handler into the table."""
-
-    def enter(handler: HandlerT) -> HandlerT:
-        HANDLERS.update(dict.fromkeys(commands, handler))
-        return handler
-
-    return enter
 
 
 def _signed(value: int) -> int:
     return value - (1 << 32) if value >> 31 else value
+
+
+def _key(command: Any) -> FileKey:  # noqa: ANN401 - of any command with a file
+    return command.file_type, command.identifier
+
+
+def _ints(value: Callable[[Module], Sequence[int]], content_id: int = 0) -> Handler:
+    return lambda module, _: m.ReplyInt(content_id=content_id, values=tuple(value(module)))
+
+
+def _known(feature: int) -> int:
+    if feature not in _FEATURES:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    return feature
+
+
+def _control_reply(outputs: Mapping[int, int], feature: int) -> m.Response:
+    return m.ReplyInt(values=(_signed(outputs.get(_known(feature), 0)),))
+
+
+def _accepted(module: Module, command: m.Message) -> None:
+    """Do nothing."""
+
+
+HANDLERS: dict[type[m.Message], Handler] = {
+    # restarts, modes (4.1, 4.2)
+    m.ModReset: lambda module, _: module.request_restart(),
+    m.GetMode: lambda module, _: m.ReplyByte(values=bytes([module.modes.mode])),
+    m.GetProfileId: _ints(lambda module: [_signed(module.modes.profile_id)]),
+    # files (4.11)
+    m.OpenFile: lambda module, c: module.files.open(_key(c)),
+    m.CloseFile: lambda module, c: module.files.close(_key(c)),
+    m.GetFileLength: lambda module, c: m.ReplyInt(values=(module.files.length(_key(c)),)),
+    m.GetFileData: lambda module, c: m.ReplyByte(
+        values=module.files.read(_key(c), c.offset, c.length)
+    ),
+    m.SearchFileType: lambda module, c: m.ReplyInt(
+        values=tuple(_signed(name) for kind, name in module.files.names() if kind == c.file_type)
+    ),
+    m.GetCrashDumpLength: _ints(
+        lambda module: [len(module.files.get(CRASH_DUMP) or b"")],
+        DirCode.XTS_SDC_GET_CRASH_DUMP_LENGTH,
+    ),
+    # IO pins (4.8)
+    m.IoPinSetControl: lambda module, c: module.pins.set_control(
+        c.pin_id, c.pin_setup, c.pin_feature
+    ),
+    m.IoPinGetControl: lambda module, c: m.ReplyInt(
+        content_id=IoPinCode.XTS_SPCIOP_GETCONTROL,
+        values=(module.pins.control(c.pin_id).setup, module.pins.control(c.pin_id).feature),
+    ),
+    m.IoPinSetValue: lambda module, c: module.pins.set_value(c.pin_id, c.pin_value),
+    m.IoPinGetValue: lambda module, c: m.ReplyInt(
+        content_id=IoPinCode.XTS_SPCIOP_GETVALUE, values=(module.pins.value(c.pin_id),)
+    ),
+    # profile settings (4.4, 4.5)
+    m.SetDetectionZone: lambda module, c: module.profile.set_zone(
+        c.start_m, c.end_m, module.options
+    ),
+    m.GetDetectionZone: lambda module, _: m.ReplyFloat(
+        content_id=AppObject.DETECTION_ZONE, values=module.profile.zone_m
+    ),
+    m.GetDetectionZoneLimits: lambda module, _: m.ReplyFloat(
+        content_id=AppObject.DETECTION_ZONE_LIMITS, values=(*ZONE_LIMITS_M, x4.BASEBAND_BIN_M)
+    ),
+    m.SetSensitivity: lambda module, c: module.profile.set_sensitivity(
+        c.sensitivity, module.options
+    ),
+    m.GetSensitivity: _ints(lambda module: [module.profile.sensitivity], AppObject.SENSITIVITY),
+    m.SetTxCenterFrequency: lambda module, c: module.profile.set_band(
+        c.tx_center_frequency, module.options
+    ),
+    m.GetTxCenterFrequency: _ints(
+        lambda module: [module.profile.tx_center_frequency], AppObject.TX_CENTER_FREQ
+    ),
+    m.AppSetLedControl: lambda module, c: module.profile.set_led(c.mode, module.options),
+    m.SetLedControl: lambda module, c: module.profile.set_led(c.mode, module.options),
+    m.AppGetLedControl: lambda module, _: m.ReplyByte(
+        content_id=AppObject.LED_CONTROL, values=bytes([module.profile.led])
+    ),
+    m.FactoryPreset: lambda module, _: module.restore_factory_settings(),
+    # noise maps (4.6)
+    m.NoiseMapSetControl: lambda module, c: module.profile.set_noise_map_control(c.control),
+    m.NoiseMapGetControl: _ints(
+        lambda module: [module.profile.noise_map_control], NoiseMapCode.XTS_SPCN_GETCONTROL
+    ),
+    m.NoiseMapGetPeriodicStore: _ints(
+        lambda module: [module.profile.noise_map_interval_min, 0], NoiseMapCode.GET_PERIODIC_STORE
+    ),
+    m.StoreNoiseMap: lambda module, _: module.store_noise_maps(),
+    m.LoadNoiseMap: _accepted,  # without effect in released firmware
+    # outputs (4.7)
+    m.OutputSetControl: lambda module, c: module.profile.set_output(_known(c.feature), c.control),
+    m.OutputGetControl: lambda module, c: _control_reply(module.profile.outputs, c.feature),
+    m.DebugOutputSetControl: lambda module, c: module.profile.set_debug_output(
+        _known(c.feature), c.control
+    ),
+    m.DebugOutputGetControl: lambda module, c: _control_reply(
+        module.profile.debug_outputs, c.feature
+    ),
+    # X4 driver (4.9); this emulator's frames come from its scene
+    m.X4DriverSet: lambda module, c: module.chip.set(c.setting, c.value),
+    m.PrepareInjectFrame: _accepted,
+    m.InjectFrame: _accepted,
+}
+"""Answers that are one expression; the functions below enter the others."""
+
+
+def answers(command: type[m.Command[Any]]) -> Callable[[HandlerT], HandlerT]:
+    """Enter a handler into the table."""
+
+    def enter(handler: HandlerT) -> HandlerT:
+        HANDLERS[command] = handler
+        return handler
+
+    return enter
 
 
 # --- modes, profiles, restarts (4.1 to 4.3, 4.5)
@@ -96,11 +202,6 @@ def _signed(value: int) -> int:
 def _ping(module: Module, command: m.Ping) -> m.Response:
     safe = module.state is State.SAFE and versions.SAFE_MODE_PONG.is_in(module.firmware)
     return m.Pong(value=PongCode.XTS_SPRP_SAFEMODE if safe else PongCode.XTS_SPRP_READY)
-
-
-@answers(m.ModReset)
-def _reset(module: Module, command: m.ModReset) -> None:
-    module.request_restart()
 
 
 @answers(m.StartBootloader)
@@ -132,20 +233,10 @@ def _set_mode(module: Module, command: m.SetMode) -> None:
     module.trace(TraceLevel.INFO, f"Mode {SensorMode(command.mode).label}.")
 
 
-@answers(m.GetMode)
-def _get_mode(module: Module, command: m.GetMode) -> m.Response:
-    return m.ReplyByte(values=bytes([module.modes.mode]))
-
-
 @answers(m.LoadApp)
 def _load_app(module: Module, command: m.LoadApp) -> None:
     module.load_profile(command.profile_id)
     module.trace(TraceLevel.INFO, f"Profile {command.profile_id:08X} loaded.")
-
-
-@answers(m.GetProfileId)
-def _get_profile_id(module: Module, command: m.GetProfileId) -> m.Response:
-    return m.ReplyInt(values=(_signed(module.modes.profile_id),))
 
 
 @answers(m.DebugLevel)
@@ -158,10 +249,22 @@ def _debug_level(module: Module, command: m.DebugLevel) -> None:
 # --- files (4.10 and 4.11)
 
 
-@answers(m.SearchFileType)
-def _search(module: Module, command: m.SearchFileType) -> m.Response:
-    found = (identifier for kind, identifier in module.files.names() if kind == command.file_type)
-    return m.ReplyInt(values=tuple(_signed(identifier) for identifier in found))
+@answers(m.CreateFile)
+def _create(module: Module, command: m.CreateFile) -> None:
+    module.files.create(_key(command), command.length)
+    module.save()
+
+
+@answers(m.SetFileData)
+def _write(module: Module, command: m.SetFileData) -> None:
+    module.files.write(_key(command), command.offset, command.data)
+    module.save()
+
+
+@answers(m.FormatFilesystem)
+def _format(module: Module, command: m.FormatFilesystem) -> None:
+    module.files.format(command.key)
+    module.save()
 
 
 @answers(m.FindAllFiles)
@@ -172,56 +275,11 @@ def _find_all(module: Module, command: m.FindAllFiles) -> m.Response:
     return m.ReplyInt(values=tuple(_signed(value) for value in types + identifiers))
 
 
-@answers(m.CreateFile)
-def _create(module: Module, command: m.CreateFile) -> None:
-    module.files.create((command.file_type, command.identifier), command.length)
-    module.save()
-
-
-@answers(m.OpenFile)
-def _open(module: Module, command: m.OpenFile) -> None:
-    module.files.open((command.file_type, command.identifier))
-
-
-@answers(m.SetFileData)
-def _write(module: Module, command: m.SetFileData) -> None:
-    module.files.write((command.file_type, command.identifier), command.offset, command.data)
-    module.save()
-
-
-@answers(m.CloseFile)
-def _close(module: Module, command: m.CloseFile) -> None:
-    module.files.close((command.file_type, command.identifier))
-
-
-@answers(m.GetFileLength)
-def _length(module: Module, command: m.GetFileLength) -> m.Response:
-    return m.ReplyInt(values=(module.files.length((command.file_type, command.identifier)),))
-
-
-@answers(m.GetFileData)
-def _read(module: Module, command: m.GetFileData) -> m.Response:
-    key = command.file_type, command.identifier
-    return m.ReplyByte(values=module.files.read(key, command.offset, command.length))
-
-
 @answers(m.DeleteFile)
 def _delete(module: Module, command: m.DeleteFile) -> None:
-    module.files.delete((command.file_type, command.identifier))
+    module.files.delete(_key(command))
     module.wait = Wait(duration_ns=module.options.file_delete_ns, before_reply=True)
     module.save()
-
-
-@answers(m.FormatFilesystem)
-def _format(module: Module, command: m.FormatFilesystem) -> None:
-    module.files.format(command.key)
-    module.save()
-
-
-@answers(m.GetCrashDumpLength)
-def _crash_dump_length(module: Module, command: m.GetCrashDumpLength) -> m.Response:
-    dump = module.files.get(CRASH_DUMP) or b""
-    return m.ReplyInt(content_id=DirCode.XTS_SDC_GET_CRASH_DUMP_LENGTH, values=(len(dump),))
 
 
 @answers(m.ClearCrashDump)
@@ -247,85 +305,7 @@ def _crash_dump(module: Module, command: m.GetCrashDump) -> m.Response:
     return m.ReplyByte(content_id=content_id, values=dump[command.offset : end])
 
 
-# --- IO pins (4.8)
-
-
-@answers(m.IoPinSetControl)
-def _set_control(module: Module, command: m.IoPinSetControl) -> None:
-    module.pins.set_control(command.pin_id, command.pin_setup, command.pin_feature)
-
-
-@answers(m.IoPinGetControl)
-def _get_control(module: Module, command: m.IoPinGetControl) -> m.Response:
-    control = module.pins.control(command.pin_id)
-    values = (control.setup, control.feature)
-    return m.ReplyInt(content_id=IoPinCode.XTS_SPCIOP_GETCONTROL, values=values)
-
-
-@answers(m.IoPinSetValue)
-def _set_value(module: Module, command: m.IoPinSetValue) -> None:
-    module.pins.set_value(command.pin_id, command.pin_value)
-
-
-@answers(m.IoPinGetValue)
-def _get_value(module: Module, command: m.IoPinGetValue) -> m.Response:
-    level = module.pins.value(command.pin_id)
-    return m.ReplyInt(content_id=IoPinCode.XTS_SPCIOP_GETVALUE, values=(level,))
-
-
 # --- profile settings, noise maps, outputs (4.4 to 4.7)
-
-
-@answers(m.SetDetectionZone)
-def _set_zone(module: Module, command: m.SetDetectionZone) -> None:
-    module.profile.set_zone(command.start_m, command.end_m, module.options)
-
-
-@answers(m.GetDetectionZone)
-def _get_zone(module: Module, command: m.GetDetectionZone) -> m.Response:
-    return m.ReplyFloat(content_id=AppObject.DETECTION_ZONE, values=module.profile.zone_m)
-
-
-@answers(m.GetDetectionZoneLimits)
-def _get_zone_limits(module: Module, command: m.GetDetectionZoneLimits) -> m.Response:
-    values = (*ZONE_LIMITS_M, x4.BASEBAND_BIN_M)
-    return m.ReplyFloat(content_id=AppObject.DETECTION_ZONE_LIMITS, values=values)
-
-
-@answers(m.SetSensitivity)
-def _set_sensitivity(module: Module, command: m.SetSensitivity) -> None:
-    module.profile.set_sensitivity(command.sensitivity, module.options)
-
-
-@answers(m.GetSensitivity)
-def _get_sensitivity(module: Module, command: m.GetSensitivity) -> m.Response:
-    return m.ReplyInt(content_id=AppObject.SENSITIVITY, values=(module.profile.sensitivity,))
-
-
-@answers(m.SetTxCenterFrequency)
-def _set_band(module: Module, command: m.SetTxCenterFrequency) -> None:
-    module.profile.set_band(command.tx_center_frequency, module.options)
-
-
-@answers(m.GetTxCenterFrequency)
-def _get_band(module: Module, command: m.GetTxCenterFrequency) -> m.Response:
-    band = module.profile.tx_center_frequency
-    return m.ReplyInt(content_id=AppObject.TX_CENTER_FREQ, values=(band,))
-
-
-@answers(m.AppSetLedControl, m.SetLedControl)
-def _set_led(module: Module, command: m.AppSetLedControl | m.SetLedControl) -> None:
-    module.profile.set_led(command.mode, module.options)
-
-
-@answers(m.AppGetLedControl)
-def _get_led(module: Module, command: m.AppGetLedControl) -> m.Response:
-    return m.ReplyByte(content_id=AppObject.LED_CONTROL, values=bytes([module.profile.led]))
-
-
-@answers(m.FactoryPreset)
-def _factory_preset(module: Module, command: m.FactoryPreset) -> None:
-    module.restore_factory_settings()
 
 
 @answers(m.SetParameterFile)
@@ -349,36 +329,9 @@ def _get_parameter_file(module: Module, command: m.GetParameterFile) -> m.Respon
     return replies[module.options.parameter_file_reply]
 
 
-@answers(m.NoiseMapSetControl)
-def _set_noise_map_control(module: Module, command: m.NoiseMapSetControl) -> None:
-    module.profile.set_noise_map_control(command.control)
-
-
-@answers(m.NoiseMapGetControl)
-def _get_noise_map_control(module: Module, command: m.NoiseMapGetControl) -> m.Response:
-    values = (module.profile.noise_map_control,)
-    return m.ReplyInt(content_id=NoiseMapCode.XTS_SPCN_GETCONTROL, values=values)
-
-
 @answers(m.NoiseMapSetPeriodicStore)
 def _set_periodic_store(module: Module, command: m.NoiseMapSetPeriodicStore) -> None:
     module.profile.noise_map_interval_min = command.interval_min & 0x7FFFFFFF
-
-
-@answers(m.NoiseMapGetPeriodicStore)
-def _get_periodic_store(module: Module, command: m.NoiseMapGetPeriodicStore) -> m.Response:
-    values = (module.profile.noise_map_interval_min, 0)
-    return m.ReplyInt(content_id=NoiseMapCode.GET_PERIODIC_STORE, values=values)
-
-
-@answers(m.StoreNoiseMap)
-def _store_noise_map(module: Module, command: m.StoreNoiseMap) -> None:
-    module.store_noise_maps()
-
-
-@answers(m.LoadNoiseMap)
-def _load_noise_map(module: Module, command: m.LoadNoiseMap) -> m.Response:
-    return m.Ack()  # without effect in released firmware
 
 
 @answers(m.DeleteNoiseMap)
@@ -387,36 +340,6 @@ def _delete_noise_map(module: Module, command: m.DeleteNoiseMap) -> None:
         if module.files.get(key) is not None:
             module.files.delete(key)
     module.save()
-
-
-@answers(m.OutputSetControl)
-def _set_output(module: Module, command: m.OutputSetControl) -> None:
-    module.profile.set_output(_known(command.feature), command.control)
-
-
-@answers(m.OutputGetControl)
-def _get_output(module: Module, command: m.OutputGetControl) -> m.Response:
-    return _control_reply(module.profile.outputs, command.feature)
-
-
-@answers(m.DebugOutputSetControl)
-def _set_debug_output(module: Module, command: m.DebugOutputSetControl) -> None:
-    module.profile.set_debug_output(_known(command.feature), command.control)
-
-
-@answers(m.DebugOutputGetControl)
-def _get_debug_output(module: Module, command: m.DebugOutputGetControl) -> m.Response:
-    return _control_reply(module.profile.debug_outputs, command.feature)
-
-
-def _control_reply(outputs: Mapping[int, int], feature: int) -> m.Response:
-    return m.ReplyInt(values=(_signed(outputs.get(_known(feature), 0)),))
-
-
-def _known(feature: int) -> int:
-    if feature not in _FEATURES:
-        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    return feature
 
 
 def _as_text(value: str | bytes) -> str:
@@ -442,11 +365,6 @@ def _system_get_info(module: Module, command: m.SystemGetInfo) -> m.Response:
 def _set_baud_rate(module: Module, command: m.SetBaudRate) -> None:
     ignored = not SLOWEST_BAUDRATE <= command.baudrate <= FASTEST_BAUDRATE
     module.change_baudrate(module.uart_baudrate if ignored else command.baudrate)
-
-
-@answers(m.PrepareInjectFrame, m.InjectFrame)
-def _inject(module: Module, command: m.Message) -> m.Response:
-    return m.Ack()  # accepted; this emulator's frames come from its scene
 
 
 @answers(m.SystemTest)
@@ -489,11 +407,6 @@ def _x4_init(module: Module, command: m.X4DriverInit) -> None:
     module.chip.init()
     if module.options.x4_init_ns:
         module.wait = Wait(duration_ns=module.options.x4_init_ns, before_reply=True)
-
-
-@answers(m.X4DriverSet)
-def _x4_set(module: Module, command: m.X4DriverSet) -> None:
-    module.chip.set(command.setting, command.value)
 
 
 @answers(m.X4DriverGet)
