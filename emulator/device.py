@@ -244,6 +244,12 @@ class ByteDevice(Protocol):
     def wake_ns(self, now_ns: int) -> int | None: ...
 
 
+class PortDevice(ByteDevice, Protocol):
+    """A device whose port may go away."""
+
+    def port_present(self, now_ns: int) -> bool: ...
+
+
 class Device:
     """A module as its port sees it.
 

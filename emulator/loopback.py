@@ -8,7 +8,7 @@ host reads takes the time of a line. Give the driver the transport's own clock,
 
 from __future__ import annotations
 
-from emulator.device import Device
+from emulator.device import Device, PortDevice
 from xethru_protocol.wire.errors import Disconnected
 
 NS_PER_S = 1_000_000_000
@@ -18,57 +18,93 @@ _AT_ONCE = 64
 _NS_PER_BYTE = 25  # USB 2.0 high speed, about 40 MB/s
 
 
-class LoopbackTransport:
-    """An `xethru_protocol.transport.Transport` wired straight to a device.
+class VirtualLine:
+    """A device and the virtual time that it shares with its hosts."""
 
-    Every read returns at most one packet, which the device makes at that moment: nothing is in
-    flight between device and host. After `close`, `read` and `write` raise `Disconnected`.
-    """
-
-    def __init__(self, device: Device, name: str = "loopback") -> None:
-        self._device = device
-        self._name = name
+    def __init__(self, device: PortDevice) -> None:
+        self.device = device
         self._now_ns = 0
         self._at_once = 0  # packets since the device last had none
-        self._open = True
-        device.port_opened(self._now_ns)
 
     @property
-    def name(self) -> str:
-        return self._name
+    def present(self) -> bool:
+        return self.device.port_present(self._now_ns)
 
     def clock_ns(self) -> int:
-        """Return the virtual time, ns since the transport was made."""
+        """Return the virtual time, ns since the line was made."""
         return self._now_ns
 
     def read(self, timeout_s: float) -> bytes:
-        """Return the next packet, or ``b""`` once the timeout has passed in virtual time."""
-        self._check_open()
-        deadline_ns = self._now_ns + max(round(timeout_s * NS_PER_S), 0)
+        """Return the next packet; ``b""`` once the timeout has passed or the port is gone."""
+        deadline_ns = self._deadline_ns(timeout_s)
         while True:
-            self._device.advance(self._now_ns)
-            packet = self._device.next_packet(self._now_ns)
+            self.device.advance(self._now_ns)
+            packet = self.device.next_packet(self._now_ns) if self.present else None
             if packet is not None:
                 self._at_once += 1
                 if self._at_once > _AT_ONCE:
                     self._now_ns += len(packet) * _NS_PER_BYTE
                 return packet
             self._at_once = 0
-            wake_ns = self._device.wake_ns(self._now_ns)
-            if wake_ns is None or wake_ns > deadline_ns:
-                self._now_ns = deadline_ns
+            wake_ns = self.device.wake_ns(self._now_ns)
+            if not self.present or wake_ns is None or wake_ns > deadline_ns:
+                self._now_ns = deadline_ns if self.present else self._now_ns
                 return b""
             self._now_ns = max(wake_ns, self._now_ns)
 
+    def sleep(self, seconds: float) -> None:
+        """Let time pass while nobody reads."""
+        deadline_ns = self._deadline_ns(seconds)
+        self.device.advance(self._now_ns)
+        while (wake_ns := self.device.wake_ns(self._now_ns)) is not None:
+            if not self._now_ns < wake_ns <= deadline_ns:
+                break
+            self._now_ns = wake_ns
+            self.device.advance(self._now_ns)
+        self._now_ns = deadline_ns
+        self.device.advance(self._now_ns)
+
+    def _deadline_ns(self, seconds: float) -> int:
+        return self._now_ns + max(round(seconds * NS_PER_S), 0)
+
+
+class LoopbackTransport:
+    """An `xethru_protocol.transport.Transport` wired straight to a device, alone or with a line.
+
+    Every read returns at most one packet, which the device makes at that moment: nothing is in
+    flight between device and host. After `close`, `read` and `write` raise `Disconnected`.
+    """
+
+    def __init__(self, to: PortDevice | VirtualLine, name: str = "loopback") -> None:
+        self._line = to if isinstance(to, VirtualLine) else VirtualLine(to)
+        self._name = name
+        self._open = True
+        self.clock_ns = self._line.clock_ns
+        device = self._line.device
+        if isinstance(device, Device):
+            device.port_opened(self.clock_ns())
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return the next packet, or ``b""`` once the timeout has passed in virtual time."""
+        self._check_open()
+        data = self._line.read(timeout_s)
+        self._check_open()
+        return data
+
     def write(self, data: bytes) -> None:
         self._check_open()
-        self._device.receive_data(data, self._now_ns)
+        self._line.device.receive_data(data, self.clock_ns())
 
     def close(self) -> None:
-        if self._open:
-            self._open = False
-            self._device.port_closed(self._now_ns)
+        device = self._line.device
+        if self._open and isinstance(device, Device):
+            device.port_closed(self.clock_ns())
+        self._open = False
 
     def _check_open(self) -> None:
-        if not self._open:
+        if not self._open or not self._line.present:
             raise Disconnected(f"{self._name}: the port is closed")

@@ -11,10 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from emulator.device import radar_device
+from emulator.device import PortDevice, radar_device
 from emulator.echo.echo import echo_source
 from emulator.echo.people import people_truth
-from emulator.faults.faulty_device import FaultyDevice, InnerDevice
+from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
 from emulator.module.memory import Identity
 from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
@@ -94,7 +94,7 @@ class FaultSession:
         if self._truth is not None:
             self._truth.write(injected.line())
 
-    def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
+    def wrap(self, device: PortDevice, name: str) -> FaultyDevice:
         faulty = FaultyDevice(device, name, self._plan, self._note, zero_ns=self._zero_ns)
         self.devices[name] = faulty
         return faulty

@@ -12,9 +12,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
-from emulator.device import ByteDevice, Device
+from emulator.device import Device, PortDevice
 from emulator.faults.kind import (
     Action,
     CommandEffect,
@@ -66,12 +66,6 @@ _LATTICE_SETTINGS = {
     X4Setting.DOWNCONVERSION: "downconversion",
     X4Setting.TXCENTERFREQUENCY: "tx_center_frequency",
 }
-
-
-class InnerDevice(ByteDevice, Protocol):
-    """A module whose port may go away."""
-
-    def port_present(self, now_ns: int) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -346,7 +340,7 @@ class FaultyDevice:
 
     def __init__(
         self,
-        inner: InnerDevice,
+        inner: PortDevice,
         name: str,
         plan: FaultPlan,
         note: Callable[[Injected], object] = lambda injected: None,

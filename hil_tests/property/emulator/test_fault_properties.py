@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.chip import Pace
-from emulator.device import radar_device
+from emulator.device import PortDevice, radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import FaultyDevice, InnerDevice
+from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.kind import (
     Context,
     Handling,
@@ -71,11 +71,11 @@ PACKETS = st.one_of(
 )
 
 
-def module() -> InnerDevice:
+def module() -> PortDevice:
     return radar_device(Identity(serial="1" * 12), echo_source(empty_room(), 0, 0), Pace.REALTIME)
 
 
-def transcript(device: InnerDevice, chunk: int = 7) -> list[tuple[int, bytes]]:
+def transcript(device: PortDevice, chunk: int = 7) -> list[tuple[int, bytes]]:
     """Return what a device sends in 2 s, with times."""
     data = b"".join(HOST.send(command) for command in SCRIPT)
     sent = []
