@@ -68,17 +68,26 @@ def test_frames_keep_their_pace(
 ) -> None:
     """Protocol reference 9.6: 17 is 17.049379 Hz, 58.653 ms; short frames, so any line carries it.
 
-    Judged in virtual time; in real time, when 41 frames arrive says as much of a busy host as of
-    the module, so that is measured only.
+    To the microsecond in virtual time. In real time a busy host is late, so the most punctual of
+    ten frames count, and the best of three streams.
     """
-    radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
-    radar.start(17.0)
-    arrivals_ns = np.array([frame.arrival_ns for frame in radar.frames(41)])
-    radar.stop()
+    virtual = radar_place.place.virtual
+    for _ in range(1 if virtual else 3):
+        radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
+        rate_hz = radar.start(17.0)
+        frames = list(radar.frames(41))
+        radar.stop()
+        arrivals_ns = np.array([frame.arrival_ns for frame in frames])
+        counters = np.array([frame.counter for frame in frames])
+        late_s = (arrivals_ns - arrivals_ns[0]) * 1e-9 - (counters - counters[0]) / rate_hz
+        pace_error = (late_s[-10:].min() - late_s[:10].min()) * rate_hz / 31
+        if abs(pace_error) < 0.05:
+            break
+    measure("pace_error", 100 * float(pace_error), unit="%", limit=(-5, 5))
     intervals_ms = np.diff(arrivals_ns) * 1e-6
     measure("frame_interval_p99", float(np.percentile(intervals_ms, 99)), unit="ms")
     mean_ms = float(intervals_ms.mean())
-    limit = (58.652, 58.654) if radar_place.place.virtual else (None, None)
+    limit = (58.652, 58.654) if virtual else (None, None)
     measure("frame_interval_mean", mean_ms, unit="ms", limit=limit)
     measure("frames_lost", radar.frames_lost, limit=(None, 0))
 

@@ -15,11 +15,13 @@
 | `SCHEME:TARGET` | whatever the hook `pytest_xethru_radar_target` of a conftest.py makes of it |
 
 Each takes ``?has=NAME,NAME``: further capabilities, such as a reflector on a stage, for tests
-marked with ``@pytest.mark.requires``.
+marked with ``@pytest.mark.requires``. ``?known_range=1.50`` at a real module says that the only
+reflector near this range stands 1.50 m in front of it.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -49,9 +51,9 @@ _FIRMWARE = ("sensor", "xep")
 _LINES = ("memory", "pty", "uart", "tcp")
 _OPTIONS: dict[Kind, tuple[str, ...]] = {
     Kind.EMULATED: ("firmware", "fps", "has", "line", "radar", "seed"),
-    Kind.PORT: ("fps", "has", "line"),
-    Kind.SERIAL_NUMBER: ("fps", "has"),
-    Kind.NETWORK: ("fps", "has"),
+    Kind.PORT: ("fps", "has", "known_range", "line"),
+    Kind.SERIAL_NUMBER: ("fps", "has", "known_range"),
+    Kind.NETWORK: ("fps", "has", "known_range"),
     Kind.REPLAY: ("has", "radar"),
     Kind.AUTO: ("fps", "has"),
 }
@@ -106,6 +108,11 @@ class RadarSpec:
     def fps(self) -> float:
         """Frame rate that tests should ask for [Hz]."""
         return float(self.options.get("fps", DEFAULT_FPS))
+
+    @property
+    def known_range_m(self) -> float | None:
+        """Range of the reflector in front of a real module [m]; None if none is declared."""
+        return float(self.options["known_range"]) if "known_range" in self.options else None
 
     @property
     def has(self) -> frozenset[str]:
@@ -200,12 +207,19 @@ def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
     seed = options.get("seed", "0")
     if not re.fullmatch(r"[0-9]{1,19}", seed) or int(seed) >= 2**63:
         raise SpecError(f"--radar {text}: seed={seed}: must be a whole number of 0...2**63 - 1")
-    try:
-        fps = float(options.get("fps", DEFAULT_FPS))
-    except ValueError:
-        fps = 0.0
-    if not 0 < fps < 65536:
+    if not 0 < _number(options.get("fps", str(DEFAULT_FPS))) < 65536:
         raise SpecError(f"--radar {text}: fps={options['fps']}: must be a rate of 1...65535 Hz")
+    if kind is not Kind.OWN and not 0.4 <= _number(options.get("known_range", "1")) <= 9.0:
+        raise SpecError(
+            f"--radar {text}: known_range={options['known_range']}: must be 0.4...9 metres"
+        )
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _name(kind: Kind, target: str, options: Mapping[str, str]) -> str:

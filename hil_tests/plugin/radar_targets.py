@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from hil_tests.device.serving import Served, emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.plugin.power import PowerCommand, PowerError
@@ -111,6 +113,7 @@ CAPABILITIES: Mapping[str, str] = {
     "unplug": "only emulated ones can be unplugged by a program",
     "power": "--hil-power-cmd CMD switches the power of a real one",
     "faults": "only emulated radars have faults",
+    "known_range": "nothing of known range is in view; --radar emu:lab, or /dev/...?known_range=M",
     "uart": "USB, tcp:// and pseudo-terminals have no baud rate",
     "virtual_time": "waiting must cost nothing",
 }
@@ -118,6 +121,9 @@ CAPABILITIES: Mapping[str, str] = {
 
 _UART_BYTES_PER_S = POWER_UP_BAUD / 10
 _EMPTY_ROOM_RADARS = 4
+_SEEN_COSINE, _CLEAR_COSINE = 0.42, 0.57  # 65 deg off boresight, 55 deg
+_NEAR_M, _FAR_M = 0.4, 2.0
+_ALONE_M = 0.2  # two echoes overlap below; an envelope's standard deviation is 5 cm
 
 
 class TargetError(Exception):
@@ -169,6 +175,13 @@ class RadarTarget(ABC):
         """Whether time passes only while a driver waits for the module."""
         return "virtual_time" in self.capabilities
 
+    def known_ranges_m(self, t_ns: int) -> Sequence[float]:
+        """Return true ranges of reflectors that stand alone, at a time of `clock_ns` [m].
+
+        Empty where none is in view; `known_range` is the capability.
+        """
+        return () if self.spec.known_range_m is None else (self.spec.known_range_m,)
+
     def explore(self) -> None:  # noqa: B027 - most targets know it without asking
         """Complete the capabilities; called once, after locking."""
 
@@ -216,12 +229,13 @@ class InProcessTarget(RadarTarget):
     """A module in this process, in virtual time; a fresh one for every test."""
 
     def __init__(self, spec: RadarSpec) -> None:
+        self._scene, self.scene_text = _scene(spec), _scene_text(spec)
+        able = frozenset(CAPABILITIES) - {"uart", "known_range"}
         super().__init__(
             spec,
-            frozenset(CAPABILITIES) - {"uart"},
+            able | ({"known_range"} if _is_open_space(self._scene) else set()),
             f"emulated in this process, virtual time, {spec.target or 'an empty room'}",
         )
-        self._scene, self.scene_text = _scene(spec), _scene_text(spec)
         self._index = _index_of(spec, [radar.name for radar in self._scene.radars])
         self.begin_test()
 
@@ -254,6 +268,9 @@ class InProcessTarget(RadarTarget):
     def candidates(self) -> Sequence[str]:
         return self._line.ports()
 
+    def known_ranges_m(self, t_ns: int) -> Sequence[float]:
+        return _ranges_in_view(self._scene, self._index, t_ns)
+
     def unplug(self, seconds: float) -> None:
         self._line.device.unplug(self._line.clock_ns(), round(seconds * 1e9))
 
@@ -281,6 +298,9 @@ class ProcessTarget(RadarTarget):
         able = {"settings", "profiles", "files", "unplug", "power", "faults"}
         if spec.line == "uart":
             able.add("uart")
+        self._scene = None if played else _scene(spec)
+        if self._scene is not None and _is_open_space(self._scene):
+            able.add("known_range")
         super().__init__(
             spec,
             frozenset() if played else frozenset(able),
@@ -306,6 +326,12 @@ class ProcessTarget(RadarTarget):
         if self.spec.line == "tcp":
             return open_line(f"tcp://127.0.0.1:{self._served.tcp_ports[self._index]}")
         return open_line(path or self._served.paths[self._index], baudrate)
+
+    def known_ranges_m(self, t_ns: int) -> Sequence[float]:
+        if self._scene is None:
+            return ()
+        scene_ns = t_ns - self._served.scene_time_zero_ns
+        return _ranges_in_view(self._scene, self._index, scene_ns)
 
     def unplug(self, seconds: float) -> None:
         self._ask("unplug", seconds=seconds)
@@ -360,6 +386,7 @@ class PortTarget(RadarTarget):
     def __init__(self, spec: RadarSpec, power: PowerCommand | None = None) -> None:
         path = _port_of(spec.target) if spec.kind is Kind.SERIAL_NUMBER else spec.target
         able = {"settings", "profiles", "files"} | ({"power"} if power else set())
+        able |= set() if spec.known_range_m is None else {"known_range"}
         super().__init__(spec, frozenset(able), f"module at {path}")
         self._path, self._power = path, power
         self._is_here = spec.kind is not Kind.NETWORK
@@ -458,6 +485,31 @@ def _scene(spec: RadarSpec) -> Scene:
         return load_scene(spec.target) if spec.target else empty_room(_EMPTY_ROOM_RADARS)
     except SceneError as error:
         raise TargetError(f"--radar {spec.text}: {error}") from None
+
+
+def _is_open_space(scene: Scene) -> bool:
+    """Whether targets send the only echoes, and always the same."""
+    others = (*scene.walls, *scene.objects, *scene.people, *scene.movers, *scene.other_modules)
+    return bool(scene.targets) and not others
+
+
+def _ranges_in_view(scene: Scene, index: int, scene_ns: int) -> Sequence[float]:
+    """Return the ranges of targets near boresight that no other target's echo overlaps [m]."""
+    from emulator.echo.reflections import viewpoint
+
+    radar = scene.radars[index]
+    view = viewpoint(radar, scene.trajectory().poses(np.array([scene_ns])))
+    places = np.array([(target.x_m, target.y_m) for target in scene.targets])
+    distance_m, cos_angle = (values[0] for values in view.towards(*places.T))
+    ranges_m = distance_m - [target.radius_m for target in scene.targets] + radar.range_offset_m
+    seen = ranges_m[cos_angle > _SEEN_COSINE]
+    alone = [np.sort(np.abs(seen - range_m))[1:2].sum() for range_m in ranges_m]
+    wanted = (cos_angle > _CLEAR_COSINE) & (ranges_m > _NEAR_M) & (ranges_m < _FAR_M)
+    return [
+        float(range_m)
+        for range_m, apart_m, ok in zip(ranges_m, alone, wanted, strict=True)
+        if ok and (apart_m > _ALONE_M or len(seen) == 1)
+    ]
 
 
 def _serve_arguments(spec: RadarSpec) -> list[str]:
