@@ -9,9 +9,11 @@ import selectors
 import socket
 import stat
 from abc import abstractmethod
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 
 from emulator.chip import Pace
@@ -36,15 +38,15 @@ class SocketClient:
         Until the client closes its direction.
     begun
         What it sent of a line without end.
-    next_line
-        Index of the odometry line that it gets next.
+    sent
+        Bytes of odometry that it has got.
     """
 
     connection: socket.socket
     unsent: bytes = b""
     reads: bool = True
     begun: bytes = b""
-    next_line: int = 0
+    sent: int = 0
 
 
 class SocketService(Service):
@@ -186,7 +188,8 @@ class OdometryFeed(SocketService):
         self, path: Path, lines: Sequence[str], pace: Pace, *, scene_time_zero_ns: int = 0
     ) -> None:
         super().__init__(path, "odometry", most_clients=MOST_ODOMETRY_CLIENTS)
-        self._lines = [f"{line}\n".encode() for line in lines]
+        self._text = "".join(f"{line}\n" for line in lines).encode()
+        self._ends = list(accumulate(len(line.encode()) + 1 for line in lines))
         realtime = pace is Pace.REALTIME
         self._due_ns = [scene_time_zero_ns + stamp_ns(line) if realtime else 0 for line in lines]
 
@@ -197,11 +200,10 @@ class OdometryFeed(SocketService):
                 self._serve(client, now_ns)
 
     def wake_ns(self, now_ns: int) -> int | None:
-        wakes = [
-            self._due_ns[client.next_line]
-            for client in self._clients
-            if not client.unsent and client.next_line < len(self._lines)
-        ]
+        coming = (
+            bisect_right(self._ends, client.sent) for client in self._clients if not client.unsent
+        )
+        wakes = [self._due_ns[line] for line in coming if line < len(self._due_ns)]
         if (accept_again_ns := super().wake_ns(now_ns)) is not None:
             wakes.append(accept_again_ns)
         return min(wakes, default=None)
@@ -216,34 +218,24 @@ class OdometryFeed(SocketService):
                 pass
             except OSError:
                 client.reads = False
-        if events & selectors.EVENT_WRITE or not client.unsent:
-            self._serve(client, now_ns)
-        else:
-            self._watch(client)
+        self._serve(client, now_ns)
 
     def _serve(self, client: SocketClient, now_ns: int) -> None:
-        while True:
+        """Send what is due, or what the line takes of it."""
+        n_due = bisect_right(self._due_ns, now_ns)
+        due = self._ends[n_due - 1] if n_due else 0
+        while client.unsent or client.sent < due:
             if not client.unsent:
-                client.unsent = self._due_lines(client, now_ns)
-            if not client.unsent:
-                break
+                client.unsent = self._text[client.sent : min(due, client.sent + SEND_SIZE)]
+                client.sent += len(client.unsent)
             if not self._send(client):
                 return
             if client.unsent:
                 break
-        if not client.unsent and client.next_line == len(self._lines):
-            self._drop(client)
-        else:
+        if client.unsent or client.sent < len(self._text):
             self._watch(client)
-
-    def _due_lines(self, client: SocketClient, now_ns: int) -> bytes:
-        first = last = client.next_line
-        size = 0
-        while last < len(self._lines) and self._due_ns[last] <= now_ns and size < SEND_SIZE:
-            size += len(self._lines[last])
-            last += 1
-        client.next_line = last
-        return b"".join(self._lines[first:last])
+        else:
+            self._drop(client)
 
 
 def stamp_ns(line: str) -> int:
