@@ -336,11 +336,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
     with stop.leaving(0):  # the imports take most of a second
         # heavy, and only now: --help and usage errors answer at once
-        from emulator import serving
-    start = {"serve": serving.serve, "play": serving.play, "proxy": serving.proxy}
+        from emulator.serve_play_proxy import CannotServeError, play, proxy, serve
+    start = {"serve": serve, "play": play, "proxy": proxy}
     try:
         start[arguments.command](arguments, stop, _warn)
-    except serving.CannotServeError as error:
+    except CannotServeError as error:
         return _failed(str(error), exit_code=error.exit_code)
     return 0
 

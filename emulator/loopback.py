@@ -8,10 +8,10 @@ host reads takes the time of a line. Give the driver the transport's own clock,
 
 from __future__ import annotations
 
-from emulator.device import Device, PortDevice
+from emulator.chip.chip import NS_PER_S
+from emulator.x4m300 import Device, PortDevice
 from xethru_protocol.wire.errors import Disconnected
 
-NS_PER_S = 1_000_000_000
 # More packets than a module's queue holds are made while the host reads them. Without time for them
 # no limit of time would ever pass for that host.
 _AT_ONCE = 64

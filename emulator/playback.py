@@ -27,12 +27,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from emulator.chip.chip import Chip
-from emulator.device import Device
+from emulator.chip.chip import NS_PER_S, Chip
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity
-from emulator.module.module import LosslessOutbox, MessageStream, Module
+from emulator.module.outbox import LosslessOutbox, MessageStream
+from emulator.module.state import Module
 from emulator.scene.scene import empty_room
+from emulator.x4m300 import Device
 from xethru_protocol.recordings import (
     RadarFacts,
     RecordingError,
@@ -55,7 +56,6 @@ from xethru_protocol.wire.messages import (
 )
 from xethru_protocol.wire.rows import ROWS, UnknownMessage
 
-NS_PER_S = 1_000_000_000
 SLOWEST_RATE = 1e-6
 """Least rate above 0 that a playback in progress takes; a year for half a minute."""
 QUIET_NS = NS_PER_S // 2

@@ -15,13 +15,13 @@ from collections.abc import Iterator, Sequence
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import PortDevice, radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, fault
 from emulator.faults.plan import FaultPlan, Injected
 from emulator.loopback import LoopbackTransport, VirtualLine
 from emulator.module.memory import Identity
 from emulator.scene.scene import empty_room
+from emulator.x4m300 import PortDevice, radar_device
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import Transport

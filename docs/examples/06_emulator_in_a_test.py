@@ -20,7 +20,7 @@ import sys
 
 import numpy as np
 
-from hil_tests.plugin.gate import Measure
+from hil_tests.plugin.findings import Measure
 from xethru_protocol import X4M300
 
 

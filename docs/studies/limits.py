@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.stats import ncx2
 
 from emulator.chip.chip import CaptureSettings
+from emulator.echo.pulse import sum_of_pulses
 from emulator.echo.receiver import Receiver
-from emulator.echo.reflections import sum_of_pulses
 from emulator.scene.scene import NoiseSpec, RadarSpec, empty_room
 from slam.app.rig.sources import sampler_limits
 from slam.app.run.output import print_table

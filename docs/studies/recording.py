@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S, SPEED_OF_LIGHT_MPS
+from emulator.echo.paths import SPEED_OF_LIGHT_MPS
+from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, Scene, TargetSpec, empty_room
+from emulator.x4m300 import radar_device
 from slam.app.run.pictures import ESTIMATE, ODOMETRY, TRUTH, label, picture
 from xethru_protocol import load
 from xethru_protocol.driver.link import RawConfig

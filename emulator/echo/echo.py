@@ -10,7 +10,7 @@ with the leakage among the paths i, and the chip counts ``clip(round((x[n] + N /
 max)``. Elevation of targets, polarisation, and paths of more bounces than named here are left out.
 
 Pulse p
-    Gaussian envelope on the carrier (``emulator.echo.reflections``). Where a radar of the scene
+    Gaussian envelope on the carrier (``emulator.echo.paths``). Where a radar of the scene
     has a table ``pulse``, the standard deviation is width (1 - skew) sigma before the peak and
     width (1 + skew) sigma after it, and ringing times the same pulse follows 3.2 sigma later, its
     carrier 1 rad ahead. All that this radar receives has this pulse, except for its clutter.
@@ -25,7 +25,7 @@ Place of a radar
 Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
     R is half the length of the path; c = 299 792 458 m/s; offset is the module's range error; L is
     the label of sample 0 in module metres (c_module = 3.0e8 m/s, protocol reference 9.1).
-Amplitude a of rod, point, person, mover (``emulator.echo.reflections``)
+Amplitude a of rod, point, person, mover (``emulator.echo.paths``)
     amplitude_1m R**-1.5 (rod) or R**-2 (point), times the beam cos(angle)**n, the root of TX power
     and the module's gain. Radar equation for amplitudes (Skolnik, Introduction to Radar Systems):
     a point spreads twice as a sphere, a long rod once as a sphere and once as a cylinder. The
@@ -144,18 +144,17 @@ from numpy.typing import NDArray
 from emulator.chip.chip import CaptureSettings, EchoSource
 from emulator.echo.model_error import Bursts, Stamps, TargetPairs, Wander
 from emulator.echo.other_modules import OtherModules
-from emulator.echo.people import mover_scatterer, person_scatterer
-from emulator.echo.receiver import CarrierJitter, Receiver, one_count
-from emulator.echo.reflections import (
+from emulator.echo.paths import (
     SPEED_OF_LIGHT_MPS,
-    PulseShape,
     Reflections,
     Viewpoint,
     direct_reflections,
     reflection_phase_rad,
-    sum_of_pulses,
     viewpoint,
 )
+from emulator.echo.people import mover_scatterer, person_scatterer
+from emulator.echo.pulse import PulseShape, sum_of_pulses
+from emulator.echo.receiver import CarrierJitter, Receiver, one_count
 from emulator.echo.targets import Targets, mirrored_reflections
 from emulator.echo.walls import (
     corner_pairs,

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from emulator.chip.chip import CaptureSettings
-from emulator.echo.reflections import PulseShape, Reflections, Scatterers, Viewpoint, sum_of_pulses
+from emulator.echo.paths import Reflections, Scatterers, Viewpoint
+from emulator.echo.pulse import PulseShape, sum_of_pulses
 from emulator.scene.philox import (
     UNITS_PER_SIGMA,
     WORDS_PER_BLOCK,

@@ -30,18 +30,15 @@ from numpy.typing import NDArray
 from scipy.special import wofz
 
 from emulator.chip.chip import CaptureSettings
-from emulator.echo.receiver import highest_rate_hz
-from emulator.echo.reflections import (
-    CARRIER_CYCLES_PER_SAMPLE,
-    HALF_WINDOW,
+from emulator.echo.paths import (
     NEAREST_M,
-    SIGMA_S,
     SPEED_OF_LIGHT_MPS,
     Viewpoint,
     beam_gain,
     reflection_phase_rad,
-    sum_of_pulses,
 )
+from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, HALF_WINDOW, SIGMA_S, sum_of_pulses
+from emulator.echo.receiver import highest_rate_hz
 from emulator.scene.scene import OtherModuleSpec, RadarSpec
 from xethru_protocol.wire.x4 import (
     FRAME_SAMPLES,

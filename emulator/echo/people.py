@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.reflections import (
+from emulator.echo.paths import (
     RANGE_EXPONENT,
     Scatterers,
     Viewpoint,

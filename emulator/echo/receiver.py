@@ -60,7 +60,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings
-from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
+from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.scene.philox import (
     UNITS_PER_SIGMA,
     Purpose,

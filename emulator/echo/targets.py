@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.receiver import KnotGrid, SlowNoise
-from emulator.echo.reflections import (
+from emulator.echo.paths import (
     NEAREST_M,
     RANGE_EXPONENT,
     Reflections,
@@ -25,6 +24,7 @@ from emulator.echo.reflections import (
     reflection_phase_rad,
     target_scatterers,
 )
+from emulator.echo.receiver import KnotGrid, SlowNoise
 from emulator.scene.philox import Purpose
 from emulator.scene.scene import HeightsSpec, ScintillationSpec, TargetSpec
 

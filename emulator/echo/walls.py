@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fresnel
 
-from emulator.echo.reflections import (
+from emulator.echo.paths import (
     NEAREST_M,
     Reflections,
     Scatterers,
@@ -598,7 +598,7 @@ def ghost_reflections(
 def spread(scatterers: Scatterers, out_m: Array, back_m: Array, half_cosine: Array) -> Array:
     """Return the echoes' amplitudes for two different legs, shape (m,), beam left aside.
 
-    With equal legs it is that of `emulator.echo.reflections.direct_reflections`.
+    With equal legs it is that of `emulator.echo.paths.direct_reflections`.
 
     Parameters
     ----------

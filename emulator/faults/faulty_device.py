@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, cast
 
-from emulator.device import Device, PortDevice
+from emulator.chip.chip import NS_PER_S
 from emulator.faults.kind import (
     Action,
     CommandEffect,
@@ -36,6 +36,7 @@ from emulator.faults.kind import (
 )
 from emulator.faults.plan import FaultPlan, FaultSpec, Injected, fault_spec
 from emulator.scene.philox import Rng
+from emulator.x4m300 import Device, PortDevice
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire.codec import decode_command
 from xethru_protocol.wire.codes import SystemCode, X4Setting
@@ -51,7 +52,6 @@ from xethru_protocol.wire.messages import (
 )
 from xethru_protocol.wire.rows import ROWS, UnknownMessage
 
-NS_PER_S = 1_000_000_000
 PACKETS_PER_CALL = 32
 _RETRY_NS = 10_000_000
 """How much later a call goes on that found only packets to lose: time must pass meanwhile."""

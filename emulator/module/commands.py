@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from emulator.chip.chip import Refusal, Silence
 from emulator.module.memory import FileKey
 from emulator.module.modes import Group, State, check_permission, group_of
-from emulator.module.module import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
 from emulator.module.settings import ZONE_LIMITS_M
+from emulator.module.state import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import versions, x4
 from xethru_protocol.wire.codes import (

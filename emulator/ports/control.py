@@ -42,15 +42,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.device import Device
+from emulator.chip.chip import NS_PER_S
 from emulator.echo.people import PersonTruth
 from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlanError, parse_fault
 from emulator.playback import PlayStream, kinds
 from emulator.ports.sockets import SocketClient, SocketService
 from emulator.scene.people import SleepStage
+from emulator.x4m300 import Device
 
-NS_PER_S = 1_000_000_000
 MOST_CLIENTS = 16
 LONGEST_LINE = 65_536
 """Bytes; a client that sends more without a line end is hung up on."""

@@ -15,9 +15,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import ClassVar
 
+from emulator.chip.chip import NS_PER_S
 from emulator.module.settings import BITS_PER_BYTE, received_bytes
 
-NS_PER_S = 1_000_000_000
 LARGEST_TRANSFER = 512
 """Bytes, on USB."""
 MOST_UNDER_WAY = 65536

@@ -18,12 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from emulator.device import ByteDevice
 from emulator.module.settings import DEFAULT_BAUDRATE
+from emulator.ports.event_loop import Port, Service, wait_for
 from emulator.ports.lines import UartLine, UsbLine
 from emulator.ports.pty import LinkError, PortWatch, PtyLink
-from emulator.ports.server import Port, Service, wait_for
 from emulator.ports.tcp import TcpLink
+from emulator.x4m300 import ByteDevice
 
 LOOK_AGAIN_NS = 20_000_000
 """How often to look whether the port is back; a host looks less often."""

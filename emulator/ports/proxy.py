@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from emulator.ports.server import Service, wait_for
+from emulator.ports.event_loop import Service, wait_for
 from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.transport import LineTransport
 from xethru_protocol.wire.errors import Disconnected

@@ -17,7 +17,7 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from emulator.ports.server import Service
+from emulator.ports.event_loop import Service
 
 _IN_CLOSE_WRITE = 0x08
 _IN_CLOSE_NOWRITE = 0x10

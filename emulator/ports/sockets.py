@@ -17,10 +17,10 @@ from itertools import accumulate
 from pathlib import Path
 
 from emulator.chip import Pace
+from emulator.chip.chip import NS_PER_S
+from emulator.ports.event_loop import Service, wait_for
 from emulator.ports.pty import LinkError
-from emulator.ports.server import Service, wait_for
 
-NS_PER_S = 1_000_000_000
 RETRY_NS = 1_000_000_000
 """How long new clients wait when descriptors have run out and no client of ours leaves."""
 MOST_ODOMETRY_CLIENTS = 64

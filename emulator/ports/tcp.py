@@ -13,8 +13,8 @@ import selectors
 import socket
 from collections.abc import Callable
 
+from emulator.ports.event_loop import Service, wait_for
 from emulator.ports.pty import LARGEST_READ, LinkError
-from emulator.ports.server import Service, wait_for
 
 BACKLOG = 16
 LAST_PORT = 65535

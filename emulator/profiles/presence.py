@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.reflections import SPEED_OF_LIGHT_MPS
+from emulator.echo.paths import SPEED_OF_LIGHT_MPS
 from emulator.profiles.doppler import (
     FAST,
     FRAME_RATE_HZ,

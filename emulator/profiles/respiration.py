@@ -32,7 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.reflections import SPEED_OF_LIGHT_MPS
+from emulator.echo.paths import SPEED_OF_LIGHT_MPS
 from emulator.profiles.doppler import FAST, SLOW, ProfileSweep
 from emulator.profiles.presence import (
     FULL_MOVEMENT_DB,

@@ -40,7 +40,8 @@ from numpy.typing import NDArray
 
 from emulator.chip import Pace
 from emulator.chip.chip import NS_PER_S, EchoSource, ModuleClock, Refusal
-from emulator.module.module import NOISE_MAPS, MessageStream, Module
+from emulator.module.outbox import MessageStream
+from emulator.module.state import NOISE_MAPS, Module
 from emulator.profiles import respiration
 from emulator.profiles.doppler import (
     FRAME_RATE_HZ,

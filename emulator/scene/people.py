@@ -60,6 +60,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from emulator.chip.chip import NS_PER_S
 from emulator.scene.motion import Degrees, Metres, Name
 from emulator.scene.philox import WORDS_PER_BLOCK, Purpose, stream_of, uniforms
 from emulator.scene.tables import Number, Table
@@ -67,7 +68,6 @@ from emulator.scene.tables import Number, Table
 _Seconds = Annotated[Number, Field(ge=0, le=86_400)]
 _Size = Annotated[Number, Field(gt=0, le=1)]
 
-_NS_PER_S = 1_000_000_000
 _INSPIRATION, _EXPIRATION = 0.4, 0.4
 _RAMP_S = 1.5
 _WANDER_PERIODS_S = np.array([23.0, 41.0, 67.0])
@@ -417,7 +417,7 @@ class BodyMotion:
         self, stream: int, seed: int, *, mean_s: float, takes_s: float, size_m: float
     ) -> None:
         self._stream, self._seed = stream, seed
-        self._mean_s, self._takes_ns = mean_s, round(takes_s * _NS_PER_S)
+        self._mean_s, self._takes_ns = mean_s, round(takes_s * NS_PER_S)
         self._size_m = size_m
         # begins, per event a number in [0, 1), and places; replaced as a whole when more are drawn
         self._events = (np.empty(0, dtype=np.int64), np.empty(0), np.zeros((1, 2)))

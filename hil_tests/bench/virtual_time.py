@@ -1,11 +1,11 @@
 """Device time without waiting: a driver and a module in this process, on a virtual clock."""
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import load_scene
+from emulator.x4m300 import radar_device
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 

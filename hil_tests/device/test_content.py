@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hil_tests.plugin.bench import RadarUnderTest
-from hil_tests.plugin.gate import Limit, Measure
+from hil_tests.plugin.findings import Limit, Measure
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.x4 import CARRIER_HZ, SAMPLING_RATE_HZ

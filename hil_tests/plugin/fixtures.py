@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from hil_tests.plugin.choices import CHOICES
-from hil_tests.plugin.gate import InjectFault, Measure, findings_of, gate, lacking
+from hil_tests.plugin.findings import InjectFault, Measure, findings_of
+from hil_tests.plugin.options import CHOICES
+from hil_tests.plugin.requirements import gate, lacking
 
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarUnderTest

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from hil_tests.plugin.choices import CHOICES, WORKER_KEY, add_options, choose
-from hil_tests.plugin.gate import FINDINGS, Findings, check_faults
+from hil_tests.plugin.findings import FINDINGS, Findings, check_faults
+from hil_tests.plugin.options import CHOICES, WORKER_KEY, add_options, choose
 from hil_tests.plugin.radar_specs import Kind, RadarSpec, no_radar
 
 if TYPE_CHECKING:
@@ -259,7 +259,7 @@ def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> N
     from xethru_protocol.extras import what_is_missing
 
     try:
-        from hil_tests.plugin.bundle import folder_name, write_bundle
+        from hil_tests.plugin.artifacts import folder_name, write_bundle
     except ModuleNotFoundError as error:
         missing = what_is_missing(error, extra="hil")
         report.sections.append(("radar artefacts", f"not kept: {missing or error}"))

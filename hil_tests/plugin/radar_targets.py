@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.emulator_process import Served, emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import Kind, RadarSpec
@@ -242,10 +242,10 @@ class InProcessTarget(RadarTarget):
     def begin_test(self) -> None:
         """Make a new module, so that no test sees what an earlier one left."""
         from emulator.chip import Pace
-        from emulator.device import radar_device
         from emulator.echo.echo import echo_source
         from emulator.module.memory import Identity
         from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
+        from emulator.x4m300 import radar_device
         from hil_tests.faulty import FaultyLine
 
         radar = self._scene.radars[self._index]
@@ -495,7 +495,7 @@ def _is_open_space(scene: Scene) -> bool:
 
 def _ranges_in_view(scene: Scene, index: int, scene_ns: int) -> Sequence[float]:
     """Return the ranges of targets near boresight that no other target's echo overlaps [m]."""
-    from emulator.echo.reflections import viewpoint
+    from emulator.echo.paths import viewpoint
 
     radar = scene.radars[index]
     view = viewpoint(radar, scene.trajectory().poses(np.array([scene_ns])))

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from pydantic import Field
 
+from emulator.chip.chip import NS_PER_S
 from emulator.faults.kind import (
     Context,
     Entry,
@@ -30,7 +31,6 @@ of_packet = Entry(Layer.STREAM, Target.PACKET)
 of_environment = Entry(Layer.ENVIRONMENT, Target.FRAME)
 
 _WRAP = 1 << 32
-_NS_PER_S = 1_000_000_000
 _CYCLES_PER_BIN = 7.29 / 23.328  # carrier of the pulse over the sampling rate, Hz / Hz
 
 
@@ -170,7 +170,7 @@ def slow_rate(packet: bytes, wanted: _Slower, rng: Rng, context: Context) -> Pie
 )
 def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces:
     """Nothing comes for a while, then all at once."""
-    end_ns = context.since_ns + round(wanted.seconds * _NS_PER_S)
+    end_ns = context.since_ns + round(wanted.seconds * NS_PER_S)
     return [Piece(packet, delay_ns=max(end_ns - context.now_ns, 0))]
 
 
@@ -244,6 +244,6 @@ def interference(packet: bytes, wanted: _Pulses, rng: Rng, context: Context) -> 
 @of_environment("nothing", _Fading, lasting=True, hidden=_CONTENT)
 def fading(packet: bytes, wanted: _Fading, rng: Rng, context: Context) -> Pieces:
     """All echoes fade and come back."""
-    phase = (context.now_ns - context.since_ns) / _NS_PER_S / wanted.period_s
+    phase = (context.now_ns - context.since_ns) / NS_PER_S / wanted.period_s
     loss_db = wanted.depth_db * (1 - math.cos(2 * math.pi * phase)) / 2
     return _distorted(packet, context, lambda samples: samples * np.float32(10 ** (-loss_db / 20)))

@@ -20,7 +20,7 @@ from emulator.chip.chip import Chip
 from emulator.echo.echo import echo_source
 from emulator.scene.scene import load_scene
 from hil_tests.bench.virtual_time import counters_of, lab_radar
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.emulator_process import Served, emulator
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings
 from emulator.echo.echo import SceneEcho, echo_source
-from emulator.echo.reflections import sum_of_pulses
+from emulator.echo.pulse import sum_of_pulses
 from emulator.scene.scene import ClutterSpec, LeakageSpec, Scene, load_scene
 from hil_tests.unit.emulator.rooms import PAPER
 

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.chip import Pace
-from emulator.device import PortDevice, radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.kind import (
@@ -26,6 +25,7 @@ from emulator.faults.plan import FaultPlan, FaultSpec, Injected, fault_spec
 from emulator.module.memory import Identity
 from emulator.scene.philox import Rng
 from emulator.scene.scene import empty_room
+from emulator.x4m300 import PortDevice, radar_device
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting

@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.chip.chip import Chip
-from emulator.device import Device
 from emulator.loopback import LoopbackTransport
-from emulator.module.module import LosslessOutbox, Module
+from emulator.module.outbox import LosslessOutbox
+from emulator.module.state import Module
 from emulator.playback import QUIET_NS, PlayClock, PlayStream, TimedMessage
+from emulator.x4m300 import Device
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role

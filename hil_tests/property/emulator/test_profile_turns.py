@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emulator.chip import Pace
 from emulator.chip.chip import CaptureSettings
-from emulator.device import REALTIME_BLOCK, Device, radar_device
+from emulator.x4m300 import REALTIME_BLOCK, Device, radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, SensorMode

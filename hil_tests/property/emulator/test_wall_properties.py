@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from emulator.echo.reflections import Scatterers
+from emulator.echo.paths import Scatterers
 from emulator.echo.walls import faces_of, passing, spread
 from emulator.scene.people import PersonSpec
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M, ObjectSpec, TargetSpec, WallSpec

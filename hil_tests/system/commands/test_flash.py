@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import emulator, open_radar
+from hil_tests.device.emulator_process import emulator, open_radar
 from hil_tests.unit.xethru_protocol.driver.test_driver_firmware import application
 from xethru_protocol.driver.firmware import FirmwareImage
 from xethru_protocol.driver.radar import X4M300

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from hil_tests.device.serving import emulator
+from hil_tests.device.emulator_process import emulator
 from hil_tests.paths import FIXTURES
 
 pytestmark = pytest.mark.slow  # each run of pytest takes seconds to start on a busy machine

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from hil_tests.device.serving import emulator
+from hil_tests.device.emulator_process import emulator
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.recordings.messages import dumped, xethru
 from xethru_protocol.cli import main

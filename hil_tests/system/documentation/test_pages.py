@@ -41,7 +41,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from emulator import cli as emulator_cli
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.emulator_process import Served, emulator
 from hil_tests.paths import REPOSITORY
 from hil_tests.patience import seconds
 from hil_tests.system.documentation.markdown_blocks import Block, Prompt, blocks_of, prompts_of

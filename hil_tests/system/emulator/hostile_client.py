@@ -11,11 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from emulator.chip import Pace
-from emulator.device import Device, radar_device
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity
-from emulator.ports.server import Port, Server
+from emulator.ports.event_loop import Port, Server
 from emulator.scene.scene import empty_room
+from emulator.x4m300 import Device, radar_device
 from hil_tests.golden.vectors import load, load_hand_made
 from hil_tests.unit.emulator.doubles import PairLine
 from xethru_protocol.wire import messages as m

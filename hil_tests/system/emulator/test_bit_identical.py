@@ -9,12 +9,12 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.cli import ask
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import load_scene
-from hil_tests.device.serving import Served, emulator, open_radar
+from emulator.x4m300 import radar_device
+from hil_tests.device.emulator_process import Served, emulator, open_radar
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.x4 import real_frame_rate

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import emulator, open_radar
+from hil_tests.device.emulator_process import emulator, open_radar
 from hil_tests.patience import seconds, wait_until
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300

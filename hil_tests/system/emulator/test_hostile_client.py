@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.emulator_process import Served, emulator
 from hil_tests.patience import seconds
 from hil_tests.system.emulator import corrupted_traffic
 from hil_tests.system.emulator.corrupted_traffic import (

@@ -7,7 +7,7 @@ import pytest
 
 from emulator.loopback import LoopbackTransport
 from emulator.playback import played_radars
-from hil_tests.device.serving import Served, emulator, open_radar
+from hil_tests.device.emulator_process import Served, emulator, open_radar
 from hil_tests.paths import real_raw_recording, real_recording
 from xethru_protocol.cli import main
 from xethru_protocol.driver.link import RawConfig

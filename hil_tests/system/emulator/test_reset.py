@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import Served, emulator, open_radar
+from hil_tests.device.emulator_process import Served, emulator, open_radar
 from hil_tests.patience import seconds
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300

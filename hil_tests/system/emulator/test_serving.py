@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.bench.virtual_time import counters_of
-from hil_tests.device.serving import emulator, open_radar
+from hil_tests.device.emulator_process import emulator, open_radar
 from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds
 from hil_tests.unit.full_disk import child_on_full_disk

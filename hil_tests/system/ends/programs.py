@@ -33,7 +33,7 @@ from PIL import Image
 from rosbags.highlevel import AnyReader
 
 from emulator.scene.scene import load_scene
-from hil_tests.device.serving import emulator
+from hil_tests.device.emulator_process import emulator
 from hil_tests.patience import seconds
 from hil_tests.system.recorded_session import record_session, write_shorter_scene
 from hil_tests.system.short_scene import write_short_scene

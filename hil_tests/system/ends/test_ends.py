@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import open_radar
+from hil_tests.device.emulator_process import open_radar
 from hil_tests.system.ends.programs import (
     Ending,
     Stage,

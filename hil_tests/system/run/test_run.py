@@ -17,7 +17,7 @@ import pytest
 from mcap.reader import make_reader
 
 from emulator.scene.scene import load_scene
-from hil_tests.device.serving import emulator
+from hil_tests.device.emulator_process import emulator
 from hil_tests.paths import REPOSITORY
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.device.serving import emulator, open_radar
+from hil_tests.device.emulator_process import emulator, open_radar
 from hil_tests.patience import seconds
 from hil_tests.unit.emulator.test_playback_control import samples, write_session
 from xethru_protocol.driver.link import RawConfig

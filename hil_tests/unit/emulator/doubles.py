@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from emulator.chip import Pace
 from emulator.chip.chip import CaptureSettings, Chip
-from emulator.device import Device, radar_device
 from emulator.module.memory import Identity
 from emulator.module.settings import DeviceOptions
-from emulator.ports.server import Server
+from emulator.ports.event_loop import Server
+from emulator.x4m300 import Device, radar_device
 from hil_tests.patience import seconds
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from emulator import control, emulated_port
-from hil_tests.device.serving import emulator, open_radar
+from hil_tests.device.emulator_process import emulator, open_radar
 from xethru_protocol.wire.codes import PongCode
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import load_scene
+from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, ramp_device
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m

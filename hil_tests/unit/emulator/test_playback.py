@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from emulator.chip.chip import Chip
-from emulator.device import Device
 from emulator.loopback import LoopbackTransport
-from emulator.module.module import LosslessOutbox, Module
+from emulator.module.outbox import LosslessOutbox
+from emulator.module.state import Module
 from emulator.playback import PlayStream, played_radars, schedule
+from emulator.x4m300 import Device
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from hil_tests.unit.xethru_protocol.scripted import framed

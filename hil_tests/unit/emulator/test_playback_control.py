@@ -8,7 +8,7 @@ import pytest
 from mcap.writer import Writer
 
 from emulator.loopback import LoopbackTransport
-from emulator.module.module import LosslessOutbox
+from emulator.module.outbox import LosslessOutbox
 from emulator.playback import (
     NOMINAL_PERIOD_NS,
     QUIET_NS,

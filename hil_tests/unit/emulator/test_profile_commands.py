@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import Device, radar_device
 from emulator.module.settings import DeviceOptions
+from emulator.x4m300 import Device, radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, ProfileId, SensorMode

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity
 from emulator.module.settings import DeviceOptions
 from emulator.scene.scene import empty_room
+from emulator.x4m300 import radar_device
 from hil_tests.faulty import PATH, FaultyLine
 from hil_tests.plugin.cassette import (
     EMULATED,

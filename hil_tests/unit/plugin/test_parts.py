@@ -11,10 +11,11 @@ import pytest
 
 from hil_tests.plugin import power, radar_targets
 from hil_tests.plugin.bench import Bench, PortBusyError, PortLock
-from hil_tests.plugin.gate import Measure, findings_of, gate
+from hil_tests.plugin.findings import Measure, findings_of
 from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import TappedTransport, WireTap
+from hil_tests.plugin.requirements import gate
 
 
 def test_a_lock_is_for_one_process(tmp_path: Path) -> None:

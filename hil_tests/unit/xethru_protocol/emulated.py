@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from emulator.chip.chip import Chip
 from emulator.module.commands import answer
 from emulator.module.memory import FileKey, Identity
-from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions
+from emulator.module.state import Module
 from hil_tests.unit.emulator.doubles import RampSource
 from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from xethru_protocol.driver.radar import X4M300

@@ -19,7 +19,7 @@ import pytest
 import serial
 from serial import rfc2217
 
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.emulator_process import Served, emulator
 from hil_tests.patience import patient_ns, seconds, wait_until
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main

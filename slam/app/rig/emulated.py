@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from emulator import cli as emulator_cli
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
+from emulator.x4m300 import radar_device
 from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.files import rig_file_of

@@ -5,12 +5,12 @@ import math
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.module.settings import DeviceOptions
 from emulator.scene.scene import load_scene
+from emulator.x4m300 import radar_device
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from emulator.chip import Pace
 from emulator.chip.chip import EchoSource, ModuleClock
-from emulator.device import radar_device
 from emulator.echo.echo import SceneEcho, echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene
+from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from hil_tests.unit.emulator.rooms import PAPER, radar_at, room, target
 from xethru_protocol.driver.frames import Frame

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from emulator.echo.reflections import beam_gain
+from emulator.echo.paths import beam_gain
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M, MultipathSpec, WallSpec
 from hil_tests.unit.emulator.rooms import WAVENUMBER, Heard, box, heard, radar_at, target, wall
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import hilbert
 
 from emulator.echo.echo import SceneEcho, echo_source
-from emulator.echo.reflections import (
+from emulator.echo.paths import (
     BEAM_EXPONENT,
     beam_gain,
     direct_reflections,

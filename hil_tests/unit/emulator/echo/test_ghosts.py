@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from emulator.echo.reflections import beam_gain
+from emulator.echo.paths import beam_gain
 from emulator.scene.people import PersonSpec
 from emulator.scene.scene import MultipathSpec
 from hil_tests.unit.emulator.rooms import heard, radar_at, target, wall

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.echo.reflections import (
+from emulator.echo.pulse import (
     BANDWIDTH_HZ,
     CARRIER_CYCLES_PER_SAMPLE,
     HALF_WINDOW,

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from emulator.echo.reflections import BEAM_EXPONENT
+from emulator.echo.paths import BEAM_EXPONENT
 from emulator.echo.targets import Scintillation, Targets
 from emulator.scene.scene import AntennaSpec, HeightsSpec, ScintillationSpec, TargetSpec
 from hil_tests.unit.emulator.rooms import WAVELENGTH_M, WAVENUMBER, heard, radar_at, target, wall

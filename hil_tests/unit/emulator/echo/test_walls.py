@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from emulator.echo.reflections import BEAM_EXPONENT
+from emulator.echo.paths import BEAM_EXPONENT
 from emulator.echo.walls import edge_wave, faces_of, passing, past_edge
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M
 from hil_tests.unit.emulator.rooms import (

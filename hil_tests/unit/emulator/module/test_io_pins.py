@@ -2,7 +2,7 @@
 
 import pytest
 
-from emulator.module.module import MessageKind
+from emulator.module.outbox import MessageKind
 from hil_tests.unit.emulator.doubles import BareHost
 from xethru_protocol.wire import messages as m
 

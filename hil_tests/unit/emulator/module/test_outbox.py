@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from emulator.module.module import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream
+from emulator.module.outbox import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream
 from xethru_protocol.wire import messages as m
 
 SECOND = 1_000_000_000

@@ -4,8 +4,8 @@ import pytest
 
 from emulator.chip.chip import Chip
 from emulator.module.commands import HANDLERS, answer
-from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions
+from emulator.module.state import Module
 from hil_tests.golden.builders import message_of
 from hil_tests.golden.test_protocol_vectors import KNOWN
 from hil_tests.golden.vectors import Vector

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.ports import folders
 from emulator.ports.folders import Announcement, DirectoryMemory, fresh_port_folder
 from emulator.ports.pty import LinkError
+from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FORMAT_KEY, OutputFeature, SensorMode

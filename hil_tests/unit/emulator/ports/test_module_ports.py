@@ -17,11 +17,11 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.module.settings import DeviceOptions
+from emulator.ports.event_loop import Server
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.pty import LinkError
-from emulator.ports.server import Server
+from emulator.x4m300 import radar_device
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.emulator.doubles import IDENTITY, PortHost, RampSource, ramp_device
 from xethru_protocol.wire import messages as m

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.chip import Pace
-from emulator.device import Device
 from emulator.module.settings import received_bytes
+from emulator.ports.event_loop import Port
 from emulator.ports.lines import Line, UartLine, UsbLine
-from emulator.ports.server import Port
+from emulator.x4m300 import Device
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting

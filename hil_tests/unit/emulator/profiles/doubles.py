@@ -6,8 +6,8 @@ from typing import Any
 from emulator.chip import Pace
 from emulator.chip.chip import Chip, ModuleClock
 from emulator.echo.echo import SceneEcho
-from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions, ProfileSettings
+from emulator.module.state import Module
 from emulator.profiles.run import ProfileStream
 from emulator.scene.people import PersonSpec
 from emulator.scene.scene import LeakageSpec, NoiseSpec, Scene, empty_room

@@ -7,10 +7,10 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.chip.chip import ModuleClock
-from emulator.device import ChipStream, CombinedStream
 from emulator.module.modes import State
-from emulator.module.module import NOISE_MAPS
 from emulator.module.settings import ProfileSettings
+from emulator.module.state import NOISE_MAPS
+from emulator.x4m300 import ChipStream, CombinedStream
 from hil_tests.unit.emulator.profiles.doubles import (
     BIN_M,
     FRAME_HZ,

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from emulator.echo.paths import direct_reflections, viewpoint
 from emulator.echo.people import people_truth, person_scatterer
-from emulator.echo.reflections import direct_reflections, viewpoint
 from emulator.scene.motion import MoverSpec
 from emulator.scene.people import PersonSpec, SleepStage, facing_cosines, moves, positions_m
 from emulator.scene.scene import load_scene

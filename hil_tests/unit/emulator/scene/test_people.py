@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from emulator.echo.paths import direct_reflections, viewpoint
 from emulator.echo.people import person_scatterer
-from emulator.echo.reflections import direct_reflections, viewpoint
 from emulator.scene.people import PersonSpec, chest_displacement_m, positions_m
 from emulator.scene.scene import load_scene
 from hil_tests.unit.emulator.rooms import radar_at

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import empty_room, load_scene
+from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY
 from hil_tests.unit.xethru_protocol.recordings.messages import xethru
 from xethru_protocol.driver.link import RawConfig

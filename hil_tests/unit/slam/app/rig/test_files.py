@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import empty_room, load_scene
+from emulator.x4m300 import radar_device
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from slam.app.errors import AppError, UsageError

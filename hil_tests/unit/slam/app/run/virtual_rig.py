@@ -9,13 +9,13 @@ from queue import Empty
 import numpy as np
 
 from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.ports.sockets import stamp_ns
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
+from emulator.x4m300 import radar_device
 from slam.app.records import RadarInfo
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
 from slam.app.rig.sources import RadarLink, RigSource

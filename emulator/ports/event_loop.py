@@ -14,10 +14,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from emulator.device import ByteDevice
+from emulator.chip.chip import NS_PER_S
 from emulator.ports.lines import Line
+from emulator.x4m300 import ByteDevice
 
-NS_PER_S = 1_000_000_000
 PACKETS_PER_TURN = 8
 LONGEST_WAIT_S = 86400.0
 """The system waits no longer than 24 days; a playback at a small rate may ask for years."""

@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from emulator.device import COMMANDS_AT_ONCE, Device
 from emulator.module.commands import answer
-from emulator.module.module import Module
+from emulator.module.state import Module
+from emulator.ports.event_loop import PACKETS_PER_TURN, Port, Server
 from emulator.ports.pty import PtyLink
-from emulator.ports.server import PACKETS_PER_TURN, Port, Server
+from emulator.x4m300 import COMMANDS_AT_ONCE, Device
 from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import PairLine, PortHost, ramp_device
 from xethru_protocol.wire import messages as m
@@ -182,7 +182,7 @@ def test_a_flood_of_commands_is_carried_out_bit_by_bit(
         carried_out += 1
         return answer(module, command)
 
-    monkeypatch.setattr("emulator.device.answer", counted)
+    monkeypatch.setattr("emulator.x4m300.answer", counted)
     bench.turns(1)
     total = 300  # more than a thousand bytes, which are read at once
     os.write(noisy.fd, noisy.line.send(flood) * total)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hil_tests.plugin.bench import RadarUnderTest
-from hil_tests.plugin.gate import Findings, Measurement
+from hil_tests.plugin.findings import Findings, Measurement
 from hil_tests.plugin.radar_targets import Way, WireBytes, WireTap
 from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
 from xethru_protocol.wire.codec import describe, encode

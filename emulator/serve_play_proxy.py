@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from emulator.device import PortDevice, radar_device
 from emulator.echo.echo import echo_source
 from emulator.echo.people import people_truth
 from emulator.faults.faulty_device import FaultyDevice
@@ -20,6 +19,7 @@ from emulator.module.memory import Identity
 from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
 from emulator.playback import PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket, People
+from emulator.ports.event_loop import Server, Service
 from emulator.ports.folders import (
     Announcement,
     DirectoryMemory,
@@ -30,11 +30,11 @@ from emulator.ports.folders import (
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.proxy import ModuleLine
 from emulator.ports.pty import LinkError, PortWatch
-from emulator.ports.server import Server, Service
 from emulator.ports.sockets import OdometryFeed
 from emulator.ports.tcp import is_loopback
 from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
+from emulator.x4m300 import PortDevice, radar_device
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.system import STDOUT, StopFlag, json_text

@@ -19,17 +19,16 @@ from emulator.chip.chip import Chip, EchoSource, ModuleClock
 from emulator.module.commands import answer
 from emulator.module.memory import Identity, Memory
 from emulator.module.modes import STREAMING, Group, State, group_of
-from emulator.module.module import (
-    ACK_WAIT_NS,
+from emulator.module.outbox import (
     FirmwareOutbox,
     LosslessOutbox,
     MessageKind,
     MessageStream,
-    Module,
     Outbox,
     StreamBegin,
 )
 from emulator.module.settings import DeviceOptions
+from emulator.module.state import ACK_WAIT_NS, Module
 from emulator.profiles.run import ProfileStream
 from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.codes import SystemCode

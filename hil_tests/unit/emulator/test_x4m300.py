@@ -7,10 +7,10 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.chip.chip import ModuleClock
-from emulator.device import radar_device
 from emulator.module.memory import Identity
-from emulator.module.module import StreamBegin
+from emulator.module.outbox import StreamBegin
 from emulator.module.settings import DeviceOptions
+from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import (
     IDENTITY,
     BareHost,
