@@ -1,4 +1,4 @@
-"""Unix sockets beside the radars' ports: a listener with clients, and odometry over one."""
+"""Listening sockets; unix ones beside the radars' ports, and odometry over one."""
 
 from __future__ import annotations
 
@@ -49,7 +49,60 @@ class SocketClient:
     sent: int = 0
 
 
-class SocketService(Service):
+class Listener(Service):
+    """A listening socket, which rests while there are no descriptors for new clients."""
+
+    def __init__(self, listener: socket.socket) -> None:
+        listener.setblocking(False)
+        self._listener = listener
+        self._selector: selectors.BaseSelector | None = None
+        self._accept_again_ns: int | None = None
+
+    @abstractmethod
+    def _admit(self, connection: socket.socket, now_ns: int) -> None:
+        """Take a client, or hang up on it."""
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        self._selector = selector
+        self._listen()
+
+    def advance(self, now_ns: int) -> None:
+        if self._accept_again_ns is not None and now_ns >= self._accept_again_ns:
+            self._listen()
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        return self._accept_again_ns
+
+    def close(self) -> None:
+        self._selector = None  # the loop may be gone
+        self._listener.close()
+
+    def _listen(self) -> None:
+        self._accept_again_ns = None
+        if self._selector is not None:
+            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+
+    def _accept(self, events: int, now_ns: int) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError as error:
+            if error.errno in _EXHAUSTED and self._selector is not None:
+                # the client stays in the backlog, so the listener would be ready all the time
+                self._selector.unregister(self._listener)
+                self._accept_again_ns = now_ns + RETRY_NS
+            return  # or the client gave up between the event and now
+        connection.setblocking(False)
+        self._admit(connection, now_ns)
+
+    def _hang_up(self, connection: socket.socket) -> None:
+        if self._selector is not None:
+            wait_for(self._selector, connection.fileno(), 0)
+        connection.close()
+        if self._accept_again_ns is not None:
+            self._listen()  # a descriptor came free
+
+
+class SocketService(Listener):
     """A listening unix socket.
 
     Parameters
@@ -71,9 +124,7 @@ class SocketService(Service):
         self.path = path
         self._most_clients = most_clients
         self._clients: list[SocketClient] = []
-        self._selector: selectors.BaseSelector | None = None
-        self._accept_again_ns: int | None = None
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        super().__init__(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
         try:
             with contextlib.suppress(FileNotFoundError):
                 if stat.S_ISSOCK(path.lstat().st_mode):
@@ -83,7 +134,6 @@ class SocketService(Service):
             if private:
                 path.chmod(0o600)
             self._listener.listen()
-            self._listener.setblocking(False)
         except OSError as error:
             self._listener.close()
             reason = error.strerror or str(error)
@@ -93,42 +143,17 @@ class SocketService(Service):
     def _ready(self, client: SocketClient, events: int, now_ns: int) -> None:
         """Read from a client, or write to it; ``events`` is 0 for one that has just come."""
 
-    def register(self, selector: selectors.BaseSelector) -> None:
-        self._selector = selector
-        self._listen()
-
-    def advance(self, now_ns: int) -> None:
-        if self._accept_again_ns is not None and now_ns >= self._accept_again_ns:
-            self._listen()
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        return self._accept_again_ns
-
     def close(self) -> None:
-        """Close everything and remove the socket if it is still ours; the loop may be gone."""
+        """Close everything and remove the socket if it is still ours."""
         self._selector = None
         for client in list(self._clients):
             self._drop(client)
         with contextlib.suppress(OSError):
             if _identity(self.path) == self._identity:  # else another emulator took the path over
                 self.path.unlink()
-        self._listener.close()
+        super().close()
 
-    def _listen(self) -> None:
-        self._accept_again_ns = None
-        if self._selector is not None:
-            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
-
-    def _accept(self, events: int, now_ns: int) -> None:
-        try:
-            connection, _ = self._listener.accept()
-        except OSError as error:
-            if error.errno in _EXHAUSTED and self._selector is not None:
-                # the client stays in the backlog, so the listener would be ready all the time
-                self._selector.unregister(self._listener)
-                self._accept_again_ns = now_ns + RETRY_NS
-            return  # or the client gave up between the event and now
-        connection.setblocking(False)
+    def _admit(self, connection: socket.socket, now_ns: int) -> None:
         if len(self._clients) >= self._most_clients:
             connection.close()
             return
@@ -157,12 +182,8 @@ class SocketService(Service):
             )
 
     def _drop(self, client: SocketClient) -> None:
-        if self._selector is not None:
-            wait_for(self._selector, client.connection.fileno(), 0)
-        client.connection.close()
         self._clients.remove(client)
-        if self._accept_again_ns is not None:
-            self._listen()  # a descriptor came free
+        self._hang_up(client.connection)
 
 
 def _identity(path: Path) -> tuple[int, int]:

@@ -5,20 +5,16 @@ A client that comes while another one has the module is hung up on at once.
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import ipaddress
 import os
-import selectors
 import socket
 from collections.abc import Callable
 
-from emulator.ports.event_loop import Service, wait_for
 from emulator.ports.pty import LARGEST_READ, LinkError
+from emulator.ports.sockets import Listener
 
 BACKLOG = 16
 LAST_PORT = 65535
-_NO_DESCRIPTOR = frozenset({errno.EMFILE, errno.ENFILE})
 
 
 def is_loopback(host: str) -> bool:
@@ -37,7 +33,7 @@ def is_loopback(host: str) -> bool:
         return False  # a name may lead anywhere
 
 
-class TcpLink(Service):
+class TcpLink(Listener):
     """A listening socket and its one client: a line and a service of the loop.
 
     Parameters
@@ -60,28 +56,19 @@ class TcpLink(Service):
 
     def __init__(self, host: str, port: int, *, admits: Callable[[], bool]) -> None:
         self._admits = admits
-        self._selector: selectors.BaseSelector | None = None
         self._client: socket.socket | None = None
         if port > LAST_PORT:
             raise LinkError(f"{host}:{port}: cannot listen: ports end at {LAST_PORT}; lower --tcp")
         try:
             family, _, _, _, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
-            self._listener = socket.create_server(
-                (address[0], port), family=family, backlog=BACKLOG
-            )
+            listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)
         except (OSError, UnicodeError) as error:  # the latter of a name that no host can have
             raise LinkError(
                 f"{host}:{port}: cannot listen: {_reason(error)}; "
                 "choose another --tcp or --tcp-host"
             ) from error
-        self._listener.setblocking(False)
-        self.port: int = self._listener.getsockname()[1]
-        # given up for a moment to hang up on a client when descriptors have run out
-        self._spare_fd = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
-
-    def register(self, selector: selectors.BaseSelector) -> None:
-        self._selector = selector
-        selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        super().__init__(listener)
+        self.port: int = listener.getsockname()[1]
 
     def fileno(self) -> int:
         return -1 if self._client is None else self._client.fileno()
@@ -113,45 +100,21 @@ class TcpLink(Service):
 
     def hang_up(self) -> None:
         client, self._client = self._client, None
-        if client is None:
-            return
-        if self._selector is not None:
-            wait_for(self._selector, client.fileno(), 0)
-        client.close()
+        if client is not None:
+            self._hang_up(client)
 
     def close(self) -> None:
-        self._selector = None
+        self._selector = None  # the loop may be gone
         self.hang_up()
-        self._listener.close()
-        if self._spare_fd >= 0:
-            os.close(self._spare_fd)
-            self._spare_fd = -1
+        super().close()
 
-    def _accept(self, events: int, now_ns: int) -> None:
-        try:
-            client, _ = self._listener.accept()
-        except OSError as error:
-            if error.errno in _NO_DESCRIPTOR:
-                self._refuse_client()
-            return  # else it left again before it was let in
+    def _admit(self, connection: socket.socket, now_ns: int) -> None:
         if self._client is not None or not self._admits():
-            client.close()
+            connection.close()
             return
-        client.setblocking(False)
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self._client = client
-
-    def _refuse_client(self) -> None:
-        """Hang up on a waiting client without a descriptor for it, which would wake us for ever."""
-        if self._spare_fd < 0:
-            return
-        os.close(self._spare_fd)
-        self._spare_fd = -1
-        with contextlib.suppress(OSError):
-            self._listener.accept()[0].close()
-        with contextlib.suppress(OSError):
-            self._spare_fd = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._client = connection
 
 
 def _reason(error: OSError | UnicodeError) -> str:
