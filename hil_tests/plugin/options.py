@@ -96,7 +96,8 @@ def add_options(parser: pytest.Parser) -> None:
 
 def choose(config: pytest.Config) -> Choices:
     """Read and check the options; `pytest.UsageError` if they make no sense."""
-    rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
+    rig = _setting(config, "rig", RIG_ENVIRONMENT, RIG_INI)
+    power = _setting(config, "hil_power_cmd", POWER_ENVIRONMENT, POWER_INI)
     worker: dict[str, list[str]] = getattr(config, "workerinput", {})
     try:
         chosen = (
@@ -121,21 +122,20 @@ def choose(config: pytest.Config) -> Choices:
         specs=specs,
         chosen=bool(chosen),
         rig=Path(rig) if rig else None,
-        power=_power(config),
+        power=_power_command(power) if power else None,
         cassette=Path(cassette) if cassette else None,
         artifacts=Path(config.invocation_params.dir, config.getoption("hil_artifacts")),
         json=Path(config.invocation_params.dir, report) if report else None,
     )
 
 
-def _power(config: pytest.Config) -> PowerCommand | None:
-    text = (
-        config.getoption("hil_power_cmd")
-        or os.environ.get(POWER_ENVIRONMENT)
-        or config.getini(POWER_INI)
-    )
+def _setting(config: pytest.Config, option: str, environment: str, ini: str) -> str:
+    return str(config.getoption(option) or os.environ.get(environment) or config.getini(ini))
+
+
+def _power_command(text: str) -> PowerCommand:
     try:
-        return PowerCommand(text) if text else None
+        return PowerCommand(text)
     except PowerError as error:
         raise pytest.UsageError(f"--hil-power-cmd {error}") from None
 
