@@ -120,13 +120,6 @@ def test_extra_bytes_are_ignored(host: BareHost) -> None:
     )
 
 
-def test_a_bad_checksum_is_not_answered(host: BareHost) -> None:
-    host.device.receive_data(bytes.fromhex("7D 26 00 7E"), 0)
-    assert host.hear() == []
-    assert mode_of(host) == 0x01
-    assert host.device.faults_seen == 1
-
-
 def test_a_burst_goes_to_one_register(host: BareHost) -> None:
     """4.9, SPI bursts: the address is sent once, and every byte belongs to it."""
     assert host.ask(m.X4DriverWrite(address=0x14, values=b"\x01\x02\x03")) == m.Ack()
@@ -291,13 +284,6 @@ def test_reset_acks_goes_deaf_and_comes_back_stopped(host: BareHost) -> None:
     assert count.values == (1467,), "X4 settings are never saved"
 
 
-def test_reset_of_a_running_module_restores_its_profile(host: BareHost) -> None:
-    host.ask(m.ModReset())
-    assert len(host.at(3 * SECOND)) == 2  # before the profile's first message
-    assert mode_of(host) == 0x01
-    assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_2,))
-
-
 @pytest.mark.parametrize("restart", ["reset", "power"])
 def test_a_module_whose_profile_was_loaded_but_not_run_starts_stopped(
     host: BareHost, restart: str
@@ -346,13 +332,6 @@ def test_frames_that_wait_hold_no_command_back() -> None:
     assert host.device.wants_data
     host.send(m.Ping())
     assert m.Pong(value=0xAAEEAEEA) in host.hear()
-
-
-def test_what_waits_is_lost_by_a_reset(host: BareHost) -> None:
-    host.send(m.ModReset())
-    host.send(m.Ping())
-    # before the profile's first message
-    assert host.at(3 * SECOND) == [m.System(code=0x10), m.System(code=0x11)]
 
 
 def test_a_second_reset_does_not_postpone_the_first(host: BareHost) -> None:
@@ -459,19 +438,6 @@ def test_a_stream_after_a_reset_begins_with_the_first_frame_ahead() -> None:
         host.at(now_ns)
     host.set(X4Setting.FPS, 50.0)
     assert len(host.at(host.now_ns + SECOND // 50)) == 1, "and not what a second before it missed"
-
-
-def test_realtime_frames_equal_asap_frames() -> None:
-    asap, realtime = BareHost(ramp_device()), BareHost(ramp_device(Pace.REALTIME))
-    for host in (asap, realtime):
-        host.stream(200.0)
-    wanted = {frame.info: frame for frame in asap.frames(400)}
-    got = []
-    for step in range(1, 60):  # an uneven loop
-        heard = realtime.at(realtime.now_ns + step * 1_000_000)
-        got += [message for message in heard if isinstance(message, m.DataFloat)]
-    assert len(got) > 200
-    assert all(frame == wanted[frame.info] for frame in got if frame.info in wanted)
 
 
 def test_realtime_overflow_shows_as_counter_gaps_and_commands_still_work() -> None:

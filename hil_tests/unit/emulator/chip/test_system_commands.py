@@ -157,16 +157,6 @@ def test_ten_faults_in_a_row_start_safe_mode(host: BareHost) -> None:
     assert host.ask(m.Ping()) == READY
 
 
-def test_more_than_fifteen_faults_end_in_the_bootloader(host: BareHost) -> None:
-    crash(host, 15)
-    assert host.hear(2) == BOOTED
-    assert host.ask(m.Ping()) == SAFE
-    crash(host, 1)
-    host.send(m.Ping())
-    assert host.hear() == []
-    assert b"fault 16 in a row" in (host.device.module.files.get((0x04554D50, 0)) or b"")
-
-
 @pytest.mark.parametrize(("pause_s", "pong"), [(290, SAFE), (301, READY)])
 def test_five_minutes_without_fault_clear_the_count(
     host: BareHost, pause_s: float, pong: m.Pong
