@@ -49,12 +49,26 @@ def emulated_port(scene: str | Path | None = None, *options: str) -> Iterator[st
         If the emulator does not start; it has written the reason to stderr.
     """
     what = "--bare" if scene is None else os.fspath(scene)
+    with running("serve", what, *options) as (_, ready):
+        yield ready["devices"][0]["path"]
+
+
+@contextmanager
+def running(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
+    """Run ``xethru-emulator`` until the block ends; yield its process and its ready line.
+
+    Raises
+    ------
+    RuntimeError
+        If it does not start; it has written the reason to stderr.
+    """
     # -P: a folder "emulator" where the user happens to stand must not come first
-    command = [sys.executable, "-P", "-m", "emulator.cli", "serve", what, *options]
+    command = [sys.executable, "-P", "-m", "emulator.cli", *map(str, arguments)]
     with subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
+        text=True,
         process_group=0,  # Ctrl-C ends the block, which stops the module before it goes away
         preexec_fn=signal_at_parents_death(signal.SIGTERM),
     ) as process:
@@ -63,7 +77,7 @@ def emulated_port(scene: str | Path | None = None, *options: str) -> Iterator[st
             ready = process.stdout.readline()
             if not ready:
                 raise RuntimeError(f"the emulator did not start: exit code {process.wait()}")
-            yield json.loads(ready)["devices"][0]["path"]
+            yield process, json.loads(ready)
         finally:
             process.terminate()
             try:

@@ -1,17 +1,15 @@
 """`xethru-emulator` as a process of its own, for tests that go through real ports."""
 
-import json
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from emulator import running
 from hil_tests.patience import patient_ns, seconds
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import signal_at_parents_death
 
 END_LIMIT_S = seconds(10)
 
@@ -40,19 +38,7 @@ def open_radar(path: str, reconnect_s: float = 0.0) -> X4M300:
 @contextmanager
 def emulator(*arguments: str | Path) -> Iterator[Served]:
     """Run ``xethru-emulator`` until the block ends; stderr goes to the test's."""
-    process = subprocess.Popen(
-        # -P: a package "emulator" of the project that is tested must not come first
-        [sys.executable, "-P", "-m", "emulator.cli", *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        text=True,
-        # a test session that is killed leaves no emulator behind
-        preexec_fn=signal_at_parents_death(signal.SIGTERM),
-    )
-    assert process.stdout is not None
-    try:
-        line = process.stdout.readline()
-        assert line, f"no ready line; exit code {process.wait(END_LIMIT_S)}"
-        ready = json.loads(line)
+    with running(*arguments) as (process, ready):
         assert ready["ready"] is True
         devices = ready["devices"]
         yield Served(
@@ -65,7 +51,3 @@ def emulator(*arguments: str | Path) -> Iterator[Served]:
             control=ready["control"],
             tcp_ports=tuple(device["tcp"] for device in devices),
         )
-    finally:
-        process.kill()
-        process.wait(END_LIMIT_S)
-        process.stdout.close()

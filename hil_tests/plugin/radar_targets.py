@@ -317,8 +317,8 @@ class ProcessTarget(RadarTarget):
             self._served: Served = self._cleanup.enter_context(emulator(*arguments))
             self._index = _index_of(spec, self._served.names)
             self.scene_text = None if played else _scene_text(spec)
-        except AssertionError as error:
-            raise TargetError(f"--radar {spec.text}: the emulator did not start: {error}") from None
+        except RuntimeError as error:
+            raise TargetError(f"--radar {spec.text}: {error}") from None
         except TargetError:
             self._cleanup.close()
             raise
