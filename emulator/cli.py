@@ -31,7 +31,7 @@ from xethru_protocol.system import (
 from xethru_protocol.validation import number, shown
 
 if TYPE_CHECKING:
-    from emulator.faults.kind import Kind
+    from emulator.faults.kind import KindOfFault
 
 TIMEOUT_S = 10.0
 _INTERRUPTED = 130
@@ -132,7 +132,7 @@ def _list(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _text(kind: Kind, *, full: bool) -> str:
+def _text(kind: KindOfFault, *, full: bool) -> str:
     from emulator.faults.plan import described
 
     row = described(kind)

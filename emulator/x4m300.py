@@ -18,7 +18,7 @@ from emulator.chip import Pace
 from emulator.chip.chip import Chip, EchoSource, ModuleClock
 from emulator.module.commands import answer
 from emulator.module.memory import Identity, Memory
-from emulator.module.modes import STREAMING, Group, State, group_of
+from emulator.module.modes import STREAMING, Group, ModuleState, group_of
 from emulator.module.outbox import (
     FirmwareOutbox,
     LosslessOutbox,
@@ -316,7 +316,7 @@ class Device:
         self.advance(now_ns)
         if not self.listens:
             return
-        if self.module.state is State.BOOTLOADER:
+        if self.module.state is ModuleState.BOOTLOADER:
             for payload in self.module.receive_in_bootloader(data):
                 self._outbox.put(MessageKind.REPLY, decode_response(payload), now_ns)
             self._plan_restart(now_ns)
@@ -377,7 +377,7 @@ class Device:
             self._restart(self._reset_ns)
         if self._ready_ns is not None and now_ns >= self._ready_ns:
             self._ready_ns = None
-            if self.module.state is not State.BOOTLOADER:
+            if self.module.state is not ModuleState.BOOTLOADER:
                 for code in (SystemCode.XTS_SPRS_BOOTING, SystemCode.XTS_SPRS_READY):
                     self._outbox.put(MessageKind.REPLY, System(code=code), now_ns)
         if self._held is not None and now_ns >= self._held[0]:
@@ -405,7 +405,7 @@ class Device:
 
     @property
     def _sends(self) -> bool:
-        return not self.module.asleep and self.module.state is not State.BOOTLOADER
+        return not self.module.asleep and self.module.state is not ModuleState.BOOTLOADER
 
     def next_packet(self, now_ns: int) -> bytes | None:
         """Return the next packet for the line, complete; None if there is nothing to send now."""

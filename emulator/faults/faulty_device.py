@@ -19,7 +19,7 @@ from emulator.faults.kind import (
     Action,
     CommandEffect,
     Context,
-    Kind,
+    KindOfFault,
     MomentEffect,
     PacketClass,
     PacketEffect,
@@ -101,7 +101,7 @@ class Armed:
     def __init__(self, number: int, spec: FaultSpec, radar: str, seed: int) -> None:
         self.number = number
         self.spec = spec
-        self.kind: Kind = spec.row
+        self.kind: KindOfFault = spec.row
         self.parameters: Parameters = spec.kind_parameters()
         stream = zlib.crc32(radar.encode()) << 32 | number
         self.rng = Rng(seed if spec.seed is None else spec.seed, stream)

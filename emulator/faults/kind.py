@@ -36,7 +36,7 @@ from xethru_protocol.wire.framing import (
 )
 from xethru_protocol.wire.messages import Command, Response
 
-Samples = NDArray[np.float32]
+RfSamples = NDArray[np.float32]
 
 _FRAME = struct.Struct("<4sIxBBIII")
 _PAYLOAD = struct.Struct("<BBIII")
@@ -93,12 +93,12 @@ def frame_counter(packet: bytes) -> int | None:
     return counter if is_frame else None
 
 
-def frame_samples(packet: bytes) -> Samples:
+def frame_samples(packet: bytes) -> RfSamples:
     """Return the samples of a radar frame, shape (n,), read-only."""
     return np.frombuffer(packet, "<f4", offset=_FRAME.size)
 
 
-def frame_packet(counter: int, samples: Samples) -> bytes:
+def frame_packet(counter: int, samples: RfSamples) -> bytes:
     """Return a radar frame in NoEscape framing; the counter wraps at 2**32."""
     head = _PAYLOAD.pack(
         ResponseCode.XTS_SPR_DATA,
@@ -257,7 +257,7 @@ Effect = PacketEffect | CommandEffect | MomentEffect
 EffectT = TypeVar("EffectT", bound=Callable[..., Any])
 
 
-def changed_frame(packet: bytes, change: Callable[[Samples], Samples | None]) -> Pieces:
+def changed_frame(packet: bytes, change: Callable[[RfSamples], RfSamples | None]) -> Pieces:
     """Return a radar frame with other samples.
 
     None for anything else, for a frame without samples, and if ``change`` returns None.
@@ -270,7 +270,7 @@ def changed_frame(packet: bytes, change: Callable[[Samples], Samples | None]) ->
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
+class KindOfFault:
     """One row of the catalogue.
 
     Attributes
@@ -296,12 +296,12 @@ class Kind:
     hidden: str
 
 
-ENTERED: list[Kind] = []
+ENTERED: list[KindOfFault] = []
 """All kinds; `emulator.faults.kinds` puts them in order."""
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class Catalogued:
     """Enters effects of one layer that wait for the same into the catalogue, as a decorator.
 
     An effect's name and the first line of its docstring describe the kind.
@@ -319,7 +319,7 @@ class Entry:
         hidden: str = "",
     ) -> Callable[[EffectT], EffectT]:
         def enter(effect: EffectT) -> EffectT:
-            row = Kind(
+            row = KindOfFault(
                 name=effect.__name__,
                 layer=self.layer,
                 target=self.target,

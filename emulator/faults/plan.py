@@ -40,7 +40,7 @@ from pydantic import (
     model_validator,
 )
 
-from emulator.faults.kind import Kind, Parameters, Target
+from emulator.faults.kind import KindOfFault, Parameters, Target
 from emulator.faults.kinds import KINDS
 from emulator.scene.tables import Table, finite, load_table
 from xethru_protocol.validation import problem_text, shown
@@ -58,7 +58,7 @@ _LIMITS = {
 _COMMANDS = frozenset(row.name for message, row in ROWS.items() if issubclass(message, Command))
 
 
-def described(kind: Kind) -> dict[str, Any]:
+def described(kind: KindOfFault) -> dict[str, Any]:
     """Return a kind as JSON-able values: what it does, its parameters, what is counted."""
     schema = kind.parameters.model_json_schema()
     return {
@@ -76,7 +76,7 @@ def described(kind: Kind) -> dict[str, Any]:
     }
 
 
-def example(kind: Kind) -> str:
+def example(kind: KindOfFault) -> str:
     parameters = kind.parameters().model_dump(exclude_none=True)
     lines = ["[[fault]]", f'kind = "{kind.name}"', "at_s = 2.0"]
     if parameters:
@@ -173,7 +173,7 @@ class FaultSpec(Table):
         return self
 
     @property
-    def row(self) -> Kind:
+    def row(self) -> KindOfFault:
         return KINDS[self.kind]
 
     def kind_parameters(self) -> Parameters:

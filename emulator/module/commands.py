@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from emulator.chip.chip import Refusal, Silence
 from emulator.module.memory import FileKey
-from emulator.module.modes import Group, State, check_permission, group_of
+from emulator.module.modes import Group, ModuleState, check_permission, group_of
 from emulator.module.settings import ZONE_LIMITS_M
 from emulator.module.state import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
 from xethru_protocol.wire import messages as m
@@ -200,7 +200,7 @@ def answers(command: type[m.Command[Any]]) -> Callable[[HandlerT], HandlerT]:
 
 @answers(m.Ping)
 def _ping(module: Module, command: m.Ping) -> m.Response:
-    safe = module.state is State.SAFE and versions.SAFE_MODE_PONG.is_in(module.firmware)
+    safe = module.state is ModuleState.SAFE and versions.SAFE_MODE_PONG.is_in(module.firmware)
     return m.Pong(value=PongCode.XTS_SPRP_SAFEMODE if safe else PongCode.XTS_SPRP_READY)
 
 
@@ -228,7 +228,7 @@ def _set_mode(module: Module, command: m.SetMode) -> None:
     if stops_nothing and not versions.STOP_WITHOUT_PROFILE.is_in(module.firmware):
         raise Silence
     entered = module.state is not before
-    if entered and module.state is State.MANUAL and options.manual_settings == "init":
+    if entered and module.state is ModuleState.MANUAL and options.manual_settings == "init":
         module.chip.init()
     module.trace(TraceLevel.INFO, f"Mode {SensorMode(command.mode).label}.")
 
@@ -485,7 +485,7 @@ def answer(module: Module, command: m.Message) -> m.Response | None:
         if any(not row.is_in(module.firmware) for row in versions.needed_by(command)):
             return m.Error(code=ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
         if (
-            module.state is State.RUN
+            module.state is ModuleState.RUN
             and group_of(command) is Group.PROFILE_SET
             and not versions.SETTINGS_WHILE_RUNNING.is_in(module.firmware)
         ):

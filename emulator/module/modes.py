@@ -22,7 +22,7 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import ErrorCode, ProfileId, SensorMode
 
 
-class State(Enum):
+class ModuleState(Enum):
     """What a module is doing, as far as commands can tell."""
 
     RUN = "profile runs"
@@ -48,26 +48,26 @@ class Request(Enum):
 
 
 _ANYWHERE = {
-    Request.STOP: State.STOPPED,
-    Request.LOAD: State.LOADED,
-    Request.REG: State.REG,
+    Request.STOP: ModuleState.STOPPED,
+    Request.LOAD: ModuleState.LOADED,
+    Request.REG: ModuleState.REG,
 }
-_WITH_PROFILE = {Request.RUN: State.RUN, Request.IDLE: State.IDLE}
-_RAW = {Request.MANUAL: State.MANUAL}
+_WITH_PROFILE = {Request.RUN: ModuleState.RUN, Request.IDLE: ModuleState.IDLE}
+_RAW = {Request.MANUAL: ModuleState.MANUAL}
 
-TRANSITIONS: dict[State, dict[Request, State]] = {
-    State.RUN: _ANYWHERE | _WITH_PROFILE | _RAW,
-    State.IDLE: _ANYWHERE | _WITH_PROFILE | _RAW,
-    State.LOADED: _ANYWHERE | _WITH_PROFILE | _RAW,
-    State.STOPPED: _ANYWHERE | _RAW,
-    State.MANUAL: _ANYWHERE | _RAW,
-    State.REG: _ANYWHERE | _RAW,
+TRANSITIONS: dict[ModuleState, dict[Request, ModuleState]] = {
+    ModuleState.RUN: _ANYWHERE | _WITH_PROFILE | _RAW,
+    ModuleState.IDLE: _ANYWHERE | _WITH_PROFILE | _RAW,
+    ModuleState.LOADED: _ANYWHERE | _WITH_PROFILE | _RAW,
+    ModuleState.STOPPED: _ANYWHERE | _RAW,
+    ModuleState.MANUAL: _ANYWHERE | _RAW,
+    ModuleState.REG: _ANYWHERE | _RAW,
 }
 """The machine of the sensor firmware; without a profile, RUN and IDLE are refused.
 
 The other states know no modes.
 """
-JUMPS = frozenset({(State.RUN, Request.MANUAL), (State.IDLE, Request.MANUAL)})
+JUMPS = frozenset({(ModuleState.RUN, Request.MANUAL), (ModuleState.IDLE, Request.MANUAL)})
 """Steps that option run_to_manual may refuse."""
 
 _REQUESTS: dict[int, Request] = {
@@ -77,17 +77,17 @@ _REQUESTS: dict[int, Request] = {
     SensorMode.XTID_SM_STOP: Request.STOP,
     SensorMode.XTID_SM_REG: Request.REG,
 }
-_MODES: dict[State, SensorMode] = {
-    State.RUN: SensorMode.XTID_SM_RUN,
-    State.IDLE: SensorMode.XTID_SM_IDLE,
-    State.LOADED: SensorMode.XTID_SM_STOP,
-    State.STOPPED: SensorMode.XTID_SM_STOP,
-    State.MANUAL: SensorMode.XTID_SM_MANUAL,
-    State.REG: SensorMode.XTID_SM_REG,
+_MODES: dict[ModuleState, SensorMode] = {
+    ModuleState.RUN: SensorMode.XTID_SM_RUN,
+    ModuleState.IDLE: SensorMode.XTID_SM_IDLE,
+    ModuleState.LOADED: SensorMode.XTID_SM_STOP,
+    ModuleState.STOPPED: SensorMode.XTID_SM_STOP,
+    ModuleState.MANUAL: SensorMode.XTID_SM_MANUAL,
+    ModuleState.REG: SensorMode.XTID_SM_REG,
     # without modes a module streams its radar frames, as in MANUAL
-    State.XEP: SensorMode.XTID_SM_MANUAL,
-    State.SAFE: SensorMode.XTID_SM_MANUAL,
-    State.BOOTLOADER: SensorMode.XTID_SM_STOP,
+    ModuleState.XEP: SensorMode.XTID_SM_MANUAL,
+    ModuleState.SAFE: SensorMode.XTID_SM_MANUAL,
+    ModuleState.BOOTLOADER: SensorMode.XTID_SM_STOP,
 }
 
 
@@ -102,7 +102,7 @@ class Start:
     The default is a stock X4M300, whose profile runs.
     """
 
-    state: State = State.RUN
+    state: ModuleState = ModuleState.RUN
     profile_id: int = int(ProfileId.XTS_ID_APP_PRESENCE_2)
 
 
@@ -118,10 +118,10 @@ class ModeMachine:
     def mode(self) -> SensorMode:
         return _MODES[self.state]
 
-    def power_up(self, into: State | None) -> None:
+    def power_up(self, into: ModuleState | None) -> None:
         """Enter a state after a restart; None for the one that the start asks for."""
         self.state = into or self.start.state
-        loaded = self.state in (State.RUN, State.LOADED)
+        loaded = self.state in (ModuleState.RUN, ModuleState.LOADED)
         self.profile_id = self.start.profile_id if loaded else int(ProfileId.XTS_ID_APP_NONE)
 
     def set_mode(self, mode: int) -> None:
@@ -130,11 +130,11 @@ class ModeMachine:
         if request is None:
             raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
         self._enter(request)
-        if self.state is State.RUN:
-            self.start = Start(state=State.RUN, profile_id=self.profile_id)
+        if self.state is ModuleState.RUN:
+            self.start = Start(state=ModuleState.RUN, profile_id=self.profile_id)
         elif request is Request.STOP:
-            self.start = Start(state=State.STOPPED, profile_id=self.start.profile_id)
-        if self.state not in (State.RUN, State.IDLE):
+            self.start = Start(state=ModuleState.STOPPED, profile_id=self.start.profile_id)
+        if self.state not in (ModuleState.RUN, ModuleState.IDLE):
             self.profile_id = int(ProfileId.XTS_ID_APP_NONE)
 
     def load_profile(self, profile_id: int) -> None:
@@ -143,19 +143,19 @@ class ModeMachine:
             raise Refusal(ErrorCode.XTS_SPRE_APP_INVALID)
         self._enter(Request.LOAD)
         self.profile_id = profile_id
-        self.start = Start(state=State.STOPPED, profile_id=self.start.profile_id)
+        self.start = Start(state=ModuleState.STOPPED, profile_id=self.start.profile_id)
 
     def switches_profile(self, mode: int) -> bool:
         """Whether a SETMODE would run another profile than the last one."""
         return (
             mode == SensorMode.XTID_SM_RUN
-            and self.state is State.LOADED
+            and self.state is ModuleState.LOADED
             and self.profile_id != self.start.profile_id
         )
 
     def restart_with_profile(self) -> None:
         """Let the next power-up find the loaded profile loaded."""
-        self.start = Start(state=State.LOADED, profile_id=self.profile_id)
+        self.start = Start(state=ModuleState.LOADED, profile_id=self.profile_id)
 
     def _enter(self, request: Request) -> None:
         target = TRANSITIONS[self.state].get(request)
@@ -218,15 +218,15 @@ class Verdict(Enum):
 _OK, _UNKNOWN, _NO_ANSWER = Verdict.TAKEN, Verdict.UNKNOWN, Verdict.NO_ANSWER
 _BUSY, _NONE, _QUIET = Verdict.BUSY_PROFILE, Verdict.NO_PROFILE, Verdict.QUIET
 _ORDER = (
-    State.RUN,
-    State.IDLE,
-    State.LOADED,
-    State.STOPPED,
-    State.MANUAL,
-    State.REG,
-    State.SAFE,
-    State.XEP,
-    State.BOOTLOADER,
+    ModuleState.RUN,
+    ModuleState.IDLE,
+    ModuleState.LOADED,
+    ModuleState.STOPPED,
+    ModuleState.MANUAL,
+    ModuleState.REG,
+    ModuleState.SAFE,
+    ModuleState.XEP,
+    ModuleState.BOOTLOADER,
 )
 _FIRMWARE_LACKS = (_UNKNOWN, _UNKNOWN, _NO_ANSWER)
 _EVERYWHERE = (_OK,) * 8 + (_NO_ANSWER,)
@@ -250,7 +250,7 @@ _ROWS: dict[Group, tuple[Verdict, ...]] = {
 }
 # fmt: on
 
-PERMISSIONS: dict[Group, dict[State, Verdict]] = {
+PERMISSIONS: dict[Group, dict[ModuleState, Verdict]] = {
     group: dict(zip(_ORDER, verdicts, strict=True)) for group, verdicts in _ROWS.items()
 }
 """The table, by group and state."""
@@ -320,7 +320,7 @@ def group_of(command: m.Message) -> Group:
     return GROUPS.get(type(command), Group.BASIC)
 
 
-def check_permission(command: m.Message, state: State, options: DeviceOptions) -> None:
+def check_permission(command: m.Message, state: ModuleState, options: DeviceOptions) -> None:
     """Raise `Refusal` or `Silence` if a command is not taken in a state."""
     verdict = PERMISSIONS[group_of(command)][state]
     if verdict is Verdict.TAKEN:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from emulator.chip.chip import NS_PER_S, Chip, Refusal
 from emulator.module.bootloader import PAGE_COUNT, SMALL_PAGE_COUNT, Bootloader
 from emulator.module.memory import ERASED, FileSystem, Identity, Memory, SavedState, StoredFile
-from emulator.module.modes import ModeMachine, Start, State
+from emulator.module.modes import ModeMachine, ModuleState, Start
 from emulator.module.pins import IoPins
 from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
 from xethru_protocol.wire import messages as m
@@ -131,7 +131,7 @@ class Module:
         self._memory = memory
         saved = (None if memory is None else memory.load()) or _as_shipped(identity, self.options)
         self._saved_profiles = {one.profile_id: one for one in saved.profiles}
-        start = Start(state=State[saved.start], profile_id=saved.profile_id)
+        start = Start(state=ModuleState[saved.start], profile_id=saved.profile_id)
         if start.profile_id not in self.options.profiles:  # of another model
             start = Start(profile_id=int(self.options.shipped_profile))
         self.modes = ModeMachine(self.options, start)
@@ -158,13 +158,13 @@ class Module:
         self._power_up_parts(into_bootloader=False)
 
     @property
-    def state(self) -> State:
+    def state(self) -> ModuleState:
         return self.modes.state
 
     @property
     def base_firmware(self) -> bool:
         """Whether only the base firmware runs: option "xep", or safe mode."""
-        return self.state in (State.XEP, State.SAFE)
+        return self.state in (ModuleState.XEP, ModuleState.SAFE)
 
     def power_up(self, *, into_bootloader: bool = False) -> None:
         """Restart: chip defaults, saved settings, and the mode the module was left in."""
@@ -184,7 +184,7 @@ class Module:
         if self._sleep_ns is not None and now_ns >= self._sleep_ns:
             self.asleep = True
         interval_ns = self.profile.noise_map_interval_min * NS_PER_MIN
-        running = self.state is State.RUN
+        running = self.state is ModuleState.RUN
         if running and interval_ns and now_ns - self._noise_map_stored_ns >= interval_ns:
             with suppress(Refusal):  # no room: the next interval tries again
                 self.store_noise_maps()
@@ -217,7 +217,7 @@ class Module:
 
     def crash(self, reason: str, now_ns: int) -> None:
         """Fail as by a watchdog or a hard fault: leave a crash dump and restart at once."""
-        if self.state is State.BOOTLOADER or self.asleep:
+        if self.state is ModuleState.BOOTLOADER or self.asleep:
             return
         if now_ns - self._last_fault_ns >= self.options.watchdog_memory_ns:
             self._faults = 0
@@ -252,7 +252,7 @@ class Module:
     def set_mode(self, mode: int) -> None:
         """Change the mode, or raise `Refusal`; starting a profile saves its settings."""
         self.modes.set_mode(mode)
-        if self.state is State.RUN:
+        if self.state is ModuleState.RUN:
             self._saved_profiles[self.modes.profile_id] = self.profile.model_copy()
             self._noise_map_stored_ns = self.now_ns
         else:
@@ -305,14 +305,14 @@ class Module:
         self.modes.power_up(self._first_state(into_bootloader))
         self.profile = self._settings_of(self.modes.start.profile_id)
 
-    def _first_state(self, into_bootloader: bool) -> State | None:
+    def _first_state(self, into_bootloader: bool) -> ModuleState | None:
         if into_bootloader or self.bootloader.stays:
-            return State.BOOTLOADER
+            return ModuleState.BOOTLOADER
         if self._faults >= SAFE_MODE_FAULTS:
-            return State.SAFE
+            return ModuleState.SAFE
         if self.firmware.sensor is None:
-            return State.XEP
-        return State.REG if self.certification else None
+            return ModuleState.XEP
+        return ModuleState.REG if self.certification else None
 
     def _settings_of(self, profile_id: int) -> ProfileSettings:
         """Return the settings a profile works with: changed, else saved, else as shipped."""

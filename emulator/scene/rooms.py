@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Row = dict[str, Any]
+Values = dict[str, Any]
 Point = Sequence[float] | NDArray[np.float64]
-Way = list[tuple[float, float]]
+Course = list[tuple[float, float]]
 
 MOST_ROOMS = 10_000
 """Of a family: numbers run from 0 to one less."""
@@ -49,7 +49,7 @@ _RIG = ((-0.1, 0.2, 90.0), (0.1, 0.2, 90.0), (-0.1, -0.2, -90.0), (0.1, -0.2, -9
 _RIGS = (((0.0, 0.2, 90.0), (0.0, -0.2, -90.0)), (*_RIG[:2], (0.0, -0.2, -90.0)), _RIG)
 """Two, three and four radars: a side with one radar has no pair of ranges of one time."""
 _SPEEDS_MPS = (0.05, 0.3)
-_SENSORS: Row = {
+_SENSORS: Values = {
     "noise": {"rf_sigma": 5e-4, "iterations": 16, "pulses_per_step": 300},
     "clutter": {"sigma": 2.25e-4, "correlation_s": 4.8},
     "jitter": {"white_rad": 0.0056, "slow_rad": 0.032, "slow_correlation_s": 4.0},
@@ -62,17 +62,17 @@ _SENSORS: Row = {
 class Room:
     """What a family draws; everything else is the same in all of them."""
 
-    way: Way
-    targets: list[Row] = field(default_factory=list)
-    walls: list[Row] = field(default_factory=list)
-    objects: list[Row] = field(default_factory=list)
-    people: list[Row] = field(default_factory=list)
+    way: Course
+    targets: list[Values] = field(default_factory=list)
+    walls: list[Values] = field(default_factory=list)
+    objects: list[Values] = field(default_factory=list)
+    people: list[Values] = field(default_factory=list)
     rig: Sequence[tuple[float, float, float]] = _RIG
     wheels_factor: float = 1.0  # on every standard deviation of the wheels
     speed_mps: float = 0.05
 
 
-def _off_course_m(point: NDArray[np.float64], way: Way) -> float:
+def _off_course_m(point: NDArray[np.float64], way: Course) -> float:
     """Return how far a point is from the nearest place of a closed course."""
     corners = np.array([*way, way[0]])
     nearest = math.inf
@@ -84,7 +84,7 @@ def _off_course_m(point: NDArray[np.float64], way: Way) -> float:
 
 
 def _beside(
-    rng: np.random.Generator, count: int, way: Way, *, off: tuple[float, float], apart: float
+    rng: np.random.Generator, count: int, way: Course, *, off: tuple[float, float], apart: float
 ) -> list[NDArray[np.float64]]:
     """Return up to ``count`` places within two distances from the course, apart from each other."""
     nearest, farthest = off
@@ -100,15 +100,15 @@ def _beside(
     return places
 
 
-def _rod(place: Point, amplitude: float = 0.015) -> Row:
+def _rod(place: Point, amplitude: float = 0.015) -> Values:
     return {"kind": "rod", "x_m": place[0], "y_m": place[1], "amplitude_1m": amplitude}
 
 
-def _rods(places: Sequence[Point]) -> list[Row]:
+def _rods(places: Sequence[Point]) -> list[Values]:
     return [_rod(place) for place in places]
 
 
-def _rectangle(rng: np.random.Generator, shortest: float, longest: float) -> Way:
+def _rectangle(rng: np.random.Generator, shortest: float, longest: float) -> Course:
     width, depth = rng.uniform(shortest, longest, 2)
     return [(0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth)]
 
@@ -188,14 +188,14 @@ def people(rng: np.random.Generator) -> Room:
     """Twelve rods, two walkers."""
     way = _rectangle(rng, 2.0, 2.8)
     width, depth = way[2]
-    round_the_course: Way = [
+    round_the_course: Course = [
         (-1.0, -0.7),
         (width + 1, -0.6),
         (width + 0.9, depth + 0.7),
         (-0.9, depth + 0.6),
     ]
-    inside: Way = [(width / 2, 0.3 * depth), (width / 2, 0.7 * depth)]
-    walkers: list[Row] = [
+    inside: Course = [(width / 2, 0.3 * depth), (width / 2, 0.7 * depth)]
+    walkers: list[Values] = [
         {"waypoints_m": round_the_course, "speed_mps": 0.6, "walk": "round", "rcs_m2": 0.5},
         {"waypoints_m": inside, "speed_mps": 0.3, "walk": "to_and_fro", "rcs_m2": 0.5},
     ]
@@ -213,11 +213,11 @@ def rig(rng: np.random.Generator) -> Room:
     return Room(way=way, targets=rods, rig=mounts)
 
 
-def _square(rng: np.random.Generator) -> Way:
+def _square(rng: np.random.Generator) -> Course:
     return _rectangle(rng, 2.4, 3.6)
 
 
-def _circle(rng: np.random.Generator) -> Way:
+def _circle(rng: np.random.Generator) -> Course:
     """Return 24 corners of a circle that begins along x."""
     step_m = rng.uniform(1.2, 1.8) * math.tau / 24
     way = [(0.0, 0.0)]
@@ -227,23 +227,23 @@ def _circle(rng: np.random.Generator) -> Way:
     return way
 
 
-def _eight(rng: np.random.Generator) -> Way:
+def _eight(rng: np.random.Generator) -> Course:
     """Return two squares that touch at the start, each driven round once, in opposite senses."""
     a = rng.uniform(1.8, 2.4)
     return [(0.0, 0.0), (a, 0.0), (a, a), (0.0, a), (0.0, -a), (-a, -a), (-a, 0.0)]
 
 
-def _corridor(rng: np.random.Generator) -> Way:
+def _corridor(rng: np.random.Generator) -> Course:
     """Return a straight way, there and back."""
     return [(0.0, 0.0), (rng.uniform(4.0, 6.0), 0.0)]
 
 
-def _course(rng: np.random.Generator) -> Way:
+def _course(rng: np.random.Generator) -> Course:
     shapes = (_square, _circle, _eight, _corridor)
     return shapes[int(rng.integers(len(shapes)))](rng)
 
 
-def _drawn(rng: np.random.Generator) -> Row:
+def _drawn(rng: np.random.Generator) -> Values:
     """Return the rig and the speed of a room that leaves them free."""
     rig = _RIGS[int(rng.integers(len(_RIGS)))]
     return {"rig": rig, "speed_mps": float(rng.choice(_SPEEDS_MPS))}
@@ -253,7 +253,7 @@ def rack(rng: np.random.Generator) -> Room:
     """One to four aisles between rows of uprights at one pitch."""
     n_aisles, pitch = int(rng.integers(1, 5)), rng.uniform(0.5, 0.8)
     length, width, depth = rng.uniform(3.0, 5.0), rng.uniform(1.4, 2.0), rng.uniform(0.3, 0.6)
-    way: Way = []
+    way: Course = []
     for aisle in range(n_aisles):
         y = aisle * (width + depth)
         way += [(0.0, y), (length, y)] if aisle % 2 == 0 else [(length, y), (0.0, y)]
@@ -358,7 +358,7 @@ def room_of(name: str) -> tuple[str, int] | None:
     return (found[1], int(found[2])) if found and found[1] in FAMILIES else None
 
 
-def room_tables(family: str, number: int) -> Row:
+def room_tables(family: str, number: int) -> Values:
     """Return the tables of the scene of a room; numbers have four decimals."""
     index = list(FAMILIES).index(family)
     room = FAMILIES[family](np.random.default_rng([index, number]))
@@ -388,7 +388,7 @@ def room_tables(family: str, number: int) -> Row:
         "people": _named("person", room.people),
     }
     description = FAMILIES[family].__doc__ or ""
-    tables: Row = {
+    tables: Values = {
         "name": f"{family}_{number}",
         "environment": "lab",
         "description": f"random room: {description}",
@@ -398,7 +398,7 @@ def room_tables(family: str, number: int) -> Row:
     return tables
 
 
-def _named(kind: str, rows: Sequence[Row]) -> list[Row]:
+def _named(kind: str, rows: Sequence[Values]) -> list[Values]:
     return [{"name": f"{kind}_{number}", **row} for number, row in enumerate(rows)]
 
 

@@ -21,35 +21,35 @@ from xethru_protocol.wire.x4 import CARRIER_HZ, SAMPLING_RATE_HZ
 
 pytestmark = pytest.mark.requires("settings")
 
-Samples = NDArray[np.float64]
+RfFrames = NDArray[np.float64]
 _BANDWIDTH_HZ = 1.4e9
 _SEARCHED_M = 0.12
 _WILD = 10.0  # standard deviations
 
 
-def noise(samples: Samples) -> float:
+def noise(samples: RfFrames) -> float:
     """Return the standard deviation from frame to frame where hardly an echo reaches."""
     far = samples[:, -samples.shape[1] // 10 :]
     return float(np.diff(far, axis=0).std() / np.sqrt(2))
 
 
-def constant_part(samples: Samples) -> float:
+def constant_part(samples: RfFrames) -> float:
     return float(np.abs(samples.mean(axis=1)).max())
 
 
-def stuck(samples: Samples) -> float:
+def stuck(samples: RfFrames) -> float:
     """Return in what share of the frames some bin has the value of its neighbour or of before."""
     shares = [(np.diff(samples, axis=axis) == 0).mean(axis=0).max() for axis in (0, 1)]
     return float(max(shares))
 
 
-def clipped(samples: Samples) -> float:
+def clipped(samples: RfFrames) -> float:
     """Return how many samples of a frame have its largest magnitude, in the worst one."""
     magnitude = np.abs(samples)
     return float((magnitude == magnitude.max(axis=1, keepdims=True)).sum(axis=1).max())
 
 
-def isolated(samples: Samples) -> float:
+def isolated(samples: RfFrames) -> float:
     """Return how many samples per frame leave the course of time alone; an echo is some wide."""
     off = np.abs(samples[1:-1] - (samples[:-2] + samples[2:]) / 2)
     sigma = np.median(off) / 0.6745
@@ -61,7 +61,7 @@ def isolated(samples: Samples) -> float:
 class Check:
     """A number of RF frames, samples of shape (n_frames, n_bins), and what a sound module shows."""
 
-    value: Callable[[Samples], float]
+    value: Callable[[RfFrames], float]
     limit: Limit
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.radar_specs import Kind, RadarSpec
+from hil_tests.plugin.radar_specs import RadarKind, RadarSpec
 from hil_tests.plugin.radar_targets import (
     RadarTarget,
     TargetError,
@@ -322,7 +322,7 @@ class Bench:
 
     def rig(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return the names of a rig; one emulated radar stands for all of its scene."""
-        if len(names) != 1 or self.specs[names[0]].kind is not Kind.EMULATED:
+        if len(names) != 1 or self.specs[names[0]].kind is not RadarKind.EMULATED:
             return tuple(names)
         spec = self.specs[names[0]]
         if "radar" in spec.options:

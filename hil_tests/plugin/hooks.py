@@ -13,7 +13,7 @@ import pytest
 
 from hil_tests.plugin.findings import FINDINGS, Findings, check_faults
 from hil_tests.plugin.options import CHOICES, WORKER_KEY, add_options, choose
-from hil_tests.plugin.radar_specs import Kind, RadarSpec, no_radar
+from hil_tests.plugin.radar_specs import RadarKind, RadarSpec, no_radar
 
 if TYPE_CHECKING:
     from hil_tests.plugin.radar_targets import RadarTarget
@@ -121,7 +121,7 @@ def pytest_configure(config: pytest.Config) -> None:
     choices = config.stash[CHOICES] = choose(config)
     if len(config.hook.pytest_xethru_radar_target.get_hookimpls()) == 1:  # ours
         for spec in choices.specs:
-            if spec.kind is Kind.OWN:
+            if spec.kind is RadarKind.OWN:
                 raise pytest.UsageError(str(no_radar(spec.text)))
     summary = config.stash[SUMMARY] = Summary()
     config.pluginmanager.register(summary, "xethru-hil-summary")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.plugin.power import PowerCommand, PowerError
-from hil_tests.plugin.radar_specs import Kind, RadarSpec, SpecError, parse_specs
+from hil_tests.plugin.radar_specs import RadarKind, RadarSpec, SpecError, parse_specs
 
 ENVIRONMENT = "XETHRU_RADARS"
 INI = "xethru_radars"
@@ -163,13 +163,13 @@ def _check_report(report: Path) -> None:
 
 def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
     """Replace `auto` by the ports where modules answer."""
-    if not any(spec.kind is Kind.AUTO for spec in specs):
+    if not any(spec.kind is RadarKind.AUTO for spec in specs):
         return specs
     from hil_tests.plugin.radar_targets import ports_that_answer
 
     texts: list[str] = []
     for spec in specs:
-        if spec.kind is not Kind.AUTO:
+        if spec.kind is not RadarKind.AUTO:
             texts.append(spec.text)
             continue
         paths = [path for path, _ in ports_that_answer()]

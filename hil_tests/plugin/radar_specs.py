@@ -35,7 +35,7 @@ class SpecError(ValueError):
     """A spec names no radar; the message is one line with what is allowed."""
 
 
-class Kind(Enum):
+class RadarKind(Enum):
     """How a radar is reached."""
 
     EMULATED = "emu"
@@ -49,13 +49,13 @@ class Kind(Enum):
 
 _FIRMWARE = ("sensor", "xep")
 _LINES = ("memory", "pty", "uart", "tcp")
-_OPTIONS: dict[Kind, tuple[str, ...]] = {
-    Kind.EMULATED: ("firmware", "fps", "has", "line", "radar", "seed"),
-    Kind.PORT: ("fps", "has", "known_range", "line"),
-    Kind.SERIAL_NUMBER: ("fps", "has", "known_range"),
-    Kind.NETWORK: ("fps", "has", "known_range"),
-    Kind.REPLAY: ("has", "radar"),
-    Kind.AUTO: ("fps", "has"),
+_OPTIONS: dict[RadarKind, tuple[str, ...]] = {
+    RadarKind.EMULATED: ("firmware", "fps", "has", "line", "radar", "seed"),
+    RadarKind.PORT: ("fps", "has", "known_range", "line"),
+    RadarKind.SERIAL_NUMBER: ("fps", "has", "known_range"),
+    RadarKind.NETWORK: ("fps", "has", "known_range"),
+    RadarKind.REPLAY: ("has", "radar"),
+    RadarKind.AUTO: ("fps", "has"),
 }
 """Of the built-in kinds; a hook reads what it likes of its own."""
 DEFAULT_FPS = 17.0
@@ -73,7 +73,7 @@ class RadarSpec:
     """
 
     text: str
-    kind: Kind
+    kind: RadarKind
     target: str
     options: Mapping[str, str] = field(default_factory=dict)
     name: str
@@ -81,15 +81,15 @@ class RadarSpec:
     @property
     def emulated(self) -> bool:
         """Whether this program starts the radar itself; else other processes may want it, too."""
-        return self.kind in {Kind.EMULATED, Kind.REPLAY}
+        return self.kind in {RadarKind.EMULATED, RadarKind.REPLAY}
 
     @property
     def shared_as(self) -> str:
         """What all specs of one radar have in common: the port's own path or the address."""
-        if self.kind is Kind.PORT:
+        if self.kind is RadarKind.PORT:
             return os.path.realpath(self.target)
         # an adapter is one by every scheme
-        return self.target.partition("://")[2] if self.kind is Kind.NETWORK else self.target
+        return self.target.partition("://")[2] if self.kind is RadarKind.NETWORK else self.target
 
     @property
     def line(self) -> str:
@@ -141,33 +141,33 @@ def parse_specs(texts: Iterable[str]) -> tuple[RadarSpec, ...]:
     return tuple(specs)
 
 
-def _kind(body: str) -> tuple[Kind, str]:  # noqa: PLR0911 - one return per kind
+def _kind(body: str) -> tuple[RadarKind, str]:  # noqa: PLR0911 - one return per kind
     scheme, colon, rest = body.partition(":")
     if scheme == "emu":
-        return Kind.EMULATED, rest
+        return RadarKind.EMULATED, rest
     if body == "auto":
-        return Kind.AUTO, ""
+        return RadarKind.AUTO, ""
     if body.startswith("serial="):
         number = body.removeprefix("serial=")
         if not re.fullmatch(r"[0-9]{12}", number):
             raise SpecError(f"--radar {body}: a serial number has 12 digits, as on the label")
-        return Kind.SERIAL_NUMBER, number
+        return RadarKind.SERIAL_NUMBER, number
     if scheme in _NETWORK_SCHEMES and rest.startswith("//"):
         host, _, port = rest.removeprefix("//").rpartition(":")
         if not host or not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
             raise SpecError(
                 f"--radar {body}: must be {scheme}://HOST:PORT with a port of 1...65535"
             )
-        return Kind.NETWORK, body
+        return RadarKind.NETWORK, body
     if scheme == "replay" and colon:
         if not rest or not os.path.exists(rest):
             raise SpecError(f"--radar {body}: there is no recording {rest}")
-        return Kind.REPLAY, rest
+        return RadarKind.REPLAY, rest
     if colon and re.fullmatch(r"[a-z][a-z0-9_]*", scheme):
         if scheme not in _BUILT_IN_SCHEMES:
-            return Kind.OWN, body
+            return RadarKind.OWN, body
     elif "/" in body or body.startswith("~") or os.path.exists(body):
-        return Kind.PORT, str(Path(os.path.expanduser(body)))
+        return RadarKind.PORT, str(Path(os.path.expanduser(body)))
     raise no_radar(body)
 
 
@@ -192,9 +192,9 @@ def _query(text: str, query: str, allowed: Sequence[str] | None) -> dict[str, st
     return options
 
 
-def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
-    line = options.get("line") if kind is not Kind.OWN else None
-    lines = _LINES if kind is Kind.EMULATED else ("uart",)
+def _check(text: str, kind: RadarKind, options: Mapping[str, str]) -> None:
+    line = options.get("line") if kind is not RadarKind.OWN else None
+    lines = _LINES if kind is RadarKind.EMULATED else ("uart",)
     if line is not None and line not in lines:
         raise SpecError(f"--radar {text}: line={line}: must be {' or '.join(lines)}")
     firmware = options.get("firmware", "sensor")
@@ -209,7 +209,7 @@ def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
         raise SpecError(f"--radar {text}: seed={seed}: must be a whole number of 0...2**63 - 1")
     if not 0 < _number(options.get("fps", str(DEFAULT_FPS))) < 65536:
         raise SpecError(f"--radar {text}: fps={options['fps']}: must be a rate of 1...65535 Hz")
-    if kind is not Kind.OWN and not 0.4 <= _number(options.get("known_range", "1")) <= 9.0:
+    if kind is not RadarKind.OWN and not 0.4 <= _number(options.get("known_range", "1")) <= 9.0:
         raise SpecError(
             f"--radar {text}: known_range={options['known_range']}: must be 0.4...9 metres"
         )
@@ -222,18 +222,18 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _name(kind: Kind, target: str, options: Mapping[str, str]) -> str:
-    if kind is Kind.EMULATED:
+def _name(kind: RadarKind, target: str, options: Mapping[str, str]) -> str:
+    if kind is RadarKind.EMULATED:
         parts = ["emu", Path(target).stem, options.get("radar", "")]
         line = options.get("line", "memory")
         parts.append("" if line == "memory" else line)
         parts.append("xep" if options.get("firmware") == "xep" else "")
         return "-".join(filter(None, parts))
-    if kind is Kind.SERIAL_NUMBER:
+    if kind is RadarKind.SERIAL_NUMBER:
         return target
-    if kind is Kind.AUTO:
+    if kind is RadarKind.AUTO:
         return "auto"
-    if kind in {Kind.NETWORK, Kind.OWN}:
+    if kind in {RadarKind.NETWORK, RadarKind.OWN}:
         return re.sub(r"[^0-9A-Za-z.]+", "-", target).strip("-")
     last = Path(target).name or target
-    return f"replay-{Path(last).stem}" if kind is Kind.REPLAY else last
+    return f"replay-{Path(last).stem}" if kind is RadarKind.REPLAY else last

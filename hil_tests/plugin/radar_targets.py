@@ -22,7 +22,7 @@ import numpy as np
 from hil_tests.device.emulator_process import Served, emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.plugin.power import PowerCommand, PowerError
-from hil_tests.plugin.radar_specs import Kind, RadarSpec
+from hil_tests.plugin.radar_specs import RadarKind, RadarSpec
 from xethru_protocol.driver.link import POWER_UP_BAUD
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import Transport, capacity_bytes_per_s, find_ports, open_line
@@ -295,7 +295,7 @@ class ProcessTarget(RadarTarget):
     """A module of an emulator that runs in a process of its own, or a recording played there."""
 
     def __init__(self, spec: RadarSpec) -> None:
-        played = spec.kind is Kind.REPLAY
+        played = spec.kind is RadarKind.REPLAY
         able = {"settings", "profiles", "files", "unplug", "power", "faults"}
         if spec.line == "uart":
             able.add("uart")
@@ -385,12 +385,12 @@ class PortTarget(RadarTarget):
     """A module at a port, named or found by its serial number; perhaps a port of the network."""
 
     def __init__(self, spec: RadarSpec, power: PowerCommand | None = None) -> None:
-        path = _port_of(spec.target) if spec.kind is Kind.SERIAL_NUMBER else spec.target
+        path = _port_of(spec.target) if spec.kind is RadarKind.SERIAL_NUMBER else spec.target
         able = {"settings", "profiles", "files"} | ({"power"} if power else set())
         able |= set() if spec.known_range_m is None else {"known_range"}
         super().__init__(spec, frozenset(able), f"module at {path}")
         self._path, self._power = path, power
-        self._is_here = spec.kind is not Kind.NETWORK
+        self._is_here = spec.kind is not RadarKind.NETWORK
         # this keeps sessions of this machine apart
         self.lock_target = os.path.realpath(path) if self._is_here else spec.shared_as
 
@@ -423,11 +423,11 @@ class PortTarget(RadarTarget):
 def target_of(spec: RadarSpec, power: PowerCommand | None = None) -> RadarTarget:
     """Return the target of a built-in spec; `TargetError` or `PortUnavailable` if it has none."""
     match spec.kind:
-        case Kind.EMULATED if spec.line == "memory":
+        case RadarKind.EMULATED if spec.line == "memory":
             return InProcessTarget(spec)
-        case Kind.EMULATED | Kind.REPLAY:
+        case RadarKind.EMULATED | RadarKind.REPLAY:
             return ProcessTarget(spec)
-        case Kind.OWN:
+        case RadarKind.OWN:
             raise TargetError(f"--radar {spec.text}: no hook pytest_xethru_radar_target knows it")
         case _:
             return PortTarget(spec, power)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from emulator.faults.kind import Context, Entry, Layer, Parameters, Piece, Pieces, Target
+from emulator.faults.kind import Catalogued, Context, Layer, Parameters, Piece, Pieces, Target
 from emulator.module.settings import received_bytes
 from emulator.scene.philox import Rng
 from xethru_protocol.wire.framing import ESCAPE, START
 
-of_packet = Entry(Layer.BYTE, Target.PACKET)
+of_packet = Catalogued(Layer.BYTE, Target.PACKET)
 
 _FLOW_CONTROL = b"\x11\x13"
 _CALM = bytes(code for code in range(256) if code not in b"\x7c\x7d\x7e\x7f")

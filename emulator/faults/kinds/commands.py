@@ -9,8 +9,8 @@ from typing import Literal
 from pydantic import Field
 
 from emulator.faults.kind import (
+    Catalogued,
     Context,
-    Entry,
     Handling,
     Layer,
     Parameters,
@@ -26,9 +26,9 @@ from xethru_protocol.wire.codes import PongCode, ResponseCode, SystemCode
 from xethru_protocol.wire.framing import END, ESCAPE, START, encode_normal
 from xethru_protocol.wire.messages import Ack, Error, Ping, Pong, System, X4DriverSet
 
-of_command = Entry(Layer.TRANSACTION, Target.COMMAND)
-of_reply = Entry(Layer.TRANSACTION, Target.REPLY)
-of_packet = Entry(Layer.TRANSACTION, Target.PACKET)
+of_command = Catalogued(Layer.TRANSACTION, Target.COMMAND)
+of_reply = Catalogued(Layer.TRANSACTION, Target.REPLY)
+of_packet = Catalogued(Layer.TRANSACTION, Target.PACKET)
 
 _NS_PER_MS = 1_000_000
 _LONGEST_WAIT = 20.0  # multiples of the delay that a heavy tail reaches at most

@@ -9,8 +9,8 @@ from pydantic import Field
 
 from emulator.faults.kind import (
     Action,
+    Catalogued,
     Context,
-    Entry,
     Layer,
     Parameters,
     Piece,
@@ -36,10 +36,10 @@ from xethru_protocol.wire.messages import (
     X4DriverSet,
 )
 
-of_moment = Entry(Layer.DEVICE, Target.MOMENT)
-of_reply = Entry(Layer.DEVICE, Target.REPLY)
-of_frame = Entry(Layer.DEVICE, Target.FRAME)
-of_time = Entry(Layer.TIME, Target.PACKET)
+of_moment = Catalogued(Layer.DEVICE, Target.MOMENT)
+of_reply = Catalogued(Layer.DEVICE, Target.REPLY)
+of_frame = Catalogued(Layer.DEVICE, Target.FRAME)
+of_time = Catalogued(Layer.TIME, Target.PACKET)
 
 _NS_PER_US, _NS_PER_MS, _NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 

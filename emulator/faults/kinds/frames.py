@@ -9,13 +9,13 @@ import numpy as np
 from pydantic import Field
 
 from emulator.faults.kind import (
+    Catalogued,
     Context,
-    Entry,
     Layer,
     Parameters,
     Piece,
     Pieces,
-    Samples,
+    RfSamples,
     Target,
     changed_frame,
     normal_payload,
@@ -34,9 +34,9 @@ from xethru_protocol.wire.framing import (
 )
 from xethru_protocol.wire.messages import Ack, DataString
 
-of_reply = Entry(Layer.FRAME, Target.REPLY)
-of_packet = Entry(Layer.FRAME, Target.PACKET)
-of_frame = Entry(Layer.FRAME, Target.FRAME)
+of_reply = Catalogued(Layer.FRAME, Target.REPLY)
+of_packet = Catalogued(Layer.FRAME, Target.PACKET)
+of_frame = Catalogued(Layer.FRAME, Target.FRAME)
 
 _SPECIAL = (START, END, ESCAPE)
 _UNKNOWN_CODE = 0xB7
@@ -73,11 +73,11 @@ def _replaced(
     packet: bytes,
     wanted: _Samples,
     rng: Rng,
-    replace: Callable[[Samples], Samples],
+    replace: Callable[[RfSamples], RfSamples],
 ) -> Pieces:
     """Return a frame of which some samples, chosen at random, are replaced."""
 
-    def change(samples: Samples) -> Samples | None:
+    def change(samples: RfSamples) -> RfSamples | None:
         if samples.size < wanted.samples:
             return None
         places: set[int] = set()
@@ -232,7 +232,7 @@ def off_lattice_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Cont
     half = np.float32(lattice.quantum / 2)
     highest = np.float32(lattice.highest)
 
-    def between(samples: Samples) -> Samples:
+    def between(samples: RfSamples) -> RfSamples:
         # between two chip counters, whatever the sample was
         return (samples + np.where(samples + half > highest, -half, half)).astype(np.float32)
 
@@ -265,7 +265,7 @@ def in_range_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context
 def wrong_bin_count(packet: bytes, wanted: _Bins, rng: Rng, context: Context) -> Pieces:
     """A frame has another number of bins than the settings make."""
 
-    def resized(samples: Samples) -> Samples | None:
+    def resized(samples: RfSamples) -> RfSamples | None:
         n_bins = samples.size + wanted.more
         return np.resize(samples, n_bins) if wanted.more and n_bins >= 1 else None
 

@@ -10,13 +10,13 @@ from pydantic import Field
 
 from emulator.chip.chip import NS_PER_S
 from emulator.faults.kind import (
+    Catalogued,
     Context,
-    Entry,
     Layer,
     Parameters,
     Piece,
     Pieces,
-    Samples,
+    RfSamples,
     Target,
     changed_frame,
     frame_counter,
@@ -26,9 +26,9 @@ from emulator.faults.kind import (
 from emulator.scene.philox import Rng
 from xethru_protocol.wire.x4 import FIRST_COUNTER
 
-of_frame = Entry(Layer.STREAM, Target.FRAME)
-of_packet = Entry(Layer.STREAM, Target.PACKET)
-of_environment = Entry(Layer.ENVIRONMENT, Target.FRAME)
+of_frame = Catalogued(Layer.STREAM, Target.FRAME)
+of_packet = Catalogued(Layer.STREAM, Target.PACKET)
+of_environment = Catalogued(Layer.ENVIRONMENT, Target.FRAME)
 
 _WRAP = 1 << 32
 _CYCLES_PER_BIN = 7.29 / 23.328  # carrier of the pulse over the sampling rate, Hz / Hz
@@ -99,7 +99,9 @@ def _since_first(counter: int, context: Context) -> int:
     return counter - (counter if context.first_counter is None else context.first_counter)
 
 
-def _distorted(packet: bytes, context: Context, distort: Callable[[Samples], Samples]) -> Pieces:
+def _distorted(
+    packet: bytes, context: Context, distort: Callable[[RfSamples], RfSamples]
+) -> Pieces:
     """Return a frame with other samples, rounded to values of the chip."""
     lattice = context.lattice
     if lattice is None:
@@ -178,7 +180,7 @@ def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces
 def saturation(packet: bytes, wanted: _Level, rng: Rng, context: Context) -> Pieces:
     """The amplitudes of a frame are clipped."""
 
-    def clipped(samples: Samples) -> Samples:
+    def clipped(samples: RfSamples) -> RfSamples:
         limit = wanted.level * np.abs(samples).max()
         return np.clip(samples, -limit, limit)
 
@@ -189,7 +191,7 @@ def saturation(packet: bytes, wanted: _Level, rng: Rng, context: Context) -> Pie
 def dead_bins(packet: bytes, wanted: _DeadBins, rng: Rng, context: Context) -> Pieces:
     """Bins of a frame are stuck at one value."""
 
-    def stuck(samples: Samples) -> Samples | None:
+    def stuck(samples: RfSamples) -> RfSamples | None:
         if wanted.first >= samples.size:
             return None
         dead = samples.copy()
@@ -219,7 +221,7 @@ def stale_frame(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -
 def strong_clutter(packet: bytes, wanted: _Clutter, rng: Rng, context: Context) -> Pieces:
     """A strong reflector stands in one place."""
 
-    def with_clutter(samples: Samples) -> Samples:
+    def with_clutter(samples: RfSamples) -> RfSamples:
         bins = np.arange(samples.size) - wanted.bin
         envelope = np.exp(-0.5 * (bins / wanted.bins) ** 2)
         wave = wanted.amplitude * envelope * np.cos(2 * math.pi * _CYCLES_PER_BIN * bins)
@@ -232,7 +234,7 @@ def strong_clutter(packet: bytes, wanted: _Clutter, rng: Rng, context: Context) 
 def interference(packet: bytes, wanted: _Pulses, rng: Rng, context: Context) -> Pieces:
     """Every frame has pulses at random bins."""
 
-    def with_pulses(samples: Samples) -> Samples:
+    def with_pulses(samples: RfSamples) -> RfSamples:
         pulses = np.zeros(samples.size)
         for _ in range(wanted.pulses):
             pulses[rng.below(samples.size)] += wanted.amplitude * (2 * rng.below(2) - 1)

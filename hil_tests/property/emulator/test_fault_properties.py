@@ -13,7 +13,7 @@ from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.kind import (
     Context,
     Handling,
-    Kind,
+    KindOfFault,
     PacketClass,
     Piece,
     Target,
@@ -125,7 +125,7 @@ def test_another_seed_or_radar_gives_other_bytes() -> None:
     assert bytes_of(1, "a") != bytes_of(1, "b")
 
 
-def effect_of(kind: Kind, packet: bytes, seed: int) -> Any:  # noqa: ANN401 - of either sort
+def effect_of(kind: KindOfFault, packet: bytes, seed: int) -> Any:  # noqa: ANN401 - of either sort
     context = Context(
         now_ns=10**9,
         since_ns=10**9 - 10**6,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.radar_specs import Kind, RadarSpec, SpecError, parse_specs
+from hil_tests.plugin.radar_specs import RadarKind, RadarSpec, SpecError, parse_specs
 
 
 def one(text: str) -> RadarSpec:
@@ -15,25 +15,25 @@ def one(text: str) -> RadarSpec:
 @pytest.mark.parametrize(
     ("text", "kind", "target", "name"),
     [
-        ("emu", Kind.EMULATED, "", "emu"),
-        ("emu:lab", Kind.EMULATED, "lab", "emu-lab"),
-        ("emu:rooms/a.toml?fps=17&seed=3", Kind.EMULATED, "rooms/a.toml", "emu-a"),
-        ("emu:?line=uart", Kind.EMULATED, "", "emu-uart"),
-        ("emu:?firmware=xep", Kind.EMULATED, "", "emu-xep"),
-        ("emu:lab?radar=left_front", Kind.EMULATED, "lab", "emu-lab-left_front"),
-        ("/dev/ttyACM0", Kind.PORT, "/dev/ttyACM0", "ttyACM0"),
-        ("./ports/radar_1?line=uart", Kind.PORT, "ports/radar_1", "radar_1"),
-        ("ports/left", Kind.PORT, "ports/left", "left"),
-        ("ports/usb:1", Kind.PORT, "ports/usb:1", "usb:1"),
-        ("/dev/serial/by-path/pci-0:1", Kind.PORT, "/dev/serial/by-path/pci-0:1", "pci-0:1"),
-        ("serial=202611210001", Kind.SERIAL_NUMBER, "202611210001", "202611210001"),
-        ("tcp://192.0.2.7:3000", Kind.NETWORK, "tcp://192.0.2.7:3000", "tcp-192.0.2.7-3000"),
-        ("rfc2217://pi:7000", Kind.NETWORK, "rfc2217://pi:7000", "rfc2217-pi-7000"),
-        ("auto", Kind.AUTO, "", "auto"),
-        ("mylab:rack3?slot=2", Kind.OWN, "mylab:rack3", "mylab-rack3"),
+        ("emu", RadarKind.EMULATED, "", "emu"),
+        ("emu:lab", RadarKind.EMULATED, "lab", "emu-lab"),
+        ("emu:rooms/a.toml?fps=17&seed=3", RadarKind.EMULATED, "rooms/a.toml", "emu-a"),
+        ("emu:?line=uart", RadarKind.EMULATED, "", "emu-uart"),
+        ("emu:?firmware=xep", RadarKind.EMULATED, "", "emu-xep"),
+        ("emu:lab?radar=left_front", RadarKind.EMULATED, "lab", "emu-lab-left_front"),
+        ("/dev/ttyACM0", RadarKind.PORT, "/dev/ttyACM0", "ttyACM0"),
+        ("./ports/radar_1?line=uart", RadarKind.PORT, "ports/radar_1", "radar_1"),
+        ("ports/left", RadarKind.PORT, "ports/left", "left"),
+        ("ports/usb:1", RadarKind.PORT, "ports/usb:1", "usb:1"),
+        ("/dev/serial/by-path/pci-0:1", RadarKind.PORT, "/dev/serial/by-path/pci-0:1", "pci-0:1"),
+        ("serial=202611210001", RadarKind.SERIAL_NUMBER, "202611210001", "202611210001"),
+        ("tcp://192.0.2.7:3000", RadarKind.NETWORK, "tcp://192.0.2.7:3000", "tcp-192.0.2.7-3000"),
+        ("rfc2217://pi:7000", RadarKind.NETWORK, "rfc2217://pi:7000", "rfc2217-pi-7000"),
+        ("auto", RadarKind.AUTO, "", "auto"),
+        ("mylab:rack3?slot=2", RadarKind.OWN, "mylab:rack3", "mylab-rack3"),
     ],
 )
-def test_what_a_spec_names(text: str, kind: Kind, target: str, name: str) -> None:
+def test_what_a_spec_names(text: str, kind: RadarKind, target: str, name: str) -> None:
     spec = one(text)
     assert (spec.kind, spec.target, spec.name) == (kind, target, name)
 
@@ -45,7 +45,7 @@ def test_a_name_without_a_slash_is_a_port_if_it_is_there(
     with pytest.raises(SpecError, match="names no radar"):
         one("left")
     (tmp_path / "left").touch()
-    assert (one("left").kind, one("left").target) == (Kind.PORT, "left")
+    assert (one("left").kind, one("left").target) == (RadarKind.PORT, "left")
 
 
 def test_recordings_must_exist(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.chip.chip import ModuleClock
-from emulator.module.modes import State
+from emulator.module.modes import ModuleState
 from emulator.module.settings import ProfileSettings
 from emulator.module.state import NOISE_MAPS
 from emulator.x4m300 import ChipStream, CombinedStream
@@ -86,10 +86,10 @@ def test_idle_pauses_and_run_fills_the_matrices_anew() -> None:
     """Protocol reference 8.3; the second is an assumption."""
     stream, module = profile(room())
     assert presence_until(stream, 30)[-1][1].state == PresenceState.NO_PRESENCE
-    module.modes.state = State.IDLE
+    module.modes.state = ModuleState.IDLE
     stream.command_done(m.SetMode(mode=SensorMode.XTID_SM_IDLE), 30 * SECOND)
     assert stream.next_due_ns() is None
-    module.modes.state = State.RUN
+    module.modes.state = ModuleState.RUN
     stream.command_done(m.SetMode(mode=SensorMode.XTID_SM_RUN), 100 * SECOND)
     heard = presence_until(stream, 125)
     assert heard[0][0] == pytest.approx(101, abs=0.1)
@@ -111,12 +111,12 @@ def test_an_output_that_is_switched_off_leaves_nothing_waiting() -> None:
 
 def test_stop_ends_it_and_a_restart_begins_when_the_module_is_ready() -> None:
     stream, module = profile(room())
-    module.modes.state = State.STOPPED
+    module.modes.state = ModuleState.STOPPED
     stream.command_done(m.SetMode(mode=SensorMode.XTID_SM_STOP), 5 * SECOND)
     assert stream.next_due_ns() is None
     stream.restarted(8 * SECOND)
     assert stream.next_due_ns() is None
-    module.modes.state = State.RUN
+    module.modes.state = ModuleState.RUN
     stream.restarted(12 * SECOND)
     first_s, first = presence_until(stream, 14)[0]
     assert first.state == PresenceState.INITIALIZING
