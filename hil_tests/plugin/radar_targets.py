@@ -23,7 +23,6 @@ from hil_tests.device.emulator_process import Served, emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import RadarKind, RadarSpec
-from xethru_protocol.driver.link import POWER_UP_BAUD
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import Transport, capacity_bytes_per_s, find_ports, open_line
 from xethru_protocol.wire.codes import POWER_UP_BAUD
