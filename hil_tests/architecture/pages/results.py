@@ -7,7 +7,7 @@ from typing import Any
 from hil_tests.architecture.pages.markdown import table
 from hil_tests.paths import FIXTURES, REPOSITORY
 from slam.app.run.output import share_text
-from slam.app.sweep.statistics import carries_text, in_band_text, outcomes_text
+from slam.app.sweep.table import carries_text, in_band_text, outcomes_text
 
 PAGE = REPOSITORY / "docs" / "results.md"
 README = REPOSITORY / "README.md"

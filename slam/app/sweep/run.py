@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -301,16 +301,16 @@ class SweepRun(Summary):
     them, and ``carry`` whether a robot that was carried was found again.
     """
 
-    settings: dict[str, str] = field(default_factory=dict)
-    stress: str = CLEAN
-    false: int = 0
-    confident_false: int = 0
-    bound: BoundSummary | None = None
-    family: str = ""
-    lost_share: float = 0.0
-    lost_at_end: bool = False
-    confidently_wrong_share: float = 0.0
-    carry: Carry | None = None
+    settings: dict[str, str]
+    stress: str
+    false: int
+    confident_false: int
+    bound: BoundSummary | None
+    family: str
+    lost_share: float
+    lost_at_end: bool
+    confidently_wrong_share: float
+    carry: Carry | None
 
     @property
     def key(self) -> Key:

@@ -27,14 +27,13 @@ from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.sweep import CLEAN
 from slam.app.sweep.bound import PURPOSE, load_gtsam
 from slam.app.sweep.run import Case, Key, SweepRun, make_case, program_version, run_case
-from slam.app.sweep.statistics import (
+from slam.app.sweep.statistics import outcomes, summarise_groups
+from slam.app.sweep.table import (
     group_line,
-    outcomes,
     outcomes_text,
     settings_text,
     stress_table,
     stress_tables,
-    summarise_groups,
 )
 from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
 from xethru_protocol.system import (
@@ -244,8 +243,8 @@ def run_sweep(
         groups = summarise_groups(runs)
     for group in groups:
         print_text(one_line(group_line(group)))
-    for clean, rows in stress_tables(groups):
-        print_table(*stress_table(clean, rows))
+    for each in stress_tables(groups):
+        print_table(*stress_table(*each))
     if len(groups) > 1:
         print_text(f"all together: {outcomes_text(outcomes(runs))}")
 

@@ -14,7 +14,8 @@ from slam.app.records import RadarInfo, SessionInfo
 from slam.app.run.runner import RunRecord, States
 from slam.app.sweep.places import Carry, carry_of, confidently_wrong
 from slam.app.sweep.run import SweepRun, make_case
-from slam.app.sweep.statistics import group_line, outcomes, summarise_groups
+from slam.app.sweep.statistics import outcomes, summarise_groups
+from slam.app.sweep.table import group_line
 from slam.geometry import paper_rig
 
 S = 1_000_000_000

@@ -12,15 +12,9 @@ from slam.app.errors import UsageError
 from slam.app.records import Snapshot
 from slam.app.sweep.bound import BoundSummary
 from slam.app.sweep.run import SweepRun, distance_m, false_landmarks, make_case
-from slam.app.sweep.statistics import (
-    group_line,
-    in_band,
-    stress_table,
-    stress_tables,
-    summarise_groups,
-    times_clean,
-)
+from slam.app.sweep.statistics import in_band, summarise_groups
 from slam.app.sweep.sweep import rooms_named
+from slam.app.sweep.table import group_line, stress_table, stress_tables, times_clean
 from slam.evaluation import LandmarkScore
 
 RUN = replace(
