@@ -13,9 +13,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from slam.app.benchmarks import BENCHMARKS
 from slam.app.commands.options import add_lean, add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
-from slam.app.experiments.benchmarks import BENCHMARKS
 from slam.app.sweep import FAMILIES, STRESSES
 from xethru_protocol.cli.version import add_version
 from xethru_protocol.extras import what_is_missing
@@ -502,7 +502,7 @@ _COMMANDS = (
     ),
     _Command(
         "benchmark",
-        "slam.app.experiments.benchmarks.command:run_benchmark",
+        "slam.app.benchmarks.command:run_benchmark",
         "run the back end of preset robust on a public data set, beside its truth",
         _add_benchmark,
         "Runs the back end of preset robust on all drives of a public data set that you have "

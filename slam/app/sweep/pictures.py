@@ -118,7 +118,7 @@ def _read_groups(path: Path, result: Path) -> list[Group]:
     if result.resolve() == path.resolve():
         raise AppError(f"{path}: the result would replace the sweep; choose another --out")
     try:
-        sweep = _Sweep.model_validate_json(read_bounded(path, _MOST_BYTES))
+        sweep = _Sweep.model_validate(json.loads(read_bounded(path, _MOST_BYTES)))
         json.dumps([asdict(run) for run in sweep.runs], allow_nan=False)
         groups = summarise_groups(sweep.runs)
         json.dumps(groups, allow_nan=False)
@@ -131,8 +131,8 @@ def _read_groups(path: Path, result: Path) -> list[Group]:
             f"{path}: is not a result of this version's `uwb-slam sweep --json`: "
             f"{problem_text(error.errors(), _Sweep)}"
         ) from None
-    except (ValueError, ArithmeticError):
-        raise AppError(f"{path}: holds numbers that no `uwb-slam sweep --json` writes") from None
+    except (ValueError, ArithmeticError, RecursionError):
+        raise AppError(f"{path}: is not a result of `uwb-slam sweep --json`, nor JSON") from None
     return groups
 
 

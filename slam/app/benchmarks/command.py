@@ -13,10 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from slam.app.errors import naming
-from slam.app.experiments.benchmarks import BENCHMARKS
-from slam.app.experiments.benchmarks.data_set import DataSet
-from slam.app.experiments.benchmarks.evaluation import (
+from slam.app.benchmarks import BENCHMARKS
+from slam.app.benchmarks.data_set import DataSet
+from slam.app.benchmarks.evaluation import (
     ODOMETRY,
     WITH_IDS,
     WITHOUT_IDS,
@@ -25,6 +24,7 @@ from slam.app.experiments.benchmarks.evaluation import (
     score_run,
     write_run,
 )
+from slam.app.errors import naming
 from slam.app.run.output import print_progress, print_table, print_text, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
@@ -61,7 +61,7 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
 
     Raises AppError if a file is missing, is not what it should be, or cannot be written.
     """
-    read = import_module(f"slam.app.experiments.benchmarks.{BENCHMARKS[name].module}").read_data_set
+    read = import_module(f"slam.app.benchmarks.{BENCHMARKS[name].module}").read_data_set
     data_set: DataSet = read(data)
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)

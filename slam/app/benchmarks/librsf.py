@@ -15,27 +15,31 @@ Indoor_UWB in libRSF, TU Chemnitz. Lines of other kinds are an error.
 from __future__ import annotations
 
 import math
-from pathlib import Path as FilePath
+from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 
-from slam.app.errors import AppError
-from slam.app.experiments.benchmarks.data_set import (
+from slam.app.benchmarks.data_set import (
     DataSet,
     Observation,
-    Path,
+    Positions,
     Run,
     Sensor,
-    Step,
-    increments_of,
     nanoseconds,
     positions_of,
+    steps_at,
 )
-from slam.app.experiments.benchmarks.tables import REMEDY, bad_line, found, number_of, rows_of
+from slam.app.benchmarks.tables import check_ascending, found, read_rows
+from slam.app.errors import AppError
 from slam.config import WheelNoise
 
 _INPUT, _TRUTH = "_Input.txt", "_GT.txt"
-_NUMBERS = {"range2": 7, "odom2diff": 8, "point2": 7}
+_RANGES = {
+    "range2": "time range variance x y module SNR",
+    "odom2diff": "time left right sideways half_track v11 v22 v33",
+}
+_POINTS = {"point2": "time x y c11 c12 c21 c22"}
 
 SENSOR = Sensor(
     # 1 cm/s of each wheel, 15.7 cm apart, every 0.128 s
@@ -64,73 +68,46 @@ SENSOR = Sensor(
 )
 
 
-def read_data_set(folder: FilePath) -> DataSet:
+def read_data_set(folder: Path) -> DataSet:
     """Read all runs of a folder, by the names of their input files."""
     runs = tuple(read_run(path) for path in found(folder, f"*{_INPUT}"))
     title = "Indoor UWB: a small robot among four modules"
     return DataSet(name="uwb-indoor", title=title, sensor=SENSOR, runs=runs)
 
 
-def read_run(path: FilePath) -> Run:
+def read_run(path: Path) -> Run:
     """Read NAME_Input.txt and NAME_GT.txt beside it."""
-    ranges: list[tuple[float, Observation]] = []
-    odometry: list[list[float]] = []
-    for number, kind, values in _measurements(path, ("range2", "odom2diff")):
-        if kind == "odom2diff":
-            if values[4] <= 0.0:
-                raise bad_line(path, number, "half the track must be positive")
-            if odometry and values[0] < odometry[-1][0]:
-                raise bad_line(path, number, "its time is before that of the odometry before")
-            odometry.append(values)
+    rows = read_rows(path, _RANGES)
+    odometry = [row for row in rows if row.kind == "odom2diff"]
+    seen: dict[float, list[Observation]] = defaultdict(list)
+    for row in rows:
+        if row.kind == "odom2diff":
+            if row.values[4] <= 0.0:
+                raise row.error("half the track must be positive")
             continue
-        time_s, range_m, variance, _, _, module, _ = values
+        time_s, range_m, variance, _, _, module, _ = row.values
         if variance <= 0.0 or range_m <= 0.0:
-            raise bad_line(path, number, "range and variance must be positive")
-        label = int(module)
-        seen = Observation(range_m=range_m, range_sigma_m=math.sqrt(variance), label=label)
-        ranges.append((time_s, seen))
+            raise row.error("range and variance must be positive")
+        label, sigma_m = int(module), math.sqrt(variance)
+        seen[time_s].append(Observation(range_m=range_m, range_sigma_m=sigma_m, label=label))
+    check_ascending(odometry)
     if len(odometry) < 2:
         raise AppError(f"{path}: holds {len(odometry)} lines of odom2diff, at least 2 are needed")
     truth_path = path.with_name(path.name.removesuffix(_INPUT) + _TRUTH)
-    points = [values for _, _, values in _measurements(truth_path, ("point2",))]
-    truth = np.array(points)[np.argsort([values[0] for values in points], kind="stable")]
-    wheels = np.array(odometry)
+    points = np.array([row.values for row in read_rows(truth_path, _POINTS)])
+    truth = points[np.argsort(points[:, 0], kind="stable")]
+    wheels = np.array([row.values for row in odometry])
     # A velocity is of the time up to its stamp: it holds from the stamp before.
     t_s = np.concatenate([wheels[:1, 0], wheels[:-1, 0]])
     left, right, sideways, half_m = wheels[:, 1], wheels[:, 2], wheels[:, 3], wheels[:, 4]
-    at_s = np.unique([*wheels[:, 0].tolist(), *(t for t, _ in ranges)])
+    at_s = np.unique([*wheels[:, 0].tolist(), *seen])
     at_s = at_s[(at_s >= wheels[0, 0]) & (at_s <= wheels[-1, 0])]
     poses = positions_of(t_s, (right + left) / 2, sideways, (right - left) / (2.0 * half_m), at_s)
-    steps = [
-        Step(
-            t_ns=t_ns,
-            increment=increment,
-            observations=tuple(seen for time, seen in ranges if time == time_s),
-        )
-        for time_s, t_ns, increment in zip(
-            at_s.tolist(), nanoseconds(at_s).tolist(), increments_of(poses), strict=True
-        )
-    ]
+    steps = steps_at(at_s, poses, seen)
+    n_ranges = sum(map(len, seen.values()))
     return Run(
         name=path.name.removesuffix(_INPUT),
-        steps=tuple(steps),
-        truth=Path(t_ns=nanoseconds(truth[:, 0]), xy_m=truth[:, 1:3]),
-        left_out=len(ranges) - sum(len(step.observations) for step in steps),
+        steps=steps,
+        truth=Positions(t_ns=nanoseconds(truth[:, 0]), xy_m=truth[:, 1:3]),
+        left_out=n_ranges - sum(len(step.observations) for step in steps),
     )
-
-
-def _measurements(path: FilePath, kinds: tuple[str, ...]) -> list[tuple[int, str, list[float]]]:
-    what = f"libRSF text with lines of {' and '.join(kinds)}"
-    found_lines = []
-    for number, (kind, *words) in rows_of(path, what):
-        if kind not in kinds:
-            raise bad_line(path, number, f"a line begins with {' or '.join(kinds)}")
-        if len(words) != _NUMBERS[kind]:
-            raise bad_line(path, number, f"{len(words)} numbers, {kind} has {_NUMBERS[kind]}")
-        try:
-            found_lines.append((number, kind, [number_of(word) for word in words]))
-        except ValueError as error:
-            raise bad_line(path, number, error) from None
-    if not found_lines:
-        raise AppError(f"{path}: holds no measurement; it must be {what}; {REMEDY}")
-    return found_lines

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fclusterdata
 from threadpoolctl import threadpool_limits
 
-from slam.app.experiments.benchmarks.data_set import Array, Observation, Run, Sensor
+from slam.app.benchmarks.data_set import Array, Observation, Run, Sensor
 from slam.geometry import Mount, Rig, compose, has_moved
 from slam.robust.association import RangeScan
 from slam.robust.branches import Hypotheses
