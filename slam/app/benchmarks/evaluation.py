@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.app.benchmarks.back_end import Solution, solve
 from slam.app.benchmarks.data_set import Array, DataSet, Positions, Run
 from slam.app.errors import AppError, naming
-from slam.app.odometry.track import NS_PER_S, Trajectory, write_tum
+from slam.app.odometry.track import NS_PER_S
+from slam.app.run.results import write_path
 from slam.evaluation import ate_rmse_m
 from slam.geometry import align_se2, transform
-from xethru_protocol.system import StopFlag, written_whole
+from xethru_protocol.system import StopFlag
 
 ODOMETRY = "odometry"
 WITH_IDS, WITHOUT_IDS = "with_ids", "without_ids"
@@ -112,13 +112,8 @@ def write_run(folder: Path, scored: ScoredRun) -> None:
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for name, poses in scored.paths.items():
-        _write_tum(folder / f"{name}.tum", run.t_ns, poses)
+        write_path(folder / f"{name}.tum", run.t_ns, poses)
     truth = run.truth
     _, rows = np.unique(truth.t_ns, return_index=True)
     places = np.column_stack([truth.xy_m[rows], np.zeros(len(rows))])
-    _write_tum(folder / "truth.tum", truth.t_ns[rows], places)
-
-
-def _write_tum(path: Path, t_ns: NDArray[np.int64], poses: Array) -> None:
-    with naming(path), written_whole(path) as fresh:
-        write_tum(fresh, Trajectory(stamps_ns=t_ns, poses=poses))
+    write_path(folder / "truth.tum", truth.t_ns[rows], places)

@@ -9,7 +9,7 @@ One item per line; times in seconds, metres, radians, covariances as upper trian
     EDGE_RANGE   time pose landmark range variance
 
 Names are a letter and a number; those of landmarks begin with L. Graphs in three dimensions and
-priors are no drives on a floor and are an error. Format: the files of PyFactorGraph and
+priors are refused. Format: the files of PyFactorGraph and
 CORA, Marine Robotics Group.
 """
 
@@ -34,7 +34,7 @@ from slam.app.benchmarks.data_set import (
     Sensor,
     steps_of,
 )
-from slam.app.benchmarks.tables import Row, found, number_of, read_rows
+from slam.app.benchmarks.tables import TableRow, found, number_of, read_rows
 from slam.app.errors import AppError
 from slam.app.odometry.track import NS_PER_S
 from slam.config import WheelNoise
@@ -88,12 +88,12 @@ def read_data_set(folder: Path) -> DataSet:
 def read_run(path: Path) -> Run:
     """Return the drive that a graph holds.
 
-    A range belongs to its pose; the time of the edge is not used. Raises AppError that names a line
-    that is none of it, or a name that no line defines, or if the poses are no single chain.
+    A range belongs to its pose; the time of the edge is not used. Raises AppError that names a
+    damaged line, or a name that no line defines, or if the poses do not form a single chain.
     """
     rows = read_rows(path, _COLUMNS)
     poses, landmarks = _defined(rows, "VERTEX_SE2"), _defined(rows, "VERTEX_XY")
-    odometry: list[Row] = []
+    odometry: list[TableRow] = []
     seen: dict[str, list[Observation]] = defaultdict(list)
     for row in rows:
         if row.kind not in _MEASURED:
@@ -115,7 +115,7 @@ def read_run(path: Path) -> Run:
         raise AppError(f"{path}: holds no EDGE_SE2; a drive has odometry")
     names = [odometry[0].names[1], *(row.names[2] for row in odometry)]
     if [row.names[1] for row in odometry] != names[:-1] or len(set(names)) != len(poses):
-        raise AppError(f"{path}: its EDGE_SE2 are no chain through all poses of one robot")
+        raise AppError(f"{path}: its EDGE_SE2 must be a chain through all poses of one robot")
     stamps = [_stamp_ns(poses[name], poses[name].names[0]) for name in names]
     if any(b <= a for a, b in pairwise(stamps)):
         raise AppError(f"{path}: the times of its poses do not increase along EDGE_SE2")
@@ -130,9 +130,9 @@ def read_run(path: Path) -> Run:
     )
 
 
-def _defined(rows: Sequence[Row], kind: str) -> dict[str, Row]:
+def _defined(rows: Sequence[TableRow], kind: str) -> dict[str, TableRow]:
     """Return the rows of a kind of vertex by their names."""
-    of_names: dict[str, Row] = {}
+    of_names: dict[str, TableRow] = {}
     for row in rows:
         if row.kind == kind:
             name = row.names[-1]
@@ -144,16 +144,16 @@ def _defined(rows: Sequence[Row], kind: str) -> dict[str, Row]:
     return of_names
 
 
-def _stamp_ns(row: Row, word: str) -> int:
+def _stamp_ns(row: TableRow, word: str) -> int:
     try:
         if abs(number_of(word)) >= 2**63 / NS_PER_S:
-            raise ValueError(f"{shown(word)} is no time in seconds")
+            raise ValueError(f"{shown(word)} must be a time in seconds")
     except ValueError as error:
         raise row.error(error) from None
     return round(Decimal(word) * NS_PER_S)
 
 
-def _observation(row: Row, covariance: Array) -> Observation:
+def _observation(row: TableRow, covariance: Array) -> Observation:
     label = int(row.names[2][1:])
     if row.kind == "EDGE_RANGE":
         range_m, variance = row.values

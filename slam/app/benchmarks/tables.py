@@ -24,7 +24,7 @@ REMEDY = "docs/benchmarks.md says where the data are from and how to lay out the
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
+class TableRow:
     """One line of a file: its kind, the words in columns of names, the values in the others."""
 
     path: Path
@@ -40,8 +40,8 @@ class Row:
         )
 
 
-def read_rows(path: Path, columns: Mapping[str, str]) -> list[Row]:
-    """Read a file with at least one row; empty lines and comments (#) are none.
+def read_rows(path: Path, columns: Mapping[str, str]) -> list[TableRow]:
+    """Read a file with at least one row; empty lines and comments (#) are skipped.
 
     ``columns`` has, by the word that a line of the kind begins with, the columns behind that word;
     those in brackets are names, the others finite decimal numbers. Under the key "" are the columns
@@ -67,7 +67,7 @@ def read_table(path: Path, columns: str, *, ascending: bool = False) -> Array:
     return np.array([row.values for row in rows])
 
 
-def check_ascending(rows: list[Row]) -> None:
+def check_ascending(rows: list[TableRow]) -> None:
     """Raise AppError if the first value of a row, a time, is less than that of the row before."""
     for before, row in pairwise(rows):
         if row.values[0] < before.values[0]:
@@ -80,7 +80,7 @@ def _lines(path: Path, what: str) -> Iterator[tuple[int, list[str]]]:
         text = read_bounded(path, _MAX_BYTES).decode("ascii")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        raise AppError(f"{path}, line {line}: no ASCII text; it must be {what}") from None
+        raise AppError(f"{path}, line {line}: must be ASCII text: a table of {what}") from None
     except OSError as error:
         raise AppError(
             f"{path}: cannot be read: {reason_of(error)}; it is a table of {what}; {REMEDY}"
@@ -91,9 +91,9 @@ def _lines(path: Path, what: str) -> Iterator[tuple[int, list[str]]]:
             yield line, words
 
 
-def _row(path: Path, line: int, words: list[str], columns: Mapping[str, str]) -> Row:
+def _row(path: Path, line: int, words: list[str], columns: Mapping[str, str]) -> TableRow:
     kind = "" if "" in columns else words.pop(0)
-    row = Row(path=path, line=line, kind=kind, names=(), values=())
+    row = TableRow(path=path, line=line, kind=kind, names=(), values=())
     if kind not in columns:
         raise row.error(f"{shown(kind)} is not one of {', '.join(columns)}")
     expected = columns[kind].split()
@@ -108,26 +108,26 @@ def _row(path: Path, line: int, words: list[str], columns: Mapping[str, str]) ->
             values.append(number_of(word))
         except ValueError as error:
             raise row.error(error) from None
-    return Row(path=path, line=line, kind=kind, names=tuple(names), values=tuple(values))
+    return TableRow(path=path, line=line, kind=kind, names=tuple(names), values=tuple(values))
 
 
 def number_of(word: str) -> float:
-    """Return a finite decimal number; ValueError if the word is none."""
+    """Return a finite decimal number; ValueError for another word."""
     value = float(word) if _DECIMAL.fullmatch(word) else math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{shown(word)} is no finite decimal number")
+        raise ValueError(f"{shown(word)} must be a finite decimal number")
     return value
 
 
 def folder_at(path: Path) -> Path:
-    """Return the folder; AppError if it is none."""
+    """Return the folder; AppError if it does not exist."""
     if not path.is_dir():
         raise AppError(f"{path}: no such folder; {REMEDY}")
     return path
 
 
 def found(folder: Path, pattern: str) -> list[Path]:
-    """Return the files of a folder that match, by name; AppError if there are none."""
+    """Return the files of a folder that match, by name; AppError if no file does."""
     paths = sorted(path for path in folder_at(folder).glob(pattern) if path.is_file())
     if not paths:
         raise AppError(f"{folder}: holds no {pattern}; {REMEDY}")

@@ -51,7 +51,7 @@ from slam.app.benchmarks.data_set import (
 )
 from slam.app.benchmarks.tables import (
     REMEDY,
-    Row,
+    TableRow,
     check_ascending,
     folder_at,
     read_rows,
@@ -60,6 +60,7 @@ from slam.app.benchmarks.tables import (
 from slam.app.errors import AppError
 from slam.config import WheelNoise
 from slam.geometry import between, compose
+from xethru_protocol.validation import shown
 
 _GRAPH = "victoria_park.txt"
 _GRAPH_COLUMNS = {
@@ -198,13 +199,13 @@ def _read_graph(path: Path, t_s: Array, way_m: Array, truth: Positions) -> Run:
     return Run(name="victoria-park-gtsam", steps=steps, truth=truth, is_dense=False)
 
 
-def _id(row: Row, word: str) -> int:
+def _id(row: TableRow, word: str) -> int:
     if not _ID.fullmatch(word):
-        raise row.error(f'"{word[:40]}" is no id: a whole number')
+        raise row.error(f"{shown(word)} must be a whole number")
     return int(word)
 
 
-def _tree(row: Row, label: int) -> Observation:
+def _tree(row: TableRow, label: int) -> Observation:
     """Return a tree as the laser sees it, from its place in the frame of the axle."""
     x_m, y_m, *_ = row.values
     if x_m == 0.0 and y_m == 0.0:

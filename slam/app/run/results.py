@@ -77,16 +77,17 @@ def write_trajectories(out: Path, record: RunRecord) -> None:
     if states.has_truth:
         paths["truth"] = states.truth
     for name, poses in paths.items():
-        _write_tum(out / f"{name}.tum", states.t_ns, poses)
+        write_path(out / f"{name}.tum", states.t_ns, poses)
     if record.smoothed is not None:
         write_smoothed(out, record.smoothed)
 
 
 def write_smoothed(out: Path, smoothed: SmoothedRun) -> None:
-    _write_tum(out / SMOOTHED, smoothed.t_ns, smoothed.poses)
+    write_path(out / SMOOTHED, smoothed.t_ns, smoothed.poses)
 
 
-def _write_tum(path: Path, t_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+def write_path(path: Path, t_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    """Write poses (n, 3) at stamps as TUM text; AppError if the file cannot be written."""
     with naming(path), written_whole(path) as fresh:
         write_tum(fresh, Trajectory(stamps_ns=t_ns, poses=poses))
 

@@ -33,7 +33,7 @@ from slam.app.sweep.statistics import Group, in_band, nis_in_band, summarise_gro
 from slam.app.sweep.table import (
     CONSISTENCY_COLUMNS,
     SCENES_COLUMNS,
-    Table,
+    PrintedTable,
     group_name,
     settings_text,
     stress_table,
@@ -74,7 +74,7 @@ class Experiment:
     title: str  # of the picture
     size_in: tuple[float, float]  # its width and height
     draw: Callable[[Figure], None]
-    tables: Sequence[Table]
+    tables: Sequence[PrintedTable]
 
 
 def run_experiment(stop: StopFlag, *, name: str, sweep: Path, out: Path) -> None:

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from slam.app.run.evaluation import ratio
 from slam.app.run.output import mm_text, share_text
 from slam.app.sweep import CLEAN
-from slam.app.sweep.places import FOUND_WITHIN_S
+from slam.app.sweep.outcomes import FOUND_WITHIN_S
 from slam.app.sweep.statistics import HARMED, Group, in_band, nis_in_band
 
-Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
+PrintedTable = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Title, header and rows, for `print_table`."""
 
 
@@ -154,7 +154,7 @@ _STRESS_COLUMNS = (
 )
 
 
-def table_of(title: str, groups: Sequence[Group], columns: Sequence[str]) -> Table:
+def table_of(title: str, groups: Sequence[Group], columns: Sequence[str]) -> PrintedTable:
     return title, columns, [[COLUMNS[name](group) for name in columns] for group in groups]
 
 
@@ -173,7 +173,7 @@ def stress_tables(groups: Sequence[Group]) -> list[tuple[Group, list[Group]]]:
     return tables
 
 
-def stress_table(clean: Group, groups: Sequence[Group]) -> Table:
+def stress_table(clean: Group, groups: Sequence[Group]) -> PrintedTable:
     """Return the table of one of `stress_tables`, with the ATE in units of the clean runs'."""
     title = (
         f"{group_name(clean)}, {clean['runs']} runs, with the same seeds in every row: simulated"

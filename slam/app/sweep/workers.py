@@ -118,7 +118,7 @@ def _belong_to(parent: int) -> None:
         os._exit(1)
 
 
-class ClusterLostError(Exception):
+class ClusterLostError(AppError):
     """The scheduler went away, or a task took every worker down that it was given to."""
 
 
