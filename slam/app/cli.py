@@ -403,7 +403,7 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
         "name",
         choices=tuple(BENCHMARKS),
         metavar="NAME",
-        help="; ".join(f"{name}: {row.help}" for name, row in BENCHMARKS.items()),
+        help="; ".join(f"{name}: {text}" for name, text in BENCHMARKS.items()),
     )
     benchmark.add_argument(
         "--data", type=Path, required=True, metavar="DIR", help="folder with the files"

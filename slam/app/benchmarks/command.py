@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from slam.app.benchmarks import BENCHMARKS
 from slam.app.benchmarks.data_set import DataSet
 from slam.app.benchmarks.evaluation import (
     ODOMETRY,
@@ -55,8 +54,8 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
 
     Raises AppError if a file is missing, is not what it should be, or cannot be written.
     """
-    read = import_module(f"slam.app.benchmarks.{BENCHMARKS[name].module}").read_data_set
-    data_set: DataSet = read(data)
+    module = import_module(f"slam.app.benchmarks.{name.replace('-', '_')}")
+    data_set: DataSet = module.read_data_set(data)
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
     runs = []

@@ -138,7 +138,6 @@ class Sensor:
 class DataSet:
     """Drives with one kind of robot and sensor."""
 
-    name: str
     title: str
     sensor: Sensor
     runs: tuple[Run, ...]

@@ -96,7 +96,7 @@ def read_data_set(folder: Path) -> DataSet:
             f"folders; {REMEDY}"
         )
     title = "MRCLAM: robots among cylinders"
-    return DataSet(name="mrclam", title=title, sensor=SENSOR, runs=tuple(runs))
+    return DataSet(title=title, sensor=SENSOR, runs=tuple(runs))
 
 
 def read_run(folder: Path, robot: str) -> Run:

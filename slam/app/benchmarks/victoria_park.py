@@ -146,7 +146,6 @@ def read_data_set(folder: Path) -> DataSet:
         way_m = np.concatenate([[0.0], np.cumsum(np.abs(axle_mps[:-1]) * np.diff(t_s))])
         runs.append(_read_graph(folder / _GRAPH, t_s, way_m, truth))
     return DataSet(
-        name="victoria-park",
         title="Victoria Park: a car among trees",
         sensor=SENSOR,
         runs=tuple(runs),

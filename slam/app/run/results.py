@@ -16,7 +16,7 @@ from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.output import Row, print_result, print_text
+from slam.app.run.output import ResultRow, print_result, print_text
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
 from slam.results import SmoothedRun
@@ -33,7 +33,7 @@ RESULTS = ("map.png", "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "od
 
 
 def finish(
-    out: Path, source: RunSource, record: RunRecord, stop: StopFlag, also: Sequence[Row] = ()
+    out: Path, source: RunSource, record: RunRecord, stop: StopFlag, also: Sequence[ResultRow] = ()
 ) -> None:
     """Write a run's results into an existing folder, then print its table; `also` are more rows.
 

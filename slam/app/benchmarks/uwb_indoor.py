@@ -72,7 +72,7 @@ def read_data_set(folder: Path) -> DataSet:
     """Read all runs of a folder, by the names of their input files."""
     runs = tuple(read_run(path) for path in found(folder, f"*{_INPUT}"))
     title = "Indoor UWB: a small robot among four modules"
-    return DataSet(name="uwb-indoor", title=title, sensor=SENSOR, runs=runs)
+    return DataSet(title=title, sensor=SENSOR, runs=runs)
 
 
 def read_run(path: Path) -> Run:

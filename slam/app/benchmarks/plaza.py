@@ -82,7 +82,7 @@ def read_data_set(folder: Path) -> DataSet:
     """Read all drives of a folder, one per .pyfg file."""
     runs = tuple(read_run(path) for path in found(folder, "*.pyfg"))
     title = "Plaza: a mower among four radio beacons"
-    return DataSet(name="plaza", title=title, sensor=SENSOR, runs=runs)
+    return DataSet(title=title, sensor=SENSOR, runs=runs)
 
 
 def read_run(path: Path) -> Run:
