@@ -24,7 +24,7 @@ from slam.app.rig.emulated import rig_of, true_landmarks_m
 from slam.app.run.output import print_table
 from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, TRUTH, label, picture
 from slam.app.run.runner import execute
-from slam.app.sweep.run import Steps, first_laps, loopback_source
+from slam.app.sweep.run import StepKeeper, first_laps, loopback_source
 from slam.config import load_preset, override
 from slam.geometry import transform
 from slam.paper.clustering import CollectedState, filter_window
@@ -85,7 +85,7 @@ def drive(scene: str, seed: int) -> Lap:
     lap = first_laps(load_scene(scene), 1)
     # With a window of one state each comes out as it is collected.
     config = override(load_preset("paper", lap.environment), {"window.size": 1})
-    kept, slam = Steps(), UwbRadarSlam(config, rig_of(lap))
+    kept, slam = StepKeeper(), UwbRadarSlam(config, rig_of(lap))
     truth = execute(loopback_source(lap, "paper", slam, seed), [kept]).states.truth
     names = ("t_ns", "odometry_pose", "detections", "fixes")
     states = tuple(CollectedState(**{n: getattr(step, n) for n in names}) for step in kept.steps)

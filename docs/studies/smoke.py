@@ -28,7 +28,7 @@ from emulator.scene.scene import Scene, load_scene
 from slam.app.rig.emulated import rig_of, true_landmarks_m
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
 from slam.app.run.runner import States, execute
-from slam.app.sweep.run import Steps, first_laps, loopback_source
+from slam.app.sweep.run import StepKeeper, first_laps, loopback_source
 from slam.config import load_preset
 from slam.geometry import transform
 from slam.paper.pipeline import UwbRadarSlam
@@ -91,7 +91,7 @@ class Run(NamedTuple):
 def drive(scene: Scene, *, seed: int, noise_seed: int) -> Run:
     """Drive through a scene; `seed` is that of odometry, `noise_seed` that of the receivers."""
     slam = UwbRadarSlam(load_preset("paper", scene.environment), rig_of(scene))
-    source, kept = loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed), Steps()
+    source, kept = loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed), StepKeeper()
     record = execute(source, [kept])
     return Run(record.states, kept.steps, record.world_from_map, true_landmarks_m(scene))
 

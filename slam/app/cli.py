@@ -15,8 +15,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from slam.app.benchmarks import BENCHMARKS
 from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
-from slam.app.experiments.benchmarks import BENCHMARKS
 from slam.app.sweep import FAMILIES, STRESSES
 from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
 from xethru_protocol.cli.version import add_version
@@ -480,7 +480,7 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
         "name",
         choices=tuple(BENCHMARKS),
         metavar="NAME",
-        help="; ".join(f"{name}: {row.help}" for name, row in BENCHMARKS.items()),
+        help="; ".join(f"{name}: {text}" for name, text in BENCHMARKS.items()),
     )
     benchmark.add_argument(
         "--data", type=Path, required=True, metavar="DIR", help="folder with the files"
@@ -569,7 +569,7 @@ _COMMANDS = (
     ),
     _Command(
         "benchmark",
-        "slam.app.experiments.benchmarks.command:run_benchmark",
+        "slam.app.benchmarks.command:run_benchmark",
         "run the back end of preset robust on a public data set, beside its truth",
         _add_benchmark,
         "Runs the back end of preset robust on all drives of a public data set that you have "

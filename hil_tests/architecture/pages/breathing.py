@@ -6,9 +6,10 @@ measures anew.
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from hil_tests.architecture.pages.markdown import table
+from hil_tests.architecture.pages.markdown import table, with_part, write
 from hil_tests.paths import FIXTURES, REPOSITORY
 
 PAGE = REPOSITORY / "docs" / "breathing.md"
@@ -31,16 +32,13 @@ NOBODY = (
     ("fast fan", "nobody, a fan of 9 to 40 blades a second"),
 )
 
-_MARKS = {name: (f"<!-- {name} -->\n", f"<!-- /{name} -->") for name in ("at rest", "nobody")}
 
-
-def page_with_tables(page: str, found: Mapping[str, Any]) -> str:
+def documents() -> dict[Path, str]:
     """Return the page with both tables made anew, between their comments."""
+    found, page = json.loads(BASELINE.read_text()), PAGE.read_text("utf-8")
     for name, made in (("at rest", rest_table(found)), ("nobody", nobody_table(found))):
-        begin, end = _MARKS[name]
-        before, rest = page.split(begin)
-        page = f"{before}{begin}\n{made}\n{end}{rest.split(end)[1]}"
-    return page
+        page = with_part(page, name, f"\n{made}\n")
+    return {PAGE: page}
 
 
 def rest_table(found: Mapping[str, Any]) -> str:
@@ -74,4 +72,4 @@ def nobody_table(found: Mapping[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page_with_tables(PAGE.read_text(), json.loads(BASELINE.read_text())))
+    write(documents())

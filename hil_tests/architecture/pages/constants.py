@@ -6,10 +6,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from pathlib import Path
 from types import ModuleType
 from typing import get_args, get_type_hints
 
-from hil_tests.architecture.pages.markdown import table
+from hil_tests.architecture.pages.markdown import table, write
 from hil_tests.paths import REPOSITORY
 from slam.config import Origin, RobustConfig, load_preset
 from slam.robust import parameters
@@ -135,7 +136,7 @@ def counts() -> Counter[Origin]:
     )
 
 
-def page() -> str:
+def documents() -> dict[Path, str]:
     found = counts()
     kinds = [(str(origin), str(found[origin]), text) for origin, text in MEANINGS.items()]
     kinds.append(("all", str(found.total()), ""))
@@ -153,8 +154,8 @@ def page() -> str:
         ]
         columns = ("name", "value", "unit", "origin", "what it is")
         parts += [f"## {group.title}\n", f"{group.purpose}\n", table(columns, rows, ["value"])]
-    return "\n".join(parts)
+    return {PAGE: "\n".join(parts)}
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page())
+    write(documents())

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator
 from enum import IntEnum
+from pathlib import Path
 
-from hil_tests.architecture.pages.markdown import table
+from hil_tests.architecture.pages.markdown import table, write
 from hil_tests.paths import REPOSITORY
 from xethru_protocol.export.description import Field, Layout, layouts
 from xethru_protocol.wire import codes
@@ -57,7 +58,7 @@ that are left, and a `?` marks a field that may be absent.
 """
 
 
-def page() -> str:
+def documents() -> dict[Path, str]:
     found = layouts()
     parts = [HEAD]
     for title, from_host in (("From the host", True), ("From the module", False)):
@@ -68,7 +69,7 @@ def page() -> str:
         if isinstance(kind, type) and issubclass(kind, int) and kind.__module__ == codes.__name__:
             parts += [f"### {kind.__name__}\n", (kind.__doc__ or "").partition("\n")[0] + "\n"]
             parts.append(table(("value", "name"), _members(kind), ["value"]))
-    return "\n".join(parts)
+    return {PAGE: "\n".join(parts)}
 
 
 def _members(kind: type) -> Iterator[tuple[str, str]]:
@@ -102,4 +103,4 @@ def _rows(fields: tuple[Field, ...], when: str = "") -> Iterator[tuple[str, str,
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), "utf-8")
+    write(documents())

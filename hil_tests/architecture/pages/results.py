@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from hil_tests.architecture.pages.markdown import table
+from hil_tests.architecture.pages.markdown import table, with_part, write
 from hil_tests.paths import FIXTURES, REPOSITORY
 from slam.app.run.output import share_text
-from slam.app.sweep.statistics import carries_text, in_band_text, outcomes_text
+from slam.app.sweep.table import carries_text, in_band_text, outcomes_text
 
 PAGE = REPOSITORY / "docs" / "results.md"
 README = REPOSITORY / "README.md"
@@ -116,13 +117,11 @@ README_ROWS = (
 )
 """Text, file and group of each row of README's table."""
 
-_BEGIN, _END = "<!-- results -->\n", "<!-- /results -->"
 
-
-def readme_with_table(readme: str) -> str:
-    """Return README with its table made anew, between the two comments."""
-    before, rest = readme.split(_BEGIN)
-    return f"{before}{_BEGIN}{_readme_table()}{_END}{rest.split(_END)[1]}"
+def documents() -> dict[Path, str]:
+    """Return the page, and README with its table made anew."""
+    readme = with_part(README.read_text("utf-8"), "results", _readme_table())
+    return {PAGE: "\n".join([HEAD, *_sections()]), README: readme}
 
 
 def _readme_table() -> str:
@@ -133,10 +132,6 @@ def _readme_table() -> str:
         cells = {title: of(group) for title, of in COLUMNS}
         rows.append([text, *(cells[title] for title in README_COLUMNS)])
     return table([first, *README_COLUMNS], rows, README_COLUMNS)
-
-
-def page() -> str:
-    return "\n".join([HEAD, *_sections()])
 
 
 def _sweep(name: str) -> dict[str, Any]:
@@ -222,5 +217,4 @@ HARM_COLUMNS: tuple[tuple[str, Callable[[Group], str]], ...] = (
 README_COLUMNS = ("runs", "wheels", "causal", "smoothed")
 
 if __name__ == "__main__":
-    PAGE.write_text(page())
-    README.write_text(readme_with_table(README.read_text()))
+    write(documents())

@@ -28,7 +28,7 @@ from slam.app.rig.emulated import (
     rig_of,
 )
 from slam.app.run.runner import run_slam
-from slam.app.sweep.run import Steps
+from slam.app.sweep.run import StepKeeper
 from slam.config import FrontEnd, SampleTime, load_preset, override
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import StepResult
@@ -99,7 +99,7 @@ def results_of(
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
         scans: Iterable[Scan] = source.scans(end_tick(trajectory.duration_ns), StopFlag())
         scans = without_some(scans) if lose else scans
-        kept = Steps()
+        kept = StepKeeper()
         slam = UwbRadarSlam(config, rig_of(scene))
         run_slam(scans, track, slam, trajectory.poses, [kept])
         return tuple(kept.steps)

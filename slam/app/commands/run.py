@@ -33,7 +33,7 @@ from slam.app.run.live_source import (
     drift_text,
     reading,
 )
-from slam.app.run.output import Progress, Row, note
+from slam.app.run.output import Progress, ResultRow, note
 from slam.app.run.results import (
     REPORT,
     RESULTS,
@@ -330,7 +330,7 @@ def _report_end(live: LiveSource, log: LiveLog, out: Path) -> None:
 
 def _rows(
     record: RunRecord, live: LiveSource, odometry: LiveOdometry, slam: PromptSlam
-) -> list[Row]:
+) -> list[ResultRow]:
     left_out = live.ticks.n_unused - live.ticks.n_dropped + slam.n_given_up
     load = live.busy_s / max(record.duration_ns / NS_PER_S, 1e-9)
     rows = [

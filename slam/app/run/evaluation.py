@@ -224,7 +224,7 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
         odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
         final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
         landmarks=score(last.landmarks_m, estimate),
-        nees_pose=_nees(record, truth_in_map, estimate, states.pose_covariances),
+        nees_pose=nees_at_ten_times(record, truth_in_map, estimate, states.pose_covariances),
         nis_mean=sum(states.nis.tolist()) / dof if (dof := int(states.nis_dof.sum())) else None,
         nis_times=_nis_times(record),
     )
@@ -234,11 +234,13 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
         summary,
         smoothed_ate_rmse_m=ate_rmse_m(smoothed.poses[:, :2], truth_xy),
         smoothed_landmarks=score(smoothed.landmarks_m, smoothed.poses),
-        smoothed_nees_pose=_nees(record, truth_in_map, smoothed.poses, smoothed.pose_covariances),
+        smoothed_nees_pose=nees_at_ten_times(
+            record, truth_in_map, smoothed.poses, smoothed.pose_covariances
+        ),
     )
 
 
-def _nees(
+def nees_at_ten_times(
     record: RunRecord,
     truth_in_map: NDArray[np.float64],
     poses: NDArray[np.float64],

@@ -133,7 +133,7 @@ def write_json(path: Path, numbers: Mapping[str, object]) -> None:
         fresh.write_text(text + "\n", encoding="ascii")
 
 
-Row = tuple[str, str, str]
+ResultRow = tuple[str, str, str]
 """Name, value and note."""
 
 
@@ -144,7 +144,7 @@ def print_table(title: str, header: Sequence[str] | None, rows: Sequence[Sequenc
 def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> str:
     """Return a table: the first column to the left, others to the right.
 
-    Without a header, rows are a `Row` each, whose note is to the left, too.
+    Without a header, rows are a `ResultRow` each, whose note is to the left, too.
     """
     left = {0, 2} if header is None else {0}
     title = one_line(title)
@@ -164,7 +164,7 @@ def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence
 
 
 def print_result(
-    source: RunSource, record: RunRecord, summary: Summary | None, also: Sequence[Row] = ()
+    source: RunSource, record: RunRecord, summary: Summary | None, also: Sequence[ResultRow] = ()
 ) -> None:
     """Print the table of a run; without `summary` no truth is known. `also` are more rows."""
     info, lost_frames = source.info, source.lost_frames()
@@ -184,7 +184,7 @@ def print_result(
 
 def summary_rows(
     summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int
-) -> list[Row]:
+) -> list[ResultRow]:
     """Return errors in mm with their ratio to odometry's, landmarks and speed.
 
     `lag_states` is the number of newer states that a filtered state has seen.
@@ -214,7 +214,7 @@ def summary_rows(
     ]
 
 
-def _smoothed_row(summary: Summary) -> list[Row]:
+def _smoothed_row(summary: Summary) -> list[ResultRow]:
     share = summary.smoothed_ate_ratio
     if share is None:
         return []
@@ -222,7 +222,7 @@ def _smoothed_row(summary: Summary) -> list[Row]:
     return [("smoothed ATE", mm_text(summary.smoothed_ate_rmse_m), note)]
 
 
-def _landmark_rows(landmarks: LandmarkScore) -> list[Row]:
+def _landmark_rows(landmarks: LandmarkScore) -> list[ResultRow]:
     if landmarks.true is None:
         return [("landmarks", str(landmarks.estimated), "the true ones are unknown")]
     return [
@@ -249,7 +249,7 @@ def share_text(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Row]:
+def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[ResultRow]:
     """Return what is known without the truth: time, way driven, last pose and landmarks."""
     duration_s = record.duration_ns / NS_PER_S
     speed = f"{record.n_frames} frames used, {lost_frames} lost between counters"

@@ -16,7 +16,7 @@ from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.output import Row, print_result, print_text
+from slam.app.run.output import ResultRow, print_result, print_text
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
 from slam.results import SmoothedRun
@@ -34,7 +34,7 @@ RESULTS = ("map.png", "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "od
 
 
 def finish(
-    out: Path, source: RunSource, record: RunRecord, stop: StopFlag, also: Sequence[Row] = ()
+    out: Path, source: RunSource, record: RunRecord, stop: StopFlag, also: Sequence[ResultRow] = ()
 ) -> None:
     """Write a run's results into an existing folder, then print its table; `also` are more rows.
 
@@ -78,16 +78,17 @@ def write_trajectories(out: Path, record: RunRecord) -> None:
     if states.has_truth:
         paths["truth"] = states.truth
     for name, poses in paths.items():
-        _write_tum(out / f"{name}.tum", states.t_ns, poses)
+        write_path(out / f"{name}.tum", states.t_ns, poses)
     if record.smoothed is not None:
         write_smoothed(out, record.smoothed)
 
 
 def write_smoothed(out: Path, smoothed: SmoothedRun) -> None:
-    _write_tum(out / SMOOTHED, smoothed.t_ns, smoothed.poses)
+    write_path(out / SMOOTHED, smoothed.t_ns, smoothed.poses)
 
 
-def _write_tum(path: Path, t_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+def write_path(path: Path, t_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    """Write poses (n, 3) at stamps as TUM text; AppError if the file cannot be written."""
     with naming(path), written_whole(path) as fresh:
         write_tum(fresh, Trajectory(stamps_ns=t_ns, poses=poses))
 

@@ -17,7 +17,7 @@ FAMILIES = (
 )
 """Families of random rooms; `emulator.scene.rooms` would load NumPy."""
 
-Table = Mapping[str, object]
+SceneKeys = Mapping[str, object]
 """Keys of a table of a scene, and their values."""
 
 
@@ -45,10 +45,10 @@ class Stress:
     mount_sigma_deg: float = 0.0
     # keys that replace those of every such table of the scene: of `RadarSpec`, `TargetSpec`,
     # `MultipathSpec` and `OdometrySpec` (`emulator.scene.scene`)
-    radars: Table = field(default_factory=dict)
-    targets: Table = field(default_factory=dict)
-    multipath: Table = field(default_factory=dict)
-    odometry: Table = field(default_factory=dict)
+    radars: SceneKeys = field(default_factory=dict)
+    targets: SceneKeys = field(default_factory=dict)
+    multipath: SceneKeys = field(default_factory=dict)
+    odometry: SceneKeys = field(default_factory=dict)
     carried_at: float = 0.0  # part of the drive at which the robot is picked up
     carried_skips: float = 0.0  # part of its course that it misses
 
@@ -57,15 +57,15 @@ _SKEWS_MS = (0.0, 190.0, 100.0, 150.0)
 
 # Strengths of model error, as in the project's laws (`emulator.echo.model_error`).
 _OFFSET_SIGMA_M, _MOUNT_SIGMA_M, _MOUNT_SIGMA_DEG = 0.02, 0.005, 1.0
-_SKEWED_PULSE: Table = {"pulse": {"width": 1.15, "skew": 0.15, "ringing": 0.15}}
-_BURSTS: Table = {"bursts": {"echo_share": 0.15, "noise_share": 0.05}}
-_STAMPS: Table = {"stamp_sigma_ms": 20.0}
-_ROD_ROD: Table = {"target_pairs": 0.25}
-_SLIP: Table = {"slips_per_s": 1 / 20, "slip_sigma_m": 0.015, "slip_sigma_deg": 2.0}
-_LARGE_SLIP: Table = {"slips_per_s": 1 / 60, "slip_sigma_m": 0.06, "slip_sigma_deg": 8.0}
+_SKEWED_PULSE: SceneKeys = {"pulse": {"width": 1.15, "skew": 0.15, "ringing": 0.15}}
+_BURSTS: SceneKeys = {"bursts": {"echo_share": 0.15, "noise_share": 0.05}}
+_STAMPS: SceneKeys = {"stamp_sigma_ms": 20.0}
+_ROD_ROD: SceneKeys = {"target_pairs": 0.25}
+_SLIP: SceneKeys = {"slips_per_s": 1 / 20, "slip_sigma_m": 0.015, "slip_sigma_deg": 2.0}
+_LARGE_SLIP: SceneKeys = {"slips_per_s": 1 / 60, "slip_sigma_m": 0.06, "slip_sigma_deg": 8.0}
 
 
-def _wander(range_m: float) -> Table:
+def _wander(range_m: float) -> SceneKeys:
     return {"wander": {"range_m": range_m, "inside_m": 0.02, "fading": 0.4, "phase_rad": 1.0}}
 
 

@@ -37,13 +37,12 @@ from scipy.optimize import least_squares, linear_sum_assignment
 
 from emulator.scene.scene import Scene
 from slam.app.errors import AppError
-from slam.app.odometry.track import NS_PER_S
 from slam.app.records import SessionObserver, Snapshot
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
-from slam.app.run.evaluation import NEES_AT
+from slam.app.run.evaluation import nees_at_ten_times
 from slam.app.run.runner import RunRecord, States
 from slam.config import BackEnd, SlamConfig, WheelNoise
-from slam.evaluation import ate_rmse_m, nees_pose
+from slam.evaluation import ate_rmse_m
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
 from slam.robust.association import LONGEST_M, crossings
@@ -551,17 +550,10 @@ def bound_of(
         offset_sigma_m=offset_sigma_m,
     )
     paths = solve_known(run, rig, wheels_of(scene), offset_sigma_m=offset_sigma_m)
-    stamps_ns = states.t_ns
-    values = []
-    for part in NEES_AT:
-        t_ns = round(part * record.duration_ns)
-        row = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
-        truth = between(record.world_from_map, states.truth[row])
-        nees = nees_pose(paths.filtered[row], paths.filtered_covariance[row], truth)
-        values.append((int(stamps_ns[row]) / NS_PER_S, nees))
+    truth = np.array([between(record.world_from_map, pose) for pose in states.truth])
     truth_xy = states.truth[:, :2]
     return BoundSummary(
         filtered_ate_rmse_m=ate_rmse_m(paths.filtered[:, :2], truth_xy),
         smoothed_ate_rmse_m=ate_rmse_m(paths.smoothed[:, :2], truth_xy),
-        nees_pose=tuple(values),
+        nees_pose=nees_at_ten_times(record, truth, paths.filtered, paths.filtered_covariance),
     )

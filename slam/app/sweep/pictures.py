@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from pydantic import BaseModel, Field, ValidationError
 
 from slam.app.errors import AppError, naming
-from slam.app.run.output import mm_text, print_table, share_text, write_json
+from slam.app.run.output import print_table, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
     GRID,
@@ -28,21 +28,21 @@ from slam.app.run.pictures import (
     picture,
 )
 from slam.app.sweep import CLEAN
-from slam.app.sweep.statistics import (
-    carries_text,
+from slam.app.sweep.run import SweepRun
+from slam.app.sweep.statistics import Group, in_band, nis_in_band, summarise_groups
+from slam.app.sweep.table import (
+    CONSISTENCY_COLUMNS,
+    SCENES_COLUMNS,
+    PrintedTable,
     group_name,
-    in_band,
-    in_band_text,
-    nis_in_band,
     settings_text,
     stress_table,
     stress_tables,
+    table_of,
     times_clean,
 )
 from xethru_protocol.system import StopFlag, read_bounded
 from xethru_protocol.validation import problem_text
-
-Group = dict[str, Any]
 
 TARGETS = {
     **dict.fromkeys(("outliers", "dropped", "skew", "walk", "silent"), 1.5),
@@ -62,74 +62,19 @@ _MOST_BYTES = 1 << 28
 _COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
 
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Error = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_Nees = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_Count = Annotated[int, Field(ge=0)]
-_NisRow = tuple[_Number, _Nees, _Nees, _Nees] | tuple[_Number, None, None, None]
-
-
-class _Spread(BaseModel):
-    median: _Error
-    p90: _Error
-
-
-class _Medians(BaseModel):
-    precision: _Number | None
-    recall: _Number | None
-
-
-class _Anees(BaseModel):
-    anees_pose: Annotated[tuple[tuple[_Number, _Nees], ...], Field(min_length=1)]
-    anees_band_95: tuple[_Nees, _Nees]
-
-
-class _Smoothed(_Anees):
-    ate_rmse_m: _Spread
-    ratio: _Spread
-
-
-class _Group(_Anees):
-    """What is shown of a group of `slam.app.sweep.statistics.summarise_groups`."""
-
-    scene: str
-    preset: str
-    settings: dict[str, str]
-    stress: str
-    runs: Annotated[int, Field(gt=0)]
-    runs_below_odometry: _Count
-    runs_above_odometry: _Count
-    runs_lost: _Count
-    runs_lost_at_end: _Count
-    carries: _Count
-    carries_in_time: _Count
-    ratio: _Spread
-    ate_rmse_m: _Spread
-    odometry_ate_rmse_m: _Spread
-    landmark_medians: _Medians
-    without_duplicates: _Error
-    false_per_run: _Error
-    confident_false: _Count
-    anees_mean: _Nees
-    smoothed: _Smoothed | None
-    nis_mean: _Number | None
-    nis_times: tuple[_NisRow, ...]
-    bound: _Anees | None
-
-
 class _Sweep(BaseModel):
-    groups: Annotated[tuple[_Group, ...], Field(min_length=1)]
+    runs: Annotated[list[SweepRun], Field(min_length=1)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
     """What is shown of a sweep: NAME.json, NAME.png and tables on standard output."""
 
-    numbers: Mapping[str, object]
+    numbers: Sequence[Mapping[str, object]]  # of each group
     title: str  # of the picture
     size_in: tuple[float, float]  # its width and height
     draw: Callable[[Figure], None]
-    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence[str]]]]  # title, header, rows
+    tables: Sequence[PrintedTable]
 
 
 def run_experiment(stop: StopFlag, *, name: str, sweep: Path, out: Path) -> None:
@@ -141,7 +86,7 @@ def run_experiment(stop: StopFlag, *, name: str, sweep: Path, out: Path) -> None
         out.mkdir(parents=True, exist_ok=True)
     shown = experiment_of(name, sweep, out)
     stop.check()
-    write_json(out / f"{name}.json", shown.numbers)
+    write_json(out / f"{name}.json", {"simulated": True, "groups": shown.numbers})
     width_in, height_in = shown.size_in
     path = out / f"{name}.png"
     with picture(path, width_in=width_in, height_in=height_in, title=shown.title) as figure:
@@ -169,11 +114,14 @@ def experiment_of(name: str, sweep: Path, out: Path) -> Experiment:
 
 
 def _read_groups(path: Path, result: Path) -> list[Group]:
+    """Return the groups of the runs of a sweep; the groups in the file are not used."""
     if result.resolve() == path.resolve():
         raise AppError(f"{path}: the result would replace the sweep; choose another --out")
     try:
-        content = json.loads(read_bounded(path, _MOST_BYTES))
-        _Sweep.model_validate(content)
+        sweep = _Sweep.model_validate(json.loads(read_bounded(path, _MOST_BYTES)))
+        json.dumps([asdict(run) for run in sweep.runs], allow_nan=False)
+        groups = summarise_groups(sweep.runs)
+        json.dumps(groups, allow_nan=False)
     except OSError as error:
         raise AppError(
             f"{path}: cannot be read: {error.strerror or error}; `uwb-slam sweep --json` writes it"
@@ -183,49 +131,31 @@ def _read_groups(path: Path, result: Path) -> list[Group]:
             f"{path}: is not a result of this version's `uwb-slam sweep --json`: "
             f"{problem_text(error.errors(), _Sweep)}"
         ) from None
-    except (ValueError, RecursionError):
+    except (ValueError, ArithmeticError, RecursionError):
         raise AppError(f"{path}: is not a result of `uwb-slam sweep --json`, nor JSON") from None
-    groups: list[Group] = content["groups"]
     return groups
 
 
 def _consistency(groups: Sequence[Group]) -> Experiment:
     scenes = list(dict.fromkeys(group["scene"] for group in groups))
-    rows = [
-        {
-            "name": group_name(group),
-            "runs": group["runs"],
-            "anees_in_band": in_band(group),
-            "anees_band_95": group["anees_band_95"],
-            "bound_anees_in_band": None if group["bound"] is None else in_band(group["bound"]),
-            "nis_in_band": nis_in_band(group),
-            "nis_mean": group["nis_mean"],
-        }
-        for group in groups
-    ]
-    cells = [
-        (
-            group_name(group),
-            str(group["runs"]),
-            in_band_text(group),
-            "-" if group["bound"] is None else in_band_text(group["bound"]),
-            str(nis_in_band(group)),
-            "-" if group["nis_mean"] is None else f"{group['nis_mean']:.4g}",
-        )
-        for group in groups
-    ]
+    title = "times of ten in their 95 % band, and the band of the ANEES: simulated numbers"
     return Experiment(
-        numbers={"simulated": True, "groups": rows},
+        numbers=[
+            {
+                "name": group_name(group),
+                "runs": group["runs"],
+                "anees_in_band": in_band(group),
+                "anees_band_95": group["anees_band_95"],
+                "bound_anees_in_band": None if group["bound"] is None else in_band(group["bound"]),
+                "nis_in_band": nis_in_band(group),
+                "nis_mean": group["nis_mean"],
+            }
+            for group in groups
+        ],
         title="Mean over seeds against the 95 % band of a consistent filter (simulated)",
         size_in=(1.2 + 4.6 * len(scenes), 7.2),
         draw=lambda figure: _draw_consistency(figure, groups, scenes),
-        tables=[
-            (
-                "times of ten in their 95 % band, and the band of the ANEES: simulated numbers",
-                ("group", "seeds", "ANEES", "known association", "NIS", "NIS mean"),
-                cells,
-            )
-        ],
+        tables=[table_of(title, groups, CONSISTENCY_COLUMNS)],
     )
 
 
@@ -262,20 +192,6 @@ def _line(axes: Axes, rows: Sequence[Sequence[float]], colour: str, name: str) -
 
 
 def _stress(tables: Sequence[tuple[Group, Sequence[Group]]]) -> Experiment:
-    numbers = [
-        {
-            "name": group_name(group),
-            "runs": group["runs"],
-            "ate_rmse_m": group["ate_rmse_m"],
-            "times_clean": {of: _finite(times_clean(group, clean, of)) for of in ("median", "p90")},
-            **_common(group),
-            "without_duplicates": group["without_duplicates"],
-            "false_per_run": group["false_per_run"],
-            "confident_false": group["confident_false"],
-        }
-        for clean, rows in tables
-        for group in rows
-    ]
     most_rows = max(len(groups) for _, groups in tables)
 
     def draw(figure: Figure) -> None:
@@ -287,11 +203,20 @@ def _stress(tables: Sequence[tuple[Group, Sequence[Group]]]) -> Experiment:
         _legend_below(figure, panels[0, 0], panels[0, 1])
 
     return Experiment(
-        numbers={"simulated": True, "groups": numbers},
+        numbers=[
+            {
+                **_numbers(group, "false_per_run"),
+                "times_clean": {
+                    of: _finite(times_clean(group, clean, of)) for of in ("median", "p90")
+                },
+            }
+            for clean, groups in tables
+            for group in groups
+        ],
         title="What each hardship costs, on equal seeds (simulated)",
         size_in=(10.4, 0.9 + (1.1 + 0.3 * most_rows) * len(tables)),
         draw=draw,
-        tables=[stress_table(clean, rows) for clean, rows in tables],
+        tables=[stress_table(*each) for each in tables],
     )
 
 
@@ -324,76 +249,44 @@ def _draw_times_clean(
 
 
 def _scenes(groups: Sequence[Group]) -> Experiment:
-    rows = [
-        {
-            "name": group_name(group),
-            "runs": group["runs"],
-            **_common(group),
-            "odometry_ate_rmse_m": group["odometry_ate_rmse_m"],
-            "ate_rmse_m": group["ate_rmse_m"],
-            "times": len(group["anees_pose"]),
-            "nis_mean": group["nis_mean"],
-            "landmark_medians": group["landmark_medians"],
-            "without_duplicates": group["without_duplicates"],
-            "confident_false": group["confident_false"],
-        }
-        for group in groups
-    ]
-    columns = {
-        "group": [row["name"] for row in rows],
-        "seeds": [str(row["runs"]) for row in rows],
-        "wheels": [mm_text(row["odometry_ate_rmse_m"]["median"]) for row in rows],
-        "SLAM": [mm_text(row["ate_rmse_m"]["median"]) for row in rows],
-        "SLAM p90": [mm_text(row["ate_rmse_m"]["p90"]) for row in rows],
-        "of wheels": [f"{row['ratio']['median']:.3f}" for row in rows],
-        "smoothed": [
-            "-" if row["smoothed_ratio"] is None else f"{row['smoothed_ratio']['median']:.3f}"
-            for row in rows
-        ],
-        "worse than wheels": [f"{row['runs_above_odometry']} of {row['runs']}" for row in rows],
-        "lost": [str(row["runs_lost"]) for row in rows],
-        "carries found": [carries_text(row) for row in rows],
-        "ANEES": [f"{row['anees_mean']:.1f}" for row in rows],
-        "in band": [in_band_text(group) for group in groups],
-        "NIS": ["-" if row["nis_mean"] is None else f"{row['nis_mean']:.2f}" for row in rows],
-        "precision": [share_text(row["landmark_medians"]["precision"]) for row in rows],
-        "recall": [share_text(row["landmark_medians"]["recall"]) for row in rows],
-        "no duplicate": [f"{row['without_duplicates']:.0%}" for row in rows],
-        "confident false": [str(row["confident_false"]) for row in rows],
-    }
-
     def draw(figure: Figure) -> None:
         errors, nees = figure.subplots(1, 2)
         _draw_errors(errors, groups)
         _draw_nees(nees, groups, [""] * len(groups))
         _legend_below(figure, errors, nees)
 
+    title = "clean runs by scene and preset; medians over seeds; simulated"
     return Experiment(
-        numbers={"simulated": True, "groups": rows},
+        numbers=[
+            {
+                **_numbers(group, "odometry_ate_rmse_m", "nis_mean", "landmark_medians"),
+                "times": len(group["anees_pose"]),
+            }
+            for group in groups
+        ],
         title="Clean runs, a row per scene and preset (simulated)",
         size_in=(10.4, 1.6 + 0.34 * len(groups)),
         draw=draw,
-        tables=[
-            (
-                "clean runs by scene and preset; errors, precision, recall: medians over seeds; "
-                "simulated",
-                list(columns),
-                list(zip(*columns.values(), strict=True)),
-            )
-        ],
+        tables=[table_of(title, groups, SCENES_COLUMNS)],
     )
 
 
-def _common(group: Group) -> Group:
-    """Return the numbers of a group that both tables have; ratios are per run, to its wheels."""
-    keys = ("ratio", "runs_below_odometry", "runs_above_odometry", "runs_lost", "runs_lost_at_end")
+_KEYS = (
+    *("runs", "runs_below_odometry", "runs_above_odometry", "runs_lost", "runs_lost_at_end"),
+    *("carries", "carries_in_time", "ratio", "ate_rmse_m", "anees_mean", "anees_band_95"),
+    *("without_duplicates", "confident_false"),
+)
+"""Of the numbers of a group, those that NAME.json has."""
+
+
+def _numbers(group: Group, *also: str) -> dict[str, object]:
+    """Return the numbers of a group for NAME.json; ratios are per run, to its wheels."""
     smoothed = group["smoothed"]
     return {
-        **{key: group[key] for key in (*keys, "carries", "carries_in_time")},
+        "name": group_name(group),
+        **{key: group[key] for key in (*_KEYS, *also)},
         "smoothed_ratio": None if smoothed is None else smoothed["ratio"],
-        "anees_mean": group["anees_mean"],
         "anees_in_band": in_band(group),
-        "anees_band_95": group["anees_band_95"],
     }
 
 
@@ -450,7 +343,8 @@ def _draw_nees(axes: Axes, groups: Sequence[Group], names: Sequence[str]) -> Non
                 color=ESTIMATE,
                 label="ANEES at one of ten times" if is_first else None,
             )
-    least = min(*lows, *(value for values in every for value in values))
+    # A logarithmic axis has no place for zero.
+    least = min(*lows, *(value for values in every for value in values if value > 0.0))
     axes.set_xlim(0.7 * least, 1.2 * _MOST_NEES)
     axes.set_xscale("log")
     label(axes, "consistency", "mean NEES of the pose (3 dof)", "")

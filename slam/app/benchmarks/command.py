@@ -13,10 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from slam.app.errors import naming
-from slam.app.experiments.benchmarks import BENCHMARKS
-from slam.app.experiments.benchmarks.data_set import DataSet
-from slam.app.experiments.benchmarks.evaluation import (
+from slam.app.benchmarks.data_set import DataSet
+from slam.app.benchmarks.evaluation import (
     ODOMETRY,
     WITH_IDS,
     WITHOUT_IDS,
@@ -25,6 +23,7 @@ from slam.app.experiments.benchmarks.evaluation import (
     score_run,
     write_run,
 )
+from slam.app.errors import naming
 from slam.app.run.output import print_progress, print_table, print_text, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
@@ -37,13 +36,6 @@ from slam.app.run.pictures import (
 from slam.app.run.pictures import ODOMETRY as ODOMETRY_COLOUR
 from xethru_protocol.system import StopFlag
 
-_COLUMNS = {
-    ODOMETRY: "dead reckoning",
-    WITH_IDS: "ids: causal",
-    f"{WITH_IDS}_smoothed": "smoothed",
-    WITHOUT_IDS: "no ids: causal",
-    f"{WITHOUT_IDS}_smoothed": "smoothed",
-}
 _PANELS = 4
 _PANEL_IN = 3.4
 _ALONE_IN = 7.5
@@ -54,6 +46,7 @@ _STYLES = {
     f"{WITHOUT_IDS}_smoothed": ("smoothed, without ids", "#e599b7", 1.0),
     f"{WITH_IDS}_smoothed": ("smoothed, with ids", SMOOTHED, 1.0),
 }
+"""Of each path its name, and the colour and width of its line."""
 
 
 def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: bool) -> None:
@@ -61,8 +54,8 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
 
     Raises AppError if a file is missing, is not what it should be, or cannot be written.
     """
-    read = import_module(f"slam.app.experiments.benchmarks.{BENCHMARKS[name].module}").read_data_set
-    data_set: DataSet = read(data)
+    module = import_module(f"slam.app.benchmarks.{name.replace('-', '_')}")
+    data_set: DataSet = module.read_data_set(data)
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
     runs = []
@@ -88,7 +81,7 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
 
 
 def _table(data: DataSet, runs: Sequence[ScoredRun]) -> tuple[str, Sequence[str], list[list[str]]]:
-    names = [name for name in _COLUMNS if any(name in one.ate_rmse_m for one in runs)]
+    names = [name for name in _STYLES if any(name in one.ate_rmse_m for one in runs)]
     rows = [
         [
             one.run.name,
@@ -102,7 +95,7 @@ def _table(data: DataSet, runs: Sequence[ScoredRun]) -> tuple[str, Sequence[str]
     if len(runs) > 1 and len(mean) > 1:  # more than dead reckoning
         rows.append(["mean", "", *(_metres(mean.get(name)) for name in names), ""])
     title = f"{data.title}: ATE [m], time-associated, SE(2)-aligned (real data)"
-    header = ["run", "observations", *(_COLUMNS[name] for name in names), "CPU time"]
+    header = ["run", "observations", *(_STYLES[name][0] for name in names), "CPU time"]
     return title, header, rows
 
 

@@ -1,16 +1,20 @@
-"""What became of a robot: lost, confidently wrong, or found again after a carry."""
+"""What a run came to: lost or found again after a carry, confidently wrong, false landmarks."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from emulator.scene.scene import Scene
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import SessionInfo, SessionObserver, Snapshot
+from slam.app.rig.emulated import outlines_m
 from slam.app.run.runner import RunRecord
+from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import Rig, between, transform, wrap_angles
 
 LANDMARKS_TO_FIND = 3
@@ -24,6 +28,9 @@ FOUND_FOR_S = 5.0
 WRONG_M, WRONG_TAIL = 0.15, 1e-3
 """A position is confidently wrong when it is further off than this [m], and than all but this share
 of errors under its own covariance."""
+
+CONFIDENT_M = 0.05
+"""Largest standard deviation, in any direction, of a landmark that claims to be known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,3 +140,34 @@ def _begin_s(since_s: NDArray[np.float64], right: NDArray[np.bool_]) -> float | 
         elif at_s - begin >= FOUND_FOR_S:
             break
     return begin
+
+
+def false_landmarks(last: Snapshot, scene: Scene) -> tuple[int, int]:
+    """Count the landmarks of the last state that have nothing within 15 cm; in all, and confident.
+
+    Judged in the start frame and not aligned, since that is the frame of the claim: a map turned
+    by an error of heading that it does not know of is false, too. Something is a target's surface,
+    a wall, or the side of a box.
+    """
+    false = confident = 0
+    for place, covariance in zip(last.landmarks_m, last.landmark_covariances_m2, strict=True):
+        if distance_m(scene, transform(last.world_from_map, place)) > LANDMARK_MATCH_M:
+            false += 1
+            variance = float(np.linalg.eigvalsh(covariance)[-1])
+            confident += variance < CONFIDENT_M**2
+    return false, confident
+
+
+def distance_m(scene: Scene, point: NDArray[np.float64]) -> float:
+    """Return the distance from a point, shape (2,) [m], world frame, to what reflects."""
+    x, y = float(point[0]), float(point[1])
+    distances = [
+        abs(math.hypot(target.x_m - x, target.y_m - y) - target.radius_m)
+        for target in scene.targets
+    ]
+    for line in outlines_m(scene):
+        starts, ways = line[:-1], np.diff(line, axis=0)
+        shares = ((point - starts) * ways).sum(axis=1) / (ways**2).sum(axis=1)
+        feet = starts + np.clip(shares, 0.0, 1.0)[:, np.newaxis] * ways
+        distances.append(float(np.linalg.norm(feet - point, axis=1).min()))
+    return min(distances, default=math.inf)

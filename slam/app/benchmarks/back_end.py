@@ -11,7 +11,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fclusterdata
 from threadpoolctl import threadpool_limits
 
-from slam.app.experiments.benchmarks.data_set import Array, Observation, Run, Sensor
+from slam.app.benchmarks.data_set import Array, Observation, Run, Sensor
 from slam.geometry import Mount, Rig, compose, has_moved
 from slam.robust.association import RangeScan
 from slam.robust.branches import Hypotheses
@@ -34,7 +34,6 @@ class Solution:
 
     causal: Array  # (n, 3): the pose of each step as it was known then
     smoothed: Array | None  # (n, 3): all poses solved for at once at the end
-    n_scans: int  # that were used
     landmarks_m: Array  # (k, 2), map frame
     seconds: float  # processor time
 
@@ -45,11 +44,6 @@ def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Sol
     A scan from where the last one was taken has the same errors once more and is not used; between
     two scans that are used the path follows the odometry.
     """
-    with threadpool_limits(limits=1):  # the same numbers on every machine, and faster
-        return _solve(run, sensor, stop, with_labels=with_labels)
-
-
-def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Solution:
     began = time.process_time()
     rig = Rig(mounts=(Mount(name="sensor", x_m=0.0, y_m=0.0, yaw_rad=0.0),))
     hypotheses = Hypotheses(rig, parameters_of(sensor))
@@ -58,23 +52,24 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
     scan_of: list[int] = []
     moves: list[Array] = []
     stamps_ns: list[int] = []
-    for step in run.steps:
+    with threadpool_limits(limits=1):  # the same numbers on every machine, and faster
+        for step in run.steps:
+            stop.check()
+            moved = compose(moved, step.increment)
+            if step.observations and (
+                not stamps_ns
+                or has_moved(np.zeros(3), moved, sensor.least_move_m, sensor.least_turn_rad)
+            ):
+                hypotheses.predict(moved)
+                hypotheses.update([_scan(step.observations, sensor, with_labels=with_labels)])
+                moved = np.zeros(3)
+                stamps_ns.append(step.t_ns)
+            causal.append(compose(hypotheses.pose, moved))
+            scan_of.append(len(stamps_ns))
+            moves.append(moved)
         stop.check()
-        moved = compose(moved, step.increment)
-        is_first = not stamps_ns
-        if step.observations and (
-            is_first or has_moved(np.zeros(3), moved, sensor.least_move_m, sensor.least_turn_rad)
-        ):
-            hypotheses.predict(moved)
-            hypotheses.update([_scan(step.observations, sensor, with_labels=with_labels)])
-            moved = np.zeros(3)
-            stamps_ns.append(step.t_ns)
-        causal.append(compose(hypotheses.pose, moved))
-        scan_of.append(len(stamps_ns))
-        moves.append(moved)
-    stop.check()
-    back_end = hypotheses.best
-    solved = back_end.smoothed(np.array(stamps_ns, dtype=np.int64))
+        back_end = hypotheses.best
+        solved = back_end.smoothed(np.array(stamps_ns, dtype=np.int64))
     smoothed = None
     if solved is not None:
         poses = np.vstack([np.zeros(3), solved.poses])
@@ -82,7 +77,6 @@ def _solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> So
     return Solution(
         causal=np.array(causal),
         smoothed=smoothed,
-        n_scans=len(stamps_ns),
         landmarks_m=back_end.state.landmarks_m[back_end.reported_rows()].copy(),
         seconds=time.process_time() - began,
     )

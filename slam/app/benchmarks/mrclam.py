@@ -18,24 +18,23 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 
-from slam.app.errors import AppError
-from slam.app.experiments.benchmarks.data_set import (
+from slam.app.benchmarks.data_set import (
     DataSet,
     Observation,
-    Path,
+    Positions,
     Run,
     Sensor,
-    Step,
-    increments_of,
     nanoseconds,
     positions_of,
     step_times,
+    steps_at,
 )
-from slam.app.experiments.benchmarks.tables import REMEDY, folder_at, read_table
+from slam.app.benchmarks.tables import REMEDY, folder_at, read_table
+from slam.app.errors import AppError
 from slam.config import WheelNoise
 
 _BARCODES = "Barcodes.dat"
@@ -82,7 +81,7 @@ SENSOR = Sensor(
 )
 
 
-def read_data_set(folder: FilePath) -> DataSet:
+def read_data_set(folder: Path) -> DataSet:
     """Read a folder MRCLAM_DatasetN, or all such folders in one."""
     folder_at(folder)
     sets = [folder] if (folder / _BARCODES).is_file() else []
@@ -97,27 +96,24 @@ def read_data_set(folder: FilePath) -> DataSet:
             f"folders; {REMEDY}"
         )
     title = "MRCLAM: robots among cylinders"
-    return DataSet(name="mrclam", title=title, sensor=SENSOR, runs=tuple(runs))
+    return DataSet(title=title, sensor=SENSOR, runs=tuple(runs))
 
 
-def read_run(folder: FilePath, robot: str) -> Run:
+def read_run(folder: Path, robot: str) -> Run:
     """Read the drive of one robot, such as ``Robot1``, without what it saw of other robots."""
     subject_of = {
         int(barcode): int(subject)
-        for subject, barcode in read_table(folder / _BARCODES, ("subject", "barcode")).tolist()
+        for subject, barcode in read_table(folder / _BARCODES, "subject barcode").tolist()
     }
-    places = read_table(folder / _LANDMARKS, ("subject", "x", "y", "sigma_x", "sigma_y"))
+    places = read_table(folder / _LANDMARKS, "subject x y sigma_x sigma_y")
     landmarks = {int(subject) for subject, *_ in places.tolist()}
-    odometry = read_table(
-        folder / f"{robot}_Odometry.dat", ("time", "forward velocity", "turn rate"), ascending=True
-    )
-    seen = read_table(
-        folder / f"{robot}_Measurement.dat",
-        ("time", "barcode", "range", "bearing"),
-        ascending=True,
-    )
-    truth = read_table(
-        folder / f"{robot}_Groundtruth.dat", ("time", "x", "y", "heading"), ascending=True
+    odometry, seen, truth = (
+        read_table(folder / f"{robot}_{name}.dat", f"time {columns}", ascending=True)
+        for name, columns in (
+            ("Odometry", "forward turn_rate"),
+            ("Measurement", "barcode range bearing"),
+            ("Groundtruth", "x y heading"),
+        )
     )
     t_s, first_s, last_s = odometry[:, 0], float(odometry[0, 0]), float(odometry[-1, 0])
     by_time: dict[float, list[Observation]] = defaultdict(list)
@@ -138,15 +134,9 @@ def read_run(folder: FilePath, robot: str) -> Run:
         )
     at_s = step_times(np.array(sorted(by_time)), first_s, last_s, _MOST_GAP_S)
     poses = positions_of(t_s, odometry[:, 1], np.zeros(len(t_s)), odometry[:, 2], at_s)
-    steps = [
-        Step(t_ns=t_ns, increment=increment, observations=tuple(by_time.get(time_s, ())))
-        for time_s, t_ns, increment in zip(
-            at_s.tolist(), nanoseconds(at_s).tolist(), increments_of(poses), strict=True
-        )
-    ]
     return Run(
         name=f"{folder.resolve().name}-{robot}",
-        steps=tuple(steps),
-        truth=Path(t_ns=nanoseconds(truth[:, 0]), xy_m=truth[:, 1:3]),
+        steps=steps_at(at_s, poses, by_time),
+        truth=Positions(t_ns=nanoseconds(truth[:, 0]), xy_m=truth[:, 1:3]),
         left_out=left_out,
     )

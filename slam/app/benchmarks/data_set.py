@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Step:
+class DriveStep:
     """A motion, and what is seen at its end."""
 
     t_ns: int
@@ -42,7 +43,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Path:
+class Positions:
     """Positions over time: stamps ascending, (n,) [ns], and places (n, 2) [m]."""
 
     t_ns: NDArray[np.int64]
@@ -67,8 +68,8 @@ class Run:
     """One drive."""
 
     name: str
-    steps: tuple[Step, ...]  # at least two
-    truth: Path
+    steps: tuple[DriveStep, ...]  # at least two
+    truth: Positions
     left_out: int = 0  # observations that the reader left out, such as those of other robots
     # Whether it is worth a try without ids: not if its author has left most observations out
     is_dense: bool = True
@@ -137,7 +138,6 @@ class Sensor:
 class DataSet:
     """Drives with one kind of robot and sensor."""
 
-    name: str
     title: str
     sensor: Sensor
     runs: tuple[Run, ...]
@@ -181,6 +181,26 @@ def _twist_steps(duration_s: Array, forward: Array, left: Array, turn: Array) ->
     x = (along * forward - across * left) * duration_s
     y = (across * forward + along * left) * duration_s
     return np.column_stack([x, y, angle])
+
+
+def steps_of(
+    keys: Iterable[Hashable],
+    t_ns: Iterable[int],
+    increments: Iterable[Array],
+    seen: Mapping[Any, Sequence[Observation]],
+) -> tuple[DriveStep, ...]:
+    """Return the steps of a drive; ``keys`` say which observations are made at the end of each."""
+    return tuple(
+        DriveStep(t_ns=stamp, increment=increment, observations=tuple(seen.get(key, ())))
+        for key, stamp, increment in zip(keys, t_ns, increments, strict=True)
+    )
+
+
+def steps_at(
+    at_s: Array, poses: Array, seen: Mapping[float, Sequence[Observation]]
+) -> tuple[DriveStep, ...]:
+    """Return the steps to poses (k, 3) at times (k,), with what is seen at exactly these times."""
+    return steps_of(at_s.tolist(), nanoseconds(at_s).tolist(), increments_of(poses), seen)
 
 
 def increments_of(poses: Array) -> list[Array]:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam.app.benchmarks.back_end import Solution, solve
+from slam.app.benchmarks.data_set import Array, DataSet, Positions, Run
 from slam.app.errors import AppError, naming
-from slam.app.experiments.benchmarks.back_end import Solution, solve
-from slam.app.experiments.benchmarks.data_set import Array, DataSet, Path, Run
-from slam.app.odometry.track import NS_PER_S, Trajectory, write_tum
+from slam.app.odometry.track import NS_PER_S
+from slam.app.run.results import write_path
 from slam.evaluation import ate_rmse_m
 from slam.geometry import align_se2, transform
-from xethru_protocol.system import StopFlag, written_whole
+from xethru_protocol.system import StopFlag
 
 ODOMETRY = "odometry"
 WITH_IDS, WITHOUT_IDS = "with_ids", "without_ids"
@@ -58,7 +58,7 @@ def associated(run: Run, poses: Array) -> tuple[Array, Array]:
 
     The path is interpolated between its steps, so that how densely it is sampled does not count.
     """
-    path = Path(t_ns=run.t_ns, xy_m=poses[:, :2])
+    path = Positions(t_ns=run.t_ns, xy_m=poses[:, :2])
     xy, known = path.at(run.truth.t_ns)
     return xy[known], run.truth.xy_m[known]
 
@@ -103,7 +103,7 @@ def mean_ate_m(runs: Sequence[ScoredRun]) -> dict[str, float]:
     return {name: float(np.mean([one.ate_rmse_m[name] for one in runs])) for name in names}
 
 
-def write_run(folder: FilePath, scored: ScoredRun) -> None:
+def write_run(folder: Path, scored: ScoredRun) -> None:
     """Write the paths of a run as TUM files.
 
     The truth has no heading: its orientation is the identity.
@@ -112,13 +112,8 @@ def write_run(folder: FilePath, scored: ScoredRun) -> None:
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for name, poses in scored.paths.items():
-        _write_tum(folder / f"{name}.tum", run.t_ns, poses)
+        write_path(folder / f"{name}.tum", run.t_ns, poses)
     truth = run.truth
     _, rows = np.unique(truth.t_ns, return_index=True)
     places = np.column_stack([truth.xy_m[rows], np.zeros(len(rows))])
-    _write_tum(folder / "truth.tum", truth.t_ns[rows], places)
-
-
-def _write_tum(path: FilePath, t_ns: NDArray[np.int64], poses: Array) -> None:
-    with naming(path), written_whole(path) as fresh:
-        write_tum(fresh, Trajectory(stamps_ns=t_ns, poses=poses))
+    write_path(folder / "truth.tum", truth.t_ns[rows], places)

@@ -1,1 +1,0 @@
-"""What is run on data that is not ours: `benchmarks`."""
