@@ -28,6 +28,8 @@ Revision
 Doubt
     A slip (`slam.robust.proposals.slips`), believed or only possible, and a carry that is possible
     during a stop add to the reported covariance until landmarks known before confirm the pose.
+    Those that a possible motion lays on others of the map confirm nothing
+    (`slam.robust.proposals.constellation.stands_out`), nor do they place a carried robot.
 
 The robot is reported as lost while the landmarks known before the carry are against its pose by
 more than the price of a carry, and others are seen, or ranges have shown a carry. That ends when
