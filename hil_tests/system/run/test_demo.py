@@ -18,7 +18,7 @@ from slam.app.odometry.track import read_tum
 from slam.app.run.evaluation import summarise
 from slam.app.run.results import evaluate
 from slam.app.run.runner import execute
-from slam.app.session import messages as ros
+from slam.app.session import cdr as ros
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.rerun_recording import count_rows
 

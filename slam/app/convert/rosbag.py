@@ -37,8 +37,7 @@ from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan, SessionInfo, TruthAt
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
-from slam.app.session import messages as ros
-from slam.app.session.cdr import wheel_odometry
+from slam.app.session import cdr
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
     imported_info,
@@ -105,7 +104,7 @@ def _radar_of(pattern: re.Pattern[str], topic: str) -> str | None:
 # A header's stamp further from the time of recording is of another clock.
 _SAME_CLOCK_NS = NS_PER_S
 _TIME_OF_DAY_NS = 1_000_000_000 * NS_PER_S  # of 2001; simulated clocks begin at 0
-_TRUTH_TYPES = (ros.POSE, "geometry_msgs/msg/PoseWithCovarianceStamped", ros.ODOMETRY)
+_TRUTH_TYPES = (cdr.POSE, cdr.POSE_WITH_COVARIANCE, cdr.ODOMETRY)
 _PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
 
 
@@ -222,7 +221,7 @@ def _contents(bag: Path, truth_topic: str, stop: StopFlag) -> _Contents:
                 contents.session = reader.deserialize(raw, connection.msgtype).data
             elif topic in (ODOMETRY_TOPIC, truth_topic):
                 poses = contents.odometry if topic == ODOMETRY_TOPIC else contents.truth
-                sample = ros.pose_sample(reader.deserialize(raw, connection.msgtype))
+                sample = cdr.pose_sample(reader.deserialize(raw, connection.msgtype))
                 if abs(sample.t_ns - t_ns) >= _SAME_CLOCK_NS:
                     sample = replace(sample, t_ns=t_ns)
                 if poses and sample.t_ns <= poses[-1].t_ns:
@@ -242,7 +241,7 @@ def _check_type(bag: Path, topic: str, message_type: str, truth_topic: str) -> N
     elif _radar_of(_INFO, topic) is not None or topic == SESSION_TOPIC:
         allowed = (STRING,)
     elif topic == ODOMETRY_TOPIC:
-        allowed = (ros.ODOMETRY,)
+        allowed = (cdr.ODOMETRY,)
     elif topic == truth_topic:
         allowed = _TRUTH_TYPES
     else:
@@ -396,7 +395,7 @@ class _Bag:
         self._writer.open()
         self._connections: dict[str, Any] = {}
 
-    def write(self, topic: str, t_ns: int, message_type: str, data: bytes | memoryview) -> None:
+    def write(self, topic: str, t_ns: int, message_type: str, data: bytes) -> None:
         """Write a message in CDR; the topic appears with its first one."""
         if topic not in self._connections:
             latching = {"latching": 1 if message_type == STRING else None} if self._is_ros1 else {}
@@ -444,11 +443,11 @@ def _fill(bag: _Bag, session: RecordedSession, stop: StopFlag) -> tuple[int, int
             bag.write(topic, record.t_ns, FLOAT_ARRAY, pack_array(FLOAT_ARRAY, record.samples))
             frames += 1
         elif isinstance(record, TumSample):
-            bag.write(ODOMETRY_TOPIC, record.t_ns, ros.ODOMETRY, wheel_odometry(record))
+            bag.write(ODOMETRY_TOPIC, record.t_ns, cdr.ODOMETRY, cdr.wheel_odometry(record))
             poses += 1
         elif isinstance(record, ScanEnd) and record.truth is not None:
-            data = ros.serialise(ros.pose_stamped(record.t_ns, "world", record.truth))
-            bag.write(TRUTH_TOPIC, record.t_ns, ros.POSE, data)
+            data = cdr.pose_stamped(record.t_ns, "world", record.truth)
+            bag.write(TRUTH_TOPIC, record.t_ns, cdr.POSE, data)
             truths += 1
     if not frames:
         raise AppError(f"{session.path}: holds no frame")

@@ -36,7 +36,6 @@ from slam.app.records import RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.echoes import envelope_db, wedge
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
 from slam.app.session import cdr
-from slam.app.session import messages as ros
 from slam.app.session.cdr import Marker, Shape
 from slam.config import WheelNoise
 from slam.frames import RadarFrame
@@ -52,7 +51,7 @@ class Channels(Protocol):
 
     def channel(self, topic: str, message_type: str, *, latched: bool = False) -> int: ...
 
-    def write(self, channel: int, t_ns: int, data: bytes | memoryview) -> None: ...
+    def write(self, channel: int, t_ns: int, data: bytes) -> None: ...
 
 
 class Drawings:
@@ -77,13 +76,11 @@ class Drawings:
             if radar.n_bins >= _FEWEST_BINS
         }
         self._ranges = [
-            file.channel(f"/radar/{radar.name}/range", "sensor_msgs/msg/Range")
-            for radar in info.radars
+            file.channel(f"/radar/{radar.name}/range", cdr.RANGE) for radar in info.radars
         ]
-        pose_type = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        self._pose = file.channel("/estimate/pose", pose_type)
-        self._odometry = file.channel("/estimate/odometry", ros.ODOMETRY)
-        self._landmarks = file.channel("/landmarks/markers", _MARKERS)
+        self._pose = file.channel("/estimate/pose", cdr.POSE_WITH_COVARIANCE)
+        self._odometry = file.channel("/estimate/odometry", cdr.ODOMETRY)
+        self._landmarks = file.channel("/landmarks/markers", cdr.MARKERS)
         self._paths = {
             "/odom": _Path(file, "/odom/path", "map"),
             "/estimate": _Path(file, "/estimate/path", "map"),
@@ -91,9 +88,9 @@ class Drawings:
         self._write_latched("/fields_of_view", "base_link", self._fields_of_view())
         # Rerun's views are of its own root, which no transform of ROS leads to, and it takes
         # transforms from any topic; other programs take theirs from /tf and /tf_static.
-        rerun = file.channel("/rerun/tf_static", ros.TRANSFORMS, latched=True)
-        link = ros.transforms(start_ns, {(_RERUN_ROOT, "world"): np.zeros(3)})
-        file.write(rerun, start_ns, ros.serialise(link))
+        rerun = file.channel("/rerun/tf_static", cdr.TRANSFORMS, latched=True)
+        link = cdr.transforms(start_ns, {(_RERUN_ROOT, "world"): np.zeros(3)})
+        file.write(rerun, start_ns, link)
         if scene := _scene(info):
             self._write_latched("/scene", "world", scene)
             self._paths["/truth"] = _Path(file, "/truth/path", "world")
@@ -136,13 +133,13 @@ class Drawings:
         if not self._smoothed:
             self._smoothed = (
                 _PathChannels(self._file, "/slam/smoothed_path", "map"),
-                self._file.channel("/slam/smoothed_landmarks", ros.POINT_CLOUD),
+                self._file.channel("/slam/smoothed_landmarks", cdr.POINT_CLOUD),
             )
         path, landmarks = self._smoothed
         t_ns, step = int(smoothed.t_ns[-1]), -(-len(smoothed.t_ns) // (_KEPT_POSES - 1))
         # counted from the end, whose pose is the newest
         path.write(t_ns, smoothed.t_ns[::-step][::-1], smoothed.poses[::-step][::-1])
-        self._file.write(landmarks, t_ns, ros.serialise(ros.landmark_cloud(t_ns, smoothed)))
+        self._file.write(landmarks, t_ns, cdr.landmark_cloud(t_ns, smoothed))
 
     def close(self) -> None:
         """Write the last rows of the B-scans, the whole paths and the last map."""
@@ -154,7 +151,7 @@ class Drawings:
                 path.write(self._last.t_ns, most=_KEPT_POSES)
 
     def _write_latched(self, topic: str, frame: str, drawn: Sequence[Marker]) -> None:
-        channel = self._file.channel(topic, _MARKERS, latched=True)
+        channel = self._file.channel(topic, cdr.MARKERS, latched=True)
         self._file.write(channel, self._newest_ns, cdr.markers(self._newest_ns, frame, drawn))
 
     def _fields_of_view(self) -> list[Marker]:
@@ -240,7 +237,6 @@ class Drawings:
 
 
 _RERUN_ROOT = "tf#/"
-_MARKERS = "visualization_msgs/msg/MarkerArray"
 _MARKERS_EVERY_NS = 2 * NS_PER_S
 _PATHS_EVERY_NS = 10 * NS_PER_S
 _CHI_95 = math.sqrt(-2.0 * math.log(0.05))  # of two degrees of freedom
@@ -318,13 +314,12 @@ class _PathChannels:
 
     def __init__(self, file: Channels, topic: str, frame: str) -> None:
         self._file, self._frame = file, frame
-        self._path = file.channel(topic, "nav_msgs/msg/Path")
-        self._points = file.channel(f"{topic}_points", ros.POINT_CLOUD)
+        self._path = file.channel(topic, cdr.PATH)
+        self._points = file.channel(f"{topic}_points", cdr.POINT_CLOUD)
 
     def write(self, t_ns: int, stamps_ns: NDArray[np.int64], poses: Array) -> None:
         self._file.write(self._path, t_ns, cdr.path(t_ns, self._frame, stamps_ns, poses))
-        cloud = ros.serialise(ros.path_cloud(t_ns, self._frame, poses))
-        self._file.write(self._points, t_ns, cloud)
+        self._file.write(self._points, t_ns, cdr.path_cloud(t_ns, self._frame, poses))
 
 
 class _Path:
@@ -380,7 +375,7 @@ class _Bscan:
     def __init__(self, file: Channels, radar: RadarInfo, reach_m: float, start_ns: int) -> None:
         self._file = file
         self._frame_id = f"radar_{radar.name}"
-        self._images = file.channel(f"/radar/{radar.name}/bscan", "sensor_msgs/msg/Image")
+        self._images = file.channel(f"/radar/{radar.name}/bscan", cdr.IMAGE)
         self._recent: deque[NDArray[np.float32]] = deque(maxlen=_ROWS)
         self._n_bins, self._n_new = radar.n_bins, 0
         self._last: RadarFrame | None = None

@@ -31,14 +31,12 @@ from slam.app.records import (
     Snapshot,
     TruthAt,
 )
-from slam.app.session import messages as ros
-from slam.app.session.cdr import NO_TWIST, wheel_odometry
+from slam.app.session import cdr
 from slam.app.session.drawings import Drawings, WheelMotion
 from slam.app.session.messages import (
     METADATA_NAME,
     SESSION_TOPIC,
     radar_text,
-    schema_text,
     session_table,
     smoothed_row,
     state_row,
@@ -129,14 +127,14 @@ class _SessionFile:
         metadata = {"offered_qos_profiles": _LATCHED_QOS} if latched else {}
         with self._giving_up():
             return self._writer.add_channel(
-                topic, message_type, schema_text(message_type), metadata
+                topic, message_type, cdr.schema_text(message_type), metadata
             )
 
     def write(
         self,
         channel: int,
         t_ns: int,
-        data: bytes | memoryview,
+        data: bytes,
         *,
         sequence: int = 0,
         publish_ns: int | None = None,
@@ -157,7 +155,7 @@ class _SessionFile:
                 log_time=t_ns,
                 publish_time=t_ns if publish_ns is None else publish_ns,
                 sequence=sequence,
-                data=data,  # type: ignore[arg-type]  # annotated bytes; it only concatenates
+                data=data,
             )
 
     def cut_chunk(self) -> None:
@@ -283,20 +281,20 @@ class SessionLog(SessionObserver):
         self._unused_scans = self._file.channel("/scan_unused", DOUBLE_ARRAY)
         self._steps = self._file.channel("/slam/step", DOUBLE_ARRAY)
         self._states = self._file.channel("/slam/state", DOUBLE_ARRAY)
-        self._odometry = self._file.channel("/odom", ros.ODOMETRY)
-        self._truth = self._file.channel("/truth", ros.POSE)
-        self._estimate = self._file.channel("/estimate", ros.POSE)
-        self._landmarks = self._file.channel("/landmarks", ros.POINT_CLOUD)
-        self._transforms = self._file.channel("/tf", ros.TRANSFORMS)
-        self._static_transforms = self._file.channel("/tf_static", ros.TRANSFORMS, latched=True)
-        self._log = self._file.channel("/log", ros.LOG)
+        self._odometry = self._file.channel("/odom", cdr.ODOMETRY)
+        self._truth = self._file.channel("/truth", cdr.POSE)
+        self._estimate = self._file.channel("/estimate", cdr.POSE)
+        self._landmarks = self._file.channel("/landmarks", cdr.POINT_CLOUD)
+        self._transforms = self._file.channel("/tf", cdr.TRANSFORMS)
+        self._static_transforms = self._file.channel("/tf_static", cdr.TRANSFORMS, latched=True)
+        self._log = self._file.channel("/log", cdr.LOG)
         # The topic is latched with depth 1, so each message holds all that is static so far.
         self._placements = {
             ("base_link", f"radar_{radar.name}"): np.array([radar.x_m, radar.y_m, radar.yaw_rad])
             for radar in info.radars
         }
-        static = ros.transforms(start_ns, self._placements)
-        self._write(self._static_transforms, start_ns, static)
+        static = cdr.transforms(start_ns, self._placements)
+        self._file.write(self._static_transforms, start_ns, static)
         self._wheels = WheelMotion(info.wheels)
         self._wheels_at: tuple[int, NDArray[np.float64]] | None = None
         self._drawings = Drawings(self._file, info, start_ns) if drawn else None
@@ -312,8 +310,8 @@ class SessionLog(SessionObserver):
         for frame, host_ns in zip(scan.frames, arrivals, strict=True):
             if frame.stream != self._streams[frame.radar]:
                 self._streams[frame.radar] = frame.stream
-                channel = self._rare_channel(self._names[frame.radar], "stream", ros.NUMBER)
-                self._write(channel, frame.t_ns, ros.number(frame.stream))
+                channel = self._rare_channel(self._names[frame.radar], "stream", cdr.NUMBER)
+                self._file.write(channel, frame.t_ns, cdr.number(frame.stream))
             self._file.write(
                 self._frame_channels[frame.radar],
                 frame.t_ns,
@@ -339,12 +337,12 @@ class SessionLog(SessionObserver):
 
     def on_odometry(self, sample: TumSample) -> None:
         t_ns, pose = sample.t_ns, np.array([sample.x_m, sample.y_m, sample.heading_rad])
-        twist = NO_TWIST
+        twist = cdr.NO_TWIST
         if self._wheels_at is not None:
             earlier_ns, earlier = self._wheels_at
             twist = self._wheels.twist(earlier, pose, t_ns - earlier_ns)
         self._wheels_at = t_ns, pose
-        self._file.write(self._odometry, t_ns, wheel_odometry(sample, twist))
+        self._file.write(self._odometry, t_ns, cdr.wheel_odometry(sample, twist))
         self._odometry_ns = t_ns
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
@@ -352,17 +350,19 @@ class SessionLog(SessionObserver):
         t_ns = snapshot.t_ns
         if ("world", "map") not in self._placements:
             self._placements["world", "map"] = snapshot.world_from_map
-            static = ros.transforms(t_ns, self._placements)
-            self._write(self._static_transforms, t_ns, static)
+            static = cdr.transforms(t_ns, self._placements)
+            self._file.write(self._static_transforms, t_ns, static)
         if np.all(np.isfinite(snapshot.truth)):
-            self._write(self._truth, t_ns, ros.pose_stamped(t_ns, "world", snapshot.truth))
-        self._write(self._estimate, t_ns, ros.pose_stamped(t_ns, "map", snapshot.estimate))
-        self._write(self._landmarks, t_ns, ros.landmark_cloud(t_ns, snapshot))
+            truth = cdr.pose_stamped(t_ns, "world", snapshot.truth)
+            self._file.write(self._truth, t_ns, truth)
+        estimate = cdr.pose_stamped(t_ns, "map", snapshot.estimate)
+        self._file.write(self._estimate, t_ns, estimate)
+        self._file.write(self._landmarks, t_ns, cdr.landmark_cloud(t_ns, snapshot))
         links = {
             ("map", "odom"): compose(snapshot.estimate, between(snapshot.odometry, _ORIGIN)),
             ("odom", "base_link"): snapshot.odometry,
         }
-        self._write(self._transforms, t_ns, ros.transforms(t_ns, links))
+        self._file.write(self._transforms, t_ns, cdr.transforms(t_ns, links))
         if snapshot.step is not None:  # before its state, which a reader waits for
             step = step_row(snapshot.step, snapshot.wall_spans_m)
             message = pack_array(DOUBLE_ARRAY, step, "step")
@@ -382,8 +382,7 @@ class SessionLog(SessionObserver):
 
     def on_log(self, line: LogLine) -> None:
         t_ns = max(line.t_ns, self._start_ns)
-        message = ros.log_line(t_ns, line.radar, line.text, warning=line.warning)
-        self._write(self._log, t_ns, message)
+        self._file.write(self._log, t_ns, cdr.log_line(t_ns, line))
 
     def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
         """Write bytes as a radar's port gave (rx) or took (tx) them, at a host time [ns].
@@ -395,9 +394,6 @@ class SessionLog(SessionObserver):
         channel = self._rare_channel(radar, way, BYTE_ARRAY)
         message = pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8))
         self._file.write(channel, self._t_ns, message, publish_ns=host_ns)
-
-    def _write(self, channel: int, t_ns: int, message: ros.Message) -> None:
-        self._file.write(channel, t_ns, ros.serialise(message))
 
     def _rare_channel(self, radar: str, part: str, message_type: str) -> int:
         """Return the channel of a part that few sessions have, made when it is first needed."""

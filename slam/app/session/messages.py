@@ -17,26 +17,19 @@ in /slam/smoothed, at the time of its last state::
 
 in the map frame; dt_ns is a time less that of the last state. What led to the state is in
 /slam/step, see `slam.app.session.steps`.
-
-Composite messages are made and serialised by the rosbags library.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields
-from functools import cache
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
 
 from slam.app.errors import AppError
-from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import RadarInfo, SessionInfo, Snapshot
 from slam.app.session.constants import slam_constants
 from slam.config import SlamConfig, WheelNoise, load_preset
@@ -156,185 +149,6 @@ def _landmarks_of(
     """Return ids (n,), places (n, 2) [m] and covariances (n, 2, 2) [m^2] of 7 n numbers."""
     rows = numbers.reshape(-1, _PER_LANDMARK)
     return rows[:, 0].astype(np.int64), rows[:, 1:3], rows[:, 3:].reshape(-1, 2, 2)
-
-
-ODOMETRY = "nav_msgs/msg/Odometry"
-POSE = "geometry_msgs/msg/PoseStamped"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-LOG = "rcl_interfaces/msg/Log"
-NUMBER = "std_msgs/msg/UInt32"
-
-_LOG_INFO, LOG_WARN = 20, 30
-_POINT_FIELD_FLOAT32, _POINT_FIELD_UINT32 = 7, 6
-
-# PointCloud2 is the one standard message that carries named fields per point, so the covariance
-# travels with its landmark and every viewer still draws the points. RViz wants float32 x, y, z.
-LANDMARK_DTYPE = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("id", "<u4"),
-        ("cov_xx", "<f4"),
-        ("cov_xy", "<f4"),
-        ("cov_yy", "<f4"),
-    ]
-)
-
-_POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-
-Message: TypeAlias = Any  # rosbags makes its message classes at run time
-
-
-@cache
-def _typestore() -> Any:  # noqa: ANN401 - rosbags' Typestore; its messages are untyped anyway
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
-@cache
-def _type(name: str) -> Any:  # noqa: ANN401 - a message class made at run time
-    return _typestore().types[name]
-
-
-def schema_text(message_type: str) -> bytes:
-    """Return the ros2msg schema of a type with everything it refers to."""
-    text, _digest = _typestore().generate_msgdef(message_type, ros_version=2)
-    return bytes(text, "utf-8")
-
-
-def serialise(message: Message) -> memoryview:
-    data: memoryview = _typestore().serialize_cdr(message, message.__msgtype__)
-    return data
-
-
-def deserialise(data: bytes, message_type: str) -> Message:
-    """Read CDR bytes back; arrays come as numpy arrays."""
-    return _typestore().deserialize_cdr(data, message_type)
-
-
-def pose_sample(message: Message) -> TumSample:
-    """Return the pose of a message, however deep the message holds it, at its header's stamp."""
-    pose = message.pose
-    while not hasattr(pose, "position"):
-        pose = pose.pose
-    stamp = message.header.stamp
-    return TumSample(
-        t_ns=stamp.sec * NS_PER_S + stamp.nanosec,
-        x_m=pose.position.x,
-        y_m=pose.position.y,
-        qz=pose.orientation.z,
-        qw=pose.orientation.w,
-    )
-
-
-def pose_stamped(t_ns: int, frame: str, pose: NDArray[np.float64]) -> Message:
-    """Wrap a planar pose, shape (3,), of the robot in a frame."""
-    x, y, heading = (float(value) for value in pose)
-    wrapped = _pose(x, y, math.sin(heading / 2), math.cos(heading / 2))
-    return _type(POSE)(header=_header(t_ns, frame), pose=wrapped)
-
-
-def transforms(t_ns: int, links: Mapping[tuple[str, str], NDArray[np.float64]]) -> Message:
-    """Wrap planar transforms: (parent, child) -> pose of the child in the parent, shape (3,)."""
-    rows = []
-    for (parent, child), pose in links.items():
-        x, y, heading = (float(value) for value in pose)
-        transform = _type("geometry_msgs/msg/Transform")(
-            translation=_type("geometry_msgs/msg/Vector3")(x=x, y=y, z=0.0),
-            rotation=_quaternion(math.sin(heading / 2), math.cos(heading / 2)),
-        )
-        rows.append(
-            _type("geometry_msgs/msg/TransformStamped")(
-                header=_header(t_ns, parent), child_frame_id=child, transform=transform
-            )
-        )
-    return _type(TRANSFORMS)(transforms=rows)
-
-
-def landmark_cloud(t_ns: int, of: Snapshot | SmoothedRun) -> Message:
-    """Wrap the landmarks of a state or a smoothed run, with id and covariance, in the map frame."""
-    points = np.zeros(len(of.landmark_ids), dtype=LANDMARK_DTYPE)
-    points["x"] = of.landmarks_m[:, 0]
-    points["y"] = of.landmarks_m[:, 1]
-    points["id"] = of.landmark_ids
-    points["cov_xx"] = of.landmark_covariances_m2[:, 0, 0]
-    points["cov_xy"] = of.landmark_covariances_m2[:, 0, 1]
-    points["cov_yy"] = of.landmark_covariances_m2[:, 1, 1]
-    return _cloud(t_ns, "map", points)
-
-
-def path_cloud(t_ns: int, frame: str, poses: NDArray[np.float64]) -> Message:
-    """Wrap the positions of poses (n, 3) as points."""
-    points = np.zeros(len(poses), dtype=_POINT_DTYPE)
-    points["x"], points["y"] = poses[:, 0], poses[:, 1]
-    return _cloud(t_ns, frame, points)
-
-
-def _cloud(t_ns: int, frame: str, points: NDArray[Any]) -> Message:
-    return _type(POINT_CLOUD)(
-        header=_header(t_ns, frame),
-        height=1,
-        width=len(points),
-        fields=_point_fields(points.dtype),
-        is_bigendian=False,
-        point_step=points.dtype.itemsize,
-        row_step=points.nbytes,
-        data=points.view(np.uint8),
-        is_dense=True,
-    )
-
-
-def log_line(t_ns: int, radar: str, text: str, *, warning: bool) -> Message:
-    """Wrap one line of the protocol log; the radar is the logger's name."""
-    return _type(LOG)(
-        stamp=_time(t_ns),
-        level=LOG_WARN if warning else _LOG_INFO,
-        name=radar,
-        msg=text,
-        file="",
-        function="",
-        line=0,
-    )
-
-
-def number(value: int) -> Message:
-    return _type(NUMBER)(data=value)
-
-
-@cache
-def _point_fields(dtype: np.dtype[Any]) -> list[Message]:
-    fields = dtype.fields
-    assert fields is not None
-    return [
-        _type("sensor_msgs/msg/PointField")(
-            name=name,
-            offset=fields[name][1],
-            datatype=_POINT_FIELD_UINT32 if name == "id" else _POINT_FIELD_FLOAT32,
-            count=1,
-        )
-        for name in dtype.names or ()
-    ]
-
-
-def _time(t_ns: int) -> Message:
-    seconds, rest = divmod(int(t_ns), NS_PER_S)
-    return _type("builtin_interfaces/msg/Time")(sec=seconds, nanosec=rest)
-
-
-def _header(t_ns: int, frame: str) -> Message:
-    return _type("std_msgs/msg/Header")(stamp=_time(t_ns), frame_id=frame)
-
-
-def _quaternion(qz: float, qw: float) -> Message:
-    return _type("geometry_msgs/msg/Quaternion")(x=0.0, y=0.0, z=qz, w=qw)
-
-
-def _pose(x_m: float, y_m: float, qz: float, qw: float) -> Message:
-    return _type("geometry_msgs/msg/Pose")(
-        position=_type("geometry_msgs/msg/Point")(x=x_m, y=y_m, z=0.0),
-        orientation=_quaternion(qz, qw),
-    )
 
 
 METADATA_NAME = "xethru-hil session"

@@ -25,7 +25,7 @@ from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE, sampler_limits
-from slam.app.session import messages as ros
+from slam.app.session import cdr
 from slam.app.session.gaps import read_gap
 from slam.app.session.messages import (
     GAP_TOPIC,
@@ -260,14 +260,11 @@ def _state(message: Message, step: Message | None) -> Snapshot:
 
 
 def _odometry(message: Message) -> TumSample:
-    return ros.pose_sample(ros.deserialise(message.data, ros.ODOMETRY))
+    return cdr.pose_sample(cdr.deserialise(message.data, cdr.ODOMETRY))
 
 
 def _log_line(message: Message) -> LogLine:
-    line = ros.deserialise(message.data, ros.LOG)
-    return LogLine(
-        t_ns=message.t_ns, radar=line.name, warning=line.level >= ros.LOG_WARN, text=line.msg
-    )
+    return cdr.read_log_line(message.t_ns, message.data)
 
 
 def _smoothed(message: Message) -> SmoothedRun:
@@ -442,7 +439,7 @@ class RecordedSession:
                     index, radar, limits = radar_of[entry.topic]
                     record = _frame(entry, index, radar, limits, streams[index])
                 elif entry.topic in of_stream:
-                    number = ros.deserialise(entry.data, ros.NUMBER)
+                    number = cdr.deserialise(entry.data, cdr.NUMBER)
                     streams[of_stream[entry.topic]] = int(number.data)
                 elif entry.topic == "/slam/step":
                     step = entry

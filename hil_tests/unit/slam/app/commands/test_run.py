@@ -22,7 +22,7 @@ from slam.app.odometry.track import OdometryTrack, TumSample, parse_tum_line, re
 from slam.app.records import Scan
 from slam.app.run.live_source import LiveLog
 from slam.app.run.runner import run_slam, unknown_truth
-from slam.app.session import messages as ros
+from slam.app.session import cdr as ros
 from slam.app.session.cdr import wheel_odometry
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session

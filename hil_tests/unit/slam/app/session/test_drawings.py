@@ -31,18 +31,23 @@ from slam.app.records import Scan, SessionInfo, Snapshot
 from slam.app.session import cdr
 from slam.app.session.drawings import Drawings
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import LANDMARK_DTYPE
 
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
 Messages = dict[str, list[tuple[int, Any]]]
 
 
 def read(path: Path) -> Messages:
-    """Read every message of every topic: time in the file, and what rosbags makes of it."""
+    """Read every message of every topic: time in the file, and what rosbags makes of it.
+
+    Each is packed as rosbags packs it.
+    """
     found = defaultdict(list)
     with AnyReader([path]) as reader:
+        store = reader.typestore
         for connection, t_ns, raw in reader.messages():
-            found[connection.topic].append((t_ns, reader.deserialize(raw, connection.msgtype)))
+            message = reader.deserialize(raw, connection.msgtype)
+            assert bytes(store.serialize_cdr(message, connection.msgtype)) == raw, connection.topic
+            found[connection.topic].append((t_ns, message))
     return found
 
 
@@ -241,7 +246,7 @@ def test_the_smoothed_run_is_a_path_with_its_landmarks_in_the_map_frame() -> Non
     cloud: Any = store.deserialize_cdr(
         kept.messages["/slam/smoothed_landmarks"][1], "sensor_msgs/msg/PointCloud2"
     )
-    points = cloud.data.view(LANDMARK_DTYPE)
+    points = cloud.data.view(cdr.LANDMARK_DTYPE)
     assert points["id"].tolist() == [3, 8]
     np.testing.assert_allclose(points["y"], made.landmarks_m[:, 1], rtol=1e-6)
     np.testing.assert_allclose(points["cov_xy"], [0.0, 1e-4], rtol=1e-6)

@@ -28,7 +28,7 @@ from hil_tests.unit.slam.app.sessions import (
     write_session,
 )
 from slam.app.records import LogLine
-from slam.app.session import messages as ros
+from slam.app.session import cdr
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
 from slam.geometry import ReceivedPulse
@@ -46,7 +46,7 @@ def messages(path: Path, topic: str) -> list[tuple[int, int, Any]]:
     """Return (sequence, log time, message) of one topic, with our types."""
     with path.open("rb") as stream:
         return [
-            (message.sequence, message.log_time, ros.deserialise(message.data, schema.name))
+            (message.sequence, message.log_time, cdr.deserialise(message.data, schema.name))
             for schema, _, message in make_reader(stream).iter_messages(topics=[topic])
             if schema is not None
         ]
@@ -115,7 +115,7 @@ def test_states_landmarks_and_their_covariance_come_back(finished: Path) -> None
     sent = snapshot(7)
     assert t_ns == sent.t_ns
     assert cloud.header.frame_id == "map"
-    points = cloud.data.view(ros.LANDMARK_DTYPE)
+    points = cloud.data.view(cdr.LANDMARK_DTYPE)
     assert points["id"].tolist() == sent.landmark_ids.tolist()
     np.testing.assert_allclose(points["x"], sent.landmarks_m[:, 0], rtol=1e-6)
     np.testing.assert_allclose(points["cov_xy"], sent.landmark_covariances_m2[:, 0, 1], rtol=1e-6)
@@ -125,7 +125,7 @@ Planar = tuple[complex, float]
 """Position as a complex number and heading [rad]: turning is multiplying, without our geometry."""
 
 
-def planar(position: ros.Message, orientation: ros.Message) -> Planar:
+def planar(position: cdr.Message, orientation: cdr.Message) -> Planar:
     assert (position.z, orientation.x, orientation.y) == (0, 0, 0)
     turned = complex(orientation.w, orientation.z) ** 2  # half the angle is in a quaternion
     assert abs(turned) == pytest.approx(1.0)
@@ -142,7 +142,7 @@ def assert_is(found: Planar, expected: Iterable[float]) -> None:
     assert found[1] == pytest.approx(heading)
 
 
-def links_of(message: ros.Message) -> dict[tuple[str, str], Planar]:
+def links_of(message: cdr.Message) -> dict[tuple[str, str], Planar]:
     return {
         (row.header.frame_id, row.child_frame_id): planar(
             row.transform.translation, row.transform.rotation
