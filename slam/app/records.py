@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import TracebackType
 from typing import Any, Self
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
-from slam.geometry import PAPERS_FIELD, FieldOfView, ReceivedPulse
+from slam.geometry import PAPERS_FIELD, FieldOfView, Mount, ReceivedPulse
 from slam.results import SmoothedRun, StepResult
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
@@ -51,6 +51,10 @@ class RadarInfo:
     phase_offset_rad: float = 0.0
     pulse: ReceivedPulse | None = None
     gain_db: float = 0.0
+
+    @property
+    def mount(self) -> Mount:
+        return Mount(**{each.name: getattr(self, each.name) for each in fields(Mount)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

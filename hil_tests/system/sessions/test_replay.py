@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from hil_tests.system.recorded_session import record_session, write_shorter_scene
-from hil_tests.unit.slam.app.session.test_steps import assert_same_step
+from hil_tests.unit.slam.app.session.test_state_rows import assert_same_step
 from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.cli import main
 from slam.app.records import Snapshot

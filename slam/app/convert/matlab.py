@@ -36,7 +36,7 @@ from slam.app.convert.rosbag import authors_rig, rig_of
 from slam.app.errors import AppError, OdometryError, naming
 from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan
-from slam.app.rig.sources import TRUE_PER_MODULE_METRE
+from slam.app.rig.sources import recorded_frame
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import imported_info, imported_radar
 from slam.app.session.reader import RecordedSession, describe_kind
@@ -349,14 +349,7 @@ def _frames(
     drive: MatDrive, radars: tuple[RadarInfo, ...], row: int, t_ns: int
 ) -> tuple[RadarFrame, ...]:
     return tuple(
-        RadarFrame(
-            radar=number - 1,
-            t_ns=t_ns,
-            counter=row,
-            samples=rows[row],
-            range_start_m=0.0,
-            bin_length_m=radars[number - 1].bin_length_m * TRUE_PER_MODULE_METRE,
-        )
+        recorded_frame(number - 1, radars[number - 1], rows[row], t_ns=t_ns, counter=row)
         for number, rows in sorted(drive.frames.items())
         if rows[row].any()
     )

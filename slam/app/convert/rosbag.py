@@ -36,7 +36,7 @@ from rosbags.typesys import Stores, get_typestore
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan, SessionInfo, TruthAt
-from slam.app.rig.sources import TRUE_PER_MODULE_METRE
+from slam.app.rig.sources import recorded_frame
 from slam.app.session import cdr
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
@@ -347,14 +347,8 @@ def _frames(
         for connection, t_ns, raw in stop.each(reader.messages(wanted)):
             index = names.index(str(_radar_of(_FRAMES, connection.topic)))
             message = reader.deserialize(raw, connection.msgtype)
-            yield RadarFrame(
-                radar=index,
-                t_ns=t_ns,
-                counter=counters[index],
-                samples=np.asarray(message.data, dtype=np.float32),
-                range_start_m=radars[index].range_start_m * TRUE_PER_MODULE_METRE,
-                bin_length_m=radars[index].bin_length_m * TRUE_PER_MODULE_METRE,
-            )
+            samples = np.asarray(message.data, dtype=np.float32)
+            yield recorded_frame(index, radars[index], samples, t_ns=t_ns, counter=counters[index])
             counters[index] += 1
 
 

@@ -118,6 +118,34 @@ def radar_frame(
     )
 
 
+def recorded_frame(
+    radar: int,
+    info: RadarInfo,
+    samples: NDArray[np.float32],
+    *,
+    t_ns: int,
+    counter: int,
+    limits: tuple[float, float] | None = None,
+    stream: int = 0,
+) -> RadarFrame:
+    """Return a frame for SLAM, of true metres, of a radar as it is described in a file.
+
+    ValueError if the radar was set to another number of samples.
+    """
+    if len(samples) != info.n_bins:
+        raise ValueError(f"{len(samples)} samples, but the radar was set to {info.n_bins}")
+    return RadarFrame(
+        radar=radar,
+        t_ns=t_ns,
+        counter=counter,
+        samples=samples,
+        range_start_m=info.range_start_m * TRUE_PER_MODULE_METRE,
+        bin_length_m=info.bin_length_m * TRUE_PER_MODULE_METRE,
+        limits=limits,
+        stream=stream,
+    )
+
+
 def whole_periods(start_skew_ns: int, rate_hz: float) -> int:
     """Return how many whole frame periods a radar started late.
 

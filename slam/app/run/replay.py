@@ -33,8 +33,8 @@ from slam.app.run.runner import (
     make_slam,
 )
 from slam.app.session.constants import different_constants, recorded_rules
-from slam.app.session.messages import smoothed_row, state_row
 from slam.app.session.reader import RecordedScan, RecordedSession, open_session
+from slam.app.session.state_rows import smoothed_row, state_row
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
 from slam.packed import RowsByTime

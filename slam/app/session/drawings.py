@@ -46,21 +46,21 @@ from xethru_protocol.recordings.mcap import STRING, pack_string
 Array = NDArray[np.float64]
 
 
-class Channels(Protocol):
+class Topics(Protocol):
     """Takes messages in CDR; see `SessionLog`."""
 
-    def channel(self, topic: str, message_type: str, *, latched: bool = False) -> int: ...
+    def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None: ...
 
-    def write(self, channel: int, t_ns: int, data: bytes) -> None: ...
+    def write(self, topic: str, t_ns: int, data: bytes) -> None: ...
 
 
 class Drawings:
-    """Draws a session into channels of its file.
+    """Draws a session into topics of its file.
 
     `start_ns` is the session time of the latched messages [ns].
     """
 
-    def __init__(self, file: Channels, info: SessionInfo, start_ns: int) -> None:
+    def __init__(self, file: Topics, info: SessionInfo, start_ns: int) -> None:
         self._file = file
         self._radars = info.radars
         self._field = info.field_of_view
@@ -68,32 +68,33 @@ class Drawings:
         self._newest_ns = start_ns
         self._map_from_odom: Array | None = None
         self._last: Snapshot | None = None
-        self._smoothed: tuple[_PathChannels, int] | None = None
         self._markers_ns = self._paths_ns = start_ns
         self._bscans = {
             index: _Bscan(file, radar, self._field.max_range_m, start_ns)
             for index, radar in enumerate(info.radars)
             if radar.n_bins >= _FEWEST_BINS
         }
-        self._ranges = [
-            file.channel(f"/radar/{radar.name}/range", cdr.RANGE) for radar in info.radars
-        ]
-        self._pose = file.channel("/estimate/pose", cdr.POSE_WITH_COVARIANCE)
-        self._odometry = file.channel("/estimate/odometry", cdr.ODOMETRY)
-        self._landmarks = file.channel("/landmarks/markers", cdr.MARKERS)
+        for radar in info.radars:
+            file.add_topic(f"/radar/{radar.name}/range", cdr.RANGE)
+        file.add_topic("/estimate/pose", cdr.POSE_WITH_COVARIANCE)
+        file.add_topic("/estimate/odometry", cdr.ODOMETRY)
+        file.add_topic("/landmarks/markers", cdr.MARKERS)
         self._paths = {
-            "/odom": _Path(file, "/odom/path", "map"),
-            "/estimate": _Path(file, "/estimate/path", "map"),
+            "/odom": _Path("map"),
+            "/estimate": _Path("map"),
         }
+        for topic in self._paths:
+            self._add_path(f"{topic}/path")
         self._write_latched("/fields_of_view", "base_link", self._fields_of_view())
         # Rerun's views are of its own root, which no transform of ROS leads to, and it takes
         # transforms from any topic; other programs take theirs from /tf and /tf_static.
-        rerun = file.channel("/rerun/tf_static", cdr.TRANSFORMS, latched=True)
+        file.add_topic("/rerun/tf_static", cdr.TRANSFORMS, latched=True)
         link = cdr.transforms(start_ns, {(_RERUN_ROOT, "world"): np.zeros(3)})
-        file.write(rerun, start_ns, link)
+        file.write("/rerun/tf_static", start_ns, link)
         if scene := _scene(info):
             self._write_latched("/scene", "world", scene)
-            self._paths["/truth"] = _Path(file, "/truth/path", "world")
+            self._paths["/truth"] = _Path("world")
+            self._add_path("/truth/path")
 
     def on_scan(self, scan: Scan) -> None:
         self._newest_ns = scan.t_ns
@@ -112,10 +113,10 @@ class Drawings:
         self._last = snapshot
         covariance = snapshot.pose_covariance
         pose = cdr.pose_with_covariance(t_ns, "map", snapshot.estimate, covariance)
-        self._file.write(self._pose, t_ns, pose)
+        self._file.write("/estimate/pose", t_ns, pose)
         placed = cdr.planar(snapshot.estimate)
         odometry = cdr.odometry(t_ns, "map", placed, covariance, twist)
-        self._file.write(self._odometry, t_ns, odometry)
+        self._file.write("/estimate/odometry", t_ns, odometry)
         self._write_ranges(snapshot)
         self._paths["/odom"].add(t_ns, compose(self._map_from_odom, snapshot.odometry))
         self._paths["/estimate"].add(t_ns, snapshot.estimate)
@@ -126,20 +127,17 @@ class Drawings:
             self._write_landmarks(snapshot)
         if t_ns - self._paths_ns >= _PATHS_EVERY_NS:
             self._paths_ns = t_ns
-            for path in self._paths.values():
-                path.write(t_ns, most=_SHOWN_POSES)
+            self._write_paths(t_ns, most=_SHOWN_POSES)
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        if not self._smoothed:
-            self._smoothed = (
-                _PathChannels(self._file, "/slam/smoothed_path", "map"),
-                self._file.channel("/slam/smoothed_landmarks", cdr.POINT_CLOUD),
-            )
-        path, landmarks = self._smoothed
+        self._add_path("/slam/smoothed_path")
+        self._file.add_topic("/slam/smoothed_landmarks", cdr.POINT_CLOUD)
         t_ns, step = int(smoothed.t_ns[-1]), -(-len(smoothed.t_ns) // (_KEPT_POSES - 1))
         # counted from the end, whose pose is the newest
-        path.write(t_ns, smoothed.t_ns[::-step][::-1], smoothed.poses[::-step][::-1])
-        self._file.write(landmarks, t_ns, cdr.landmark_cloud(t_ns, smoothed))
+        stamps_ns, poses = smoothed.t_ns[::-step][::-1], smoothed.poses[::-step][::-1]
+        self._write_path("/slam/smoothed_path", t_ns, "map", stamps_ns, poses)
+        landmarks = cdr.landmark_cloud(t_ns, smoothed)
+        self._file.write("/slam/smoothed_landmarks", t_ns, landmarks)
 
     def close(self) -> None:
         """Write the last rows of the B-scans, the whole paths and the last map."""
@@ -147,12 +145,28 @@ class Drawings:
             bscan.write()
         if self._last is not None:
             self._write_landmarks(self._last)
-            for path in self._paths.values():
-                path.write(self._last.t_ns, most=_KEPT_POSES)
+            self._write_paths(self._last.t_ns, most=_KEPT_POSES)
+
+    def _add_path(self, topic: str) -> None:
+        self._file.add_topic(topic, cdr.PATH)
+        self._file.add_topic(f"{topic}_points", cdr.POINT_CLOUD)
+
+    def _write_paths(self, t_ns: int, *, most: int) -> None:
+        for topic, path in self._paths.items():
+            stamps_ns, poses = path.thinned(most)
+            if len(stamps_ns):
+                self._write_path(f"{topic}/path", t_ns, path.frame, stamps_ns, poses)
+
+    def _write_path(
+        self, topic: str, t_ns: int, frame: str, stamps_ns: NDArray[np.int64], poses: Array
+    ) -> None:
+        """Write a path as poses, and as points to the topic that is named after it."""
+        self._file.write(topic, t_ns, cdr.path(t_ns, frame, stamps_ns, poses))
+        self._file.write(f"{topic}_points", t_ns, cdr.path_cloud(t_ns, frame, poses))
 
     def _write_latched(self, topic: str, frame: str, drawn: Sequence[Marker]) -> None:
-        channel = self._file.channel(topic, cdr.MARKERS, latched=True)
-        self._file.write(channel, self._newest_ns, cdr.markers(self._newest_ns, frame, drawn))
+        self._file.add_topic(topic, cdr.MARKERS, latched=True)
+        self._file.write(topic, self._newest_ns, cdr.markers(self._newest_ns, frame, drawn))
 
     def _fields_of_view(self) -> list[Marker]:
         return [
@@ -186,7 +200,7 @@ class Drawings:
                 limits_m=(self._field.min_range_m, self._field.max_range_m),
                 range_m=math.inf if strongest is None else strongest.range_m,
             )
-            self._file.write(self._ranges[index], snapshot.t_ns, message)
+            self._file.write(f"/radar/{radar.name}/range", snapshot.t_ns, message)
 
     def _write_landmarks(self, snapshot: Snapshot) -> None:
         drawn = []
@@ -233,7 +247,7 @@ class Drawings:
                     )
                 )
         message = cdr.markers(snapshot.t_ns, "map", drawn)
-        self._file.write(self._landmarks, snapshot.t_ns, message)
+        self._file.write("/landmarks/markers", snapshot.t_ns, message)
 
 
 _RERUN_ROOT = "tf#/"
@@ -309,24 +323,11 @@ _SHOWN_POSES = 256
 _KEPT_POSES = 3600
 
 
-class _PathChannels:
-    """A path as poses in one channel, and as points in another, named after it."""
-
-    def __init__(self, file: Channels, topic: str, frame: str) -> None:
-        self._file, self._frame = file, frame
-        self._path = file.channel(topic, cdr.PATH)
-        self._points = file.channel(f"{topic}_points", cdr.POINT_CLOUD)
-
-    def write(self, t_ns: int, stamps_ns: NDArray[np.int64], poses: Array) -> None:
-        self._file.write(self._path, t_ns, cdr.path(t_ns, self._frame, stamps_ns, poses))
-        self._file.write(self._points, t_ns, cdr.path_cloud(t_ns, self._frame, poses))
-
-
 class _Path:
     """A path that grows: all poses up to 3600, then every second, every fourth, and so on."""
 
-    def __init__(self, file: Channels, topic: str, frame: str) -> None:
-        self._channels = _PathChannels(file, topic, frame)
+    def __init__(self, frame: str) -> None:
+        self.frame = frame
         self._stamps: list[int] = []
         self._poses: list[tuple[float, ...]] = []
         self._every, self._n_added = 1, 0
@@ -342,15 +343,15 @@ class _Path:
             self._every *= 2
             del self._stamps[1::2], self._poses[1::2]
 
-    def write(self, t_ns: int, *, most: int) -> None:
-        """Write the path, thinned to so many poses at most, to its end."""
+    def thinned(self, most: int) -> tuple[NDArray[np.int64], Array]:
+        """Return stamps (n,) and poses (n, 3) to the end of the path, so many at most."""
         if self._newest is None:
-            return
+            return np.zeros(0, np.int64), np.zeros((0, 3))
         step = -(-len(self._poses) // (most - 1))
         stamps, poses = self._stamps[::step], self._poses[::step]
         if stamps[-1] != self._newest[0]:
             stamps, poses = [*stamps, self._newest[0]], [*poses, self._newest[1]]
-        self._channels.write(t_ns, np.array(stamps), np.array(poses))
+        return np.array(stamps), np.array(poses)
 
 
 _ROWS = 128
@@ -372,10 +373,11 @@ class _Bscan:
     frames is taken away. A lost frame is a row of NaN. After 128 rows a new picture begins.
     """
 
-    def __init__(self, file: Channels, radar: RadarInfo, reach_m: float, start_ns: int) -> None:
+    def __init__(self, file: Topics, radar: RadarInfo, reach_m: float, start_ns: int) -> None:
         self._file = file
         self._frame_id = f"radar_{radar.name}"
-        self._images = file.channel(f"/radar/{radar.name}/bscan", cdr.IMAGE)
+        self._topic = f"/radar/{radar.name}/bscan"
+        file.add_topic(self._topic, cdr.IMAGE)
         self._recent: deque[NDArray[np.float32]] = deque(maxlen=_ROWS)
         self._n_bins, self._n_new = radar.n_bins, 0
         self._last: RadarFrame | None = None
@@ -404,8 +406,8 @@ class _Bscan:
             },
             "lost frames": "NaN",
         }
-        info = file.channel(f"/radar/{radar.name}/bscan/axes", STRING, latched=True)
-        file.write(info, start_ns, pack_string(json.dumps(about)))
+        file.add_topic(f"{self._topic}/axes", STRING, latched=True)
+        file.write(f"{self._topic}/axes", start_ns, pack_string(json.dumps(about)))
 
     def add(self, frame: RadarFrame) -> None:
         if len(frame.samples) != self._n_bins:
@@ -442,4 +444,4 @@ class _Bscan:
         self._rows = self._rows[-_ROWS:]
         self._gaps, self._n_new = [], 0
         message = cdr.image(self._last.t_ns, self._frame_id, np.array(self._rows))
-        self._file.write(self._images, self._last.t_ns, message)
+        self._file.write(self._topic, self._last.t_ns, message)

@@ -11,7 +11,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TypeAlias
 
+from pydantic import TypeAdapter
+
 from slam.app.records import Gap
+from slam.app.session.messages import checked
 
 _SCANS = ("/scan", "/scan_unused")
 
@@ -132,14 +135,9 @@ def gap_json(gap: Gap) -> str:
     return json.dumps(asdict(gap))
 
 
+_GAP = TypeAdapter(Gap)
+
+
 def read_gap(text: str) -> Gap:
-    """Read a gap; ValueError, TypeError or KeyError if it makes no sense."""
-    row = json.loads(text)
-    scans = row["scans"]
-    return Gap(
-        from_ns=int(row["from_ns"]),
-        to_ns=None if row["to_ns"] is None else int(row["to_ns"]),
-        n_messages=None if row["n_messages"] is None else int(row["n_messages"]),
-        scans=None if scans is None else (int(scans[0]), int(scans[1])),
-        frames={str(name): int(n) for name, n in row["frames"].items()},
-    )
+    """Read a gap; ValueError if it makes no sense."""
+    return checked(_GAP, json.loads(text))

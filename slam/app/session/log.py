@@ -38,10 +38,8 @@ from slam.app.session.messages import (
     SESSION_TOPIC,
     radar_text,
     session_table,
-    smoothed_row,
-    state_row,
 )
-from slam.app.session.steps import step_row
+from slam.app.session.state_rows import smoothed_row, state_row, step_row
 from slam.geometry import between, compose
 from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import (
@@ -62,6 +60,21 @@ _ORIGIN = np.zeros(3)
 _CHUNK_NS = 1_000_000_000
 # MCAP's message record: opcode, length, channel, sequence, two times.
 _RECORD_OVERHEAD_BYTES = 31
+
+_TOPICS = {
+    "/scan": DOUBLE_ARRAY,
+    "/scan_unused": DOUBLE_ARRAY,
+    "/slam/step": DOUBLE_ARRAY,
+    "/slam/state": DOUBLE_ARRAY,
+    "/odom": cdr.ODOMETRY,
+    "/truth": cdr.POSE,
+    "/estimate": cdr.POSE,
+    "/landmarks": cdr.POINT_CLOUD,
+    "/tf": cdr.TRANSFORMS,
+    "/tf_static": cdr.TRANSFORMS,
+    "/log": cdr.LOG,
+}
+"""Those of every session, besides those of its radars."""
 
 _LATCHED_QOS = """\
 - history: 1
@@ -111,6 +124,7 @@ class _SessionFile:
         self._stream = BufferedWriter(self._disk)
         # Chunks are cut here, by size and by time; the writer itself knows size only.
         self._writer = McapWriter(self._stream, chunk_bytes=2 * CHUNK_BYTES)
+        self._channels: dict[str, int] = {}
         self._pending_bytes = 0
         self._whole_bytes = 0  # of the file, up to its last whole chunk
         self._newest_ns = self._whole_ns = start_ns
@@ -120,19 +134,19 @@ class _SessionFile:
         with self._giving_up():
             self._writer.add_metadata(name, dict(table))
 
-    def channel(self, topic: str, message_type: str, *, latched: bool = False) -> int:
-        """Return the number of a new channel; a latched one keeps its last message for all."""
-        if self._disk.gave_up:
-            return 0
+    def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None:
+        """Make a channel, if the topic has none yet; a latched one keeps its last message."""
+        if self._disk.gave_up or topic in self._channels:
+            return
         metadata = {"offered_qos_profiles": _LATCHED_QOS} if latched else {}
         with self._giving_up():
-            return self._writer.add_channel(
+            self._channels[topic] = self._writer.add_channel(
                 topic, message_type, cdr.schema_text(message_type), metadata
             )
 
     def write(
         self,
-        channel: int,
+        topic: str,
         t_ns: int,
         data: bytes,
         *,
@@ -151,7 +165,7 @@ class _SessionFile:
         self._newest_ns = max(self._newest_ns, t_ns)
         with self._giving_up():
             self._writer.add_message(
-                channel_id=channel,
+                channel_id=self._channels[topic],
                 log_time=t_ns,
                 publish_time=t_ns if publish_ns is None else publish_ns,
                 sequence=sequence,
@@ -261,40 +275,26 @@ class SessionLog(SessionObserver):
         self._odometry_ns = -1  # of the newest sample written
         self._truth_at = truth_at
         self._t_ns = start_ns
-        self._rare_channels: dict[str, int] = {}
-        self._smoothed: int | None = None
         self._names = [radar.name for radar in info.radars]
         self._streams = [0] * len(self._names)
-        self._frame_channels: list[int] = []
         table = session_table(info)
         self._file.add_metadata(METADATA_NAME, table)
         # The same with a checksum, and repeated; metadata have neither, but other programs show it.
-        channel = self._file.channel(SESSION_TOPIC, STRING, latched=True)
-        self._file.write(channel, start_ns, pack_string(json.dumps(table)))
+        self._file.add_topic(SESSION_TOPIC, STRING, latched=True)
+        self._file.write(SESSION_TOPIC, start_ns, pack_string(json.dumps(table)))
         for radar in info.radars:
-            self._frame_channels.append(
-                self._file.channel(f"/radar/{radar.name}/frame", FLOAT_ARRAY)
-            )
-            channel = self._file.channel(f"/radar/{radar.name}/info", STRING, latched=True)
-            self._file.write(channel, start_ns, pack_string(radar_text(radar)))
-        self._scans = self._file.channel("/scan", DOUBLE_ARRAY)
-        self._unused_scans = self._file.channel("/scan_unused", DOUBLE_ARRAY)
-        self._steps = self._file.channel("/slam/step", DOUBLE_ARRAY)
-        self._states = self._file.channel("/slam/state", DOUBLE_ARRAY)
-        self._odometry = self._file.channel("/odom", cdr.ODOMETRY)
-        self._truth = self._file.channel("/truth", cdr.POSE)
-        self._estimate = self._file.channel("/estimate", cdr.POSE)
-        self._landmarks = self._file.channel("/landmarks", cdr.POINT_CLOUD)
-        self._transforms = self._file.channel("/tf", cdr.TRANSFORMS)
-        self._static_transforms = self._file.channel("/tf_static", cdr.TRANSFORMS, latched=True)
-        self._log = self._file.channel("/log", cdr.LOG)
+            self._file.add_topic(f"/radar/{radar.name}/frame", FLOAT_ARRAY)
+            self._file.add_topic(f"/radar/{radar.name}/info", STRING, latched=True)
+            text = pack_string(radar_text(radar))
+            self._file.write(f"/radar/{radar.name}/info", start_ns, text)
+        for topic, message_type in _TOPICS.items():
+            self._file.add_topic(topic, message_type, latched=topic == "/tf_static")
         # The topic is latched with depth 1, so each message holds all that is static so far.
         self._placements = {
             ("base_link", f"radar_{radar.name}"): np.array([radar.x_m, radar.y_m, radar.yaw_rad])
             for radar in info.radars
         }
-        static = cdr.transforms(start_ns, self._placements)
-        self._file.write(self._static_transforms, start_ns, static)
+        self._file.write("/tf_static", start_ns, cdr.transforms(start_ns, self._placements))
         self._wheels = WheelMotion(info.wheels)
         self._wheels_at: tuple[int, NDArray[np.float64]] | None = None
         self._drawings = Drawings(self._file, info, start_ns) if drawn else None
@@ -310,10 +310,10 @@ class SessionLog(SessionObserver):
         for frame, host_ns in zip(scan.frames, arrivals, strict=True):
             if frame.stream != self._streams[frame.radar]:
                 self._streams[frame.radar] = frame.stream
-                channel = self._rare_channel(self._names[frame.radar], "stream", cdr.NUMBER)
-                self._file.write(channel, frame.t_ns, cdr.number(frame.stream))
+                number = cdr.number(frame.stream)
+                self._write_rare(frame.radar, "stream", cdr.NUMBER, frame.t_ns, number)
             self._file.write(
-                self._frame_channels[frame.radar],
+                f"/radar/{self._names[frame.radar]}/frame",
                 frame.t_ns,
                 pack_array(FLOAT_ARRAY, frame.samples),
                 sequence=frame.counter,
@@ -325,15 +325,15 @@ class SessionLog(SessionObserver):
         members = [number for frame in scan.frames for number in (frame.radar, frame.counter)]
         row = np.array([len(scan.frames), *members, *known], dtype=np.float64)
         mark = pack_array(DOUBLE_ARRAY, row, "n_frames_radars_counters_truth")
-        topic = self._scans if scan.used else self._unused_scans
+        topic = "/scan" if scan.used else "/scan_unused"
         self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
         if self._drawings is not None:
             self._drawings.on_scan(scan)
 
     def on_detections(self, radar: int, t_ns: int, ranges_m: NDArray[np.float64]) -> None:
         """Write ranges of the scan that comes next, shape (n,) [m], of a radar by its index."""
-        channel = self._rare_channel(self._names[radar], "detections", DOUBLE_ARRAY)
-        self._file.write(channel, t_ns, pack_array(DOUBLE_ARRAY, ranges_m, "range_m"))
+        message = pack_array(DOUBLE_ARRAY, ranges_m, "range_m")
+        self._write_rare(radar, "detections", DOUBLE_ARRAY, t_ns, message)
 
     def on_odometry(self, sample: TumSample) -> None:
         t_ns, pose = sample.t_ns, np.array([sample.x_m, sample.y_m, sample.heading_rad])
@@ -342,7 +342,7 @@ class SessionLog(SessionObserver):
             earlier_ns, earlier = self._wheels_at
             twist = self._wheels.twist(earlier, pose, t_ns - earlier_ns)
         self._wheels_at = t_ns, pose
-        self._file.write(self._odometry, t_ns, cdr.wheel_odometry(sample, twist))
+        self._file.write("/odom", t_ns, cdr.wheel_odometry(sample, twist))
         self._odometry_ns = t_ns
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
@@ -350,39 +350,35 @@ class SessionLog(SessionObserver):
         t_ns = snapshot.t_ns
         if ("world", "map") not in self._placements:
             self._placements["world", "map"] = snapshot.world_from_map
-            static = cdr.transforms(t_ns, self._placements)
-            self._file.write(self._static_transforms, t_ns, static)
+            self._file.write("/tf_static", t_ns, cdr.transforms(t_ns, self._placements))
         if np.all(np.isfinite(snapshot.truth)):
-            truth = cdr.pose_stamped(t_ns, "world", snapshot.truth)
-            self._file.write(self._truth, t_ns, truth)
-        estimate = cdr.pose_stamped(t_ns, "map", snapshot.estimate)
-        self._file.write(self._estimate, t_ns, estimate)
-        self._file.write(self._landmarks, t_ns, cdr.landmark_cloud(t_ns, snapshot))
+            self._file.write("/truth", t_ns, cdr.pose_stamped(t_ns, "world", snapshot.truth))
+        self._file.write("/estimate", t_ns, cdr.pose_stamped(t_ns, "map", snapshot.estimate))
+        self._file.write("/landmarks", t_ns, cdr.landmark_cloud(t_ns, snapshot))
         links = {
             ("map", "odom"): compose(snapshot.estimate, between(snapshot.odometry, _ORIGIN)),
             ("odom", "base_link"): snapshot.odometry,
         }
-        self._file.write(self._transforms, t_ns, cdr.transforms(t_ns, links))
+        self._file.write("/tf", t_ns, cdr.transforms(t_ns, links))
         if snapshot.step is not None:  # before its state, which a reader waits for
             step = step_row(snapshot.step, snapshot.wall_spans_m)
             message = pack_array(DOUBLE_ARRAY, step, "step")
-            self._file.write(self._steps, t_ns, message, sequence=snapshot.counter)
+            self._file.write("/slam/step", t_ns, message, sequence=snapshot.counter)
         state = pack_array(DOUBLE_ARRAY, state_row(snapshot), "state")
-        self._file.write(self._states, t_ns, state, sequence=snapshot.counter)
+        self._file.write("/slam/state", t_ns, state, sequence=snapshot.counter)
         if self._drawings is not None:
             self._drawings.on_snapshot(snapshot)
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        if self._smoothed is None:
-            self._smoothed = self._file.channel("/slam/smoothed", DOUBLE_ARRAY)
+        self._file.add_topic("/slam/smoothed", DOUBLE_ARRAY)
         message = pack_array(DOUBLE_ARRAY, smoothed_row(smoothed), "smoothed")
-        self._file.write(self._smoothed, int(smoothed.t_ns[-1]), message)
+        self._file.write("/slam/smoothed", int(smoothed.t_ns[-1]), message)
         if self._drawings is not None:
             self._drawings.on_smoothed(smoothed)
 
     def on_log(self, line: LogLine) -> None:
         t_ns = max(line.t_ns, self._start_ns)
-        self._file.write(self._log, t_ns, cdr.log_line(t_ns, line))
+        self._file.write("/log", t_ns, cdr.log_line(t_ns, line))
 
     def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
         """Write bytes as a radar's port gave (rx) or took (tx) them, at a host time [ns].
@@ -391,16 +387,16 @@ class SessionLog(SessionObserver):
         """
         if not data:
             return
-        channel = self._rare_channel(radar, way, BYTE_ARRAY)
         message = pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8))
-        self._file.write(channel, self._t_ns, message, publish_ns=host_ns)
+        topic = f"/radar/{radar}/{way}"
+        self._file.add_topic(topic, BYTE_ARRAY)
+        self._file.write(topic, self._t_ns, message, publish_ns=host_ns)
 
-    def _rare_channel(self, radar: str, part: str, message_type: str) -> int:
-        """Return the channel of a part that few sessions have, made when it is first needed."""
-        topic = f"/radar/{radar}/{part}"
-        if topic not in self._rare_channels:
-            self._rare_channels[topic] = self._file.channel(topic, message_type)
-        return self._rare_channels[topic]
+    def _write_rare(self, radar: int, part: str, message_type: str, t_ns: int, data: bytes) -> None:
+        """Write to a topic that few sessions have; its channel is made when it is first needed."""
+        topic = f"/radar/{self._names[radar]}/{part}"
+        self._file.add_topic(topic, message_type)
+        self._file.write(topic, t_ns, data)
 
     def close(self) -> None:
         drawings, self._drawings = self._drawings, None

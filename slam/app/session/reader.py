@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
-from slam.app.rig.sources import TRUE_PER_MODULE_METRE, sampler_limits
+from slam.app.rig.sources import recorded_frame, sampler_limits
 from slam.app.session import cdr
 from slam.app.session.gaps import read_gap
 from slam.app.session.messages import (
@@ -34,12 +34,10 @@ from slam.app.session.messages import (
     check_format,
     read_radar_text,
     read_session_table,
-    smoothed_of,
-    snapshot_of,
 )
-from slam.app.session.steps import with_step
+from slam.app.session.state_rows import smoothed_of, snapshot_of, with_step
 from slam.frames import Detection, RadarFrame
-from slam.geometry import Mount, Rig
+from slam.geometry import Rig
 from slam.results import SmoothedRun
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.recordings.mcap import (
@@ -206,28 +204,6 @@ SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot
 """What `RecordedSession.records` yields; a TumSample is odometry."""
 
 
-def _frame(
-    message: Message,
-    index: int,
-    radar: RadarInfo,
-    limits: tuple[float, float] | None,
-    stream: int,
-) -> RadarFrame:
-    samples = unpack_array(FLOAT_ARRAY, message.data)
-    if len(samples) != radar.n_bins:
-        raise ValueError(f"{len(samples)} samples, but the radar was set to {radar.n_bins}")
-    return RadarFrame(
-        radar=index,
-        t_ns=message.t_ns,
-        counter=message.sequence,
-        samples=samples,
-        range_start_m=radar.range_start_m * TRUE_PER_MODULE_METRE,
-        bin_length_m=radar.bin_length_m * TRUE_PER_MODULE_METRE,
-        limits=limits,
-        stream=stream,
-    )
-
-
 def _limits_of(radar: RadarInfo) -> tuple[float, float] | None:
     """Return the sampler's limits where the recorded settings are those of this driver."""
     known = {field.name for field in fields(RawConfig)}
@@ -259,30 +235,17 @@ def _state(message: Message, step: Message | None) -> Snapshot:
     return with_step(state, unpack_array(DOUBLE_ARRAY, step.data))
 
 
-def _odometry(message: Message) -> TumSample:
-    return cdr.pose_sample(cdr.deserialise(message.data, cdr.ODOMETRY))
-
-
-def _log_line(message: Message) -> LogLine:
-    return cdr.read_log_line(message.t_ns, message.data)
-
-
-def _smoothed(message: Message) -> SmoothedRun:
-    return smoothed_of(message.t_ns, unpack_array(DOUBLE_ARRAY, message.data))
-
-
-def _gap(message: Message) -> Gap:
-    return read_gap(unpack_string(message.data))
-
-
 _READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
-    GAP_TOPIC: _gap,
+    GAP_TOPIC: lambda one: read_gap(unpack_string(one.data)),
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
-    "/odom": _odometry,
-    "/log": _log_line,
-    "/slam/smoothed": _smoothed,
+    "/odom": lambda one: cdr.pose_sample(cdr.deserialise(one.data, cdr.ODOMETRY)),
+    "/log": lambda one: cdr.read_log_line(one.t_ns, one.data),
+    "/slam/smoothed": lambda one: smoothed_of(one.t_ns, unpack_array(DOUBLE_ARRAY, one.data)),
 }
+
+_Part: TypeAlias = Literal["frame", "stream", "detections", "rx", "tx", ""]
+"""The last word of a radar's topic."""
 
 
 class RecordedSession:
@@ -314,23 +277,16 @@ class RecordedSession:
         self.info = info
         self.end_ns = end_ns
         self.cut_at_byte: int | None = None
+        parts: tuple[_Part, ...] = ("frame", "stream", "detections", "rx", "tx")
+        self._of_radars = {
+            f"/radar/{radar.name}/{part}": (index, part)
+            for index, radar in enumerate(info.radars)
+            for part in parts
+        }
 
     @property
     def rig(self) -> Rig:
-        return Rig(
-            mounts=tuple(
-                Mount(
-                    name=radar.name,
-                    x_m=radar.x_m,
-                    y_m=radar.y_m,
-                    yaw_rad=radar.yaw_rad,
-                    range_offset_m=radar.range_offset_m,
-                    phase_offset_rad=radar.phase_offset_rad,
-                    pulse=radar.pulse,
-                )
-                for radar in self.info.radars
-            )
-        )
+        return Rig(mounts=tuple(radar.mount for radar in self.info.radars))
 
     def records(self) -> Iterator[SessionRecord]:
         """Yield what was recorded, in the order of the file; may be called again.
@@ -379,18 +335,14 @@ class RecordedSession:
 
     def detections(self) -> dict[int, tuple[Detection, ...]]:
         """Return the recorded ranges by the time of their scan [ns]; amplitudes are unknown."""
-        index_of = {
-            f"/radar/{radar.name}/detections": index for index, radar in enumerate(self.info.radars)
-        }
         of_scan: dict[int, tuple[Detection, ...]] = {}
         held: list[Detection] = []
-        for entry in self._messages():
-            if entry.topic in index_of:
+        for radar, part, entry in self._messages():
+            if part == "detections":
                 with _naming(self.path, entry):
                     ranges_m = unpack_array(DOUBLE_ARRAY, entry.data).tolist()
-                radar, t_ns = index_of[entry.topic], entry.t_ns
                 held += [
-                    Detection(radar=radar, t_ns=t_ns, range_m=range_m, amplitude=math.nan)
+                    Detection(radar=radar, t_ns=entry.t_ns, range_m=range_m, amplitude=math.nan)
                     for range_m in ranges_m
                 ]
             elif entry.topic == "/scan":
@@ -404,15 +356,11 @@ class RecordedSession:
         Each with the radar's name, the way, and the time by the driver's clock [ns]; nothing if
         none were recorded.
         """
-        ways: dict[str, tuple[str, Literal["rx", "tx"]]] = {}
-        for radar in self.info.radars:
-            ways[f"/radar/{radar.name}/rx"] = (radar.name, "rx")
-            ways[f"/radar/{radar.name}/tx"] = (radar.name, "tx")
-        for entry in self._messages():
-            if found := ways.get(entry.topic):
+        for radar, part, entry in self._messages():
+            if part in ("rx", "tx"):
                 with _naming(self.path, entry):
                     data = unpack_array(BYTE_ARRAY, entry.data).tobytes()
-                yield *found, data, entry.publish_ns
+                yield self.info.radars[radar].name, part, data, entry.publish_ns
 
     def odometry(self) -> OdometryTrack:
         samples = [record for record in self.records() if isinstance(record, TumSample)]
@@ -423,24 +371,24 @@ class RecordedSession:
 
     def _records(self) -> Iterator[tuple[Message, SessionRecord]]:
         """Yield the messages that do not repeat others, each with its content."""
-        radar_of = {
-            f"/radar/{radar.name}/frame": (index, radar, _limits_of(radar))
-            for index, radar in enumerate(self.info.radars)
-        }
-        of_stream = {
-            f"/radar/{radar.name}/stream": index for index, radar in enumerate(self.info.radars)
-        }
+        limits = list(map(_limits_of, self.info.radars))
         streams = [0] * len(self.info.radars)
         step: Message | None = None
-        for entry in self._messages():
+        for radar, part, entry in self._messages():
             record: SessionRecord | None = None
             with _naming(self.path, entry):
-                if entry.topic in radar_of:
-                    index, radar, limits = radar_of[entry.topic]
-                    record = _frame(entry, index, radar, limits, streams[index])
-                elif entry.topic in of_stream:
-                    number = cdr.deserialise(entry.data, cdr.NUMBER)
-                    streams[of_stream[entry.topic]] = int(number.data)
+                if part == "frame":
+                    record = recorded_frame(
+                        radar,
+                        self.info.radars[radar],
+                        unpack_array(FLOAT_ARRAY, entry.data),
+                        t_ns=entry.t_ns,
+                        counter=entry.sequence,
+                        limits=limits[radar],
+                        stream=streams[radar],
+                    )
+                elif part == "stream":
+                    streams[radar] = int(cdr.deserialise(entry.data, cdr.NUMBER).data)
                 elif entry.topic == "/slam/step":
                     step = entry
                 elif entry.topic == "/slam/state":
@@ -450,11 +398,12 @@ class RecordedSession:
             if record is not None:
                 yield entry, record
 
-    def _messages(self) -> Iterator[Message]:
+    def _messages(self) -> Iterator[tuple[int, _Part, Message]]:
+        """Yield the messages; of a radar's topic with its index and what the topic holds."""
         entries = read_entries(self.path, self._size, dict(self._channels))
         for entry in self._stop.each(entries):
             if isinstance(entry, Message):
-                yield entry
+                yield *self._of_radars.get(entry.topic, (-1, "")), entry
             elif isinstance(entry, Cut):
                 self.cut_at_byte = entry.at
 

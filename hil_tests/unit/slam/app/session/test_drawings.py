@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from hil_tests.paths import FIXTURES
-from hil_tests.unit.slam.app.session.test_steps import robust_state
+from hil_tests.unit.slam.app.session.test_state_rows import robust_state
 from hil_tests.unit.slam.app.sessions import (
     FRAME_NS,
     feed,
@@ -253,18 +253,16 @@ def test_the_smoothed_run_is_a_path_with_its_landmarks_in_the_map_frame() -> Non
 
 
 class Kept:
-    """Channels that keep what is written."""
+    """Topics that keep what is written."""
 
     def __init__(self) -> None:
-        self.topics: list[str] = []
-        self.messages: dict[str, list[bytes]] = defaultdict(list)
+        self.messages: dict[str, list[bytes]] = {}
 
-    def channel(self, topic: str, message_type: str, *, latched: bool = False) -> int:
-        self.topics.append(topic)
-        return len(self.topics) - 1
+    def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None:
+        self.messages.setdefault(topic, [])
 
-    def write(self, channel: int, t_ns: int, data: bytes | memoryview) -> None:
-        self.messages[self.topics[channel]].append(bytes(data))
+    def write(self, topic: str, t_ns: int, data: bytes) -> None:
+        self.messages[topic].append(data)
 
 
 def test_what_is_written_of_paths_grows_with_the_run_and_not_with_its_square() -> None:

@@ -15,7 +15,7 @@ from slam.app.errors import AppError
 from slam.app.records import Snapshot
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
-from slam.app.session.steps import step_row, with_step
+from slam.app.session.state_rows import step_row, with_step
 from slam.frames import Detection
 from slam.results import (
     Association,
@@ -206,7 +206,7 @@ def test_a_row_of_another_length_or_with_wrong_counts_is_an_error() -> None:
         for place, value in ((0, -1.0), (0, 0.5), (0, math.inf), (0, NAN), (2, 1e18)):
             wrong = right.copy()
             wrong[place] = value
-            with pytest.raises(ValueError, match=r"counts (need|-|0|inf|nan)|names number"):
+            with pytest.raises(ValueError, match=r"count|names number"):
                 with_step(state, wrong)
     wrong = np.array(PAPERS_ROW)
     wrong[-1] = 2.0  # of two fixes the third was rejected
