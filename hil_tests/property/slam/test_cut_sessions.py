@@ -1,7 +1,6 @@
 """A session cut or damaged anywhere: what is left is a prefix, and `repair` makes it whole."""
 
 import struct
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
+from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of
 from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
 from slam.app.errors import AppError
 from slam.app.session.log import SessionLog
@@ -83,14 +83,6 @@ def count_by_rosbags(path: Path) -> int:
         return sum(1 for connection, _, _ in reader.messages() if not is_of_head(connection.topic))
 
 
-def top_level_places(content: bytes) -> Iterator[int]:
-    """Where records begin that are not within a chunk."""
-    at = 8
-    while at + 9 <= len(content):
-        yield at
-        at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
-
-
 def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     path.write_bytes(whole)
@@ -98,7 +90,7 @@ def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> No
     assert len(everything) == N_SCANS * (3 + 5)
     longest, whole_until_ns = 0, -1
     # every record's first bytes, all of a chunk's head, and a comb through the rest
-    starts = list(top_level_places(whole))
+    starts = [at for _, at in records_of(whole)]
     before = starts[0]
     places = {at + k for at in starts for k in (-1, 0, 1, 9)}
     places |= {at + k for at in starts if whole[at] == CHUNK for k in range(0, 60, 3)}
@@ -154,7 +146,7 @@ def test_damage_in_the_middle_loses_the_chunk_it_is_in(
     path.with_name(path.name + KEPT_SUFFIX).unlink(missing_ok=True)
     path.write_bytes(whole)
     everything = messages(path)
-    chunks = [at for at in top_level_places(whole) if whole[at] == CHUNK]
+    chunks = chunks_of(whole)
     # the second chunk or a later one: the first holds what all others need to be understood
     place = chunks[1] + round(share * (chunks[-1] - chunks[1]))
     path.write_bytes(whole[:place] + garbage + whole[place + len(garbage) :])
@@ -174,7 +166,7 @@ def test_damage_in_the_middle_loses_the_chunk_it_is_in(
 def test_a_tail_of_zeros_is_a_cut(whole: Content, tmp_path: Path) -> None:
     """A file system may know of a file's length and not of its last bytes when the power goes."""
     path = tmp_path / "zeros.mcap"
-    places = list(top_level_places(whole))
+    places = [at for _, at in records_of(whole)]
     at = places[len(places) // 2]
     path.write_bytes(whole[:at] + bytes(5000))
     *entries, cut = read_entries(path)

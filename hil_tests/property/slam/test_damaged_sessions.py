@@ -1,8 +1,6 @@
 """One damaged byte anywhere: the session opens, and `repair` says what it lost."""
 
 import random
-import struct
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +8,13 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of
 from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
 from slam.app.records import LogLine
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
 from slam.app.session.repair import repair
 from slam.frames import RadarFrame
-from xethru_protocol.recordings.mcap import CHUNK
 from xethru_protocol.system import StopFlag
 
 N_BINS = 16
@@ -36,18 +34,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     log.on_log(LogLine(t_ns=9, radar="radar0", warning=False, text="the end"))
     log.close()
     return path.read_bytes()
-
-
-def records_of(content: bytes) -> Iterator[tuple[int, int]]:
-    """Yield the kind and the place of each record that is not within a chunk."""
-    at = 8
-    while at + 9 <= len(content):
-        yield content[at], at
-        at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
-
-
-def chunks_of(content: bytes) -> list[int]:
-    return [at for kind, at in records_of(content) if kind == CHUNK]
 
 
 def frames_in(path: Path) -> list[tuple[int, int]]:

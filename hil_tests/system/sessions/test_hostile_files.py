@@ -16,10 +16,9 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from hil_tests.patience import seconds
+from hil_tests.unit.slam.app.session.mcap_files import chunks_of, rewrite
 from hil_tests.unit.slam.app.sessions import (
     FRAME_NS,
     odometry,
@@ -65,9 +64,7 @@ def degenerate(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     folder = tmp_path_factory.mktemp("degenerate")
     whole = write_session(folder / "whole.mcap", 3).read_bytes()
-    at = 8
-    while whole[at] != 6:
-        at += 9 + struct.unpack_from("<Q", whole, at + 1)[0]
+    at = chunks_of(whole)[0]
     nothing = chunk(struct.pack("<BQ", 3, N_BYTES - 9).ljust(N_BYTES, b"\0"))
     path = folder / "session.mcap"
     path.write_bytes(whole[:at] + nothing * N_CHUNKS + whole[at:])
@@ -247,23 +244,23 @@ def test_errors_about_a_session_hold_no_control_characters(
 
 def rewrite_strings(path: Path, field: str) -> None:
     """Spoil the texts that describe a session, by mcap's own writer."""
+
+    def spoilt(topic: str, data: bytes) -> bytes:
+        of_radar = topic.startswith("/radar/") and "/info" in topic
+        if field == "unit" and of_radar:
+            change = {"length_unit": planted("furlong")}
+        elif field == "table" and topic == "/session/info":
+            change = {"seed": planted("7")}
+        else:
+            return data
+        return pack_string(json.dumps(json.loads(data[8:].rstrip(b"\0")) | change))
+
     (source := path.with_suffix(".whole")).write_bytes(path.read_bytes())
-    with source.open("rb") as stream, path.open("wb") as target:
-        writer = Writer(target)
-        writer.start(planted("ros2"), planted("library"))
-        numbers: dict[str, int] = {}
-        messages = make_reader(stream).iter_messages(log_time_order=False)
-        for schema, channel, message in messages:
-            assert schema is not None
-            if channel.topic not in numbers:
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", schema_id)
-            data = message.data
-            if field == "unit" and channel.topic.startswith("/radar/") and "/info" in channel.topic:
-                table = json.loads(data[8:].rstrip(b"\0"))
-                data = pack_string(json.dumps(table | {"length_unit": planted("furlong")}))
-            elif field == "table" and channel.topic == "/session/info":
-                table = json.loads(data[8:].rstrip(b"\0"))
-                data = pack_string(json.dumps(table | {"seed": planted("7")}))
-            writer.add_message(numbers[channel.topic], message.log_time, data, message.log_time)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+    rewrite(
+        source,
+        path,
+        spoilt,
+        profile=planted("ros2"),
+        library=planted("library"),
+        with_metadata=False,
+    )

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from PIL import Image
 
 from hil_tests.patience import seconds
 from hil_tests.system.recorded_session import record_session
 from hil_tests.unit.full_disk import child_on_full_disk, full_disk
+from hil_tests.unit.slam.app.session.mcap_files import rewrite
 from slam.app.cli import main
 from slam.app.commands import report, view
 from slam.app.run import output
@@ -45,31 +45,8 @@ def no_slam(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def without(session: Path, folder: Path, *topics: str) -> Path:
-    """Write a session again with the mcap library, all but some topics."""
     path = folder / "session.mcap"
-    with session.open("rb") as source, path.open("wb") as target:
-        reader, writer = make_reader(source), Writer(target)
-        writer.start(profile="ros2")
-        for metadata in reader.iter_metadata():
-            writer.add_metadata(metadata.name, metadata.metadata)
-        channels: dict[int, int] = {}
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            if channel.topic in topics:
-                continue
-            assert schema is not None
-            if channel.id not in channels:
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schema_id, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.id],
-                message.log_time,
-                message.data,
-                message.publish_time,
-                message.sequence,
-            )
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap's own
+    rewrite(session, path, lambda topic, data: None if topic in topics else data)
     return path
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
+from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of, rewrite
 from hil_tests.unit.slam.app.sessions import FRAME_NS, run, write_session
 from slam.app.records import Gap
 from slam.app.session.reader import ScanEnd, open_session
 from slam.app.session.repair import repair
 from slam.frames import RadarFrame
-from xethru_protocol.recordings.mcap import is_latched
+from xethru_protocol.recordings.mcap import DATA_END, is_latched
 from xethru_protocol.system import StopFlag, StopRequestedError, locked
 
 
@@ -107,20 +107,6 @@ def test_a_file_that_cannot_take_its_place_leaves_everything_as_it_was(
     assert Path(f"{cut}.unrepaired").read_bytes() == before
 
 
-def chunks_of(content: bytes | bytearray) -> list[int]:
-    return records_of(content, 6)
-
-
-def records_of(content: bytes | bytearray, code: int) -> list[int]:
-    """Return where the records of one kind begin in an MCAP file."""
-    at, found = 8, []
-    while at + 9 <= len(content):
-        if content[at] == code:
-            found.append(at)
-        at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
-    return found
-
-
 @pytest.fixture
 def holed(tmp_path: Path) -> Path:
     """Return a session that lacks the chunk in its middle, some ten scans."""
@@ -157,7 +143,7 @@ def test_damage_of_the_index_loses_nothing(
 ) -> None:
     path = write_session(tmp_path / "session.mcap", 60)
     content = bytearray(path.read_bytes())
-    (data_end,) = records_of(content, 15)
+    (data_end,) = (at for kind, at in records_of(content) if kind == DATA_END)
     content[data_end + 13] = 0  # the code of the first record of the index
     path.write_bytes(content)
     code, out, _ = run(capsys, "repair", path)
@@ -201,35 +187,18 @@ def test_a_second_repair_keeps_the_gap_of_the_first(holed: Path, tmp_path: Path)
     assert len(list(gaps_in(out))) == 1
 
 
-def without_description(path: Path, content: bytes) -> None:
-    """Write the file of a session without a word of what run it is of, by mcap's own writer."""
-    (source := path.with_suffix(".whole")).write_bytes(content)
-    with source.open("rb") as stream, path.open("wb") as target:
-        writer = Writer(target, chunk_size=50_000)
-        writer.start("ros2", "xethru-hil")
-        numbers: dict[str, int] = {}
-        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
-            if channel.topic.endswith("/info") or schema is None:
-                continue
-            if channel.topic not in numbers:
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", schema_id)
-            writer.add_message(
-                numbers[channel.topic],
-                message.log_time,
-                message.data,
-                message.publish_time,
-                message.sequence,
-            )
-    source.unlink()
-
-
 def test_a_session_that_nothing_describes_is_a_failure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = write_session(tmp_path / "whole.mcap", 20)
     path = tmp_path / "session.mcap"
-    without_description(path, whole.read_bytes())
+    rewrite(
+        whole,
+        path,
+        lambda topic, data: None if topic.endswith("/info") else data,
+        with_metadata=False,
+        finished=False,
+    )
     whole.unlink()
     before = path.read_bytes()
     code, out, err = run(capsys, "repair", path)
