@@ -25,8 +25,8 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.app.session.constants import slam_constants
+from slam.app.session.description import settings_text
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import settings_text
 from slam.robust.parameters import BackEndParameters
 from xethru_protocol.system import StopFlag
 

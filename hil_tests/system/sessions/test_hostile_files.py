@@ -29,8 +29,8 @@ from hil_tests.unit.slam.app.sessions import (
 )
 from slam.app.cli import main
 from slam.app.records import LogLine, SessionInfo
+from slam.app.session.description import settings_text
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import settings_text
 from slam.config import WheelNoise, load_preset
 from xethru_protocol.recordings.mcap import pack_string
 

@@ -30,8 +30,8 @@ from slam.app.run.output import Progress, note
 from slam.app.run.results import REPORT, RESULTS, SESSION, VIEW, finish, hold_folder, remove_earlier
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
+from slam.app.session.description import settings_text
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.compiled import compile_kernels
 from slam.config import BackEnd

@@ -54,8 +54,8 @@ from slam.app.run.runner import (
     make_slam,
 )
 from slam.app.session.constants import slam_constants
+from slam.app.session.description import settings_text
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.frames import RadarFrame

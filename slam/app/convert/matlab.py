@@ -37,8 +37,8 @@ from slam.app.errors import AppError, OdometryError, naming
 from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan
 from slam.app.rig.sources import recorded_frame
+from slam.app.session.description import imported_info, imported_radar
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import imported_info, imported_radar
 from slam.app.session.reader import RecordedSession, describe_kind
 from slam.config import SlamConfig
 from slam.frames import RadarFrame

@@ -38,8 +38,7 @@ from slam.app.odometry.track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSam
 from slam.app.records import RadarInfo, Scan, SessionInfo, TruthAt
 from slam.app.rig.sources import recorded_frame
 from slam.app.session import cdr
-from slam.app.session.log import SessionLog
-from slam.app.session.messages import (
+from slam.app.session.description import (
     imported_info,
     imported_radar,
     radar_text,
@@ -47,6 +46,7 @@ from slam.app.session.messages import (
     read_session_table,
     session_table,
 )
+from slam.app.session.log import SessionLog
 from slam.app.session.reader import RecordedSession, ScanEnd
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig

@@ -32,14 +32,14 @@ from slam.app.records import (
     TruthAt,
 )
 from slam.app.session import cdr
-from slam.app.session.drawings import Drawings, WheelMotion
-from slam.app.session.messages import (
+from slam.app.session.description import (
     METADATA_NAME,
     SESSION_TOPIC,
     radar_text,
     session_table,
 )
 from slam.app.session.state_rows import smoothed_row, state_row, step_row
+from slam.app.session.viewer_topics import Drawings, WheelMotion
 from slam.geometry import between, compose
 from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import (
@@ -248,7 +248,7 @@ class SessionLog(SessionObserver):
         Session time of the first scan [ns], that of everything that has no time or an earlier one:
         of latched messages and of lines about setting up.
     drawn
-        Whether to write `drawings` for other programs, too.
+        Whether to write `viewer_topics` for other programs, too.
     clock_ns
         Monotonic time [ns]; ends chunks.
 

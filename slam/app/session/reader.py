@@ -26,8 +26,7 @@ from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.sources import recorded_frame, sampler_limits
 from slam.app.session import cdr
-from slam.app.session.gaps import read_gap
-from slam.app.session.messages import (
+from slam.app.session.description import (
     GAP_TOPIC,
     METADATA_NAME,
     SESSION_TOPIC,
@@ -35,6 +34,7 @@ from slam.app.session.messages import (
     read_radar_text,
     read_session_table,
 )
+from slam.app.session.lost_messages import read_gap
 from slam.app.session.state_rows import smoothed_of, snapshot_of, with_step
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Rig

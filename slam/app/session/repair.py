@@ -18,8 +18,8 @@ from typing import BinaryIO, TypeVar
 
 from slam.app.errors import AppError
 from slam.app.records import Gap
-from slam.app.session.gaps import GapFinder, gap_json
-from slam.app.session.messages import GAP_TOPIC, METADATA_NAME, SESSION_TOPIC
+from slam.app.session.description import GAP_TOPIC, METADATA_NAME, SESSION_TOPIC
+from slam.app.session.lost_messages import GapFinder, gap_json
 from slam.app.session.reader import RADAR_INFO, open_mcap, open_session
 from xethru_protocol.recordings import mcap
 from xethru_protocol.system import STDOUT, PathInUseError, StopFlag, each_line, locked

@@ -39,7 +39,7 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.runner import RunSource, execute, make_slam
-from slam.app.session.messages import settings_text
+from slam.app.session.description import settings_text
 from slam.app.sweep import CLEAN, STRESSES, SceneKeys, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.app.sweep.outcomes import (

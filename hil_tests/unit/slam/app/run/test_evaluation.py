@@ -17,7 +17,7 @@ from slam.app.run.evaluation import NEES_AT, Summary, summarise
 from slam.app.run.output import summary_rows, table_text
 from slam.app.run.results import evaluate
 from slam.app.run.runner import RunRecord
-from slam.app.session.messages import settings_text
+from slam.app.session.description import settings_text
 from slam.config import BackEnd, DetectionConfig, RobustConfig, SlamConfig, TrilaterationConfig
 from slam.evaluation import LandmarkScore
 from slam.geometry import Mount, Rig

@@ -29,8 +29,8 @@ from slam.app.rig.sources import sampler_limits
 from slam.app.run.live_source import Event, Inbox, LiveLog, LiveSource
 from slam.app.run.replay import Comparison, recorded_source
 from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute, make_slam
+from slam.app.session.description import settings_text
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import settings_text
 from slam.app.session.reader import open_session
 from slam.config import load_preset
 from slam.frames import RadarFrame

@@ -22,7 +22,7 @@ from hil_tests.unit.slam.app.sessions import (
 from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.replay import Comparison, play_states, recorded_source
 from slam.app.session.constants import different_constants, recorded_rules, slam_constants
-from slam.app.session.messages import settings_text
+from slam.app.session.description import settings_text
 from slam.app.session.reader import open_session
 from slam.config import WheelNoise, load_preset
 from slam.robust.parameters import BackEndParameters, MapRule, TrackletRule

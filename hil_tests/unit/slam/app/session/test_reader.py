@@ -23,8 +23,8 @@ from slam.app.errors import AppError
 from slam.app.odometry.track import TumSample
 from slam.app.records import LogLine, Scan, Snapshot
 from slam.app.run.replay import play_states
+from slam.app.session.description import settings_text
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import settings_text
 from slam.app.session.reader import open_session
 from slam.app.session.state_rows import smoothed_of, smoothed_row, snapshot_of, state_row
 from slam.config import SlamConfig, load_preset

@@ -14,7 +14,7 @@ from typing import TypeAlias
 from pydantic import TypeAdapter
 
 from slam.app.records import Gap
-from slam.app.session.messages import checked
+from slam.app.session.description import checked
 
 _SCANS = ("/scan", "/scan_unused")
 
