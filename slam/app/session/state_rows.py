@@ -45,6 +45,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
+from operator import attrgetter
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
@@ -76,18 +77,19 @@ class _Columns:
     def __init__(self, kind: type, *names: str) -> None:
         types = get_type_hints(kind)
         self._types = {name: types[name] for name in names}
+        self._values_of = attrgetter(*names)
+        self._time_at = names.index("t_ns") if "t_ns" in names else None
         self.width = sum(2 if self._is_pair(name) else 1 for name in names)
 
     def _is_pair(self, name: str) -> bool:
         return bool(self._types[name] == tuple[float, float])
 
     def numbers(self, one: object, t_ns: int = 0) -> list[float]:
-        row: list[float] = []
-        for name in self._types:
-            value = getattr(one, name)
-            if name == "t_ns":
-                value -= t_ns
-            row += value if self._is_pair(name) else [value]
+        row = list(self._values_of(one))
+        if self._time_at is not None:
+            row[self._time_at] -= t_ns
+        if self.width > len(row):
+            row = [part for value in row for part in (value if type(value) is tuple else (value,))]
         return row
 
     def read(self, row: Iterator[float], t_ns: int = 0) -> dict[str, Any]:
