@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import BinaryIO, Literal, TypeAlias
+from typing import BinaryIO, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,8 +192,7 @@ class ScanEnd:
     truth: NDArray[np.float64] | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedScan:
+class RecordedScan(NamedTuple):
     """A scan as the run took it, and the true pose at it, shape (3,), world frame, if known."""
 
     scan: Scan
@@ -299,14 +298,9 @@ class RecordedSession:
         for _, record in self._records():
             yield record
 
-    def scans(self) -> Iterator[tuple[Scan, NDArray[np.float64] | None]]:
-        """Yield every scan as the run took it, and the true pose at it, shape (3,), if known.
-
-        A scan that damage or the end of a cut file left incomplete is not among them.
-        """
-        for record in self.played():
-            if isinstance(record, RecordedScan):
-                yield record.scan, record.truth
+    def scans(self) -> Iterator[RecordedScan]:
+        """Yield every scan but those that damage or the end of a cut file left incomplete."""
+        return (record for record in self.played() if isinstance(record, RecordedScan))
 
     def played(self) -> Iterator[RecordedScan | TumSample | LogLine | Snapshot | SmoothedRun | Gap]:
         """Yield what `records` does, with the frames put together into scans as in `scans`."""
