@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of, rewrite
@@ -16,7 +17,7 @@ from slam.app.records import Gap
 from slam.app.session.reader import ScanEnd, open_session
 from slam.app.session.repair import repair
 from slam.frames import RadarFrame
-from xethru_protocol.recordings.mcap import DATA_END, is_latched
+from xethru_protocol.recordings.mcap import is_latched
 from xethru_protocol.system import StopFlag, StopRequestedError, locked
 
 
@@ -143,7 +144,7 @@ def test_damage_of_the_index_loses_nothing(
 ) -> None:
     path = write_session(tmp_path / "session.mcap", 60)
     content = bytearray(path.read_bytes())
-    (data_end,) = (at for kind, at in records_of(content) if kind == DATA_END)
+    (data_end,) = (at for kind, at in records_of(content) if kind == Opcode.DATA_END)
     content[data_end + 13] = 0  # the code of the first record of the index
     path.write_bytes(content)
     code, out, _ = run(capsys, "repair", path)
