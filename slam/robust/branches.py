@@ -233,18 +233,22 @@ def totals_of(tables: Iterable[Array], known: RobustBackEnd, rule: BranchRule) -
     The errors of `BranchRule.correlated_steps` steps are taken to be one, and what one landmark
     says is bounded: it may be hidden or gone, or others may look like it.
     """
-    table = np.concatenate([np.empty((0, 2)), *tables])
+    table = np.concatenate([no_totals(), *tables])
     table = table[np.isin(table[:, 0], known.state.feature_ids)]
     ids, place = np.unique(table[:, 0], return_inverse=True)
     sums = np.bincount(place, table[:, 1], len(ids)) / rule.correlated_steps
     return np.column_stack([ids, np.clip(sums, -known.most_against(ids), rule.most_for)])
 
 
+def no_totals() -> Array:
+    return np.empty((0, 2))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Account:
     """What an explanation of all ranges since a step is worth."""
 
-    totals: Array = field(default_factory=lambda: np.empty((0, 2)))  # as `totals_of` has them
+    totals: Array = field(default_factory=no_totals)  # as `totals_of` has them
     hits: float = 0.0  # nats of the landmarks known before that are seen
     misses: float = 0.0  # of those that should be seen and are not; not positive
     n_seen: int = 0  # how many of them are seen
@@ -595,7 +599,7 @@ class Branches:
         old one do.
         """
         counted = tables[: max(self._now - self._fewest - carry.since, 0)]
-        table = np.concatenate([np.empty((0, 2)), *counted])
+        table = np.concatenate([no_totals(), *counted])
         table[:, 0] = back_end.merged_ids(table[:, 0])
         totals = totals_of([table], carry.map, self._rule)
         return account_of(totals, back_end.n_reported_since(carry.next_id))
