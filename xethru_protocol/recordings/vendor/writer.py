@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Self, TypedDict, Unpack
+from typing import Self, TypedDict
 
 from xethru_protocol.recordings.records import MS_NS, GrowingFile, RecordingError, writing
 from xethru_protocol.recordings.vendor.layouts import (
@@ -72,7 +72,6 @@ class Split:
         return _local_time(time_ms, zone) >= end
 
 
-_NO_LIMIT = Split()
 FileListener = Callable[[type[Response], Path], None]
 MetaFileListener = Callable[[str, Path], None]
 
@@ -96,20 +95,17 @@ class RecordingOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Options:
-    """`RecordingOptions`, with what is meant by leaving one out."""
+    """How each directory of a recording is written."""
 
-    session_id: str | None = None
-    profile_id: int | None = None
-    parameter_file: bytes | str | None = None
-    user_header: bytes = b""
-    split: Split | None = None
-    split_directories: Split | None = None
-    basenames: Mapping[type[Response], str] | None = None
-    interval_s: float | None = None
-    flush_on_write: bool = False
-    timezone: tzinfo | None = None
-    on_file: FileListener | None = None
-    on_meta_file: MetaFileListener | None = None
+    parameter_file: bytes | None
+    user_header: bytes
+    split: Split
+    split_directories: Split | None
+    basenames: Mapping[type[Response], str]
+    flush_on_write: bool
+    timezone: tzinfo | None
+    on_file: FileListener | None
+    on_meta_file: MetaFileListener | None
 
 
 class _DataFile(GrowingFile):
@@ -144,9 +140,8 @@ class _Part:
         options = self.options
         since_ms = self.since(time_ms)
         data = kind.record(message, self.meta.start_ms + since_ms, options.timezone)
-        split = options.split or _NO_LIMIT
         file = self.files.get(kind.data_type)
-        if file is not None and split.is_over(file.first_ms, time_ms, options.timezone):
+        if file is not None and options.split.is_over(file.first_ms, time_ms, options.timezone):
             self._close_file(file, since_ms)
             file = None
         if file is None:
@@ -159,7 +154,7 @@ class _Part:
         file.records += 1
         self.records += 1
         self.last_ms = max(self.last_ms, since_ms)
-        if split.is_full(file.records, file.size):
+        if options.split.is_full(file.records, file.size):
             self._close_file(file, since_ms)
 
     def close(self, stopped_ms: int, closed_ms: int, next_name: str = "") -> None:
@@ -182,8 +177,7 @@ class _Part:
 
     def _open_file(self, kind: Kind, since_ms: int) -> _DataFile:
         time_ms = self.meta.start_ms + since_ms
-        names = self.options.basenames or {}
-        base = names.get(kind.message, kind.file_prefix.removesuffix("_"))
+        base = self.options.basenames.get(kind.message, kind.file_prefix.removesuffix("_"))
         stem = f"{base}_{_local_time(time_ms, self.options.timezone):%Y%m%d_%H%M%S}"
         name = stem + kind.suffix
         again_ms = time_ms % 1000
@@ -241,7 +235,7 @@ class RecordingWriter:
     parameter_file
         Content of the module's parameter file, stored beside the data; None: none is stored.
     user_header
-        Bytes to put before the records of each data file; none by default.
+        Bytes to put before the records of each data file.
     split
         When to begin a new data file; None: never.
     split_directories
@@ -252,7 +246,7 @@ class RecordingWriter:
         Messages of one type that come sooner after the one stored before are left out; None: all
         are stored.
     flush_on_write
-        Have each record on the disk before the next one is written; slow, and not the default.
+        Have each record on the disk before the next one is written; slow.
     timezone
         Of the stamps in file names and text files; None: this machine's.
     on_file
@@ -271,12 +265,40 @@ class RecordingWriter:
     ['xethru_datafloat_19700101_000000.dat', 'xethru_recording_meta.dat']
     """
 
-    def __init__(self, directory: Path | str, **options: Unpack[RecordingOptions]) -> None:
+    def __init__(
+        self,
+        directory: Path | str,
+        *,
+        session_id: str | None = None,
+        profile_id: int | None = None,
+        parameter_file: bytes | str | None = None,
+        user_header: bytes = b"",
+        split: Split | None = None,
+        split_directories: Split | None = None,
+        basenames: Mapping[type[Response], str] | None = None,
+        interval_s: float | None = None,
+        flush_on_write: bool = False,
+        timezone: tzinfo | None = None,
+        on_file: FileListener | None = None,
+        on_meta_file: MetaFileListener | None = None,
+    ) -> None:
         self.directory = Path(directory)
-        self._options = _Options(**options)
-        self.session_id = self._options.session_id or new_session_id()
-        _check_basenames(self._options.basenames or {})
-        self._interval_ms = 1000 * (self._options.interval_s or 0.0)
+        self.session_id = session_id or new_session_id()
+        self._profile_id = profile_id or 0
+        self._options = _Options(
+            parameter_file=parameter_file.encode()
+            if isinstance(parameter_file, str)
+            else parameter_file,
+            user_header=user_header,
+            split=split or Split(),
+            split_directories=split_directories,
+            basenames=_checked_basenames(basenames or {}),
+            flush_on_write=flush_on_write,
+            timezone=timezone,
+            on_file=on_file,
+            on_meta_file=on_meta_file,
+        )
+        self._interval_ms = 0.0 if interval_s is None else 1000 * interval_s
         self._stored_ms: dict[int, int] = {}  # when the last message of each kind was stored
         self._part: _Part | None = None
         self._parts = 0
@@ -287,7 +309,7 @@ class RecordingWriter:
                 raise RecordingError(
                     f"{self.directory} already holds a recording; name another directory"
                 )
-        if self._options.split_directories is None:
+        if split_directories is None:
             self._store_parameter_file(self.directory)
 
     def __enter__(self) -> Self:
@@ -358,19 +380,16 @@ class RecordingWriter:
         if part is not None:
             part.close(part.last_ms, part.last_ms, f"../{directory.name}/{META_NAME}")
         meta = Meta(
-            session_id=self.session_id.encode(),
-            profile_id=self._options.profile_id or 0,
-            start_ms=time_ms,
+            session_id=self.session_id.encode(), profile_id=self._profile_id, start_ms=time_ms
         )
         self._parts += 1
         self._part = _Part(directory, meta, self._options)
         return self._part
 
     def _store_parameter_file(self, directory: Path) -> None:
-        content = self._options.parameter_file
-        if content is not None:
+        if self._options.parameter_file is not None:
             with GrowingFile(directory / PARAMETER_FILE_NAME) as file:
-                file.append(content.encode() if isinstance(content, str) else content)
+                file.append(self._options.parameter_file)
 
 
 def _holds_recording(directory: Path) -> bool:
@@ -404,7 +423,7 @@ def _local_time(time_ms: int, zone: tzinfo | None) -> datetime:
     return (datetime.fromtimestamp(0, UTC) + timedelta(milliseconds=time_ms)).astimezone(zone)
 
 
-def _check_basenames(names: Mapping[type[Response], str]) -> None:
+def _checked_basenames(names: Mapping[type[Response], str]) -> Mapping[type[Response], str]:
     for message, name in names.items():
         if message not in KIND_OF_MESSAGE:
             raise RecordingError(f"a recording has no file of {message.__name__}")
@@ -414,3 +433,4 @@ def _check_basenames(names: Mapping[type[Response], str]) -> None:
             )
     if len(set(names.values())) < len(names):
         raise RecordingError("two kinds of data file have the same base name")
+    return names
