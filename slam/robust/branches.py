@@ -318,9 +318,10 @@ class Doubt:
     position_m: Array  # shape (2,), where the newest of them may have been
     # shape (3, 3), of x, y [m] and heading for a pose there, their probabilities counted
     covariance: Array
-    variances: Array  # shape (3,), of the largest of them if it happened
+    variances: Array  # shape (3,), if they happened, at the position
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
-    alike: frozenset[int] = frozenset()  # landmarks that were found to fit elsewhere, too
+    # landmarks, and how often `BranchRule.most_for` they say, that were found to fit elsewhere, too
+    alike: tuple[frozenset[int], int] | None = None
 
     def take(self, evidence: Array, rule: BranchRule) -> bool:
         """Add the evidence of a step; return whether known landmarks fit the pose."""
@@ -338,8 +339,14 @@ class Doubt:
 
     def add(self, newer: Doubt) -> None:
         self.covariance = self.at(newer.position_m) + newer.covariance
-        self.variances = np.maximum(self.variances, newer.variances)
+        self.variances = self.variances + newer.variances
         self.position_m = newer.position_m
+
+    def join(self, newer: Doubt) -> None:
+        """Add a doubt with other evidence: what confirms both confirms either."""
+        self.add(newer)
+        self.nats = {id_: nats for id_, nats in newer.nats.items() if id_ < self.next_id}
+        self.alike = None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -403,9 +410,14 @@ class Branches:
 
     @property
     def doubted_covariance(self) -> Array:
-        """Return what doubts of the wheels add to the covariance of the pose, (3, 3)."""
+        """Return what doubts of the wheels add to the covariance of the pose, (3, 3).
+
+        It is no more than that of a lost robot.
+        """
         position_m = self.main.state.position_m
-        return sum((one.at(position_m) for one in self._doubts), np.zeros((3, 3)))
+        total = sum((one.at(position_m) for one in self._doubts), np.zeros((3, 3)))
+        over = float(np.max(np.diag(total) / self._rule.lost_variances))
+        return total / max(over, 1.0)
 
     def predict(self, increment: Array, elapsed_s: float = 1.0, stood_s: float = 0.0) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
@@ -451,10 +463,11 @@ class Branches:
     def _doubt(self, step: Step, position_m: Array) -> None:
         """Keep what is doubtful of the wheels, until it is confirmed."""
         rule, slipped = self._rule, self.main.slip_probability
+        looks = self._now % self._look_every == 0
         doubts = [
             one
             for one in self._doubts
-            if not one.take(step.evidence, rule) or self._is_alike_elsewhere(one)
+            if not one.take(step.evidence, rule) or not looks or self._is_alike_elsewhere(one)
         ]
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
@@ -477,6 +490,8 @@ class Branches:
                 last.add(one)
             else:
                 self._doubts.append(one)
+        while len(self._doubts) > rule.most_doubts:
+            self._doubts[0].join(self._doubts.pop(1))
 
     def _is_alike_elsewhere(self, doubt: Doubt) -> bool:
         """Return whether the landmarks that fit the pose may be others of the map.
@@ -485,20 +500,21 @@ class Branches:
         """
         named = self.main.merged_ids(np.array(list(doubt.nats), dtype=np.float64))
         ids, place = np.unique(named, return_inverse=True)
-        nats = np.bincount(place, list(doubt.nats.values()), len(ids))
-        fitting = frozenset(ids[nats > 0.0].tolist())
+        nats = np.bincount(place, list(doubt.nats.values()), len(ids)).clip(max=self._rule.most_for)
+        # A search takes long: it is repeated for other landmarks, or for as much as one more says.
+        fitting = frozenset(ids[nats > 0.0].tolist()), int(nats.sum() // self._rule.most_for)
         if fitting == doubt.alike:
             return True
-        position_m, limit = self.main.state.position_m, float(chdtri(3, TAIL_PROBABILITY))
+        limit = float(chdtri(3, TAIL_PROBABILITY))
 
         def is_possible(placement: Placement) -> bool:
-            away_m = transform(placement.motion, position_m) - position_m
+            away_m = transform(placement.motion, doubt.position_m) - doubt.position_m
             turn_rad = math.remainder(float(placement.motion[2]), math.tau)
             return float(np.sum(np.array([*away_m, turn_rad]) ** 2 / doubt.variances)) <= limit
 
         totals = np.column_stack([ids, nats])
         is_alike = not self._stand_out(self.main, totals, doubt.next_id, is_possible)
-        doubt.alike = fitting if is_alike else frozenset()
+        doubt.alike = fitting if is_alike else None
         return is_alike
 
     def _stand_out(

@@ -372,6 +372,8 @@ class BranchRule:
     that is noticed later, or hypotheses."""
     catch_up: Annotated[int, Origin.BUDGET, "scans"] = 10
     """How many scans an alternative that lags behind takes at a time."""
+    most_doubts: Annotated[int, Origin.BUDGET, "doubts"] = 20
+    """How many doubts of the wheels are kept apart; of more, the oldest two become one."""
     newest: Annotated[int, Origin.BUDGET, "landmarks"] = 8
     """How many of the newest landmarks are looked for among all others."""
     base_m: Annotated[float, Origin.CHOSEN] = 0.3

@@ -344,7 +344,7 @@ def _draw_nees(axes: Axes, groups: Sequence[Group], names: Sequence[str]) -> Non
                 label="ANEES at one of ten times" if is_first else None,
             )
     # A logarithmic axis has no place for zero.
-    least = min(*lows, *(value for values in every for value in values if value > 0.0))
+    least = min([*lows, *(value for values in every for value in values if value > 0.0)])
     axes.set_xlim(0.7 * least, 1.2 * _MOST_NEES)
     axes.set_xscale("log")
     label(axes, "consistency", "mean NEES of the pose (3 dof)", "")

@@ -111,13 +111,19 @@ def stands_out(
     )
     variances = known.covariance_m2.diagonal().reshape(-1, 2).mean(axis=1)
     limits = float(chdtri(2, TAIL_PROBABILITY)) * (variances[seen][:, None] + variances[None, :])
-    # Of so many landmarks two must be alike, if the rest is not to say enough.
-    seeds = math.ceil(rule.price_nats / rule.most_for) + 2
+    # What is alike, if but one of so many of the first landmarks is; if that is too little for the
+    # rest not to say enough, two of them are.
+    alike_nats = nats[seen[0]] + nats[seen].sum() - np.cumsum(nats[seen])
+    seeds = int(np.count_nonzero(alike_nats >= own - rule.price_nats)) + 1
     for pairs in dict.fromkeys(_guesses(here.points_m, known.points_m, rule, seeds)):
         one = _judged(here, known, pairs)
         if one is None or len(one.pairs) < rule.least_landmarks:
             continue
-        is_other = any(row != seen[own] for row, own in one.pairs)
+        moved = np.sum((transform(one.motion, here.points_m) - here.points_m) ** 2, axis=1)
+        # A landmark that lies on its own double is where it was.
+        is_other = any(
+            row != seen[at] and moved[at] > limits[at, seen[at]] for row, at in one.pairs
+        )
         if is_other and is_possible(one):
             # Two landmarks of one thing lie on one other landmark.
             away = transform(one.motion, here.points_m)[:, None] - known.points_m[None, :]

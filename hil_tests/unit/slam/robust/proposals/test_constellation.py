@@ -160,3 +160,18 @@ def test_two_landmarks_fit_too_many_places() -> None:
 def test_two_landmarks_of_one_thing_are_alike_with_one() -> None:
     twice = known(np.vstack([FRAMES, FRAMES[[2, 3, 4]] + [0.004, 0.0]]))
     assert not stands_out(fits(2, 3, 4, 10, 11, 12, n=13), twice, RULE, anywhere)
+
+
+def test_the_double_of_a_landmark_is_no_other_place() -> None:
+    doubled = known(np.vstack([PLACES, PLACES[1] + [0.01, 0.0]]))
+    assert stands_out(fits(0, 1, 2, 6, n=8), doubled, RULE, anywhere)
+    assert stands_out(fits(0, 1, 2, 6, 7, n=8), doubled, RULE, anywhere)
+
+
+def test_what_is_alike_is_found_among_landmarks_that_say_little() -> None:
+    """Five landmarks say 16 nats, three that are alike elsewhere 9."""
+    trio = np.array([[4.0, 0.0], [4.7, 0.2], [4.3, 0.9]])
+    both = known(np.vstack([PLACES[:5], trio, trio + np.array([5.0, 0.0])]))
+    nats = np.array([3.2] * 5 + [3.0] * 3 + [0.0] * 3)
+    assert not stands_out(nats, both, RULE, anywhere)
+    assert stands_out(np.where(nats == 3.2, 4.2, nats), both, RULE, anywhere)

@@ -91,8 +91,36 @@ def test_of_a_slip_in_sight_of_nothing_the_prior_is_left(run: Run) -> None:
 def test_a_doubt_covers_what_may_have_happened(probability: float) -> None:
     """What lies outside a region of it: exp(-r^2 / 2 V) for a variance V, in two dimensions."""
     limit = -2.0 * covered_share(probability) * math.log(TAIL_PROBABILITY)  # r^2 / V
-    assert probability * math.exp(-limit / 2.0) <= TAIL_PROBABILITY * (1.0 + 1e-9)
-    assert covered_share(probability) >= probability
+    assert probability * math.exp(-limit / 2.0) == pytest.approx(TAIL_PROBABILITY)
+
+
+def test_a_doubt_below_the_tail_adds_what_its_mixture_has() -> None:
+    assert covered_share(TAIL_PROBABILITY / 2.0) == TAIL_PROBABILITY / 2.0
+
+
+def test_doubts_that_are_joined_need_what_both_need() -> None:
+    older, newer = doubtful_turn(0.0), doubtful_turn(1.0)
+    newer.next_id = 9
+    older.nats, newer.nats = {0: 9.0, 1: 9.0}, {1: 2.0, 5: 9.0}
+    older.join(newer)
+    assert (older.next_id, older.nats) == (3, {1: 2.0})
+    np.testing.assert_allclose(older.variances, 2.0 * np.ones(3))
+
+
+def test_many_doubts_are_no_more_than_being_lost() -> None:
+    branches, rule = Branches(paper_rig(), parameters_for(LAB, SIGMA_M)), BranchRule()
+    branches._doubts = [
+        Doubt(
+            next_id=0,
+            position_m=np.array([float(at), 0.0]),
+            covariance=np.diag(rule.lost_variances),
+            variances=np.array(rule.lost_variances),
+        )
+        for at in range(10)
+    ]
+    ratios = np.diag(branches.doubted_covariance) / rule.lost_variances
+    assert ratios.max() == pytest.approx(1.0)
+    assert np.all(np.linalg.eigvalsh(branches.doubted_covariance) > 0.0)
 
 
 def doubtful_turn(x_m: float) -> Doubt:
@@ -144,5 +172,6 @@ def test_a_stop_may_have_been_a_carry_until_landmarks_are_recognised(run: Run) -
     ]
     carried = -math.expm1(-rule.carries_per_hour_stood * 3.0 / 3600.0)
     probability = carried / (1.0 + carried)
-    assert sigmas_m[stop - 1] > math.sqrt(probability) * rule.lost_position_m
+    covered_m = math.sqrt(covered_share(probability)) * rule.lost_position_m
+    assert 0.95 * covered_m < sigmas_m[stop - 1] < 1.05 * covered_m
     assert sigmas_m[-1] < 0.1 * sigmas_m[stop - 1]
