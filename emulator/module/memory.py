@@ -124,7 +124,7 @@ class StoredFile(BaseModel):
         Bytes it was created with; None: as many as it has.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     type: U32
     identifier: U32
@@ -172,7 +172,7 @@ class FileSystem:
         self._data_bytes = storage_bytes // BLOCK_BYTES * BLOCK_BYTES - BLOCK_BYTES
         self._files: list[_File] = []  # in the order of their places
         self._open: set[FileKey] = set()
-        for file in files:
+        for file in {file.key: file for file in files}.values():  # the last one of a key
             length = len(file.data) if file.length is None else file.length
             offset = self._gap(_blocks(length)) if file.offset is None else file.offset
             if offset is not None and len(self._files) < MAX_FILES:

@@ -371,11 +371,19 @@ def snapped_zone(start_m: float, end_m: float) -> tuple[float, float]:
     return origin_m + first * step_m, origin_m + last * step_m
 
 
+def _table_of_pairs(content: object) -> object:
+    """Return a table of a list of pairs; anything else as it is, to be refused."""
+    try:
+        return dict(content) if isinstance(content, list) else content
+    except (TypeError, ValueError):
+        return content
+
+
 U32 = Annotated[int, Field(ge=0, lt=1 << 32)]
 ZoneLimit = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 Outputs = Annotated[
     dict[U32, U32],
-    BeforeValidator(dict),
+    BeforeValidator(_table_of_pairs),
     PlainSerializer(lambda table: list(table.items()), when_used="json"),
 ]
 """Control bits by message id, in documents a list of pairs; what is off is absent."""

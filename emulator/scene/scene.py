@@ -46,7 +46,7 @@ CorrelationTime = Annotated[Number, Field(ge=1e-3, le=86_400)]
 
 
 class PulseSpec(Table):
-    """How a module's pulse differs from the nominal one (``emulator.echo.paths``).
+    """How a module's pulse differs from the nominal one (``emulator.echo.pulse``).
 
     The envelope's standard deviation is the nominal one times ``width`` (1 - ``skew``) before the
     peak and ``width`` (1 + ``skew``) after it; ``ringing`` is the amplitude of a copy of the pulse

@@ -92,7 +92,8 @@ def convert(
         return Conversion(messages=frames.n_frames, skipped=skipped, faults=tuple(faults))
     if is_array_file(source):
         raise RecordingError(
-            f"{source} holds arrays and no messages; it converts to {', '.join(SUFFIXES)}"
+            f"{source} holds arrays; it converts to {', '.join(SUFFIXES)}. Messages of an older"
+            " .npz are converted by the version that wrote it"
         )
     if suffix == pcap.SUFFIX:
         if recording_format(source) != "wire":

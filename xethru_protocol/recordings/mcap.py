@@ -208,7 +208,7 @@ class Record:
             return None
         try:
             content: records.McapRecord = kind.read(ReadDataStream(BytesIO(self.body)))
-        except (EndOfFile, OverflowError):  # it wants more bytes than there are
+        except (EndOfFile, OverflowError, struct.error):  # it wants more bytes than there are
             raise ValueError("a record ends before its content") from None
         builder = RecordBuilder()
         content.write(builder)

@@ -175,6 +175,12 @@ def test_modules_do_not_share_a_state(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [f"{IDENTITY.serial}.json"]
 
 
+def with_outputs(text: str, outputs: object) -> str:
+    document = json.loads(text)
+    document["profiles"][0]["outputs"] = outputs
+    return json.dumps(document)
+
+
 BROKEN: dict[str, Callable[[str], str]] = {
     "empty": lambda text: "",
     "cut": lambda text: text[: len(text) // 2],
@@ -184,6 +190,8 @@ BROKEN: dict[str, Callable[[str], str]] = {
     "another document": lambda text: json.dumps({"radar": "?"}),
     "impossible sensitivity": lambda text: text.replace('"sensitivity": 5', '"sensitivity": 12'),
     "infinite zone": lambda text: re.sub(r"9\.4392\d*", "Infinity", text),
+    "outputs as a number": lambda text: with_outputs(text, 5),
+    "outputs without pairs": lambda text: with_outputs(text, [[[], 1]]),
     "damaged file": lambda text: text.replace('"base64": "', '"base64": "\u00e4'),
 }
 
