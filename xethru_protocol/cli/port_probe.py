@@ -292,7 +292,10 @@ class PortProbe:
         if second.bootloader:
             return second
         if math.isfinite(bytes_per_s) and not first.talks:  # a UART, perhaps of another rate
-            baudrate = self.module.find_baud_rate()
+            try:
+                baudrate = self.module.find_baud_rate()
+            except Disconnected:
+                return replace(first, gone=True)
             if baudrate is not None:
                 return self._ask(m.Ping(), _REPLY_LIMIT_S, baudrate)
         return first

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from types import NoneType
 from typing import (
     Any,
     Concatenate,
@@ -593,12 +594,14 @@ class Link:
 
     def find_baud_rate(self) -> Steps[int | None]:
         for baudrate in _LIKELIEST_RATES:
-            with suppress(Disconnected):  # the adapter does not have this rate
+            try:
                 yield SetLineRate(baudrate)
-                self.conversation.new_line(self.path)  # what came at a wrong rate means nothing
-                self.baudrate = baudrate
-                if (yield from self._probe(1)):
-                    return baudrate
+            except Disconnected:  # the adapter does not have this rate
+                continue
+            self.conversation.new_line(self.path)  # what came at a wrong rate means nothing
+            self.baudrate = baudrate
+            if (yield from self._probe(1)):
+                return baudrate
         yield SetLineRate(POWER_UP_BAUD)
         self.baudrate = POWER_UP_BAUD
         return None
@@ -699,6 +702,7 @@ class Method(Generic[P, T]):
         link, *others = signature.parameters.values()
         parameters = [link.replace(name="self", annotation=link.empty), *others]
         *_, result = get_args(signature.return_annotation)  # of its steps
+        result = None if result is NoneType else result
         signature = signature.replace(parameters=parameters, return_annotation=result)
         functions: list[Any] = [blocking, awaited]
         for function in functions:
