@@ -319,6 +319,7 @@ class Doubt:
     # shape (3, 3), of x, y [m] and heading for a pose there, their probabilities counted
     covariance: Array
     variances: Array  # shape (3,), if they happened, at the position
+    lost_share: float = 0.0  # how much of the variances of a lost robot that has
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
     # landmarks, and how often `BranchRule.most_for` they say, that were found to fit elsewhere, too
     alike: tuple[frozenset[int], int] | None = None
@@ -340,6 +341,7 @@ class Doubt:
     def add(self, newer: Doubt) -> None:
         self.covariance = self.at(newer.position_m) + newer.covariance
         self.variances = self.variances + newer.variances
+        self.lost_share += newer.lost_share
         self.position_m = newer.position_m
 
     def join(self, newer: Doubt) -> None:
@@ -412,12 +414,11 @@ class Branches:
     def doubted_covariance(self) -> Array:
         """Return what doubts of the wheels add to the covariance of the pose, (3, 3).
 
-        It is no more than that of a lost robot.
+        A robot that stopped often is no more lost than one that was carried.
         """
         position_m = self.main.state.position_m
         total = sum((one.at(position_m) for one in self._doubts), np.zeros((3, 3)))
-        over = float(np.max(np.diag(total) / self._rule.lost_variances))
-        return total / max(over, 1.0)
+        return total / max(sum(one.lost_share for one in self._doubts), 1.0)
 
     def predict(self, increment: Array, elapsed_s: float = 1.0, stood_s: float = 0.0) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
@@ -474,12 +475,14 @@ class Branches:
         carried = float(expit(-nats)) if self._has_stood else 0.0
         if slipped + carried > 0.0:
             covariance = slipped * np.diag(rule.hidden_variances)
-            covariance += covered_share(carried) * np.diag(rule.lost_variances)
+            lost_share = covered_share(carried)
+            covariance += lost_share * np.diag(rule.lost_variances)
             newest = Doubt(
                 next_id=step.next_id,
                 position_m=position_m,
                 covariance=covariance,
                 variances=np.array(rule.lost_variances if carried else rule.hidden_variances),
+                lost_share=lost_share,
             )
             doubts.append(newest)
         # Those with the same evidence end together: they are one, so a long run needs few.

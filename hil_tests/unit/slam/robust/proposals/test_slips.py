@@ -107,20 +107,21 @@ def test_doubts_that_are_joined_need_what_both_need() -> None:
     np.testing.assert_allclose(older.variances, 2.0 * np.ones(3))
 
 
-def test_many_doubts_are_no_more_than_being_lost() -> None:
+@pytest.mark.parametrize("n", [1, 2, 10])
+def test_many_stops_are_no_more_than_one_carry(n: int) -> None:
     branches, rule = Branches(paper_rig(), parameters_for(LAB, SIGMA_M)), BranchRule()
     branches._doubts = [
         Doubt(
             next_id=0,
-            position_m=np.array([float(at), 0.0]),
-            covariance=np.diag(rule.lost_variances),
+            position_m=np.zeros(2),
+            covariance=0.6 * np.diag(rule.lost_variances),
             variances=np.array(rule.lost_variances),
+            lost_share=0.6,
         )
-        for at in range(10)
+        for _ in range(n)
     ]
-    ratios = np.diag(branches.doubted_covariance) / rule.lost_variances
-    assert ratios.max() == pytest.approx(1.0)
-    assert np.all(np.linalg.eigvalsh(branches.doubted_covariance) > 0.0)
+    expected = min(0.6 * n, 1.0) * np.diag(rule.lost_variances)
+    np.testing.assert_allclose(branches.doubted_covariance, expected)
 
 
 def doubtful_turn(x_m: float) -> Doubt:
