@@ -339,6 +339,7 @@ class Doubt:
         return np.asarray(T @ self.covariance @ T.T)
 
     def add(self, newer: Doubt) -> None:
+        """Add a doubt with the same evidence."""
         self.covariance = self.at(newer.position_m) + newer.covariance
         self.variances = self.variances + newer.variances
         self.lost_share += newer.lost_share

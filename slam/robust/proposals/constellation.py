@@ -95,9 +95,9 @@ def stands_out(
 ) -> bool:
     """Return whether landmarks that could not be others of a map say where the robot is.
 
-    ``nats`` are those of all of the map, (n,). Of the landmarks that say most, at most
-    `BranchRule.newest`, some could be others if a possible placement lays them on these; the rest,
-    less what is missed, must say more than `BranchRule.price_nats`.
+    ``nats`` is the evidence of all landmarks of the map, shape (n,). Of the landmarks that say
+    most, at most `BranchRule.newest`, some could be others if a possible placement lays them on
+    these; the rest, less what is missed, must say more than `BranchRule.price_nats`.
     """
     order = np.argsort(-nats, kind="stable")[: rule.newest]
     seen = order[nats[order] > 0.0]
@@ -119,15 +119,13 @@ def stands_out(
         one = _judged(here, known, pairs)
         if one is None or len(one.pairs) < rule.least_landmarks:
             continue
-        moved = np.sum((transform(one.motion, here.points_m) - here.points_m) ** 2, axis=1)
+        away = transform(one.motion, here.points_m)[:, None] - known.points_m[None, :]
+        is_near = np.sum(away**2, axis=2) <= limits
         # A landmark that lies on its own double is where it was.
-        is_other = any(
-            row != seen[at] and moved[at] > limits[at, seen[at]] for row, at in one.pairs
-        )
+        is_other = any(row != seen[at] and not is_near[at, seen[at]] for row, at in one.pairs)
         if is_other and is_possible(one):
             # Two landmarks of one thing lie on one other landmark.
-            away = transform(one.motion, here.points_m)[:, None] - known.points_m[None, :]
-            is_alike = np.any(np.sum(away**2, axis=2) <= limits, axis=1)
+            is_alike = is_near.any(axis=1)
             if own - float(nats[seen[is_alike]].sum()) <= rule.price_nats:
                 return False
     return True
