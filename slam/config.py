@@ -145,7 +145,7 @@ TEXT_ALLOWED = "text allowed"
 """Validation context of settings that come as text, from a command line."""
 
 
-class _Model(BaseModel):
+class _ConfigTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @field_validator("*", mode="before")
@@ -161,7 +161,7 @@ class _Model(BaseModel):
         return value
 
 
-class DetectionConfig(_Model):
+class DetectionConfig(_ConfigTable):
     """Denoising and peak search in one frame (paper, section Signal Processing).
 
     The range limits and ``front_end`` hold for every front end, the rest for the paper's.
@@ -189,7 +189,7 @@ class DetectionConfig(_Model):
         return self
 
 
-class MatchedFilterConfig(_Model):
+class MatchedFilterConfig(_ConfigTable):
     """The front ends that know the pulse: ``matched_filter`` and ``joint``."""
 
     carrier_hz: Positive = 7.29e9
@@ -206,7 +206,7 @@ class MatchedFilterConfig(_Model):
     model_error: NonNegative = 0.08
 
 
-class TrilaterationConfig(_Model):
+class TrilaterationConfig(_ConfigTable):
     """Which pairs of ranges become a fix (paper eq. 1 and 2)."""
 
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
@@ -221,7 +221,7 @@ class TrilaterationConfig(_Model):
         return math.radians(self.field_of_view_deg)
 
 
-class WindowConfig(_Model):
+class WindowConfig(_ConfigTable):
     """When a state is collected and how many make a window (Algorithm 1)."""
 
     min_distance_m: NonNegative = 5e-3
@@ -231,7 +231,7 @@ class WindowConfig(_Model):
     end_of_run: EndOfRun = EndOfRun.DROP
 
 
-class ClusteringConfig(_Model):
+class ClusteringConfig(_ConfigTable):
     """Outlier filtering by DBSCAN over the window."""
 
     min_observations: Annotated[int, Field(ge=1)] = 9
@@ -304,7 +304,7 @@ class WheelNoise:
         return self.walk_per_sqrt_m**2 * (distance_m + self.walk_lever_m * abs(turn_rad))
 
 
-class MotionConfig(_Model):
+class MotionConfig(_ConfigTable):
     """Motion uncertainty R of the paper, and the coefficients of its proportional alternative."""
 
     noise: MotionNoise = MotionNoise.PER_STEP_WORLD
@@ -328,14 +328,14 @@ class MotionConfig(_Model):
         )
 
 
-class ObservationConfig(_Model):
+class ObservationConfig(_ConfigTable):
     """Observation uncertainty Q of the paper."""
 
     sigma_range_m: Positive = 0.15
     sigma_bearing_rad: Positive = 1.0
 
 
-class AssociationConfig(_Model):
+class AssociationConfig(_ConfigTable):
     """When an observation belongs to a known landmark (alpha of the paper)."""
 
     gate_rule: GateRule = GateRule.MAHALANOBIS_SQ
@@ -363,7 +363,7 @@ class AssociationConfig(_Model):
         return -2.0 * math.log1p(-self.gate)
 
 
-class RobustConfig(_Model):
+class RobustConfig(_ConfigTable):
     """The radars as the robust back end models them; limits of range are those of ``detection``."""
 
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180), Origin.DATA_SHEET] = 65.0
@@ -405,7 +405,7 @@ class RobustConfig(_Model):
         return math.radians(self.field_of_view_deg)
 
 
-class SlamConfig(_Model):
+class SlamConfig(_ConfigTable):
     """All settings of one run of a pipeline."""
 
     detection: DetectionConfig = DetectionConfig()

@@ -441,7 +441,7 @@ def _parse(text: str) -> dict[int, int]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Block:
+class _SynthesisedFrames:
     first_index: int
     values: NDArray[np.float32]
     is_zero: NDArray[np.bool_]
@@ -486,7 +486,7 @@ class Chip:
         self._source = source
         self._largest_block = largest_block
         self._block_phase = block_phase
-        self._block: _Block | None = None
+        self._block: _SynthesisedFrames | None = None
         self._block_frames = 1
         self._board_offset_m = float(np.float32(board_offset_m))
         self._negates_q = negates_q
@@ -656,7 +656,7 @@ class Chip:
             self._write_setting(X4Setting.TXPOWER, settings)
             self._apply(settings)
 
-    def _synthesise(self, first_index: int, n_frames: int) -> _Block:
+    def _synthesise(self, first_index: int, n_frames: int) -> _SynthesisedFrames:
         settings = self.settings
         indices = np.arange(first_index, first_index + n_frames, dtype=np.int64)
         scene_times_ns = np.array(
@@ -672,7 +672,7 @@ class Chip:
         if settings.downconversion and not self._negates_q:
             values[:, self.area.n_bins :] *= -1
         is_zero = np.array([_is_zero(frame) for frame in values], dtype=np.bool_)
-        return _Block(first_index=first_index, values=values, is_zero=is_zero)
+        return _SynthesisedFrames(first_index=first_index, values=values, is_zero=is_zero)
 
     def _capture(self) -> CaptureSettings:
         """Return which RF samples the chip takes, labelled as with the hardware's own offset."""

@@ -142,7 +142,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings, EchoSource
-from emulator.echo.model_error import Bursts, Stamps, TargetPairs, Wander
+from emulator.echo.model_error import Bursts, StampError, TargetPairs, Wander
 from emulator.echo.other_modules import OtherModules
 from emulator.echo.paths import (
     SPEED_OF_LIGHT_MPS,
@@ -258,7 +258,7 @@ class SceneEcho:
         self._paths = ScenePaths(scene, radar, seed)
         self._pulse = PulseShape.of(radar.pulse)
         self._bursts = Bursts(radar, self._pulse, seed)
-        self._stamps = Stamps(radar, seed)
+        self._stamps = StampError(radar, seed)
         self._others = OtherModules(scene.other_modules, radar)
         self._clock = radar.clock
         self._gain = 10.0 ** (radar.gain_db / 20)

@@ -152,7 +152,7 @@ class Bursts:
         signal[noisy] += units * (spec.noise_sigma / UNITS_PER_SIGMA)
 
 
-class Stamps:
+class StampError:
     """How far the times at which frames are taken lie from those that their reader assumes."""
 
     def __init__(self, radar: RadarSpec, seed: int) -> None:

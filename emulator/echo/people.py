@@ -97,7 +97,7 @@ class PersonTruth:
     chest_m
         Shape (n,): how far the chest is out.
     sleep_stage
-        Shape (n,): `emulator.scene.people.SleepStage`.
+        Shape (n,): `emulator.scene.people.SleepDepth`.
     distance_m
         Shape (n, m): from the radar to the person, true metres, without the chest's displacement.
     towards_m

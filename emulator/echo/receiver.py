@@ -347,7 +347,7 @@ class ClutterField:
             purpose=Purpose.CLUTTER,
         )
         self._answers: dict[int, NDArray[np.float64]] = {}
-        self._answers_are_of: tuple[_Row, float] | None = None
+        self._answers_are_of: tuple[_ReceivedScatterers, float] | None = None
 
     def add_to(
         self,
@@ -360,7 +360,7 @@ class ClutterField:
         strength = self._sigma * gain
         if strength == 0.0:
             return
-        row = _Row.of(capture)
+        row = _ReceivedScatterers.of(capture)
         apart_s = self._scatterers.instants_apart_ns / 1e9
         # What the chip is set to decides, not the frames at hand: their last bits must not depend
         # on how many are made at once.
@@ -389,7 +389,7 @@ class ClutterField:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Row:
+class _ReceivedScatterers:
     """The part of the row of scatterers that a frame receives.
 
     Attributes
@@ -403,8 +403,8 @@ class _Row:
     tx_center_frequency: int
 
     @staticmethod
-    def of(capture: CaptureSettings) -> _Row:
-        return _Row(
+    def of(capture: CaptureSettings) -> _ReceivedScatterers:
+        return _ReceivedScatterers(
             first_sample=round(capture.first_sample_m / RF_BIN_M),
             n_samples=capture.n_samples,
             tx_center_frequency=capture.tx_center_frequency,

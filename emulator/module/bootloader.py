@@ -36,7 +36,7 @@ _SPECIAL = re.compile(rb"[\x7d-\x7f]")
 _NO_ESCAPE_HEADER = 5  # length and reserved
 
 
-Found = tuple[memoryview, int] | BootloaderFraming
+FoundPacket = tuple[memoryview, int] | BootloaderFraming
 
 
 class PacketParser:
@@ -47,7 +47,7 @@ class PacketParser:
         self._length = 0
         self._escaped = self._no_escape = self._fast = False
 
-    def receive(self, data: bytes) -> Iterator[Found]:
+    def receive(self, data: bytes) -> Iterator[FoundPacket]:
         """Yield what is found: the buffer from a payload on, and its length; or damage."""
         at = 0
         while at < len(data):
@@ -75,7 +75,7 @@ class PacketParser:
                 end = at + room if special is None else special.start()
                 at += self._take(data[at:end])
 
-    def _special(self, byte: int) -> Iterator[Found]:
+    def _special(self, byte: int) -> Iterator[FoundPacket]:
         if byte == ESCAPE:
             self._escaped = True
             return
@@ -116,7 +116,7 @@ class PacketParser:
         at = 1 if self._fast else 0
         return int.from_bytes(self.buffer[at : at + 4], "little")
 
-    def _counted(self) -> Found:
+    def _counted(self) -> FoundPacket:
         if self._fast:
             return memoryview(self.buffer), self._length - 1
         return memoryview(self.buffer)[_NO_ESCAPE_HEADER:], self._announced

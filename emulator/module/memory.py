@@ -21,7 +21,7 @@ from emulator.chip.chip import Refusal
 from emulator.module.settings import U32, ProfileSettings
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codes import FORMAT_KEY, FileError, InfoItem
-from xethru_protocol.wire.versions import FIRMWARE_ID, Firmware
+from xethru_protocol.wire.versions import FIRMWARE_ID, FirmwareVersions
 
 MAX_FILES = 20
 MAX_OPEN = 10
@@ -62,7 +62,7 @@ class Identity:
         """The microcontroller's own number, 16 characters."""
         return f"EMUL{self.serial}"
 
-    def with_firmware(self, firmware: Firmware) -> Identity:
+    def with_firmware(self, firmware: FirmwareVersions) -> Identity:
         """Return the strings that the module answers with firmware of other versions."""
         old = not FIRMWARE_ID.is_in(firmware)
         return replace(

@@ -39,7 +39,7 @@ from xethru_protocol.wire.versions import FIRMWARE_NAMES, firmware_named
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Model:
+class ProductModel:
     """A product: its order code, and the profile and message that are on as shipped."""
 
     order_code: str
@@ -48,12 +48,12 @@ class Model:
 
 
 MODELS = {
-    "x4m300": Model(
+    "x4m300": ProductModel(
         order_code="X4M300",
         profile=ProfileId.XTS_ID_APP_PRESENCE_2,
         output=OutputFeature.PRESENCE_SINGLE,
     ),
-    "x4m200": Model(
+    "x4m200": ProductModel(
         order_code="X4M200",
         profile=ProfileId.XTS_ID_APP_RESPIRATION_2,
         output=OutputFeature.RESP_STATUS,

@@ -11,7 +11,14 @@ from dataclasses import dataclass
 
 from emulator.chip.chip import NS_PER_S, Chip, Refusal
 from emulator.module.bootloader import PAGE_COUNT, SMALL_PAGE_COUNT, Bootloader
-from emulator.module.memory import ERASED, FileSystem, Identity, Memory, SavedState, StoredFile
+from emulator.module.memory import (
+    ERASED,
+    FileSystem,
+    Identity,
+    Memory,
+    SavedState,
+    StoredFile,
+)
 from emulator.module.modes import ModeMachine, ModuleState, Start
 from emulator.module.pins import IoPins
 from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
@@ -44,7 +51,7 @@ ACK_WAIT_NS = NS_PER_S // 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Restart:
+class PendingRestart:
     """A restart that is due, at a time (as after a fault) or half a second after the ACK (None)."""
 
     into_bootloader: bool = False
@@ -149,7 +156,7 @@ class Module:
         self._last_fault_ns = 0
         self.noise_maps: Callable[[], tuple[bytes, bytes]] = _placeholder_noise_maps
         self.now_ns = 0
-        self.restart: Restart | None
+        self.restart: PendingRestart | None
         self._baudrate_change: tuple[int, int] | None
         self._sleep_ns: int | None
         self.wait: Wait | None
@@ -174,7 +181,7 @@ class Module:
     def power_cycle(self, now_ns: int) -> None:
         """Restart at once, as after a power cut, which ends a series of faults."""
         self._faults = 0
-        self.restart = Restart(at_ns=now_ns)
+        self.restart = PendingRestart(at_ns=now_ns)
 
     def advance(self, now_ns: int) -> None:
         self.now_ns = now_ns
@@ -213,7 +220,7 @@ class Module:
         """Restart as the host commands, which ends a series of faults."""
         self._faults = 0
         self.wait = Wait(duration_ns=ACK_WAIT_NS)
-        self.restart = Restart(into_bootloader=into_bootloader)
+        self.restart = PendingRestart(into_bootloader=into_bootloader)
 
     def crash(self, reason: str, now_ns: int) -> None:
         """Fail as by a watchdog or a hard fault: leave a crash dump and restart at once."""
@@ -229,7 +236,7 @@ class Module:
             self.files.replace(CRASH_DUMP, dump)
         self.save()
         into_bootloader = self._faults > BOOTLOADER_FAULTS
-        self.restart = Restart(into_bootloader=into_bootloader, at_ns=now_ns)
+        self.restart = PendingRestart(into_bootloader=into_bootloader, at_ns=now_ns)
         if into_bootloader:
             self._faults = 0
 
@@ -238,7 +245,7 @@ class Module:
         unfinished = self.bootloader.stays
         answers = list(self.bootloader.receive(data))
         if self.bootloader.started and self.restart is None:
-            self.restart = Restart(at_ns=self.now_ns + APP_START_NS)
+            self.restart = PendingRestart(at_ns=self.now_ns + APP_START_NS)
         if self.bootloader.stays is not unfinished:
             self.save()
         return answers

@@ -48,7 +48,7 @@ from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlanError, parse_fault
 from emulator.playback import PlayStream, kinds
 from emulator.ports.sockets import SocketClient, SocketService
-from emulator.scene.people import SleepStage
+from emulator.scene.people import SleepDepth
 from emulator.x4m300 import Device
 
 MOST_CLIENTS = 16
@@ -258,7 +258,7 @@ def _person(truth: PersonTruth, radars: Sequence[tuple[int, str]]) -> dict[str, 
         "moves": bool(truth.moves[0]),
         "position_m": truth.position_m[0].tolist(),
         **row,
-        "sleep_stage": SleepStage(int(truth.sleep_stage[0])).name.lower(),
+        "sleep_stage": SleepDepth(int(truth.sleep_stage[0])).name.lower(),
         "distance_m": {name: float(truth.distance_m[0, column]) for column, name in radars},
         "towards_m": {name: float(truth.towards_m[0, column]) for column, name in radars},
     }

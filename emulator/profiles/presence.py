@@ -63,7 +63,7 @@ _ABSORBABLE = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Detection:
+class DetectedPerson:
     """A person in the zone.
 
     Attributes
@@ -101,7 +101,7 @@ def threshold_db(sensitivity: int) -> float:
     return _QUIETEST_THRESHOLD_DB - sensitivity
 
 
-def signal_quality(found: Detection, sensitivity: int) -> int:
+def signal_quality(found: DetectedPerson, sensitivity: int) -> int:
     """Return a step per 3 dB above the threshold, 1...10."""
     margin_db = found.excess_db - threshold_db(sensitivity)
     return min(max(round(margin_db / _DB_PER_QUALITY), 1), BEST_QUALITY)
@@ -113,7 +113,7 @@ def detections(
     noise_map: NoiseMap,
     frames: NDArray[np.complex128],
     sensitivity: int,
-) -> tuple[Detection, ...]:
+) -> tuple[DetectedPerson, ...]:
     """Return who is in the zone: who moves right now first, then the strongest.
 
     Parameters
@@ -144,7 +144,7 @@ def detections(
             velocity_mps = _velocity_mps(residual, centre, audible, sweep.carrier_hz)
         if sweep.in_zone[centre]:
             found.append(
-                Detection(
+                DetectedPerson(
                     distance_m=float(sweep.range_m[centre]),
                     excess_db=10 * math.log10(float(strength[run].max())),
                     velocity_mps=velocity_mps,
@@ -234,14 +234,14 @@ def _centroid(power: NDArray[np.float64], centre: int) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Presence:
+class ZoneState:
     """What the profile knows after a tick: who is in the zone, and where it moves.
 
     It initialises until matrices and noise map are there. Movement is that of `movement_list`.
     """
 
     state: PresenceState
-    detections: tuple[Detection, ...]
+    detections: tuple[DetectedPerson, ...]
     movement_slow: tuple[float, ...]
     movement_fast: tuple[float, ...]
 
@@ -278,7 +278,7 @@ class PresenceProcessing:
         for slow_time in self._slow_time.values():
             slow_time.clear()
 
-    def tick(self, sensitivity: int) -> Presence:
+    def tick(self, sensitivity: int) -> ZoneState:
         """Compute the matrices, and from them who is there."""
         self.power = {
             instance: slow_time.power()
@@ -291,7 +291,7 @@ class PresenceProcessing:
             ready = False
         if not ready:
             nothing = movement_list(self._sweep, np.ones(self._sweep.n_bins))
-            return Presence(
+            return ZoneState(
                 state=PresenceState.INITIALIZING,
                 detections=(),
                 movement_slow=nothing,
@@ -303,7 +303,7 @@ class PresenceProcessing:
         frames = self._slow_time[FAST.instance].pulses()
         found = detections(self._sweep, either, self.noise_map, frames, sensitivity)
         self.noise_map.adapt(self.power, either < _ABSORBABLE)
-        return Presence(
+        return ZoneState(
             state=PresenceState.PRESENCE if found else PresenceState.NO_PRESENCE,
             detections=found,
             movement_slow=movement_list(self._sweep, slow),

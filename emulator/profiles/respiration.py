@@ -37,9 +37,9 @@ from emulator.profiles.doppler import FAST, SLOW, ProfileSweep
 from emulator.profiles.presence import (
     FULL_MOVEMENT_DB,
     NO_MOVEMENT_DB,
-    Detection,
-    Presence,
+    DetectedPerson,
     PresenceProcessing,
+    ZoneState,
     signal_quality,
 )
 from xethru_protocol.wire import messages as m
@@ -67,14 +67,14 @@ class Respiration:
     """
 
     state: RespirationState
-    person: Detection | None = None
+    person: DetectedPerson | None = None
     rate_hz: float = 0.0
     chest_mm: float = 0.0
     confidence: float = 0.0
 
 
 def respiration(
-    presence: Presence, processing: PresenceProcessing, sweep: ProfileSweep
+    presence: ZoneState, processing: PresenceProcessing, sweep: ProfileSweep
 ) -> Respiration:
     """Return who breathes how, from the presence profile's tick and its slow pulses."""
     if presence.state is PresenceState.INITIALIZING:
@@ -151,7 +151,7 @@ def status(counter: int, now: Respiration, sensitivity: int) -> m.RespStatus:
 
 
 def sleep_status(
-    counter: int, now: Respiration, presence: Presence, sensitivity: int
+    counter: int, now: Respiration, presence: ZoneState, sensitivity: int
 ) -> m.SleepStatus:
     """Return the status with the zone's average movement, 0...100 (`presence.movement_list`)."""
     person = now.person
@@ -193,7 +193,7 @@ def vital_signs(
     )
 
 
-def moving_list(counter: int, presence: Presence) -> m.RespirationMovingList:
+def moving_list(counter: int, presence: ZoneState) -> m.RespirationMovingList:
     return m.RespirationMovingList(
         counter=counter,
         movement_slow=presence.movement_slow,
@@ -201,7 +201,7 @@ def moving_list(counter: int, presence: Presence) -> m.RespirationMovingList:
     )
 
 
-def detection_list(counter: int, presence: Presence) -> m.RespirationDetectionList:
+def detection_list(counter: int, presence: ZoneState) -> m.RespirationDetectionList:
     """Return all detections; radar cross sections are 0, as released firmware has them."""
     found = presence.detections
     return m.RespirationDetectionList(

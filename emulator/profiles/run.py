@@ -55,7 +55,7 @@ from emulator.profiles.doppler import (
     StoredMap,
     default_noise_map,
 )
-from emulator.profiles.presence import Presence, PresenceProcessing, signal_quality
+from emulator.profiles.presence import PresenceProcessing, ZoneState, signal_quality
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
@@ -120,7 +120,7 @@ def baseband(
     )
 
 
-def presence_single(counter: int, presence: Presence, sensitivity: int) -> m.PresenceSingle:
+def presence_single(counter: int, presence: ZoneState, sensitivity: int) -> m.PresenceSingle:
     """Return the nearest thing to one person: the first detection; quality 0 without presence."""
     strongest = presence.detections[0] if presence.detections else None
     quality = 0 if strongest is None else signal_quality(strongest, sensitivity)
@@ -133,7 +133,7 @@ def presence_single(counter: int, presence: Presence, sensitivity: int) -> m.Pre
     )
 
 
-def moving_list(counter: int, presence: Presence) -> m.PresenceMovingList:
+def moving_list(counter: int, presence: ZoneState) -> m.PresenceMovingList:
     nothing = (0.0,) * len(presence.detections)
     return m.PresenceMovingList(
         counter=counter & 0xFFFFFFFF,
@@ -316,7 +316,7 @@ class ProfileRun:
                     )
 
     def _report(
-        self, feature: OutputFeature, counter: int, presence: Presence, sensitivity: int
+        self, feature: OutputFeature, counter: int, presence: ZoneState, sensitivity: int
     ) -> Response:
         match feature:
             case OutputFeature.PRESENCE_SINGLE:
@@ -332,7 +332,7 @@ class ProfileRun:
         return self._breathing(feature, counter, presence, sensitivity)
 
     def _breathing(
-        self, feature: OutputFeature, counter: int, presence: Presence, sensitivity: int
+        self, feature: OutputFeature, counter: int, presence: ZoneState, sensitivity: int
     ) -> Response:
         now = respiration.respiration(presence, self.processing, self._sweep)
         match feature:

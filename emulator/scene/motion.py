@@ -37,7 +37,7 @@ _ANGLE_TOLERANCE_RAD = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trajectory:
+class TruePath:
     """A true path, piecewise linear between knots.
 
     Attributes
@@ -81,7 +81,7 @@ class Trajectory:
 
 def drive(
     stops_m: Sequence[tuple[float, float]], *, speed_mps: float, turn_rate_rad_per_s: float
-) -> Trajectory:
+) -> TruePath:
     """Return the trajectory of a robot that visits the stops in order, turning on the spot.
 
     It starts at the first stop (of at least one, world frame) with heading zero and takes the
@@ -115,12 +115,12 @@ def drive(
         time_ns += max(round(length_m / speed_mps * 1e9), 1)
         times.append(time_ns)
         poses.append((x, y, heading))
-    return Trajectory(
+    return TruePath(
         knot_times_ns=np.array(times, dtype=np.int64), knot_poses=np.array(poses, dtype=np.float64)
     )
 
 
-def carried(path: Trajectory, *, at_ns: int, skips_ns: int, takes_ns: int) -> Trajectory:
+def carried(path: TruePath, *, at_ns: int, skips_ns: int, takes_ns: int) -> TruePath:
     """Return a path of which a stretch is skipped: the robot is picked up and set down after it.
 
     It is in the air for ``takes_ns``, moving straight and turning evenly. `ValueError` is raised
@@ -139,7 +139,7 @@ def carried(path: Trajectory, *, at_ns: int, skips_ns: int, takes_ns: int) -> Tr
         [at_ns, at_ns + takes_ns],
         path.knot_times_ns[after] + takes_ns - skips_ns,
     )
-    return Trajectory(
+    return TruePath(
         knot_times_ns=np.concatenate(times),
         knot_poses=np.concatenate(
             (path.knot_poses[before], path.poses(ends_ns), path.knot_poses[after])

@@ -82,7 +82,7 @@ CROSS_SECTION_SHARES = (1.0, 0.25, 2.0)
 """Of the radar cross section, likewise."""
 
 
-class _Part(IntEnum):
+class _RandomStream(IntEnum):
     """What the random streams of a person are for."""
 
     RATE = 0
@@ -92,7 +92,7 @@ class _Part(IntEnum):
     SWAY = 4
 
 
-class SleepStage(IntEnum):
+class SleepDepth(IntEnum):
     """How deep a person sleeps; the numbers are ours."""
 
     AWAKE = 0
@@ -102,10 +102,10 @@ class SleepStage(IntEnum):
 
 
 STAGES = (
-    (SleepStage.LIGHT, 0.45, 0.95, 0.6),
-    (SleepStage.DEEP, 0.25, 0.9, 0.2),
-    (SleepStage.LIGHT, 0.08, 0.95, 0.6),
-    (SleepStage.REM, 0.22, 1.0, 1.0),
+    (SleepDepth.LIGHT, 0.45, 0.95, 0.6),
+    (SleepDepth.DEEP, 0.25, 0.9, 0.2),
+    (SleepDepth.LIGHT, 0.08, 0.95, 0.6),
+    (SleepDepth.REM, 0.22, 1.0, 1.0),
 )
 """Stage, share of the cycle, factor on the rate, factor on its wander."""
 
@@ -237,9 +237,9 @@ def moves(person: PersonSpec, t_ns: NDArray[np.int64], seed: int = 0) -> NDArray
 
 
 def sleep_stages(person: PersonSpec, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the `SleepStage` at scene times, shape (n,)."""
+    """Return the `SleepDepth` at scene times, shape (n,)."""
     if person.sleep is None:
-        return np.full(len(t_ns), SleepStage.AWAKE, dtype=np.int64)
+        return np.full(len(t_ns), SleepDepth.AWAKE, dtype=np.int64)
     night = _hypnogram(person.sleep, float(t_ns.max(initial=0)) / 1e9)
     return night.stages[night.number(t_ns / 1e9)]
 
@@ -350,7 +350,7 @@ def _wandered_s(person: PersonSpec, t_s: NDArray[np.float64], seed: int) -> NDAr
 
 
 def _rate_phases(person: PersonSpec, seed: int) -> NDArray[np.float64]:
-    return _phases_rad(person.name, _Part.RATE, len(_WANDER_PERIODS_S), seed)
+    return _phases_rad(person.name, _RandomStream.RATE, len(_WANDER_PERIODS_S), seed)
 
 
 def _since_apnoea_s(
@@ -359,7 +359,7 @@ def _since_apnoea_s(
     """Return the time since the newest apnoea began, shape (n,) [s]; infinite before the first."""
     first = max(int(t_s.min(initial=0) // apnoea.every_s) - 1, 0)
     count = max(int(t_s.max(initial=0) // apnoea.every_s) - first + 1, 1)
-    drawn = _drawn(person.name, _Part.APNOEA, count * WORDS_PER_BLOCK, seed, first)
+    drawn = _drawn(person.name, _RandomStream.APNOEA, count * WORDS_PER_BLOCK, seed, first)
     within_s = drawn[::WORDS_PER_BLOCK] * (apnoea.every_s - apnoea.lasts_s)
     begins_s = np.arange(first, first + count) * apnoea.every_s + within_s
     number = np.searchsorted(begins_s, t_s, side="right") - 1
@@ -398,7 +398,7 @@ def _cycles(sleep: SleepSpec, count: int) -> _Hypnogram:
     begins = np.arange(count)[:, np.newaxis] + shares
     stages, factors, wanders = (
         np.concatenate([[first], np.tile([row[column] for row in STAGES], count)])
-        for first, column in ((int(SleepStage.AWAKE), 0), (1.0, 2), (1.0, 3))
+        for first, column in ((int(SleepDepth.AWAKE), 0), (1.0, 2), (1.0, 3))
     )
     edges_s = sleep.from_s + 60 * sleep.cycle_min * begins.ravel()
     return _Hypnogram(edges_s=edges_s, stages=stages, factors=factors, wanders=wanders)
@@ -489,7 +489,7 @@ def _shifts(person: PersonSpec, seed: int) -> BodyMotion | None:
     spec = person.shifts
     if spec is None:
         return None
-    stream = _stream(person.name, _Part.SHIFTS)
+    stream = _stream(person.name, _RandomStream.SHIFTS)
     return _body_motion(stream, seed, 60 / spec.per_min, spec.takes_s, spec.size_m)
 
 
@@ -497,7 +497,7 @@ def _turns(person: PersonSpec, seed: int) -> BodyMotion | None:
     spec = person.sleep
     if spec is None or not spec.turns_per_hour:
         return None
-    stream = _stream(person.name, _Part.TURNS)
+    stream = _stream(person.name, _RandomStream.TURNS)
     return _body_motion(stream, seed, 3600 / spec.turns_per_hour, _TURN_TAKES_S, _TURN_SIZE_M)
 
 
@@ -507,23 +507,25 @@ def _body_motions(person: PersonSpec, seed: int) -> list[BodyMotion]:
 
 def _sway(person: PersonSpec, t_s: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     """Return the sway along x and y in those of the largest, shape (n, 2)."""
-    phases = _phases_rad(person.name, _Part.SWAY, 2 * len(_SWAY_PERIODS_S), seed)
+    phases = _phases_rad(person.name, _RandomStream.SWAY, 2 * len(_SWAY_PERIODS_S), seed)
     angle = math.tau * t_s[:, np.newaxis, np.newaxis] / _SWAY_PERIODS_S + phases.reshape(2, -1)
     return np.asarray((_SWAY_SHARES * np.sin(angle)).sum(axis=2), dtype=np.float64)
 
 
 @functools.cache
-def _stream(name: str, part: _Part) -> int:
+def _stream(name: str, part: _RandomStream) -> int:
     serial = int.from_bytes(hashlib.sha256(name.encode()).digest()[:5], "big")
     return stream_of(serial, Purpose.PERSON, part)
 
 
-def _drawn(name: str, part: _Part, count: int, seed: int, block: int = 0) -> NDArray[np.float64]:
+def _drawn(
+    name: str, part: _RandomStream, count: int, seed: int, block: int = 0
+) -> NDArray[np.float64]:
     return uniforms(count, seed=seed, stream=_stream(name, part), block=block)
 
 
 @functools.lru_cache(maxsize=256)
-def _phases_rad(name: str, part: _Part, count: int, seed: int) -> NDArray[np.float64]:
+def _phases_rad(name: str, part: _RandomStream, count: int, seed: int) -> NDArray[np.float64]:
     return math.tau * _drawn(name, part, count, seed)
 
 

@@ -24,7 +24,7 @@ from emulator.scene.motion import (
     Metres,
     MoverSpec,
     Name,
-    Trajectory,
+    TruePath,
     carried,
     drive,
 )
@@ -486,7 +486,7 @@ class Scene(Table):
             )
         return self
 
-    def trajectory(self) -> Trajectory:
+    def trajectory(self) -> TruePath:
         """Return the robot's true path, world frame (the start pose is the origin)."""
         path = drive(
             self.path.stops_m(),

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.radar_specs import RadarKind, RadarSpec
+from hil_tests.plugin.radar_specs import RadarArgument, RadarKind
 from hil_tests.plugin.radar_targets import (
     RadarTarget,
     TargetError,
@@ -168,7 +168,7 @@ class RadarUnderTest:
         self._line: Transport | None = None
 
     @property
-    def spec(self) -> RadarSpec:
+    def spec(self) -> RadarArgument:
         return self.place.spec
 
     def begin_test(self) -> None:
@@ -296,7 +296,9 @@ class Bench:
     """All radars of the session, by name; ``reach`` returns the target of a spec."""
 
     def __init__(
-        self, specs: Iterable[RadarSpec], reach: Callable[[RadarSpec], RadarTarget] = target_of
+        self,
+        specs: Iterable[RadarArgument],
+        reach: Callable[[RadarArgument], RadarTarget] = target_of,
     ) -> None:
         self.specs = {spec.name: spec for spec in specs}
         self._reach = reach

@@ -13,7 +13,7 @@ from hil_tests.plugin.requirements import gate, lacking
 
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarUnderTest
-    from hil_tests.plugin.radar_specs import RadarSpec
+    from hil_tests.plugin.radar_specs import RadarArgument
     from hil_tests.plugin.radar_targets import RadarTarget
     from xethru_protocol.driver.radar import X4M300
 
@@ -29,7 +29,7 @@ def hil_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
 
     config = request.config
 
-    def reach(spec: RadarSpec) -> RadarTarget:
+    def reach(spec: RadarArgument) -> RadarTarget:
         try:
             place = config.hook.pytest_xethru_radar_target(config=config, spec=spec)
         except ModuleNotFoundError as error:

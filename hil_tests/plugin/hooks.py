@@ -13,7 +13,7 @@ import pytest
 
 from hil_tests.plugin.findings import FINDINGS, Findings, check_faults
 from hil_tests.plugin.options import CHOICES, WORKER_KEY, add_options, choose
-from hil_tests.plugin.radar_specs import RadarKind, RadarSpec, no_radar
+from hil_tests.plugin.radar_specs import RadarArgument, RadarKind, no_radar
 
 if TYPE_CHECKING:
     from hil_tests.plugin.radar_targets import RadarTarget
@@ -28,7 +28,9 @@ class HookSpecs:
 
     @staticmethod
     @pytest.hookspec(firstresult=True)
-    def pytest_xethru_radar_target(config: pytest.Config, spec: RadarSpec) -> RadarTarget | None:
+    def pytest_xethru_radar_target(
+        config: pytest.Config, spec: RadarArgument
+    ) -> RadarTarget | None:
         """Return how the radar of a ``--radar`` value is reached, or None if others know.
 
         Called once per process and radar, before its first test. ``spec.target`` is the value
@@ -38,7 +40,7 @@ class HookSpecs:
         """
 
 
-class Summary:
+class RadarReports:
     """Collects the reports of all tests that used radars, also those of workers."""
 
     def __init__(self) -> None:
@@ -93,7 +95,7 @@ class Summary:
         )
 
 
-SUMMARY: pytest.StashKey[Summary] = pytest.StashKey()
+SUMMARY: pytest.StashKey[RadarReports] = pytest.StashKey()
 
 
 MARKERS = (
@@ -123,12 +125,12 @@ def pytest_configure(config: pytest.Config) -> None:
         for spec in choices.specs:
             if spec.kind is RadarKind.OWN:
                 raise pytest.UsageError(str(no_radar(spec.text)))
-    summary = config.stash[SUMMARY] = Summary()
+    summary = config.stash[SUMMARY] = RadarReports()
     config.pluginmanager.register(summary, "xethru-hil-summary")
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_xethru_radar_target(config: pytest.Config, spec: RadarSpec) -> RadarTarget:
+def pytest_xethru_radar_target(config: pytest.Config, spec: RadarArgument) -> RadarTarget:
     """Reach a radar of a built-in kind."""
     from hil_tests.plugin.radar_targets import target_of
 

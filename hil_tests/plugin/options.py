@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.plugin.power import PowerCommand, PowerError
-from hil_tests.plugin.radar_specs import RadarKind, RadarSpec, SpecError, parse_specs
+from hil_tests.plugin.radar_specs import RadarArgument, RadarKind, SpecError, parse_specs
 
 ENVIRONMENT = "XETHRU_RADARS"
 INI = "xethru_radars"
@@ -26,7 +26,7 @@ class Choices:
     ``chosen`` is false if the radars are the default, one `emu`.
     """
 
-    specs: tuple[RadarSpec, ...]
+    specs: tuple[RadarArgument, ...]
     chosen: bool
     rig: Path | None
     power: PowerCommand | None
@@ -161,7 +161,7 @@ def _check_report(report: Path) -> None:
         raise pytest.UsageError(f"--hil-json {report}: {wrong} is there already; name a new file")
 
 
-def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
+def _found(specs: tuple[RadarArgument, ...]) -> tuple[RadarArgument, ...]:
     """Replace `auto` by the ports where modules answer."""
     if not any(spec.kind is RadarKind.AUTO for spec in specs):
         return specs
@@ -180,7 +180,7 @@ def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
     return parse_specs(texts)
 
 
-def _check_workers(config: pytest.Config, specs: tuple[RadarSpec, ...]) -> None:
+def _check_workers(config: pytest.Config, specs: tuple[RadarArgument, ...]) -> None:
     """Reject `--dist each` if all workers would test the same real radar."""
     if not config.pluginmanager.hasplugin("xdist"):
         return

@@ -64,7 +64,7 @@ _BUILT_IN_SCHEMES = (*_NETWORK_SCHEMES, "emu", "auto", "serial", "replay")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RadarSpec:
+class RadarArgument:
     """One radar to test.
 
     ``text`` is what the user wrote, ``target`` its scene, port, serial number, recording,
@@ -119,13 +119,13 @@ class RadarSpec:
         return frozenset(filter(None, self.options.get("has", "").split(",")))
 
 
-def parse_specs(texts: Iterable[str]) -> tuple[RadarSpec, ...]:
+def parse_specs(texts: Iterable[str]) -> tuple[RadarArgument, ...]:
     """Return the radars that specs name, with unique names; `SpecError` if one names no radar.
 
     >>> [spec.name for spec in parse_specs(["emu", "emu:lab?seed=3", "/dev/ttyACM0"])]
     ['emu', 'emu-lab', 'ttyACM0']
     """
-    specs: list[RadarSpec] = []
+    specs: list[RadarArgument] = []
     for text in texts:
         body, _, query = text.strip().partition("?")
         kind, target = _kind(body)
@@ -137,7 +137,7 @@ def parse_specs(texts: Iterable[str]) -> tuple[RadarSpec, ...]:
         while name in taken:
             # no dash: pytest joins the name and other parameters with that
             name, number = f"{plain}.{number}", number + 1
-        specs.append(RadarSpec(text=text, kind=kind, target=target, options=options, name=name))
+        specs.append(RadarArgument(text=text, kind=kind, target=target, options=options, name=name))
     return tuple(specs)
 
 

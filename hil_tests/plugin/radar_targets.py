@@ -22,7 +22,7 @@ import numpy as np
 from hil_tests.device.emulator_process import Served, emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.plugin.power import PowerCommand, PowerError
-from hil_tests.plugin.radar_specs import RadarKind, RadarSpec
+from hil_tests.plugin.radar_specs import RadarArgument, RadarKind
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import Transport, capacity_bytes_per_s, find_ports, open_line
 from xethru_protocol.wire.codes import POWER_UP_BAUD
@@ -161,7 +161,7 @@ class RadarTarget(ABC):
     scene_text: str | None = None
     lock_target: str | None = None
 
-    def __init__(self, spec: RadarSpec, capabilities: frozenset[str], description: str) -> None:
+    def __init__(self, spec: RadarArgument, capabilities: frozenset[str], description: str) -> None:
         self.spec = spec
         self.capabilities = capabilities | spec.has
         self.description = description
@@ -228,7 +228,7 @@ class RadarTarget(ABC):
 class InProcessTarget(RadarTarget):
     """A module in this process, in virtual time; a fresh one for every test."""
 
-    def __init__(self, spec: RadarSpec) -> None:
+    def __init__(self, spec: RadarArgument) -> None:
         self._scene, self.scene_text = _scene(spec), _scene_text(spec)
         able = frozenset(CAPABILITIES) - {"uart", "known_range"}
         super().__init__(
@@ -293,7 +293,7 @@ class InProcessTarget(RadarTarget):
 class ProcessTarget(RadarTarget):
     """A module of an emulator that runs in a process of its own, or a recording played there."""
 
-    def __init__(self, spec: RadarSpec) -> None:
+    def __init__(self, spec: RadarArgument) -> None:
         played = spec.kind is RadarKind.REPLAY
         able = {"settings", "profiles", "files", "unplug", "power", "faults"}
         if spec.line == "uart":
@@ -383,7 +383,7 @@ class ProcessTarget(RadarTarget):
 class PortTarget(RadarTarget):
     """A module at a port, named or found by its serial number; perhaps a port of the network."""
 
-    def __init__(self, spec: RadarSpec, power: PowerCommand | None = None) -> None:
+    def __init__(self, spec: RadarArgument, power: PowerCommand | None = None) -> None:
         path = _port_of(spec.target) if spec.kind is RadarKind.SERIAL_NUMBER else spec.target
         able = {"settings", "profiles", "files"} | ({"power"} if power else set())
         able |= set() if spec.known_range_m is None else {"known_range"}
@@ -419,7 +419,7 @@ class PortTarget(RadarTarget):
             raise TargetError(f"--hil-power-cmd: {error}") from None
 
 
-def target_of(spec: RadarSpec, power: PowerCommand | None = None) -> RadarTarget:
+def target_of(spec: RadarArgument, power: PowerCommand | None = None) -> RadarTarget:
     """Return the target of a built-in spec; `TargetError` or `PortUnavailable` if it has none."""
     match spec.kind:
         case RadarKind.EMULATED if spec.line == "memory":
@@ -462,7 +462,7 @@ def _port_of(serial: str) -> str:
     raise TargetError(f"no module with serial number {serial} answers; those that do: {there}")
 
 
-def _index_of(spec: RadarSpec, names: Sequence[str]) -> int:
+def _index_of(spec: RadarArgument, names: Sequence[str]) -> int:
     wanted = spec.options.get("radar")
     if wanted is None:
         return 0
@@ -473,12 +473,12 @@ def _index_of(spec: RadarSpec, names: Sequence[str]) -> int:
     return names.index(wanted)
 
 
-def scene_radars(spec: RadarSpec) -> tuple[str, ...]:
+def scene_radars(spec: RadarArgument) -> tuple[str, ...]:
     """Return the names of the radars of an emulated spec's scene; an empty room has four."""
     return tuple(radar.name for radar in _scene(spec).radars)
 
 
-def _scene(spec: RadarSpec) -> Scene:
+def _scene(spec: RadarArgument) -> Scene:
     from emulator.scene.scene import SceneError, empty_room, load_scene
 
     try:
@@ -512,13 +512,13 @@ def _ranges_in_view(scene: Scene, index: int, scene_ns: int) -> Sequence[float]:
     ]
 
 
-def _serve_arguments(spec: RadarSpec) -> list[str]:
+def _serve_arguments(spec: RadarArgument) -> list[str]:
     scene = [spec.target] if spec.target else ["--bare", "--count", str(_EMPTY_ROOM_RADARS)]
     line = {"uart": ["--link", "uart"], "tcp": ["--tcp", "0"]}.get(spec.line, [])
     return ["serve", *scene, "--seed", str(spec.seed), *line]
 
 
-def _scene_text(spec: RadarSpec) -> str | None:
+def _scene_text(spec: RadarArgument) -> str | None:
     if not spec.target:
         return None
     path = Path(spec.target)

@@ -47,7 +47,7 @@ def of_type(draw: st.DrawFn, cls: type[Message]) -> Any:  # noqa: ANN401 - any r
     return cls(**fields)
 
 
-def _choices(kinds: tuple[tuple[str, wire_kinds.Kind], ...], name: str) -> list[int] | None:
+def _choices(kinds: tuple[tuple[str, wire_kinds.FieldKind], ...], name: str) -> list[int] | None:
     """Values that a later field's layout depends on; None if none does."""
     for _, kind in kinds:
         if isinstance(kind, wire_kinds.ByDiscriminator) and kind.field == name:
@@ -58,7 +58,7 @@ def _choices(kinds: tuple[tuple[str, wire_kinds.Kind], ...], name: str) -> list[
 
 
 def _field(  # noqa: PLR0911, PLR0912 - one case per kind of field
-    kind: wire_kinds.Kind, fields: dict[str, Any], sizes: dict[str, int]
+    kind: wire_kinds.FieldKind, fields: dict[str, Any], sizes: dict[str, int]
 ) -> st.SearchStrategy[Any]:
     match kind:
         case wire_kinds.Number():

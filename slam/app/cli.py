@@ -107,7 +107,7 @@ def _end(message: str, exit_code: int) -> int:
     return exit_code
 
 
-class _Command(NamedTuple):
+class _Subcommand(NamedTuple):
     """A row of the table of commands.
 
     `function` is "module:name" of what runs it: the module is imported once the command starts,
@@ -490,7 +490,7 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
 
 
 _COMMANDS = (
-    _Command(
+    _Subcommand(
         "demo",
         "slam.app.commands.demo:run_demo",
         "drive an emulated robot through a scene and map it",
@@ -498,7 +498,7 @@ _COMMANDS = (
         "Starts the emulator, opens its four radars through serial ports, runs SLAM "
         "while frames arrive, and writes session, map and numbers. All numbers are simulated.",
     ),
-    _Command(
+    _Subcommand(
         "view",
         "slam.app.commands.view:run_view",
         "show a session in Rerun: window, browser, file or picture",
@@ -506,7 +506,7 @@ _COMMANDS = (
         "Shows a recorded session in Rerun, as its run saw it. Without an option a window opens.",
         extra="view",
     ),
-    _Command(
+    _Subcommand(
         "report",
         "slam.app.commands.report:run_report",
         "write a session's report as one HTML page",
@@ -514,7 +514,7 @@ _COMMANDS = (
         "Writes map, trajectory, errors, consistency, link statistics and parameters of a "
         "recorded session into one page that any browser opens without a network.",
     ),
-    _Command(
+    _Subcommand(
         "run",
         "slam.app.commands.run:run_rig",
         "map with real modules, or a running emulator, in real time",
@@ -522,7 +522,7 @@ _COMMANDS = (
         _RUN_DESCRIPTION,
         _RUN_EPILOG,
     ),
-    _Command(
+    _Subcommand(
         "replay",
         "slam.app.run.replay:run_replay",
         "run SLAM again on a recorded session",
@@ -531,7 +531,7 @@ _COMMANDS = (
         "writes map, trajectories and numbers: the run's own, but for the speed. What is left of "
         "a cut file is replayed to its last whole scan.",
     ),
-    _Command(
+    _Subcommand(
         "evaluate",
         "slam.app.run.results:run_evaluate",
         "compare two trajectories",
@@ -539,7 +539,7 @@ _COMMANDS = (
         "Absolute trajectory error of EST against REF, two TUM files: associated by "
         "time, aligned by rotation and translation, root mean square of the distance.",
     ),
-    _Command(
+    _Subcommand(
         "repair",
         "slam.app.session.repair:run_repair",
         "make a recording whole that was cut or damaged",
@@ -548,7 +548,7 @@ _COMMANDS = (
         "an index, so that every program opens it again. The file as it was is kept as "
         "SESSION.unrepaired.",
     ),
-    _Command(
+    _Subcommand(
         "convert",
         "slam.app.convert.convert:run_convert",
         "sessions from and to rosbags and .mat, in the layout of the paper's data set",
@@ -558,7 +558,7 @@ _COMMANDS = (
         "else a new folder with a bag of ROS 2; or IN is a .mat or a bag, then OUT is a "
         "session, which replay, view and report take.",
     ),
-    _Command(
+    _Subcommand(
         "calibrate",
         "slam.app.commands.calibrate:run_calibrate",
         "estimate offsets, mounts, gains and pulses from a recorded drive",
@@ -567,7 +567,7 @@ _COMMANDS = (
         "session of `uwb-slam run` or `demo` past reflectors, and says what the drive cannot tell "
         "apart.",
     ),
-    _Command(
+    _Subcommand(
         "benchmark",
         "slam.app.benchmarks.command:run_benchmark",
         "run the back end of preset robust on a public data set, beside its truth",
@@ -577,7 +577,7 @@ _COMMANDS = (
         "path's error against the truth, beside dead reckoning. Writes paths as TUM text, a "
         "picture NAME.png and NAME.json. docs/benchmarks.md says where the data are from.",
     ),
-    _Command(
+    _Subcommand(
         "sweep",
         "slam.app.sweep.sweep:run_sweep",
         "repeat a run over scenes, presets and seeds",
@@ -590,7 +590,7 @@ _COMMANDS = (
         + "; ".join(f"{name}: {stress.help}" for name, stress in STRESSES.items())
         + f". The families of random rooms are {', '.join(FAMILIES)}; statistics are of families.",
     ),
-    _Command(
+    _Subcommand(
         "experiment",
         "slam.app.sweep.pictures:run_experiment",
         "draw the result of a sweep",

@@ -71,7 +71,7 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Solution:
+class BatchSolution:
     """The most likely state and how well it is known."""
 
     state: Array  # shape (n,)
@@ -94,7 +94,7 @@ class Solution:
         return (block + block.T) / 2
 
 
-def minimise(start: Array, terms: Sequence[Term], stop: Stop | None = None) -> Solution:
+def minimise(start: Array, terms: Sequence[Term], stop: Stop | None = None) -> BatchSolution:
     """Return the state of least cost near a start.
 
     Raises
@@ -125,7 +125,7 @@ def minimise(start: Array, terms: Sequence[Term], stop: Stop | None = None) -> S
         share = max(share / 10, _LEAST_DAMPING)
         if gained <= rule.relative_decrease * cost:
             break
-    return Solution(state=state, cost=cost, information=information)
+    return BatchSolution(state=state, cost=cost, information=information)
 
 
 def _cost(terms: Sequence[Term], state: Array) -> float:
@@ -158,7 +158,7 @@ def _factor(matrix: csc_array[np.float64]) -> SuperLU:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class StateLayout:
     """Where each unknown lies in the state vector."""
 
     n_poses: int
@@ -222,7 +222,7 @@ class OdometryTerm:
         u_xy = (1 + s) d + white        u_a = (1 + w) a + kappa |u_xy| / (1 + s) + white
     """
 
-    layout: Layout
+    layout: StateLayout
     steps: Array  # shape (n_poses - 1, 3): reported ux [m], uy [m], ua [rad]
     sigmas: Array  # shape (n_poses - 1, 3), standard deviations in the same units
     cauchy_scale: float | None = None
@@ -284,7 +284,7 @@ class RangeTerm:
     linear in position and in heading, which is exact on straights and for turns on the spot.
     """
 
-    layout: Layout
+    layout: StateLayout
     # Shape (m,) each: index of the pose before the sample, and how far on to the next, [0, 1]
     pose: Indices
     fraction: Array

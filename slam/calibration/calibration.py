@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from slam.calibration.batch import (
     CAUCHY_SCALE,
-    Layout,
+    BatchSolution,
     OdometryTerm,
     PriorTerm,
     RangeTerm,
-    Solution,
+    StateLayout,
     Stop,
     Term,
     minimise,
@@ -166,7 +166,7 @@ def calibrate(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Model:
+class _Unknowns:
     """The unknowns, unpacked."""
 
     poses: Array
@@ -203,14 +203,14 @@ class _Estimator:
             model, solution = self._solve(model, landmark, None, Stop())
         return self._result(model, landmark, solution)
 
-    def _growing(self) -> tuple[_Model, Indices]:
+    def _growing(self) -> tuple[_Unknowns, Indices]:
         """Take in followed echoes in the order of time.
 
         The wheels' constants are known after the first of them: later echoes are placed from a path
         that has not drifted far.
         """
         ranges, path = self._drive.ranges, _at_origin(self._drive.path)
-        model = _Model(
+        model = _Unknowns(
             poses=path.poses,
             landmarks=self._known_m,
             wheels=np.zeros(3),
@@ -233,7 +233,9 @@ class _Estimator:
             model, landmark = self._solved_and_merged(*self._without_poor(model, landmark))
         return model, landmark
 
-    def _tracks(self, model: _Model, followed: Sequence[tuple[int, Indices]]) -> tuple[Track, ...]:
+    def _tracks(
+        self, model: _Unknowns, followed: Sequence[tuple[int, Indices]]
+    ) -> tuple[Track, ...]:
         sights, range_m = self._sights(model), self._drive.ranges.range_m
         tracks = []
         for radar, rows in followed:
@@ -248,7 +250,7 @@ class _Estimator:
         own = np.maximum(self._sigma_scale * self._reported_sigma_m, _LEAST_SIGMA_M)
         return np.hypot(own, self._bend_m)
 
-    def _sights(self, model: _Model) -> Array:
+    def _sights(self, model: _Unknowns) -> Array:
         """Return antenna position and boresight at each range, (n_ranges, 3), map frame."""
         ranges = self._drive.ranges
         path = PathNodes(t_ns=self._drive.path.t_ns, poses=model.poses)
@@ -256,7 +258,7 @@ class _Estimator:
         mounts = np.column_stack([model.radars[:, 1:], yaws])
         return radar_poses(path, mounts[ranges.radar], ranges.t_ns)
 
-    def _assign(self, model: _Model, landmark: Indices, gates_m: Array) -> Indices:
+    def _assign(self, model: _Unknowns, landmark: Indices, gates_m: Array) -> Indices:
         ranges, sights = self._drive.ranges, self._sights(model)
         strength = strengths(ranges, sights, model.landmarks, landmark)
         offsets_m = model.radars[ranges.radar, 0]
@@ -265,7 +267,7 @@ class _Estimator:
         )
         return landmark
 
-    def _without_poor(self, model: _Model, landmark: Indices) -> tuple[_Model, Indices]:
+    def _without_poor(self, model: _Unknowns, landmark: Indices) -> tuple[_Unknowns, Indices]:
         """Drop landmarks that too few ranges see; known ones stay, as first."""
         n = len(model.landmarks)
         kept = well_seen(self._drive.ranges, landmark, n) | (np.arange(n) < len(self._known_m))
@@ -275,7 +277,7 @@ class _Estimator:
         moved[used] = renumbered[landmark[used]]
         return replace(model, landmarks=model.landmarks[kept]), moved
 
-    def _solved_and_merged(self, model: _Model, landmark: Indices) -> tuple[_Model, Indices]:
+    def _solved_and_merged(self, model: _Unknowns, landmark: Indices) -> tuple[_Unknowns, Indices]:
         while True:
             model, solution = self._solve(model, landmark, CAUCHY_SCALE, _ROUGH)
             pair = self._same_landmark(model, landmark, solution)
@@ -287,7 +289,7 @@ class _Estimator:
             model = replace(model, landmarks=np.delete(model.landmarks, drop, axis=0))
 
     def _same_landmark(
-        self, model: _Model, landmark: Indices, solution: Solution
+        self, model: _Unknowns, landmark: Indices, solution: BatchSolution
     ) -> tuple[int, int] | None:
         """Return the two landmarks most clearly the same, the one to keep first."""
         near = [
@@ -313,22 +315,22 @@ class _Estimator:
                 best, found = chi2, (keep, drop)
         return found
 
-    def _layout(self, model: _Model) -> Layout:
-        return Layout(
+    def _layout(self, model: _Unknowns) -> StateLayout:
+        return StateLayout(
             n_poses=len(model.poses),
             n_landmarks=len(model.landmarks),
             n_radars=len(model.radars),
         )
 
     def _solve(
-        self, model: _Model, landmark: Indices, cauchy_scale: float | None, stop: Stop
-    ) -> tuple[_Model, Solution]:
+        self, model: _Unknowns, landmark: Indices, cauchy_scale: float | None, stop: Stop
+    ) -> tuple[_Unknowns, BatchSolution]:
         layout = self._layout(model)
         term = self._range_term(layout, landmark, cauchy_scale)
         solution = minimise(model.state(), [*self._fixed_terms(layout), term], stop)
         state = solution.state
         self._learn_sigma(np.abs(term.residuals(state)) * term.sigma_m, landmark != UNASSIGNED)
-        solved = _Model(
+        solved = _Unknowns(
             poses=state[layout.poses].reshape(-1, 3),
             landmarks=state[layout.landmarks].reshape(-1, 2),
             wheels=state[layout.wheels],
@@ -345,7 +347,7 @@ class _Estimator:
             self._sigma_scale = float(np.median(errors_m[clean] / reported[clean])) / 0.6745
 
     def _range_term(
-        self, layout: Layout, landmark: Indices, cauchy_scale: float | None
+        self, layout: StateLayout, landmark: Indices, cauchy_scale: float | None
     ) -> RangeTerm:
         rows = np.flatnonzero(landmark != UNASSIGNED)
         ranges = self._drive.ranges
@@ -361,7 +363,7 @@ class _Estimator:
             cauchy_scale=cauchy_scale,
         )
 
-    def _fixed_terms(self, layout: Layout) -> Sequence[Term]:
+    def _fixed_terms(self, layout: StateLayout) -> Sequence[Term]:
         priors, known = self._priors, self._known_m
         if len(known):
             start = [priors.start_m, priors.start_m, priors.start_rad]
@@ -394,7 +396,7 @@ class _Estimator:
             ),
         )
 
-    def _result(self, model: _Model, landmark: Indices, solution: Solution) -> Calibration:
+    def _result(self, model: _Unknowns, landmark: Indices, solution: BatchSolution) -> Calibration:
         layout = self._layout(model)
         term = self._range_term(layout, landmark, None)
         used = term.residuals(solution.state) * term.sigma_m

@@ -27,7 +27,7 @@ from xethru_protocol.transport import find_ports, is_private, is_running, run_di
 from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, ProfileId, SensorMode
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.messages import Ping
-from xethru_protocol.wire.versions import Firmware, lacking
+from xethru_protocol.wire.versions import FirmwareVersions, lacking
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -436,9 +436,11 @@ def _other_product(probe: PortProbe) -> str | None:
 )
 def _stale_firmware(probe: PortProbe) -> str | None:
     version = probe.info.version
-    firmware = Firmware(xep=version) if probe.is_bare_xep else Firmware(sensor=version)
+    firmware = (
+        FirmwareVersions(xep=version) if probe.is_bare_xep else FirmwareVersions(sensor=version)
+    )
     if probe.info.version_list is not None:
-        firmware = Firmware.of_list(probe.info.version_list)
+        firmware = FirmwareVersions.of_list(probe.info.version_list)
     rows = lacking(firmware)
     faults = [f"{row.topic}: {row.before}" for row in rows if row.is_fault]
     absent = [row.topic for row in rows if row.commands]

@@ -267,15 +267,15 @@ def _text(value: Any, whole: bool) -> str:  # noqa: ANN401 - any JSON value
     return text if whole or len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 
 
-class _Given(TypedDict, total=False):
+class _LoadOptions(TypedDict, total=False):
     """What is known of the frames of a recording that does not say it."""
 
     area_m: tuple[float, float]
     downconversion: bool
 
 
-def _given(arguments: Namespace) -> _Given:
-    given: _Given = {}
+def _given(arguments: Namespace) -> _LoadOptions:
+    given: _LoadOptions = {}
     if arguments.frame_area is not None:
         start_m, end_m = arguments.frame_area
         given["area_m"] = start_m, end_m

@@ -58,7 +58,7 @@ from xethru_protocol.wire.errors import (
     ResponseTimeout,
 )
 from xethru_protocol.wire.rows import ROWS, Command, Response
-from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, Firmware, needed_by
+from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, FirmwareVersions, needed_by
 
 
 class Read(NamedTuple):  # several per frame: twice as fast to make as a frozen dataclass
@@ -491,7 +491,7 @@ class Link:
         """What changes when the module restarts, perhaps with other firmware."""
         return self.conversation.reboots, self.reconnects
 
-    def firmware(self) -> Steps[Firmware]:
+    def firmware(self) -> Steps[FirmwareVersions]:
         """Return the versions of what runs on the module; asked for once, empty if it refuses."""
         if self._version_list is None or self._version_list[0] != self._start:
             try:
@@ -499,7 +499,7 @@ class Link:
             except RemoteProtocolError:  # what is wrong will show where it matters
                 self._version_list = self._start, None
         text = None if self._version_list is None else self._version_list[1]
-        return Firmware() if text is None else Firmware.of_list(text)
+        return FirmwareVersions() if text is None else FirmwareVersions.of_list(text)
 
     def _check_version(self, command: Command[Response]) -> Steps[None]:
         """Raise `OldFirmwareError` for a command that the module's firmware does not know.

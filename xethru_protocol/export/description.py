@@ -17,7 +17,7 @@ EnumType = type[IntEnum]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Field:
+class PayloadField:
     """One field of a payload.
 
     ``type`` is a key of `SIZES`, or ``cases`` if the field ``on`` decides what follows. ``count``
@@ -35,17 +35,17 @@ class Field:
     skip: int = 0
     enum: EnumType | None = None
     on: str = ""
-    cases: tuple[tuple[int, tuple["Field", ...]], ...] = ()
+    cases: tuple[tuple[int, tuple["PayloadField", ...]], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class PayloadLayout:
     """One message: the byte strings that its payload may begin with, then its fields."""
 
     name: str
     from_host: bool
     prefixes: tuple[bytes, ...]
-    fields: tuple[Field, ...]
+    fields: tuple[PayloadField, ...]
     replies: tuple[str, ...]
     text: str  # the first sentence about it
 
@@ -56,12 +56,12 @@ class Layout:
         return "_".join((*words, "command") if self.name == "HIL" and self.from_host else words)
 
 
-def layouts() -> tuple[Layout, ...]:
+def layouts() -> tuple[PayloadLayout, ...]:
     """Return all messages, in the order of the table."""
     return tuple(_layout(cls, row) for cls, row in ROWS.items())
 
 
-def _layout(cls: type[Message], row: Row) -> Layout:
+def _layout(cls: type[Message], row: Row) -> PayloadLayout:
     kinds = row.kinds
     prefixes: tuple[bytes, ...] = (row.prefix,)
     if kinds and isinstance(kinds[0][1], fields.Spelling):
@@ -69,7 +69,7 @@ def _layout(cls: type[Message], row: Row) -> Layout:
         kinds = kinds[1:]
     labels = {name: getattr(kind, "label", "") or name for name, kind in kinds}
     found = (field for name, kind in kinds for field in _fields(name, kind, labels))
-    return Layout(
+    return PayloadLayout(
         name=row.name,
         from_host=issubclass(cls, Command),
         prefixes=prefixes,
@@ -79,54 +79,54 @@ def _layout(cls: type[Message], row: Row) -> Layout:
     )
 
 
-def _fields(name: str, kind: fields.Kind, labels: dict[str, str]) -> Iterator[Field]:  # noqa: PLR0912 - one case per kind
+def _fields(name: str, kind: fields.FieldKind, labels: dict[str, str]) -> Iterator[PayloadField]:  # noqa: PLR0912 - one case per kind
     label = labels[name]
     match kind:
         case fields.Number():
             skip = kind.code.count("x")
-            yield Field(name=label, type=TYPES[kind.code[0]], skip=skip, enum=kind.enum)
+            yield PayloadField(name=label, type=TYPES[kind.code[0]], skip=skip, enum=kind.enum)
         case fields.Member():
-            yield Field(name=label, type="u4", enum=kind.enum)
+            yield PayloadField(name=label, type="u4", enum=kind.enum)
         case fields.Count():
-            yield Field(name=label, type="u4")
+            yield PayloadField(name=label, type="u4")
         case fields.OptionalByte():
-            yield Field(name=label, type="u1", beyond=0)
+            yield PayloadField(name=label, type="u1", beyond=0)
         case fields.Bins():
-            yield Field(name=label, type=DTYPES[kind.dtype], count=labels[kind.count_field])
+            yield PayloadField(name=label, type=DTYPES[kind.dtype], count=labels[kind.count_field])
         case fields.Floats():
-            yield Field(name=label, type="f4", count=labels[kind.count], per=kind.per)
+            yield PayloadField(name=label, type="f4", count=labels[kind.count], per=kind.per)
         case fields.Block():
-            yield Field(name=label, type="bytes", count=labels[kind.count])
+            yield PayloadField(name=label, type="bytes", count=labels[kind.count])
         case fields.Text():
-            yield Field(name=label, type="text", count=labels[kind.count])
+            yield PayloadField(name=label, type="text", count=labels[kind.count])
         case fields.RestBytes():
-            yield Field(name=label, type="bytes", count="*")
+            yield PayloadField(name=label, type="bytes", count="*")
         case fields.Elements():
             yield from _elements(kind)
         case fields.TypedElements():
             lists = tuple((code, tuple(_elements(one))) for code, one in kind.types.items())
-            yield Field(name=name, type="cases", on=labels[kind.field], cases=lists)
+            yield PayloadField(name=name, type="cases", on=labels[kind.field], cases=lists)
         case fields.ByDiscriminator():
             values = tuple(
                 (code, tuple(_scalars(codes, names, code in kind.short)))
                 for code, (codes, names) in kind.layouts.items()
             )
-            yield Field(name=name, type="cases", on=labels[kind.field], cases=values)
+            yield PayloadField(name=name, type="cases", on=labels[kind.field], cases=values)
         case fields.ShortForm():
             pass
         case _:
             raise TypeError(f"{name}: {type(kind).__name__} cannot be exported")
 
 
-def _elements(kind: fields.Elements) -> Iterator[Field]:
+def _elements(kind: fields.Elements) -> Iterator[PayloadField]:
     count = kind.count_label or "count"
     trailer = kind.trailer is not None
-    yield Field(name=count, type="u4", beyond=int(trailer))
-    yield Field(name=kind.label, type=TYPES[kind.code], count=count)
+    yield PayloadField(name=count, type="u4", beyond=int(trailer))
+    yield PayloadField(name=kind.label, type=TYPES[kind.code], count=count)
     if trailer:
-        yield Field(name="trailer", type="u1", beyond=0)
+        yield PayloadField(name="trailer", type="u1", beyond=0)
 
 
-def _scalars(codes: str, names: tuple[str, ...], short: bool) -> Iterator[Field]:
+def _scalars(codes: str, names: tuple[str, ...], short: bool) -> Iterator[PayloadField]:
     for code, name in zip(codes, names, strict=True):
-        yield replace(Field(name=name, type=TYPES[code]), short=short)
+        yield replace(PayloadField(name=name, type=TYPES[code]), short=short)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
-from xethru_protocol.export.description import SIZES, Field, Layout, layouts
+from xethru_protocol.export.description import SIZES, PayloadField, PayloadLayout, layouts
 
 _HEAD = """# XeThru module protocol, written by `xethru export kaitai`.
 # The root type reads NoEscape packets of a module, one behind the other. Payloads of Normal packets
@@ -43,11 +43,11 @@ def structure() -> str:
     return _HEAD + "\n".join(_yaml(file, "")) + "\n"
 
 
-def _type(layout: Layout) -> str:
+def _type(layout: PayloadLayout) -> str:
     return f"{'command' if layout.from_host else 'response'}_{layout.id}"
 
 
-def _payload(found: Sequence[Layout]) -> dict[str, Any]:
+def _payload(found: Sequence[PayloadLayout]) -> dict[str, Any]:
     longest = max(len(prefix) for layout in found for prefix in layout.prefixes)
     return {
         "seq": [
@@ -69,7 +69,7 @@ def _condition(prefixes: Sequence[bytes]) -> str:
 
 
 def _seq(
-    fields: Sequence[Field],
+    fields: Sequence[PayloadField],
     owner: str,
     offset: int,
     types: dict[str, Any],

@@ -1,6 +1,6 @@
 """The message table as a Wireshark dissector in Lua, for pcap files of `recordings.pcap`."""
 
-from xethru_protocol.export.description import SIZES, Field, Layout, layouts
+from xethru_protocol.export.description import SIZES, PayloadField, PayloadLayout, layouts
 
 _HEAD = """\
 -- Wireshark dissector of the XeThru module protocol, written by `xethru export wireshark`.
@@ -194,12 +194,12 @@ def dissector() -> str:
     return "".join([*parts, _TAIL])
 
 
-def _all(fields: tuple[Field, ...]) -> list[Field]:
+def _all(fields: tuple[PayloadField, ...]) -> list[PayloadField]:
     inner = [one for field in fields for _, case in field.cases for one in _all(case)]
     return [field for field in fields if not field.cases] + inner
 
 
-def _declaration(layout: Layout, field: Field) -> str:
+def _declaration(layout: PayloadLayout, field: PayloadField) -> str:
     # An abbreviation has one type in Wireshark; a field whose type another decides has several.
     types = {one.type for one in _all(layout.fields) if one.name == field.name}
     end = f".{field.type}" if len(types) > 1 else ""
@@ -213,11 +213,11 @@ def _declaration(layout: Layout, field: Field) -> str:
     )
 
 
-def _list(fields: tuple[Field, ...]) -> str:
+def _list(fields: tuple[PayloadField, ...]) -> str:
     return "{" + ", ".join(map(_field, fields)) + "}"
 
 
-def _field(field: Field) -> str:
+def _field(field: PayloadField) -> str:
     if field.cases:
         cases = ", ".join(f"[{code}] = {_list(case)}" for code, case in field.cases)
         return f'{{on = "{field.on}", cases = {{{cases}}}}}'

@@ -1,8 +1,8 @@
 """The receiving side of a ModuleConnector: a thread that reads the line, and a queue per message.
 
 The vendor's library receives in a thread and keeps what comes until the script takes it; so does a
-`Connection`. Several scripts' idioms rest on that: ``while peek: read`` empties a queue, ``read``
-waits for the next message.
+`MessageQueues`. Several scripts' idioms rest on that: ``while peek: read`` empties a queue,
+``read`` waits for the next message.
 """
 
 import sys
@@ -39,7 +39,7 @@ def report(text: str) -> None:
     print(text, file=sys.stderr)  # noqa: T201
 
 
-class Source(Protocol):
+class MessageSource(Protocol):
     """Where a connection's messages come from: a module, or a recording that is played."""
 
     name: str
@@ -118,14 +118,14 @@ class ModuleSource:
             report(f"{self.name} {record.direction}: {record.summary}")
 
 
-class Connection:
+class MessageQueues:
     """Queues of what a source sent, by type of message.
 
     Every message goes to ``listeners``, too, with its arrival [ns, monotonic]; what is in
     ``on_close`` is called when the source is closed.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: MessageSource) -> None:
         self.source = source
         self.listeners: list[Taker] = []
         self.on_close: list[Callable[[], None]] = []
@@ -184,7 +184,7 @@ class Connection:
             call()
 
 
-def _weak_take(connection: Connection) -> Taker:
+def _weak_take(connection: MessageQueues) -> Taker:
     reference = weakref.WeakMethod(connection.take)
 
     def take(message: Response, arrival_ns: int) -> None:
@@ -195,7 +195,7 @@ def _weak_take(connection: Connection) -> Taker:
     return take
 
 
-OPEN: "weakref.WeakSet[Connection]" = weakref.WeakSet()
+OPEN: "weakref.WeakSet[MessageQueues]" = weakref.WeakSet()
 """Connections that were not closed yet."""
 
 

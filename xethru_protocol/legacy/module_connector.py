@@ -19,7 +19,7 @@ from xethru_protocol.driver.files import CHUNK_BYTES
 from xethru_protocol.driver.link import SLOW_TIMEOUT_S
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.legacy.connection import (
-    Connection,
+    MessageQueues,
     ModuleConnectorError,
     ModuleSource,
     close_left,
@@ -380,7 +380,7 @@ class Interface:
         self._parent = parent
 
     @property
-    def connection(self) -> Connection:
+    def connection(self) -> MessageQueues:
         return self._parent.connection
 
     @property
@@ -488,7 +488,7 @@ class ModuleConnector:
         self, device_name: "str | bytes | DataPlayer | None" = None, log_level: int = 0
     ) -> None:
         self._log_level = log_level
-        self._connection: Connection | None = None
+        self._connection: MessageQueues | None = None
         self._recorder: DataRecorder | None = None
         if device_name:
             self.open(device_name)
@@ -496,12 +496,12 @@ class ModuleConnector:
     def open(self, device: "str | bytes | DataPlayer") -> None:
         self.close()
         if isinstance(device, DataPlayer):
-            connection = Connection(PlayerSource(device))
+            connection = MessageQueues(PlayerSource(device))
         else:
             port = device.decode() if isinstance(device, bytes) else device
             close_left(port)
             try:
-                connection = Connection(ModuleSource(port, self._log_level))
+                connection = MessageQueues(ModuleSource(port, self._log_level))
             except XeThruError as error:
                 raise ModuleConnectorError(f"ModuleConnector: {error}") from None
         self._connection, self._recorder = connection, None
@@ -513,7 +513,7 @@ class ModuleConnector:
             self._close()
 
     @property
-    def connection(self) -> Connection:
+    def connection(self) -> MessageQueues:
         if self._connection is None:
             raise ModuleConnectorError("this ModuleConnector has no port: open() one")
         return self._connection

@@ -15,9 +15,9 @@ from xethru_protocol.recordings import (
     RecordingReader,
     RecordingWriter,
     Split,
+    WriterOptions,
     session_directory,
 )
-from xethru_protocol.recordings import RecordingOptions as WriterOptions
 from xethru_protocol.recordings.records import MS_NS
 from xethru_protocol.recordings.vendor.layouts import ALL_BITS, KIND_OF_MESSAGE, KIND_OF_TYPE
 from xethru_protocol.recordings.vendor.writer import new_session_id
@@ -26,23 +26,23 @@ from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.rows import Response
 
-Kind = type[Response]
+MessageType = type[Response]
 OnFile = Callable[[int, str], object]
 OnMetaFile = Callable[[str, str], object]
 
 
-def _kinds(data_types: int) -> frozenset[Kind]:
+def _kinds(data_types: int) -> frozenset[MessageType]:
     return frozenset(kind.message for bit, kind in KIND_OF_TYPE.items() if data_types & bit)
 
 
-def _kind(data_type: int) -> Kind:
+def _kind(data_type: int) -> MessageType:
     (kind,) = _kinds(data_type) or {None}
     if kind is None:
         raise ModuleConnectorError(f"{data_type} is not a single DataType that can be recorded")
     return kind
 
 
-def _bits(kinds: Iterable[Kind]) -> int:
+def _bits(kinds: Iterable[MessageType]) -> int:
     return sum(KIND_OF_MESSAGE[kind].data_type for kind in kinds)
 
 
@@ -131,10 +131,10 @@ class RecordingOptions:
 # --- DataRecorder -------------------------------------------------------------------------------
 
 
-class _Session:
+class _RunningRecording:
     """One recording that is being written, of some types of messages."""
 
-    def __init__(self, kinds: frozenset[Kind], writer: RecordingWriter) -> None:
+    def __init__(self, kinds: frozenset[MessageType], writer: RecordingWriter) -> None:
         self.kinds = kinds
         self.writer = writer
 
@@ -150,12 +150,12 @@ class DataRecorder:
     """
 
     def __init__(self) -> None:
-        self._sessions: list[_Session] = []
+        self._sessions: list[_RunningRecording] = []
         self._since_1970_ns = time.time_ns() - time.monotonic_ns()
         self._on_file: list[tuple[int, OnFile]] = []
         self._on_meta_file: OnMetaFile | None = None
         self._on_error: Callable[[str], object] | None = None
-        self._basenames: dict[Kind, str] = {}
+        self._basenames: dict[MessageType, str] = {}
         # a script's thread starts and stops it while another receives
         self._lock = threading.RLock()
 
@@ -208,7 +208,7 @@ class DataRecorder:
             except RecordingError as error:
                 self._fail(error)
                 return 1
-            self._sessions.append(_Session(kinds, writer))
+            self._sessions.append(_RunningRecording(kinds, writer))
         return 0
 
     def stop_recording(self, data_types: int) -> None:
@@ -229,7 +229,7 @@ class DataRecorder:
     def is_recording(self, data_type: int) -> bool:
         return self._session_of(_kind(data_type)) is not None
 
-    def _session_of(self, kind: Kind) -> _Session | None:
+    def _session_of(self, kind: MessageType) -> _RunningRecording | None:
         return next((session for session in self._sessions if kind in session.kinds), None)
 
     def process(self, data_type: int, data: Any) -> bool:
@@ -258,7 +258,7 @@ class DataRecorder:
     def set_error_callback(self, callback: Callable[[str], object] | None) -> None:
         self._on_error = callback
 
-    def _file_done(self, kind: Kind, path: Path) -> None:
+    def _file_done(self, kind: MessageType, path: Path) -> None:
         bit = KIND_OF_MESSAGE[kind].data_type
         for bits, callback in self._on_file:
             if bits & bit:
@@ -317,7 +317,7 @@ class DataRecord:
     def to_binary_packet(self, ok: object = None) -> Vector:
         return Vector(b"" if self._message is None else encode(self._message))
 
-    def _to(self, kind: Kind, name: str) -> Data:
+    def _to(self, kind: MessageType, name: str) -> Data:
         return CLASSES[name].of(self._message) if type(self._message) is kind else CLASSES[name]()
 
     def to_sleep_data(self, ok: object = None) -> Data:

@@ -220,7 +220,7 @@ class RegmapError(Exception):
         self.value = value
 
 
-class Field(NamedTuple):
+class RegisterField(NamedTuple):
     """Bits of a register."""
 
     space: str
@@ -231,7 +231,7 @@ class Field(NamedTuple):
     writable: bool
 
 
-def _fields() -> Iterator[tuple[str, Field]]:
+def _fields() -> Iterator[tuple[str, RegisterField]]:
     space, address = "", 0
     for word in _MAP.split():
         if word.startswith("["):
@@ -239,11 +239,14 @@ def _fields() -> Iterator[tuple[str, Field]]:
         elif word.isdigit():
             address = int(word)
         elif word.endswith("!"):
-            yield word[:-1], Field(space, address, 7, 0, readable=False, writable=True)
+            yield word[:-1], RegisterField(space, address, 7, 0, readable=False, writable=True)
         else:
             name, high, low = word.split(":")
             read_only = name.endswith("*")
-            yield name.rstrip("*"), Field(space, address, int(high), int(low), True, not read_only)
+            yield (
+                name.rstrip("*"),
+                RegisterField(space, address, int(high), int(low), True, not read_only),
+            )
 
 
 FIELDS: Final = dict(_fields())
@@ -290,10 +293,10 @@ class X4:
     __getitem__ = __getattr__
     __setitem__ = __setattr__
 
-    def _register(self, field: Field) -> int:
+    def _register(self, field: RegisterField) -> int:
         read = getattr(self._xep, f"x4driver_get_{field.space}_register")
         return int(read(field.address))
 
 
-def _mask(field: Field) -> int:
+def _mask(field: RegisterField) -> int:
     return (1 << field.high - field.low + 1) - 1

@@ -28,9 +28,9 @@ from xethru_protocol.recordings.records import (
 )
 from xethru_protocol.recordings.vendor.reader import Record, RecordingReader
 from xethru_protocol.recordings.vendor.writer import (
-    RecordingOptions,
     RecordingWriter,
     Split,
+    WriterOptions,
     session_directory,
 )
 from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chunks, read_note
@@ -48,7 +48,6 @@ __all__ = [
     "RecordingFacts",
     "RecordingFault",
     "RecordingFormat",
-    "RecordingOptions",
     "RecordingReader",
     "RecordingSummary",
     "RecordingWriter",
@@ -56,6 +55,7 @@ __all__ = [
     "Split",
     "TextColumn",
     "WireCapture",
+    "WriterOptions",
     "convert",
     "describe_recording",
     "load",

@@ -53,9 +53,9 @@ from xethru_protocol.validation import reason_of, shown
 
 Samples = npt.NDArray[Any]
 """In the dtype of their kind."""
-Kind = Literal["rf", "iq"]
+FrameKind = Literal["rf", "iq"]
 Settings = Mapping[str, Any]
-DTYPES: Mapping[Kind, np.dtype[Any]] = {
+DTYPES: Mapping[FrameKind, np.dtype[Any]] = {
     "rf": np.dtype(np.float32),
     "iq": np.dtype(np.complex64),
 }
@@ -89,7 +89,7 @@ class Frames:
     """
 
     about: str
-    kind: Kind | None
+    kind: FrameKind | None
     chunks: Callable[[], Iterator[Samples]]
     n_frames: int
     n_bins: int
@@ -100,7 +100,7 @@ class Frames:
     settings: Settings
 
 
-_NUMBERS: Mapping[Kind, str] = {"rf": "real numbers", "iq": "numbers"}
+_NUMBERS: Mapping[FrameKind, str] = {"rf": "real numbers", "iq": "numbers"}
 _DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, TypeError, IndexError),
     *(csv.Error, OverflowError, struct.error, MemoryError, RuntimeError),
@@ -153,7 +153,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 def _frames(
     path: Path,
-    kind: Kind,
+    kind: FrameKind,
     shape: tuple[int, ...],
     dtype: np.dtype[Any],
     *,
@@ -208,7 +208,7 @@ def _frames(
     )
 
 
-def _kind_in(names: Iterable[str]) -> Kind:
+def _kind_in(names: Iterable[str]) -> FrameKind:
     held = set(names)
     if "iq" in held:
         return "iq"
@@ -233,7 +233,7 @@ def _beside(frames: Frames) -> dict[str, npt.NDArray[Any]]:
 # --- .npz ---------------------------------------------------------------------------------------
 
 
-def _write_npz(fresh: Path, frames: Frames, kind: Kind) -> None:
+def _write_npz(fresh: Path, frames: Frames, kind: FrameKind) -> None:
     """Write the archive, a part of the samples at a time."""
     dtype = DTYPES[kind].newbyteorder("<")
     about = {
@@ -302,7 +302,7 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     return read(stream)
 
 
-def _npz_chunks(path: Path, kind: Kind) -> Iterator[Samples]:
+def _npz_chunks(path: Path, kind: FrameKind) -> Iterator[Samples]:
     with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
         with archive.zip.open(f"{kind}.npy") as stream:
             (n_frames, n_bins), in_columns, dtype = _header(stream)
@@ -334,7 +334,7 @@ def _optional_scipy() -> Iterator[None]:
         raise RecordingError(f"a .mat file needs a package that is optional; {missing}") from None
 
 
-def _write_mat(fresh: Path, frames: Frames, kind: Kind, path: Path) -> None:
+def _write_mat(fresh: Path, frames: Frames, kind: FrameKind, path: Path) -> None:
     with _optional_scipy():
         from scipy.io import savemat
 
@@ -430,7 +430,7 @@ def _read_mat(path: Path) -> Frames:
 _TITLE = re.compile(r"(rf|i|q)_(?:([-+.\deE]+)m|(\d+))")
 
 
-def _write_csv(fresh: Path, frames: Frames, kind: Kind) -> None:
+def _write_csv(fresh: Path, frames: Frames, kind: FrameKind) -> None:
     titles = [str(at) for at in range(frames.n_bins)]
     if frames.ranges_m is not None:
         titles = [f"{range_m!r}m" for range_m in frames.ranges_m.tolist()]
@@ -480,7 +480,7 @@ def _read_csv(path: Path) -> Frames:
             if found := _TITLE.fullmatch(title):
                 columns[found[1]].append(at)
                 ranges[found[1]].append(found[2])
-        kind: Kind = "rf" if columns["rf"] else "iq"
+        kind: FrameKind = "rf" if columns["rf"] else "iq"
         part = "rf" if columns["rf"] else "i"
         if not columns[part] or (kind == "iq" and ranges["i"] != ranges["q"]):
             raise ValueError(

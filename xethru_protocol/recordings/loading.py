@@ -27,8 +27,8 @@ from xethru_protocol.driver.frames import FrameGeometry, complex_of
 from xethru_protocol.driver.link import CONFIG_SETTINGS
 from xethru_protocol.recordings.array_files import (
     DTYPES,
+    FrameKind,
     Frames,
-    Kind,
     Samples,
     Settings,
     is_array_file,
@@ -111,7 +111,7 @@ class RadarArrays:
         return tuple(_of(self.name, frames, self._nothing) for frames in self._all)
 
     @property
-    def kind(self) -> Kind | None:
+    def kind(self) -> FrameKind | None:
         """``"rf"`` or ``"iq"``; None where it is not known, or there are no frames."""
         return self.frames.kind if self._all else None
 
@@ -135,7 +135,7 @@ class RadarArrays:
             ) from None
         return whole
 
-    def _of_kind(self, kind: Kind) -> Samples | None:
+    def _of_kind(self, kind: FrameKind) -> Samples | None:
         found = self.frames.kind
         if found is None:
             raise RecordingError(
@@ -353,7 +353,7 @@ class Given:
             if value is not None and not math.isfinite(value):
                 raise RecordingError(f"a range cannot be {value}")
 
-    def ranges_m(self, n_bins: int, kind: Kind | None) -> npt.NDArray[np.float64] | None:
+    def ranges_m(self, n_bins: int, kind: FrameKind | None) -> npt.NDArray[np.float64] | None:
         """Return the range of each bin, shape (n_bins,), as given; None if it is not."""
         if self.area_m is not None and kind is not None:
             return FrameGeometry.from_read_back(
@@ -368,7 +368,7 @@ def steps_m(start_m: float, bin_m: float, n_bins: int) -> npt.NDArray[np.float64
     return start_m + np.arange(n_bins, dtype=np.float64) * bin_m
 
 
-class _Layout(NamedTuple):
+class _ArrayLayout(NamedTuple):
     """What frames with a common array have in common; lengths in module metres."""
 
     message: str
@@ -378,15 +378,15 @@ class _Layout(NamedTuple):
     downconversion: bool | None  # of DATA FLOAT, by the module's answers
 
 
-class _Row(NamedTuple):
-    layout: _Layout
+class _FrameRow(NamedTuple):
+    layout: _ArrayLayout
     counter: int
     values: npt.NDArray[Any]  # of DATA FLOAT as sent, else in the dtype of its kind
     t_ns: int | None
 
 
 @dataclass(slots=True)
-class _Column:
+class _FrameColumns:
     settings: dict[str, Any]  # when the first frame came
     fps: set[float] = field(default_factory=set)
     counter: "array[int]" = field(default_factory=lambda: array("I"))
@@ -410,20 +410,22 @@ class _Messages:
 
     def find(self, on_fault: FaultHandler) -> list[Frames]:
         """Read the recording once for what describes its frames."""
-        columns: dict[_Layout, _Column] = {}
+        columns: dict[_ArrayLayout, _FrameColumns] = {}
         layouts = FrameLayouts(self._given.downconversion)
         for row in self._rows(on_fault, layouts):
             column = columns.get(row.layout)
             if column is None:
-                column = columns[row.layout] = _Column(dict(self._settings))
+                column = columns[row.layout] = _FrameColumns(dict(self._settings))
             column.fps.add(self._settings.get(X4Setting.FPS.name, 0.0))
             column.counter.append(row.counter)
             column.t_ns.append(NO_TIME_NS if row.t_ns is None else row.t_ns)
         found = layouts.layouts()
         return [self._frames(layout, column, found) for layout, column in columns.items()]
 
-    def _frames(self, layout: _Layout, column: _Column, found: Mapping[int, FrameLayout]) -> Frames:
-        kind: Kind | None = "rf" if layout.message.startswith("RADAR_RF") else "iq"
+    def _frames(
+        self, layout: _ArrayLayout, column: _FrameColumns, found: Mapping[int, FrameLayout]
+    ) -> Frames:
+        kind: FrameKind | None = "rf" if layout.message.startswith("RADAR_RF") else "iq"
         n_bins = layout.n_values
         if layout.message == _RAW:
             downconversion = found[n_bins].downconversion
@@ -456,7 +458,7 @@ class _Messages:
             settings=settings,
         )
 
-    def _chunks(self, layout: _Layout, kind: Kind | None) -> Iterator[Samples]:
+    def _chunks(self, layout: _ArrayLayout, kind: FrameKind | None) -> Iterator[Samples]:
         for row in self._rows(lambda fault: None):
             if row.layout == layout:
                 values = row.values
@@ -464,7 +466,9 @@ class _Messages:
                     values = complex_of(*np.split(values, 2))
                 yield values[np.newaxis]
 
-    def _rows(self, on_fault: FaultHandler, layouts: FrameLayouts | None = None) -> Iterator[_Row]:
+    def _rows(
+        self, on_fault: FaultHandler, layouts: FrameLayouts | None = None
+    ) -> Iterator[_FrameRow]:
         geometries = FrameGeometries()
         self._settings = _settings_of(self._info)
         for message, t_ns in read_recording(self._path, on_fault, radar=self._radar):
@@ -474,7 +478,7 @@ class _Messages:
                 case DataFloat(content_id=0):
                     yield self._raw(message, geometries.of(message), t_ns)
                 case BasebandIq() | BasebandAp() | RadarMessage():
-                    layout = _Layout(
+                    layout = _ArrayLayout(
                         message_name(message),
                         message.num_bins,
                         message.range_offset_m,
@@ -483,21 +487,23 @@ class _Messages:
                     )
                     if isinstance(message, RadarMessage):
                         self._settings[X4Setting.FPS.name] = float(message.frames_per_s)
-                    yield _Row(layout, message.counter, _samples(message), t_ns)
+                    yield _FrameRow(layout, message.counter, _samples(message), t_ns)
                 case ReplyByte() | ReplyInt() | ReplyFloat():
                     geometries.take(message)
                     self._take_setting(message)
 
-    def _raw(self, message: DataFloat, geometry: FrameGeometry | None, t_ns: int | None) -> _Row:
+    def _raw(
+        self, message: DataFloat, geometry: FrameGeometry | None, t_ns: int | None
+    ) -> _FrameRow:
         n_values = len(message.values)
-        layout = _Layout(_RAW, n_values, None, None, None)
+        layout = _ArrayLayout(_RAW, n_values, None, None, None)
         if geometry is not None:
             start_m, bin_m = geometry.range_start_m, geometry.bin_length_m
-            layout = _Layout(_RAW, n_values, start_m, bin_m, geometry.downconversion)
+            layout = _ArrayLayout(_RAW, n_values, start_m, bin_m, geometry.downconversion)
         elif (n_bins := self._info.get("n_bins")) in (n_values, n_values / 2):
             described = self._info.get("range_start_m"), self._info.get("bin_length_m")
-            layout = _Layout(_RAW, n_values, *described, n_bins != n_values)
-        return _Row(layout, message.info, message.values, t_ns)
+            layout = _ArrayLayout(_RAW, n_values, *described, n_bins != n_values)
+        return _FrameRow(layout, message.info, message.values, t_ns)
 
     def _take_setting(self, message: ReplyByte | ReplyInt | ReplyFloat) -> None:
         if message.content_id in _SETTINGS and message.values:

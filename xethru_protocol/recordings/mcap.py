@@ -190,7 +190,7 @@ DAMAGES = (struct.error, ValueError, RuntimeError, KeyError, zstandard.ZstdError
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class LocatedRecord:
     """One record; ``at`` is where in the file it begins, or the chunk that it is in."""
 
     at: int
@@ -238,7 +238,7 @@ class Damage:
     reason: str
 
 
-Found: TypeAlias = Record | Cut | Damage
+Found: TypeAlias = LocatedRecord | Cut | Damage
 
 
 class RecordReader:
@@ -289,7 +289,7 @@ class RecordReader:
                 if code == CHUNK:
                     yield from _records_in(at, _content(body))
                 else:
-                    record = Record(at, code, body)
+                    record = LocatedRecord(at, code, body)
                     self._check(record)
                     yield record
             except DAMAGES as error:
@@ -303,7 +303,7 @@ class RecordReader:
     def _damage(self, at: int, until: int | None, reason: str) -> Damage:
         return Damage(at, self._size if until is None else until, reason)
 
-    def _check(self, record: Record) -> None:
+    def _check(self, record: LocatedRecord) -> None:
         """Raise ValueError where a record does not fit its opcode.
 
         One flipped bit there would hide a chunk, or end the file.
@@ -438,7 +438,7 @@ def _unpacked(name: str, packed: bytes, size: int) -> bytes:
     raise ValueError(f"chunks compressed with {shown(name)} are not read here")
 
 
-def _records_in(at: int, content: bytes) -> Iterator[Record]:
+def _records_in(at: int, content: bytes) -> Iterator[LocatedRecord]:
     """Yield the records of a chunk, up to where it was cut; ValueError for others than it may hold.
 
     Zeros are such: a few kilobytes may unpack to hundreds of megabytes of them.
@@ -451,7 +451,7 @@ def _records_in(at: int, content: bytes) -> Iterator[Record]:
             raise ValueError(f"a chunk cannot hold a record of kind {code}")
         if here + length > len(content):
             return  # the chunk was cut here
-        yield Record(at, code, content[here : here + length], is_in_chunk=True)
+        yield LocatedRecord(at, code, content[here : here + length], is_in_chunk=True)
         here += length
 
 
@@ -473,7 +473,7 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
+class McapMessage:
     """A message as stored; times in ns."""
 
     channel: Channel
@@ -487,7 +487,7 @@ class Message:
         return self.channel.topic
 
 
-Entry: TypeAlias = Metadata | Channel | Message
+Entry: TypeAlias = Metadata | Channel | McapMessage
 
 
 def read_entries(
@@ -501,7 +501,7 @@ def read_entries(
     schemas: dict[int, str] = {}
     channels = {} if channels is None else channels
     for found in RecordReader(stream, size).read():
-        if not isinstance(found, Record):
+        if not isinstance(found, LocatedRecord):
             yield found
             continue
         if found.code == _DATA_END:
@@ -515,10 +515,12 @@ def read_entries(
             yield entry
 
 
-def _entry(record: Record, schemas: dict[int, str], channels: dict[int, Channel]) -> Entry | None:
+def _entry(
+    record: LocatedRecord, schemas: dict[int, str], channels: dict[int, Channel]
+) -> Entry | None:
     if record.code == MESSAGE:
         number, sequence, t_ns, publish_ns = MESSAGE_HEAD.unpack_from(record.body)
-        return Message(
+        return McapMessage(
             channel=channels[number],
             sequence=sequence,
             t_ns=t_ns,
@@ -687,7 +689,8 @@ def end_time_of(stream: BinaryIO, size: int) -> int | None:
         if code == _STATISTICS and length <= size - at:
             with suppress(ValueError):
                 if isinstance(
-                    found := Record(at, code, stream.read(length)).content(), records.Statistics
+                    found := LocatedRecord(at, code, stream.read(length)).content(),
+                    records.Statistics,
                 ):
                     return found.message_end_time
             return None
@@ -878,12 +881,12 @@ def mcap_content(path: Path) -> RecordingContent:
         name, part = _radar_topic(entry.topic)
         if entry.topic.startswith(TEXT_TOPIC):
             lines = texts.setdefault(entry.topic.removeprefix(TEXT_TOPIC), [])
-            if isinstance(entry, Message):
+            if isinstance(entry, McapMessage):
                 with suppress(ValueError, struct.error):
                     lines.append((entry.t_ns, unpack_string(entry.data)))
         elif isinstance(entry, Channel) and part in _CONTENT:
             radars.setdefault(name, {})
-        elif isinstance(entry, Message) and part == "info":
+        elif isinstance(entry, McapMessage) and part == "info":
             with suppress(ValueError, RecursionError, struct.error):
                 info = json.loads(unpack_string(entry.data))
                 infos[name] = info if isinstance(info, dict) else {}
@@ -905,7 +908,7 @@ def mcap_facts(path: Path) -> RecordingFacts:
                 raise RecordingError(
                     f"{path}: what it says about itself: {reason_of(error)}"
                 ) from None
-        if isinstance(entry, Message):
+        if isinstance(entry, McapMessage):
             break
     return RecordingFacts()
 

@@ -11,8 +11,8 @@ from xethru_protocol.recordings.formats import optional_packages
 from xethru_protocol.recordings.records import GrowingFile, RecordingError
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE
 from xethru_protocol.recordings.vendor.writer import (
-    RecordingOptions,
     RecordingWriter,
+    WriterOptions,
     new_session_id,
     session_directory,
 )
@@ -80,7 +80,7 @@ class Recorder:
         kinds: Iterable[type[Response]] | None = None,
         on_error: Callable[[RecordingError], None] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
-        **options: Unpack[RecordingOptions],
+        **options: Unpack[WriterOptions],
     ) -> None:
         self.directory: Path | None = None
         self.messages = 0

@@ -28,7 +28,7 @@ INT16 = np.dtype("<i2")
 Fields = Mapping[str, Any]
 
 
-class Kind(Protocol):
+class FieldKind(Protocol):
     """One way to put a field on the wire."""
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:

@@ -386,7 +386,7 @@ class TerminatorFinder:
     def __init__(self) -> None:
         self._found: list[int] = []  # ascending
         self._next = 0  # index in it of the first behind the last start
-        self.window = _Window(b"", 0, 0, 0)  # where they were found, unless there is only one
+        self.window = _MarkedBytes(b"", 0, 0, 0)  # where they were found, unless there is only one
         self.searched = 0
 
     def after(
@@ -418,7 +418,7 @@ class TerminatorFinder:
                 if stop == len(buffer):
                     return -1
             size = _WINDOW_DAMAGED if damaged else _WINDOW
-            self.window = window = _Window(buffer, base, at, size)
+            self.window = window = _MarkedBytes(buffer, base, at, size)
             self._found, self._next, self.searched = window.found, 0, window.end
 
     def follower(self, start: int) -> tuple[bytes, int] | None:
@@ -461,7 +461,7 @@ def _without(raw: Bytes, drop: Places) -> bytes:
     return raw[keep].tobytes()
 
 
-class _Window:
+class _MarkedBytes:
     """Bytes whose terminators were marked together; the first of them is not escaped.
 
     ``found`` are the offsets of the terminators, ``end`` is that of the first byte behind the

@@ -64,7 +64,7 @@ class Row:
 
     name: str
     prefix: bytes
-    kinds: tuple[tuple[str, fields.Kind], ...]  # in the order of the wire
+    kinds: tuple[tuple[str, fields.FieldKind], ...]  # in the order of the wire
     fields: tuple[str, ...]  # those of them that are fields of the message
     wire_only: frozenset[str]  # the others
     bulk: bool  # a real module sends it in NoEscape framing

@@ -47,25 +47,25 @@ def version_key(text: str) -> Key | None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Firmware:
+class FirmwareVersions:
     """Versions of what runs on a module; None for what it lacks or does not report."""
 
     sensor: str | None = None
     xep: str | None = None
 
     @classmethod
-    def of_list(cls, version_list: str) -> "Firmware":
+    def of_list(cls, version_list: str) -> "FirmwareVersions":
         """Return what a module's version list (SYSTEM_GET_INFO 07) says. Protocol reference 4.10.
 
-        >>> Firmware.of_list("Annapurna:1.6.8;XEP:3.4.8;X4C51:2.1.0;DSP:1.0.0")
-        Firmware(sensor='1.6.8', xep='3.4.8')
-        >>> Firmware.of_list("XEP:3.4.8;X4C51:2.1.0")
-        Firmware(sensor=None, xep='3.4.8')
+        >>> FirmwareVersions.of_list("Annapurna:1.6.8;XEP:3.4.8;X4C51:2.1.0;DSP:1.0.0")
+        FirmwareVersions(sensor='1.6.8', xep='3.4.8')
+        >>> FirmwareVersions.of_list("XEP:3.4.8;X4C51:2.1.0")
+        FirmwareVersions(sensor=None, xep='3.4.8')
 
         An application of somebody else on XEP has versions of its own, which say nothing here:
 
-        >>> Firmware.of_list("Lidar:0.1.0;XEP:3.4.8")
-        Firmware(sensor=None, xep='3.4.8')
+        >>> FirmwareVersions.of_list("Lidar:0.1.0;XEP:3.4.8")
+        FirmwareVersions(sensor=None, xep='3.4.8')
         """
         words = re.split("[;:]", version_list)
         versions = dict(zip(words[::2], words[1::2], strict=False))
@@ -111,7 +111,7 @@ class Difference:
     commands: dict[type[m.Message], Concerns] | None = None
     is_fault: bool = False
 
-    def is_in(self, firmware: Firmware) -> bool:
+    def is_in(self, firmware: FirmwareVersions) -> bool:
         """Whether a module has it as today; assumed of a text that is not a version."""
         for since, has in ((self.sensor, firmware.sensor), (self.xep, firmware.xep)):
             oldest = None if since is None else version_key(since)
@@ -320,7 +320,7 @@ def needed_by(command: m.Message) -> tuple[Difference, ...]:
     return tuple(row for row in rows if row.commands and row.commands[type(command)](command))
 
 
-def lacking(firmware: Firmware) -> tuple[Difference, ...]:
+def lacking(firmware: FirmwareVersions) -> tuple[Difference, ...]:
     """Return the rows that are not as today in a version."""
     return tuple(row for row in DIFFERENCES if not row.is_in(firmware))
 
@@ -348,7 +348,7 @@ FIRMWARE_NAMES = (
 )
 
 
-def firmware_named(name: str) -> Firmware:
+def firmware_named(name: str) -> FirmwareVersions:
     """Return the firmware of a name: ``sensor``, ``xep``, or one of them, a hyphen and a version.
 
     Without version it is the newest. Raises `ValueError`, which lists the known versions.
@@ -363,6 +363,6 @@ def firmware_named(name: str) -> Firmware:
         )
     line, _, version = name.partition("-")
     if line == _BASE.lower():
-        return Firmware(xep=version or XEP_VERSIONS[-1])
+        return FirmwareVersions(xep=version or XEP_VERSIONS[-1])
     sensor = version or [*SENSOR_VERSIONS][-1]
-    return Firmware(sensor=sensor, xep=SENSOR_VERSIONS[sensor])
+    return FirmwareVersions(sensor=sensor, xep=SENSOR_VERSIONS[sensor])

@@ -38,11 +38,11 @@ class _Burst(Parameters):
     flip: float = Field(0.3, gt=0, le=1, description="chance per bit within it")
 
 
-class _Gap(Parameters):
+class _WriteGap(Parameters):
     gap_us: float = Field(0.0, ge=0, le=100_000, description="pause between writes, us")
 
 
-class _Split(_Gap):
+class _WriteSize(_WriteGap):
     bytes: int = Field(4095, ge=1, le=65_536, description="bytes per write")
 
 
@@ -147,14 +147,14 @@ def seven_bits(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> P
     return None if left == data else [Piece(left)]
 
 
-@of_packet("nothing", _Split, hidden=_SAME_BYTES)
-def split_writes(data: bytes, wanted: _Split, rng: Rng, context: Context) -> Pieces:
+@of_packet("nothing", _WriteSize, hidden=_SAME_BYTES)
+def split_writes(data: bytes, wanted: _WriteSize, rng: Rng, context: Context) -> Pieces:
     """A packet comes in several writes."""
     return _cut(data, wanted.bytes, wanted.gap_us)
 
 
-@of_packet("nothing", _Gap, hidden=_SAME_BYTES)
-def one_byte_writes(data: bytes, wanted: _Gap, rng: Rng, context: Context) -> Pieces:
+@of_packet("nothing", _WriteGap, hidden=_SAME_BYTES)
+def one_byte_writes(data: bytes, wanted: _WriteGap, rng: Rng, context: Context) -> Pieces:
     """A packet comes byte by byte."""
     return _cut(data, 1, wanted.gap_us)
 

@@ -38,7 +38,7 @@ class _Code(Parameters):
     code: int = Field(1, ge=0, le=2**32 - 1, description="error code of the answer")
 
 
-class _SystemCode(Parameters):
+class _SentSystemCode(Parameters):
     code: int = Field(
         SystemCode.XTS_SPRS_BOOTING.value, ge=0, le=2**32 - 1, description="SYSTEM code"
     )
@@ -51,7 +51,7 @@ class _Slow(Parameters):
     )
 
 
-class _Step(Parameters):
+class _RoundingStep(Parameters):
     step: float = Field(0.25, gt=0, le=10, description="step to which values are cut")
 
 
@@ -114,8 +114,8 @@ def wrong_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -
     return [Piece(encode_normal(payload[:2] + struct.pack("<I", content_id) + payload[6:]))]
 
 
-@of_packet("BOOTING: 1 reboot", _SystemCode)
-def system_message(packet: bytes, wanted: _SystemCode, rng: Rng, context: Context) -> Pieces:
+@of_packet("BOOTING: 1 reboot", _SentSystemCode)
+def system_message(packet: bytes, wanted: _SentSystemCode, rng: Rng, context: Context) -> Pieces:
     """A SYSTEM message comes in mid-session."""
     return [Piece(response_bytes(System(code=wanted.code)) + packet)]
 
@@ -138,8 +138,10 @@ def ack_then_ignore(
     return Handling(to_host=(Piece(response_bytes(Ack())),))
 
 
-@of_command("1 RemoteProtocolError or warning where it is read back", _Step)
-def ack_quantised(packet: bytes, wanted: _Step, rng: Rng, context: Context) -> Handling | None:
+@of_command("1 RemoteProtocolError or warning where it is read back", _RoundingStep)
+def ack_quantised(
+    packet: bytes, wanted: _RoundingStep, rng: Rng, context: Context
+) -> Handling | None:
     """The module acknowledges an X4 setting and sets it to a step of its own."""
     command = context.command
     if not isinstance(command, X4DriverSet):

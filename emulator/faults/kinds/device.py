@@ -65,7 +65,7 @@ class _Serial(Parameters):
     serial: SerialNumber = Field("000000000001", description="serial number that it reports")
 
 
-class _Profile(Parameters):
+class _ReportedProfile(Parameters):
     profile: int = Field(0, ge=0, le=2**31 - 1, description="profile id that it reports")
 
 
@@ -90,7 +90,7 @@ class _Poll(Parameters):
     period_ms: float = Field(16.0, gt=0, le=1000, description="from poll to poll, ms")
 
 
-class _Silence(Parameters):
+class _SilenceLength(Parameters):
     seconds: float = Field(0.0, ge=0, le=86_400, description="how long, s; 0: for ever")
 
 
@@ -141,8 +141,8 @@ def safe_mode(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> 
     return [Piece(response_bytes(Pong(value=PongCode.XTS_SPRP_SAFEMODE)))]
 
 
-@of_reply("another profile id", _Profile, lasting=True)
-def wrong_profile(packet: bytes, wanted: _Profile, rng: Rng, context: Context) -> Pieces:
+@of_reply("another profile id", _ReportedProfile, lasting=True)
+def wrong_profile(packet: bytes, wanted: _ReportedProfile, rng: Rng, context: Context) -> Pieces:
     """The module reports another profile than the one that is loaded, from now on."""
     if not isinstance(context.command, GetProfileId):
         return None
@@ -219,10 +219,10 @@ def usb_latency(packet: bytes, wanted: _Poll, rng: Rng, context: Context) -> Pie
 
 @of_time(
     "ResponseTimeout where something was waited for; afterwards the frames lost meanwhile",
-    _Silence,
+    _SilenceLength,
     lasting=True,
 )
-def silent(packet: bytes, wanted: _Silence, rng: Rng, context: Context) -> Pieces:
+def silent(packet: bytes, wanted: _SilenceLength, rng: Rng, context: Context) -> Pieces:
     """Nothing comes from the module, though its port is there."""
     end_ns = context.since_ns + round(wanted.seconds * _NS_PER_S)
     return [] if not wanted.seconds or context.now_ns < end_ns else [Piece(packet)]

@@ -44,7 +44,7 @@ _UNKNOWN_CONTENT = struct.pack("<BI", 0x50, 0x0DDBA11)
 _LOST_REPLY = "ResponseTimeout where a reply was waited for"
 
 
-class _Cut(Parameters):
+class _BytesSent(Parameters):
     keep: int = Field(3, ge=1, le=65_535, description="bytes that are sent")
 
 
@@ -52,7 +52,7 @@ class _Samples(Parameters):
     samples: int = Field(1, ge=1, le=1536, description="how many samples")
 
 
-class _Bins(Parameters):
+class _MoreBins(Parameters):
     more: int = Field(-1, ge=-1536, le=1536, description="bins more than asked for")
 
 
@@ -141,8 +141,8 @@ def early_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> 
     return _changed(packet, packet[:2] + bytes((END,)) + packet[2:])
 
 
-@of_reply(f"1 fault at the next packet; {_LOST_REPLY}", _Cut)
-def truncated_reply(packet: bytes, wanted: _Cut, rng: Rng, context: Context) -> Pieces:
+@of_reply(f"1 fault at the next packet; {_LOST_REPLY}", _BytesSent)
+def truncated_reply(packet: bytes, wanted: _BytesSent, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a reply are sent."""
     return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
 
@@ -199,8 +199,8 @@ def cancelling_flips(packet: bytes, wanted: Parameters, rng: Rng, context: Conte
     return [Piece(encode_normal(bytes(changed)))]
 
 
-@of_frame("1 frame lost, 1 fault; the next frame's first bytes are taken for samples", _Cut)
-def truncated_frame(packet: bytes, wanted: _Cut, rng: Rng, context: Context) -> Pieces:
+@of_frame("1 frame lost, 1 fault; the next frame's first bytes are taken for samples", _BytesSent)
+def truncated_frame(packet: bytes, wanted: _BytesSent, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a radar frame are sent."""
     return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
 
@@ -261,8 +261,8 @@ def in_range_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context
     )
 
 
-@of_frame("1 frame discarded, 1 frame lost", _Bins)
-def wrong_bin_count(packet: bytes, wanted: _Bins, rng: Rng, context: Context) -> Pieces:
+@of_frame("1 frame discarded, 1 frame lost", _MoreBins)
+def wrong_bin_count(packet: bytes, wanted: _MoreBins, rng: Rng, context: Context) -> Pieces:
     """A frame has another number of bins than the settings make."""
 
     def resized(samples: RfSamples) -> RfSamples | None:

@@ -34,7 +34,7 @@ _WRAP = 1 << 32
 _CYCLES_PER_BIN = 7.29 / 23.328  # carrier of the pulse over the sampling rate, Hz / Hz
 
 
-class _Frames(Parameters):
+class _FrameCount(Parameters):
     frames: int = Field(1, ge=1, le=2**31 - 2, description="how many frames")
 
 
@@ -50,7 +50,7 @@ class _Seconds(Parameters):
     seconds: float = Field(1.5, gt=0, le=86_400, description="how long, s")
 
 
-class _Level(Parameters):
+class _ClippingLevel(Parameters):
     level: float = Field(
         0.5, gt=0, lt=1, description="part of the frame's largest amplitude that is left"
     )
@@ -109,28 +109,28 @@ def _distorted(
     return changed_frame(packet, lambda samples: lattice.nearest(distort(samples)))
 
 
-@of_frame("frames_lost += frames", _Frames, lasting=True)
-def counter_jump(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
+@of_frame("frames_lost += frames", _FrameCount, lasting=True)
+def counter_jump(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps ahead, and goes on from there."""
     return _renumbered(packet, lambda counter: counter + wanted.frames * context.firings)
 
 
-@of_frame("nothing; the counters of the frames show it", _Frames, lasting=True, hidden=_BACK)
-def counter_back(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
+@of_frame("nothing; the counters of the frames show it", _FrameCount, lasting=True, hidden=_BACK)
+def counter_back(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps back, and goes on from there."""
     return _renumbered(packet, lambda counter: counter - wanted.frames * context.firings)
 
 
-@of_frame("nothing; a wrap is not a loss", _Frames, lasting=True, hidden=_BACK)
-def counter_wrap(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
+@of_frame("nothing; a wrap is not a loss", _FrameCount, lasting=True, hidden=_BACK)
+def counter_wrap(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """The frame counter goes on shortly before 2**32, and wraps after some frames."""
     return _renumbered(
         packet, lambda counter: _WRAP - wanted.frames + _since_first(counter, context)
     )
 
 
-@of_frame("nothing; the counters of the frames show it", _Frames, lasting=True, hidden=_BACK)
-def counter_reset(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
+@of_frame("nothing; the counters of the frames show it", _FrameCount, lasting=True, hidden=_BACK)
+def counter_reset(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """The frame counter begins again at 1, as after INIT."""
     return _renumbered(packet, lambda counter: FIRST_COUNTER + _since_first(counter, context))
 
@@ -145,8 +145,8 @@ def duplicate_frame(packet: bytes, wanted: _Copies, rng: Rng, context: Context) 
     return [Piece(packet)] * (1 + wanted.copies)
 
 
-@of_frame("frames_lost += frames", _Frames, lasting=True)
-def missing_frames(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
+@of_frame("frames_lost += frames", _FrameCount, lasting=True)
+def missing_frames(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """Frames are missing."""
     return [] if context.packets_since < wanted.frames else [Piece(packet)]
 
@@ -176,8 +176,8 @@ def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces
     return [Piece(packet, delay_ns=max(end_ns - context.now_ns, 0))]
 
 
-@of_frame("nothing", _Level, hidden=_CONTENT)
-def saturation(packet: bytes, wanted: _Level, rng: Rng, context: Context) -> Pieces:
+@of_frame("nothing", _ClippingLevel, hidden=_CONTENT)
+def saturation(packet: bytes, wanted: _ClippingLevel, rng: Rng, context: Context) -> Pieces:
     """The amplitudes of a frame are clipped."""
 
     def clipped(samples: RfSamples) -> RfSamples:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hil_tests.architecture.pages.markdown import table, write
 from hil_tests.paths import REPOSITORY
-from xethru_protocol.export.description import Field, Layout, layouts
+from xethru_protocol.export.description import PayloadField, PayloadLayout, layouts
 from xethru_protocol.wire import codes
 
 PAGE = REPOSITORY / "docs" / "protocol.md"
@@ -78,7 +78,7 @@ def _members(kind: type) -> Iterator[tuple[str, str]]:
         yield f"`{member.value:02X}`", f"`{member.name}`"
 
 
-def _section(layout: Layout) -> str:
+def _section(layout: PayloadLayout) -> str:
     first, *others = (f"`{prefix.hex(' ').upper()}`" for prefix in layout.prefixes)
     begins = f"{first} and {len(others)} others" if len(others) > 3 else ", ".join([first, *others])
     lines = [f"### {layout.name}\n", f"{layout.text}\n", f"Begins with {begins}."]
@@ -90,7 +90,7 @@ def _section(layout: Layout) -> str:
     return "\n".join(lines)
 
 
-def _rows(fields: tuple[Field, ...], when: str = "") -> Iterator[tuple[str, str, str]]:
+def _rows(fields: tuple[PayloadField, ...], when: str = "") -> Iterator[tuple[str, str, str]]:
     for field in fields:
         if field.cases:
             for code, case in field.cases:

@@ -19,13 +19,13 @@ from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session, read_entries
 from slam.app.session.repair import KEPT_SUFFIX, repair
 from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY, Cut
-from xethru_protocol.recordings.mcap import Message as StoredMessage
+from xethru_protocol.recordings.mcap import McapMessage as StoredMessage
 from xethru_protocol.system import StopFlag
 
 N_BINS = 32
 N_SCANS = 16
 
-Message = tuple[str, int, int, int, bytes]
+McapMessage = tuple[str, int, int, int, bytes]
 
 
 class Content(bytes):
@@ -56,7 +56,7 @@ def is_of_head(topic: str) -> bool:
     return topic in {"/session/info", "/session/gap", "/tf_static"} or topic.endswith("/info")
 
 
-def messages(path: Path) -> list[Message]:
+def messages(path: Path) -> list[McapMessage]:
     """Return what our reader finds before the file ends; an AppError where it finds damage.
 
     What describes the run is left out.
@@ -68,7 +68,7 @@ def messages(path: Path) -> list[Message]:
     ]
 
 
-def messages_by_mcap(path: Path) -> list[Message]:
+def messages_by_mcap(path: Path) -> list[McapMessage]:
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         return [

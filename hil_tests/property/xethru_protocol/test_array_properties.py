@@ -12,7 +12,12 @@ from hypothesis.extra import numpy as arrays
 
 from hil_tests.unit.xethru_protocol.recordings.messages import write_capture
 from xethru_protocol import load
-from xethru_protocol.recordings.array_files import Frames, Kind, read_array_file, write_array_file
+from xethru_protocol.recordings.array_files import (
+    FrameKind,
+    Frames,
+    read_array_file,
+    write_array_file,
+)
 from xethru_protocol.wire import messages as m
 
 # a NaN has one text: its sign and payload bits are lost in .csv
@@ -23,7 +28,7 @@ FLOATS = st.floats(width=32, allow_nan=False) | st.just(float("nan"))
 def known_frames(draw: st.DrawFn) -> tuple[Frames, npt.NDArray[np.generic]]:
     """Frames whose ranges, times and counters are known or not, and their samples."""
     n_frames, n_bins = draw(st.integers(1, 5)), draw(st.integers(1, 4))
-    kind: Kind = draw(st.sampled_from(("rf", "iq")))
+    kind: FrameKind = draw(st.sampled_from(("rf", "iq")))
     width = n_bins * (2 if kind == "iq" else 1)
     values = draw(arrays.arrays(np.float32, (n_frames, width), elements=FLOATS))
     samples = values.view(np.complex64) if kind == "iq" else values

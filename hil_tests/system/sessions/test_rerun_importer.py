@@ -22,7 +22,7 @@ from hil_tests.patience import seconds
 from hil_tests.system.sessions.test_view import HAS_LAVAPIPE
 from slam.app.view.importer import INCOMPATIBLE, main
 from slam.app.view.rerun_recording import RrdReader, ViewerClient, count_rows, rr
-from slam.app.view.viewer import ViewerProcess
+from slam.app.view.viewer import SlamViewerProcess
 from xethru_protocol.cli.live.viewer import ViewerKind
 from xethru_protocol.recordings import WireCapture, read_recording
 from xethru_protocol.wire.codes import X4Setting
@@ -276,7 +276,7 @@ def test_a_viewer_opens_a_capture_by_its_path(
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
     picture = tmp_path / "viewer.png"
-    with ViewerProcess(ViewerKind.HEADLESS, wire) as viewer:
+    with SlamViewerProcess(ViewerKind.HEADLESS, wire) as viewer:
         viewer.wait_until_ready()
         client = ViewerClient.connect(viewer.url)
         give_up = time.monotonic() + seconds(20)

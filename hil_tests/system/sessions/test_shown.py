@@ -97,14 +97,14 @@ def test_frames_without_states_go_through_slam(session: Path, tmp_path: Path) ->
 def test_progress_comes_to_the_end_that_it_names(
     session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lines: list[output.Progress] = []
-    close = output.Progress.close
+    lines: list[output.RunProgress] = []
+    close = output.RunProgress.close
 
-    def closed(line: output.Progress) -> None:
+    def closed(line: output.RunProgress) -> None:
         lines.append(line)
         close(line)
 
-    monkeypatch.setattr(output.Progress, "close", closed)
+    monkeypatch.setattr(output.RunProgress, "close", closed)
     assert main(["report", str(session), "--out", str(tmp_path / "report.html")]) == 0
     with session.open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -182,7 +182,7 @@ def test_a_full_disk_leaves_the_earlier_picture(
     # a viewer that needs no driver
     noise = np.random.default_rng(1).integers(0, 255, (300, 300, 3), dtype=np.uint8)
     Image.fromarray(noise).save(png := io.BytesIO(), format="png")
-    monkeypatch.setattr(view, "ViewerProcess", lambda _: nullcontext(_Ready()))
+    monkeypatch.setattr(view, "SlamViewerProcess", lambda _: nullcontext(_Ready()))
     monkeypatch.setattr(view, "_settled", lambda *_: png.getvalue())
     with full_disk(20_000):
         assert main(["view", str(rrd), "--screenshot", str(out)]) == 1
@@ -220,7 +220,7 @@ def test_a_viewer_that_ends_late_for_want_of_a_driver_is_named(
     fake = tmp_path / "rerun"
     fake.write_text(_ENDS_SOON.format(python=sys.executable))
     fake.chmod(0o755)
-    monkeypatch.setattr("slam.app.view.viewer.ViewerProcess.executable", lambda self: fake)
+    monkeypatch.setattr("slam.app.view.viewer.SlamViewerProcess.executable", lambda self: fake)
     picture = tmp_path / "view.png"
     assert main(["view", str(session), "--screenshot", str(picture)]) == 1
     last = capsys.readouterr().err.splitlines()[-1]

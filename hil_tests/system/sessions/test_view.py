@@ -30,7 +30,7 @@ from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording
 from slam.app.view.rerun_recording import RrdReader, count_rows, rr
-from slam.app.view.viewer import LiveView, ViewerProcess
+from slam.app.view.viewer import LiveView, SlamViewerProcess
 from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
@@ -189,7 +189,7 @@ def saving_viewer(saved: Path) -> Iterator[str]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [
-        str(ViewerProcess.executable()),
+        str(SlamViewerProcess.executable()),
         "--save",
         str(saved),
         "--bind",

@@ -7,7 +7,7 @@ import pytest
 
 from hil_tests.plugin.bench import Bench, BrokenRadarError
 from hil_tests.plugin.findings import Measure, Measurement, findings_of
-from hil_tests.plugin.radar_specs import RadarSpec, parse_specs
+from hil_tests.plugin.radar_specs import RadarArgument, parse_specs
 from hil_tests.plugin.radar_targets import InProcessTarget, TargetError
 from hil_tests.plugin.requirements import gate
 from xethru_protocol.transport import Transport
@@ -19,7 +19,7 @@ REAL = "tcp://127.0.0.1:1"
 class Stand(InProcessTarget):
     """An emulated module in the place of any radar; counts how often it is opened."""
 
-    def __init__(self, spec: RadarSpec) -> None:
+    def __init__(self, spec: RadarArgument) -> None:
         super().__init__(parse_specs(["emu"])[0])
         self.spec = spec
         self.n_opened = 0
@@ -42,7 +42,7 @@ def bench_of(*texts: str, kind: type[Stand] = Stand) -> tuple[Bench, dict[str, S
     """Return a bench, and the stands that it has reached so far."""
     reached: dict[str, Stand] = {}
 
-    def reach(spec: RadarSpec) -> Stand:
+    def reach(spec: RadarArgument) -> Stand:
         return reached.setdefault(spec.name, kind(spec))
 
     return Bench(parse_specs(texts), reach), reached
@@ -164,7 +164,7 @@ def test_a_radar_that_does_not_answer_fails_one_test_and_is_not_tried_again(
 def test_a_radar_that_cannot_be_reached_is_not_tried_again() -> None:
     tried = []
 
-    def reach(spec: RadarSpec) -> Stand:
+    def reach(spec: RadarArgument) -> Stand:
         tried.append(spec.name)
         raise TargetError("no such port")
 

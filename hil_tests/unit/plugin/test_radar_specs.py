@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.radar_specs import RadarKind, RadarSpec, SpecError, parse_specs
+from hil_tests.plugin.radar_specs import RadarArgument, RadarKind, SpecError, parse_specs
 
 
-def one(text: str) -> RadarSpec:
+def one(text: str) -> RadarArgument:
     (spec,) = parse_specs([text])
     return spec
 

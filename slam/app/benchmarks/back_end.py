@@ -11,7 +11,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fclusterdata
 from threadpoolctl import threadpool_limits
 
-from slam.app.benchmarks.data_set import Array, Observation, Run, Sensor
+from slam.app.benchmarks.data_set import Array, LandmarkMeasurement, Run, Sensor
 from slam.geometry import Mount, Rig, compose, has_moved
 from slam.robust.association import RangeScan
 from slam.robust.branches import Hypotheses
@@ -29,7 +29,7 @@ _SIGMA_M = 0.1  # of ranges without one; all have one here
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Solution:
+class BenchmarkRun:
     """What came out of a run."""
 
     causal: Array  # (n, 3): the pose of each step as it was known then
@@ -38,7 +38,7 @@ class Solution:
     seconds: float  # processor time
 
 
-def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Solution:
+def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> BenchmarkRun:
     """Run all steps through the back end; without labels it must find out what is what itself.
 
     A scan from where the last one was taken has the same errors once more and is not used; between
@@ -74,7 +74,7 @@ def solve(run: Run, sensor: Sensor, stop: StopFlag, *, with_labels: bool) -> Sol
     if solved is not None:
         poses = np.vstack([np.zeros(3), solved.poses])
         smoothed = np.array([compose(poses[i], by) for i, by in zip(scan_of, moves, strict=True)])
-    return Solution(
+    return BenchmarkRun(
         causal=np.array(causal),
         smoothed=smoothed,
         landmarks_m=back_end.state.landmarks_m[back_end.reported_rows()].copy(),
@@ -108,7 +108,7 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
     )
 
 
-def _scan(seen: Sequence[Observation], sensor: Sensor, *, with_labels: bool) -> RangeScan:
+def _scan(seen: Sequence[LandmarkMeasurement], sensor: Sensor, *, with_labels: bool) -> RangeScan:
     """Return a scan whose observations all have bearings, or none has."""
     has_bearings = any(one.bearing_rad is not None for one in seen)
     if has_bearings and not with_labels and sensor.extent_m:
@@ -125,7 +125,7 @@ def _scan(seen: Sequence[Observation], sensor: Sensor, *, with_labels: bool) -> 
     )
 
 
-def grouped(seen: Sequence[Observation], extent_m: float) -> list[Observation]:
+def grouped(seen: Sequence[LandmarkMeasurement], extent_m: float) -> list[LandmarkMeasurement]:
     """Return one observation, without a label, of each group of those with range and bearing.
 
     Those nearer to each other than the extent of a landmark are one group; it is at their mean. As
@@ -138,13 +138,13 @@ def grouped(seen: Sequence[Observation], extent_m: float) -> list[Observation]:
     group_of = np.ones(1)
     if len(seen) > 1:
         group_of = np.asarray(fclusterdata(points, extent_m, "distance", method="single"))
-    spread_m, groups = extent_m / 4.0, list[Observation]()
+    spread_m, groups = extent_m / 4.0, list[LandmarkMeasurement]()
     for group in np.unique(group_of).tolist():
         members = np.flatnonzero(group_of == group)
         x_m, y_m = points[members].mean(axis=0).tolist()
         first, range_m = seen[int(members[0])], math.hypot(x_m, y_m)
         groups.append(
-            Observation(
+            LandmarkMeasurement(
                 range_m=range_m,
                 range_sigma_m=math.hypot(first.range_sigma_m, spread_m),
                 bearing_rad=math.atan2(y_m, x_m),

@@ -22,7 +22,7 @@ _STILL_RAD = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Observation:
+class LandmarkMeasurement:
     """One landmark seen from a pose."""
 
     range_m: float
@@ -39,7 +39,7 @@ class DriveStep:
     t_ns: int
     # (3,): dx, dy [m], turn [rad] in the body frame of the step before; zero in the first step
     increment: Array
-    observations: tuple[Observation, ...] = ()
+    observations: tuple[LandmarkMeasurement, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -187,7 +187,7 @@ def steps_of(
     keys: Iterable[Hashable],
     t_ns: Iterable[int],
     increments: Iterable[Array],
-    seen: Mapping[Any, Sequence[Observation]],
+    seen: Mapping[Any, Sequence[LandmarkMeasurement]],
 ) -> tuple[DriveStep, ...]:
     """Return the steps of a drive; ``keys`` say which observations are made at the end of each."""
     return tuple(
@@ -197,7 +197,7 @@ def steps_of(
 
 
 def steps_at(
-    at_s: Array, poses: Array, seen: Mapping[float, Sequence[Observation]]
+    at_s: Array, poses: Array, seen: Mapping[float, Sequence[LandmarkMeasurement]]
 ) -> tuple[DriveStep, ...]:
     """Return the steps to poses (k, 3) at times (k,), with what is seen at exactly these times."""
     return steps_of(at_s.tolist(), nanoseconds(at_s).tolist(), increments_of(poses), seen)

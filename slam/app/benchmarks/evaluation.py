@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.app.benchmarks.back_end import Solution, solve
+from slam.app.benchmarks.back_end import BenchmarkRun, solve
 from slam.app.benchmarks.data_set import Array, DataSet, Positions, Run
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
@@ -30,7 +30,7 @@ class ScoredRun:
     run: Run
     paths: Mapping[str, Array]  # odometry, with_ids, with_ids_smoothed and so on
     ate_rmse_m: Mapping[str, float]
-    solutions: Mapping[str, Solution]  # with_ids, without_ids
+    solutions: Mapping[str, BenchmarkRun]  # with_ids, without_ids
     n_positions: int  # of the truth, that were compared
 
     def aligned_m(self, name: str) -> Array:

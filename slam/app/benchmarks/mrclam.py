@@ -24,7 +24,7 @@ import numpy as np
 
 from slam.app.benchmarks.data_set import (
     DataSet,
-    Observation,
+    LandmarkMeasurement,
     Positions,
     Run,
     Sensor,
@@ -116,7 +116,7 @@ def read_run(folder: Path, robot: str) -> Run:
         )
     )
     t_s, first_s, last_s = odometry[:, 0], float(odometry[0, 0]), float(odometry[-1, 0])
-    by_time: dict[float, list[Observation]] = defaultdict(list)
+    by_time: dict[float, list[LandmarkMeasurement]] = defaultdict(list)
     left_out = 0
     for time_s, barcode, range_m, bearing_rad in seen.tolist():
         subject = subject_of.get(int(barcode))
@@ -124,7 +124,7 @@ def read_run(folder: Path, robot: str) -> Run:
             left_out += 1
             continue
         by_time[time_s].append(
-            Observation(
+            LandmarkMeasurement(
                 range_m=range_m,
                 range_sigma_m=max(_RANGE_SHARE * range_m, _LEAST_RANGE_SIGMA_M),
                 bearing_rad=bearing_rad,

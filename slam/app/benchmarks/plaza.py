@@ -28,7 +28,7 @@ import numpy as np
 from slam.app.benchmarks.data_set import (
     Array,
     DataSet,
-    Observation,
+    LandmarkMeasurement,
     Positions,
     Run,
     Sensor,
@@ -94,7 +94,7 @@ def read_run(path: Path) -> Run:
     rows = read_rows(path, _COLUMNS)
     poses, landmarks = _defined(rows, "VERTEX_SE2"), _defined(rows, "VERTEX_XY")
     odometry: list[TableRow] = []
-    seen: dict[str, list[Observation]] = defaultdict(list)
+    seen: dict[str, list[LandmarkMeasurement]] = defaultdict(list)
     for row in rows:
         if row.kind not in _MEASURED:
             continue
@@ -153,18 +153,18 @@ def _stamp_ns(row: TableRow, word: str) -> int:
     return round(Decimal(word) * NS_PER_S)
 
 
-def _observation(row: TableRow, covariance: Array) -> Observation:
+def _observation(row: TableRow, covariance: Array) -> LandmarkMeasurement:
     label = int(row.names[2][1:])
     if row.kind == "EDGE_RANGE":
         range_m, variance = row.values
-        return Observation(range_m=range_m, range_sigma_m=math.sqrt(variance), label=label)
+        return LandmarkMeasurement(range_m=range_m, range_sigma_m=math.sqrt(variance), label=label)
     x, y, *_ = row.values
     r = math.hypot(x, y)
     if r == 0.0:
         raise row.error(f"{row.names[1]} sees {row.names[2]} where it is itself")
     G = np.array([[x / r, y / r], [-y / r**2, x / r**2]])
     range_variance, bearing_variance = np.diag(G @ covariance @ G.T).tolist()
-    return Observation(
+    return LandmarkMeasurement(
         range_m=r,
         range_sigma_m=math.sqrt(range_variance),
         bearing_rad=math.atan2(y, x),

@@ -22,7 +22,7 @@ import numpy as np
 
 from slam.app.benchmarks.data_set import (
     DataSet,
-    Observation,
+    LandmarkMeasurement,
     Positions,
     Run,
     Sensor,
@@ -79,7 +79,7 @@ def read_run(path: Path) -> Run:
     """Read NAME_Input.txt and NAME_GT.txt beside it."""
     rows = read_rows(path, _RANGES)
     odometry = [row for row in rows if row.kind == "odom2diff"]
-    seen: dict[float, list[Observation]] = defaultdict(list)
+    seen: dict[float, list[LandmarkMeasurement]] = defaultdict(list)
     for row in rows:
         if row.kind == "odom2diff":
             if row.values[4] <= 0.0:
@@ -89,7 +89,9 @@ def read_run(path: Path) -> Run:
         if variance <= 0.0 or range_m <= 0.0:
             raise row.error("range and variance must be positive")
         label, sigma_m = int(module), math.sqrt(variance)
-        seen[time_s].append(Observation(range_m=range_m, range_sigma_m=sigma_m, label=label))
+        seen[time_s].append(
+            LandmarkMeasurement(range_m=range_m, range_sigma_m=sigma_m, label=label)
+        )
     check_ascending(odometry)
     if len(odometry) < 2:
         raise AppError(f"{path}: holds {len(odometry)} lines of odom2diff, at least 2 are needed")

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from slam.app.benchmarks.data_set import (
     Array,
     DataSet,
-    Observation,
+    LandmarkMeasurement,
     Positions,
     Run,
     Sensor,
@@ -119,14 +119,14 @@ def read_data_set(folder: Path) -> DataSet:
     seen = read_table(folder / "measurements.dat", "time range bearing diameter", ascending=True)
     gps = read_table(folder / "gps.dat", "time x y", ascending=True)
     t_s, first_s, last_s = inputs[:, 0], float(inputs[0, 0]), float(inputs[-1, 0])
-    by_time: dict[float, list[Observation]] = defaultdict(list)
+    by_time: dict[float, list[LandmarkMeasurement]] = defaultdict(list)
     left_out = 0
     for time_s, range_m, bearing_rad, _ in seen.tolist():
         if not first_s <= time_s <= last_s or not 0.0 < range_m <= SENSOR.max_range_m:
             left_out += 1
             continue
         by_time[time_s].append(
-            Observation(
+            LandmarkMeasurement(
                 range_m=range_m,
                 range_sigma_m=_RANGE_SIGMA_M,
                 bearing_rad=bearing_rad - math.pi / 2,
@@ -171,7 +171,7 @@ def _read_graph(path: Path, t_s: Array, way_m: Array, truth: Positions) -> Run:
     poses.
     """
     increments: list[tuple[float, ...]] = []
-    seen: dict[int, list[Observation]] = defaultdict(list)
+    seen: dict[int, list[LandmarkMeasurement]] = defaultdict(list)
     place_of: dict[int, int] = {}  # of a pose along the drive, by its id
     last = -1
     for row in read_rows(path, _GRAPH_COLUMNS):
@@ -204,13 +204,13 @@ def _id(row: TableRow, word: str) -> int:
     return int(word)
 
 
-def _tree(row: TableRow, label: int) -> Observation:
+def _tree(row: TableRow, label: int) -> LandmarkMeasurement:
     """Return a tree as the laser sees it, from its place in the frame of the axle."""
     x_m, y_m, *_ = row.values
     if x_m == 0.0 and y_m == 0.0:
         raise row.error(f"pose {row.names[0]} sees landmark {label} where it is itself")
     x_m, y_m = x_m - _A_M, y_m - _B_M
-    return Observation(
+    return LandmarkMeasurement(
         range_m=math.hypot(x_m, y_m),
         range_sigma_m=_RANGE_SIGMA_M,
         bearing_rad=math.atan2(y_m, x_m),

@@ -55,7 +55,7 @@ _GAIN_LIMIT_DB = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Report:
+class _CalibrationReport:
     drive: Drive
     calibration: Calibration
     gains: GainEstimate
@@ -132,12 +132,12 @@ def _drive_of(session: RecordedSession, detector: MatchedFilterDetector, stop: S
     )
 
 
-def _report_of(drive: Drive, known_m: Array | None, pulses: PulseEstimator) -> _Report:
+def _report_of(drive: Drive, known_m: Array | None, pulses: PulseEstimator) -> _CalibrationReport:
     """Calibrate, and find out what the drive does not determine."""
     with threadpool_limits(limits=1):
         calibration = calibrate(drive, known_m=known_m)
         names = [mount.name for mount in drive.rig.mounts]
-        return _Report(
+        return _CalibrationReport(
             drive=drive,
             calibration=calibration,
             gains=estimate_gains(drive, calibration),
@@ -186,7 +186,7 @@ def _is_number(value: object) -> bool:
     return math.isfinite(value)
 
 
-def _rig_file(info: SessionInfo, report: _Report) -> RigFile:
+def _rig_file(info: SessionInfo, report: _CalibrationReport) -> RigFile:
     """Return the calibrated rig as a file; what the drive does not determine stays nominal."""
     is_known = report.calibration.offset_sigmas_m <= OFFSET_LIMIT_M
     radars = []
@@ -245,7 +245,9 @@ def _planted(rig: Rig, scene: Scene | None) -> Mapping[str, tuple[float, float]]
     }
 
 
-def _facts(report: _Report, planted: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+def _facts(
+    report: _CalibrationReport, planted: Mapping[str, tuple[float, float]]
+) -> dict[str, Any]:
     calibration, gains = report.calibration, report.gains
     radars = []
     for index, mount in enumerate(report.drive.rig.mounts):
@@ -292,11 +294,11 @@ def _facts(report: _Report, planted: Mapping[str, tuple[float, float]]) -> dict[
     }
 
 
-def _used(report: _Report) -> int:
+def _used(report: _CalibrationReport) -> int:
     return int(np.count_nonzero(report.calibration.landmark != UNASSIGNED))
 
 
-def _lines(report: _Report, planted: Mapping[str, tuple[float, float]]) -> Iterable[str]:
+def _lines(report: _CalibrationReport, planted: Mapping[str, tuple[float, float]]) -> Iterable[str]:
     calibration, gains = report.calibration, report.gains
     fit = "" if math.isnan(calibration.sigma_m) else f", to {1e3 * calibration.sigma_m:.2f} mm rms"
     yield (
@@ -341,7 +343,7 @@ def _lines(report: _Report, planted: Mapping[str, tuple[float, float]]) -> Itera
             yield f"remedy: {remedy}"
 
 
-def _pulse_lines(report: _Report) -> Iterable[str]:
+def _pulse_lines(report: _CalibrationReport) -> Iterable[str]:
     pulses = report.pulses
     for index, mount in enumerate(report.drive.rig.mounts):
         estimate = pulses.estimate(index)

@@ -26,7 +26,7 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.rig.sources import RigSource
-from slam.app.run.output import Progress, note
+from slam.app.run.output import RunProgress, note
 from slam.app.run.results import REPORT, RESULTS, SESSION, VIEW, finish, hold_folder, remove_earlier
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
@@ -115,7 +115,7 @@ def run_demo(
             log = SessionLog(path, info, odometry, truth_at=trajectory.poses, drawn=not lean)
             stack.callback(log.close)
             sinks: list[SessionObserver] = [
-                Progress(info, source.lost_frames, end_ns=trajectory.duration_ns),
+                RunProgress(info, source.lost_frames, end_ns=trajectory.duration_ns),
                 log,  # closed before the views: the record must not wait for them
                 *([live.observer(info)] if live is not None else []),
                 *([make_view(out / VIEW, info)] if make_view is not None else []),

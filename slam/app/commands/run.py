@@ -33,7 +33,7 @@ from slam.app.run.live_source import (
     drift_text,
     reading,
 )
-from slam.app.run.output import Progress, ResultRow, note
+from slam.app.run.output import ResultRow, RunProgress, note
 from slam.app.run.results import (
     REPORT,
     RESULTS,
@@ -169,7 +169,7 @@ def run_rig(
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [
-                Progress(info, source.lost_frames, also=lambda: _dropped_text(live)),
+                RunProgress(info, source.lost_frames, also=lambda: _dropped_text(live)),
                 requests,
             ]
             if view is not None:

@@ -27,7 +27,7 @@ from slam.app.run.results import VIEW
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
-from slam.app.view.viewer import LiveView, ViewerProcess
+from slam.app.view.viewer import LiveView, SlamViewerProcess
 from xethru_protocol.cli.live.viewer import ViewerKind
 from xethru_protocol.system import StopFlag, one_line, written_whole
 
@@ -82,7 +82,7 @@ def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -
         No graphics driver is found, the recording is not a view of a session, the viewer does not
         come to rest, or the picture cannot be written.
     """
-    with ViewerProcess(ViewerKind.HEADLESS) as process:
+    with SlamViewerProcess(ViewerKind.HEADLESS) as process:
         process.wait_until_ready(stop.check)
         try:
             picture = _settled(process, rrd, at_s, stop)
@@ -99,7 +99,7 @@ def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -
     print_text(one_line(str(out)))
 
 
-def _settled(process: ViewerProcess, rrd: Path, at_s: float | None, stop: StopFlag) -> bytes:
+def _settled(process: SlamViewerProcess, rrd: Path, at_s: float | None, stop: StopFlag) -> bytes:
     """Return the picture once two in a row are the same: all data are loaded and drawn."""
     client = ViewerClient.connect(process.url)
     client.open(str(rrd.resolve()))

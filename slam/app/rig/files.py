@@ -224,7 +224,7 @@ def _toml(header: str, values: Mapping[str, object]) -> str:
     return "\n".join([header, *(f"{key} = {json.dumps(value)}" for key, value in values.items())])
 
 
-class _Module:
+class _OpenModule:
     """A module at a port; what happens on its link is passed on once its radar's name is known."""
 
     def __init__(self, port: str, observer: RecordObserver, held: ExitStack) -> None:
@@ -294,7 +294,7 @@ def open_rig(
         unopened = []
         for port in dict.fromkeys(candidates):
             try:
-                module = _Module(port, observer, unless_it_works)
+                module = _OpenModule(port, observer, unless_it_works)
             except AppError as error:
                 if port in named:
                     raise
@@ -333,14 +333,14 @@ def are_emulated(links: Sequence[RadarLink]) -> bool:
 def _match(
     rig: RigFile,
     rig_path: str | Path,
-    modules: Sequence[_Module],
+    modules: Sequence[_OpenModule],
     *,
     named: Sequence[str],
     unopened: Sequence[str],
     note: Callable[[str], None],
 ) -> tuple[RadarLink, ...]:
     wanted = {radar.serial for radar in rig.radars}
-    by_serial: dict[str, _Module] = {}
+    by_serial: dict[str, _OpenModule] = {}
     for module in modules:
         twin = by_serial.setdefault(module.serial, module)
         if twin is not module and module.serial in wanted:
@@ -380,8 +380,8 @@ def _match(
 def _missing_text(
     rig_path: str | Path,
     missing: Sequence[RigRadar],
-    foreign: Sequence[_Module],
-    modules: Sequence[_Module],
+    foreign: Sequence[_OpenModule],
+    modules: Sequence[_OpenModule],
 ) -> str:
     named = ", ".join(f"{radar.name} (serial number {radar.serial})" for radar in missing)
     are = "radar" if len(missing) == 1 else "radars"

@@ -45,7 +45,7 @@ from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
-Event: TypeAlias = (
+SourceEvent: TypeAlias = (
     tuple[Literal["frame"], int, Frame]
     | tuple[Literal["lost", "back"], int, str]
     | tuple[Literal["link"], str, ProtocolRecord]
@@ -67,7 +67,7 @@ MOST_EVENTS = 20_000
 """At 5 frames/s of four radars half an hour of frames, 0.1 GB: no step of SLAM takes so long."""
 
 
-class Inbox(Queue[Event]):
+class Inbox(Queue[SourceEvent]):
     """What waits for the main loop, `MOST_EVENTS` at most.
 
     Attributes
@@ -80,7 +80,7 @@ class Inbox(Queue[Event]):
         super().__init__(most)
         self.n_refused = 0
 
-    def hand_over(self, event: Event, stopped: threading.Event) -> None:
+    def hand_over(self, event: SourceEvent, stopped: threading.Event) -> None:
         """Put an event, waiting for room; drop it if the reading is stopped meanwhile."""
         while not stopped.is_set():
             try:
@@ -89,7 +89,7 @@ class Inbox(Queue[Event]):
                 continue
             return
 
-    def offer(self, event: Event) -> None:
+    def offer(self, event: SourceEvent) -> None:
         """Put an event if there is room; from a driver's callback, which must not wait."""
         try:
             self.put_nowait(event)
@@ -202,7 +202,7 @@ EARLY_NS = NS_PER_S
 """So much of the newest frames is kept before the first tick."""
 
 
-class _Waiting(NamedTuple):
+class _WaitingFrame(NamedTuple):
     """A frame that waits; it came at `host_ns` since 1970, and `came_ns` by session time."""
 
     frame: RadarFrame
@@ -243,7 +243,7 @@ class TickAssembler:
     def __init__(self, n_radars: int, period_ns: int, odometry: LiveOdometry) -> None:
         self._odometry = odometry
         self._period_ns = period_ns
-        self._waiting: list[deque[_Waiting]] = [deque() for _ in range(n_radars)]
+        self._waiting: list[deque[_WaitingFrame]] = [deque() for _ in range(n_radars)]
         self._tick = 0
         self.alive = set(range(n_radars))
         self.start_ns: int | None = None
@@ -261,7 +261,7 @@ class TickAssembler:
 
         It came at `host_ns` since 1970, and `came_ns` by session time.
         """
-        self._waiting[frame.radar].append(_Waiting(frame, host_ns, came_ns))
+        self._waiting[frame.radar].append(_WaitingFrame(frame, host_ns, came_ns))
         if self.start_ns is None:
             self._forget_before(frame.t_ns - EARLY_NS)
 
@@ -323,7 +323,7 @@ class TickAssembler:
             return False
         return now_ns < needed_ns + ODOMETRY_WAIT_NS
 
-    def _scan(self, received: Sequence[_Waiting], t_ns: int, *, used: bool) -> Scan:
+    def _scan(self, received: Sequence[_WaitingFrame], t_ns: int, *, used: bool) -> Scan:
         self.n_unused += not used
         return Scan(
             counter=self._tick,
@@ -333,7 +333,7 @@ class TickAssembler:
             used=used,
         )
 
-    def _late(self, begin_ns: int, end_ns: int) -> Sequence[_Waiting]:
+    def _late(self, begin_ns: int, end_ns: int) -> Sequence[_WaitingFrame]:
         """Take the oldest frame of every radar that is too old for a tick.
 
         Too old is by more than a whole period, or by a quarter of one if a newer frame of the tick
@@ -612,7 +612,7 @@ class LiveSource:
         except Empty:
             return
 
-    def _take(self, event: Event) -> None:
+    def _take(self, event: SourceEvent) -> None:
         match event:
             case "frame", radar, frame:
                 self._take_frame(radar, frame)

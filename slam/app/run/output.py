@@ -25,7 +25,7 @@ _NO_RADARS = frozenset({"odometry", "run"})
 """Other subjects of log lines."""
 
 
-class Progress(SessionObserver):
+class RunProgress(SessionObserver):
     """Shows session time, frames/s per radar, pose error against truth, landmarks, lost frames.
 
     One line is rewritten on a terminal. A run never waits for standard error: a line is left out

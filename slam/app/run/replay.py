@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from slam.app.errors import AppError, OdometryError, UsageError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
-from slam.app.run.output import Progress, note
+from slam.app.run.output import RunProgress, note
 from slam.app.run.results import SESSION, VIEW, finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import (
     LinkLog,
@@ -150,7 +150,7 @@ def play(session: RecordedSession, sinks: Sequence[SessionObserver], stop: StopF
         The file is damaged other than by being cut, or has no state and cannot be replayed.
     """
     lost = LostFrames()
-    progress = Progress(session.info, lambda: lost.n_lost, end_ns=session.end_ns)
+    progress = RunProgress(session.info, lambda: lost.n_lost, end_ns=session.end_ns)
     if _has_state(session, stop):
         record = play_states(session, [lost, progress, *sinks], stop)
     else:
@@ -192,7 +192,7 @@ def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
     source = recorded_source(recorded, stop, comparison)
     with ExitStack() as held:
         hold_folder(out, held)
-        progress = Progress(source.info, source.lost_frames, end_ns=recorded.end_ns)
+        progress = RunProgress(source.info, source.lost_frames, end_ns=recorded.end_ns)
         record = execute(source, [comparison, progress])
         if recorded.cut_at_byte is not None:
             note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")

@@ -23,7 +23,7 @@ Newest: TypeAlias = dict[int, tuple[int, int]]
 
 
 @dataclass(slots=True, kw_only=True)
-class _Place:
+class _DamagedPlace:
     """Damage, with the last message of each channel before it and the first behind it."""
 
     at: int
@@ -32,7 +32,7 @@ class _Place:
 
 
 @dataclass(slots=True, kw_only=True)
-class _Count:
+class _MessageCount:
     """How many messages come before some place, and how many were found of each channel."""
 
     n_before: int
@@ -47,14 +47,14 @@ class GapFinder:
         self._found: dict[int, int] = {}
         self._newest: Newest = {}
         self._start_ns: int | None = None
-        self._places: list[_Place] = []
-        self._counts: list[_Count] = []
+        self._places: list[_DamagedPlace] = []
+        self._counts: list[_MessageCount] = []
         self._n_places_of_data: int | None = None
         self.n_elsewhere = 0
         """Messages that are missing where nothing is damaged; `gaps` counts them."""
 
     def damage(self, at: int) -> None:
-        self._places.append(_Place(at=at, before=dict(self._newest)))
+        self._places.append(_DamagedPlace(at=at, before=dict(self._newest)))
 
     def message(self, channel: int, sequence: int, t_ns: int) -> None:
         self._start_ns = t_ns if self._start_ns is None else self._start_ns
@@ -72,7 +72,9 @@ class GapFinder:
     def count(self, n_before: int) -> None:
         """Take the number of messages before this place, those of latched channels left out."""
         found = dict(self._found)
-        self._counts.append(_Count(n_before=n_before, found=found, n_places=len(self._places)))
+        self._counts.append(
+            _MessageCount(n_before=n_before, found=found, n_places=len(self._places))
+        )
 
     def gaps(self, topics: Mapping[int, str]) -> dict[int, Gap]:
         """Return the gaps by the bytes at which their damage begins.
@@ -81,7 +83,7 @@ class GapFinder:
         """
         return {place.at: self._gap(place, n_lost, topics) for place, n_lost in self._lossy(topics)}
 
-    def _lossy(self, topics: Mapping[int, str]) -> Iterator[tuple[_Place, int | None]]:
+    def _lossy(self, topics: Mapping[int, str]) -> Iterator[tuple[_DamagedPlace, int | None]]:
         """Yield the places that lost something, each with how many messages, if known."""
         n_lost_before = done = self.n_elsewhere = 0
         of_data = self._places[: self._n_places_of_data]
@@ -97,9 +99,9 @@ class GapFinder:
         yield from ((place, None) for place in self._merged(of_data[done:], topics))
 
     @staticmethod
-    def _merged(places: list[_Place], topics: Mapping[int, str]) -> list[_Place]:
+    def _merged(places: list[_DamagedPlace], topics: Mapping[int, str]) -> list[_DamagedPlace]:
         """Return damage with nothing between it as one place."""
-        merged: list[_Place] = []
+        merged: list[_DamagedPlace] = []
         for place in places:
             if merged and not merged[-1].behind.keys() & topics.keys():
                 merged[-1].behind = place.behind
@@ -107,7 +109,7 @@ class GapFinder:
                 merged.append(place)
         return merged
 
-    def _gap(self, place: _Place, n_lost: int | None, topics: Mapping[int, str]) -> Gap:
+    def _gap(self, place: _DamagedPlace, n_lost: int | None, topics: Mapping[int, str]) -> Gap:
         # log lines may be of any time
         of_time = {number: topic for number, topic in topics.items() if topic != "/log"}
         before = {of_time[n]: row for n, row in place.before.items() if n in of_time}

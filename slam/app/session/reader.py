@@ -48,7 +48,7 @@ from xethru_protocol.recordings.mcap import (
     Channel,
     Cut,
     Damage,
-    Message,
+    McapMessage,
     Metadata,
     end_time_of,
     is_magic,
@@ -127,7 +127,7 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
 
 def read_entries(
     path: Path, size: int | None = None, channels: dict[int, Channel] | None = None
-) -> Iterator[Metadata | Message | Cut]:
+) -> Iterator[Metadata | McapMessage | Cut]:
     """Yield metadata and messages in the order of the file, holding one chunk in memory.
 
     The last entry is a `Cut` if the file ends too early. `size` is how many bytes to read, so that
@@ -157,13 +157,13 @@ def read_entries(
         )
 
 
-def _is_first_copy(found: Metadata | Message | Cut) -> bool:
-    return isinstance(found, Message) and (found.topic, found.sequence) == (SESSION_TOPIC, 0)
+def _is_first_copy(found: Metadata | McapMessage | Cut) -> bool:
+    return isinstance(found, McapMessage) and (found.topic, found.sequence) == (SESSION_TOPIC, 0)
 
 
 def _found_in(
     path: Path, size: int | None, channels: dict[int, Channel] | None
-) -> Iterator[Metadata | Message | Cut | Damage]:
+) -> Iterator[Metadata | McapMessage | Cut | Damage]:
     with open_mcap(path, size) as (stream, n_bytes):
         try:
             for found in entries_of(stream, n_bytes, channels):
@@ -211,7 +211,7 @@ def _limits_of(radar: RadarInfo) -> tuple[float, float] | None:
     return sampler_limits(RawConfig(**dict(radar.settings)))  # type: ignore[arg-type]  # from JSON
 
 
-def _scan_end(message: Message) -> ScanEnd:
+def _scan_end(message: McapMessage) -> ScanEnd:
     values = unpack_array(DOUBLE_ARRAY, message.data)
     n_frames = int(values[0]) if len(values) else -1
     members, truth = np.split(values[1:], [2 * n_frames])
@@ -226,7 +226,7 @@ def _scan_end(message: Message) -> ScanEnd:
     )
 
 
-def _state(message: Message, step: Message | None) -> Snapshot:
+def _state(message: McapMessage, step: McapMessage | None) -> Snapshot:
     row = unpack_array(DOUBLE_ARRAY, message.data)
     state = snapshot_of(message.sequence, message.t_ns, row)
     if step is None or step.t_ns != state.t_ns:  # none was recorded, or damage took it
@@ -234,7 +234,7 @@ def _state(message: Message, step: Message | None) -> Snapshot:
     return with_step(state, unpack_array(DOUBLE_ARRAY, step.data))
 
 
-_READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
+_READERS: Mapping[str, Callable[[McapMessage], SessionRecord]] = {
     GAP_TOPIC: lambda one: read_gap(unpack_string(one.data)),
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
@@ -243,7 +243,7 @@ _READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
     "/slam/smoothed": lambda one: smoothed_of(one.t_ns, unpack_array(DOUBLE_ARRAY, one.data)),
 }
 
-_Part: TypeAlias = Literal["frame", "stream", "detections", "rx", "tx", ""]
+_TopicPart: TypeAlias = Literal["frame", "stream", "detections", "rx", "tx", ""]
 """The last word of a radar's topic."""
 
 
@@ -276,7 +276,7 @@ class RecordedSession:
         self.info = info
         self.end_ns = end_ns
         self.cut_at_byte: int | None = None
-        parts: tuple[_Part, ...] = ("frame", "stream", "detections", "rx", "tx")
+        parts: tuple[_TopicPart, ...] = ("frame", "stream", "detections", "rx", "tx")
         self._of_radars = {
             f"/radar/{radar.name}/{part}": (index, part)
             for index, radar in enumerate(info.radars)
@@ -363,11 +363,11 @@ class RecordedSession:
         except OdometryError as error:
             raise AppError(f"{self.path}: {error}") from None
 
-    def _records(self) -> Iterator[tuple[Message, SessionRecord]]:
+    def _records(self) -> Iterator[tuple[McapMessage, SessionRecord]]:
         """Yield the messages that do not repeat others, each with its content."""
         limits = list(map(_limits_of, self.info.radars))
         streams = [0] * len(self.info.radars)
-        step: Message | None = None
+        step: McapMessage | None = None
         for radar, part, entry in self._messages():
             record: SessionRecord | None = None
             with _naming(self.path, entry):
@@ -392,18 +392,18 @@ class RecordedSession:
             if record is not None:
                 yield entry, record
 
-    def _messages(self) -> Iterator[tuple[int, _Part, Message]]:
+    def _messages(self) -> Iterator[tuple[int, _TopicPart, McapMessage]]:
         """Yield the messages; of a radar's topic with its index and what the topic holds."""
         entries = read_entries(self.path, self._size, dict(self._channels))
         for entry in self._stop.each(entries):
-            if isinstance(entry, Message):
+            if isinstance(entry, McapMessage):
                 yield *self._of_radars.get(entry.topic, (-1, "")), entry
             elif isinstance(entry, Cut):
                 self.cut_at_byte = entry.at
 
 
 @contextmanager
-def _naming(path: Path, message: Message) -> Iterator[None]:
+def _naming(path: Path, message: McapMessage) -> Iterator[None]:
     try:
         yield
     except (
@@ -444,7 +444,7 @@ class _Head:
     def is_whole(self) -> bool:
         return self.has_message and set(self.names()) <= set(self.radars)
 
-    def take(self, path: Path, found: Metadata | Message) -> bool:
+    def take(self, path: Path, found: Metadata | McapMessage) -> bool:
         """Whether it is part of a head."""
         if isinstance(found, Metadata):
             if found.name == METADATA_NAME and self.table is None:
@@ -509,7 +509,7 @@ def _read_head(path: Path, size: int | None, stop: StopFlag) -> _Head:
     return head
 
 
-def _session_table(path: Path, message: Message) -> dict[str, str]:
+def _session_table(path: Path, message: McapMessage) -> dict[str, str]:
     with _naming(path, message):
         table = json.loads(unpack_string(message.data))
         if not isinstance(table, dict):
@@ -517,7 +517,7 @@ def _session_table(path: Path, message: Message) -> dict[str, str]:
         return {str(key): str(value) for key, value in table.items()}
 
 
-def _radar_info(path: Path, message: Message) -> RadarInfo:
+def _radar_info(path: Path, message: McapMessage) -> RadarInfo:
     with _naming(path, message):
         text = unpack_string(message.data)
     return read_radar_text(path, message.topic, text)

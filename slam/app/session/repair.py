@@ -91,7 +91,7 @@ class Repair:
     last_ns: int = 0
     kept: Path | None = None
 
-    def lose(self, record: mcap.Record, error: Exception) -> None:
+    def lose(self, record: mcap.LocatedRecord, error: Exception) -> None:
         """Note that a record is left out, once for all that begin in the same place."""
         if not self.damages or self.damages[-1].at != record.at:
             self.damages.append(
@@ -302,7 +302,7 @@ def _checksum(stream: BinaryIO, size: int, end: int, stop: StopFlag) -> int:
     return checksum
 
 
-def _note(survey: Repair, finder: GapFinder, path: Path, record: mcap.Record) -> None:
+def _note(survey: Repair, finder: GapFinder, path: Path, record: mcap.LocatedRecord) -> None:
     if record.code == mcap.MESSAGE:
         _note_message(survey, finder, record.body)
         return
@@ -336,7 +336,7 @@ def _note_message(survey: Repair, finder: GapFinder, body: bytes) -> None:
     finder.message(number, sequence, t_ns)
 
 
-def _define(table: dict[int, Row], record: mcap.Record, number: int, row: Row) -> None:
+def _define(table: dict[int, Row], record: mcap.LocatedRecord, number: int, row: Row) -> None:
     """Take a schema or channel; the last word has a chunk, for the index has no checksum each."""
     if record.is_in_chunk or number not in table:
         table[number] = row
@@ -368,7 +368,7 @@ def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
             stop.check()  # also while nothing is read, but much is written
             if isinstance(found, mcap.Damage) and found.at in survey.gaps:
                 copy.write_gap(survey.gaps[found.at])
-            if not isinstance(found, mcap.Record):
+            if not isinstance(found, mcap.LocatedRecord):
                 continue
             try:
                 copy.write(found)
@@ -419,7 +419,7 @@ class _Copy:
             data=mcap.pack_string(gap_json(gap)),
         )
 
-    def write(self, record: mcap.Record) -> None:
+    def write(self, record: mcap.LocatedRecord) -> None:
         if record.code == mcap.MESSAGE:
             self._message(record.body)
             return

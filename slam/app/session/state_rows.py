@@ -116,7 +116,7 @@ _REPORT = _Columns(UpdateReport, "nis", "dof", "carried", "lost")
 _N_COUNTS = 7
 
 
-class _Row:
+class _RowReader:
     """Takes a row apart from its beginning; ValueError where it is too short or too long."""
 
     def __init__(self, row: Array) -> None:
@@ -169,7 +169,7 @@ def state_row(snapshot: Snapshot) -> Array:
 
 def snapshot_of(counter: int, t_ns: int, numbers: Array) -> Snapshot:
     """Return the state that a row holds; ValueError if its length does not fit its counts."""
-    row = _Row(numbers)
+    row = _RowReader(numbers)
     n_landmarks, n_nis = row.counts(2)
     state = Snapshot(
         counter=counter,
@@ -204,7 +204,7 @@ def smoothed_of(t_ns: int, numbers: Array) -> SmoothedRun:
     ValueError
         It has no state, its length does not fit its counts, or a number is not finite.
     """
-    row = _Row(numbers)
+    row = _RowReader(numbers)
     n_states, n_landmarks = row.counts(2)
     states = row.take(n_states, 1 + POSE_SIZE + POSE_SIZE**2)
     landmarks = _landmarks(row, n_landmarks)
@@ -230,7 +230,7 @@ def _landmark_rows(of: Snapshot | SmoothedRun) -> Array:
     )
 
 
-def _landmarks(row: _Row, n_landmarks: int) -> dict[str, Any]:
+def _landmarks(row: _RowReader, n_landmarks: int) -> dict[str, Any]:
     """Return ids (n,), places (n, 2) [m] and covariances (n, 2, 2) [m^2], by their names."""
     rows = row.take(n_landmarks, 1 + LANDMARK_SIZE + LANDMARK_SIZE**2)
     return {
@@ -301,7 +301,7 @@ def with_step(state: Snapshot, numbers: Array) -> Snapshot:
     ValueError
         The row's length does not fit its counts, or it counts what is not there.
     """
-    row = _Row(numbers)
+    row = _RowReader(numbers)
     n_detections, n_fixes, n_observations, *others = row.counts(_N_COUNTS)
     n_rejected, n_continued, n_predicted, n_spans = others
     has_sigmas, has_report, next_id = row.take(3).tolist()

@@ -196,7 +196,10 @@ def known_run(
     ``offset_sigma_m``, that of each radar's unknown range offset, widens the gate.
     """
     stamps_ns = states.t_ns.astype(np.float64)
-    odometry, truth = _Track(stamps_ns, states.odometry), _Track(stamps_ns, states.truth)
+    odometry, truth = (
+        _PosesAtStates(stamps_ns, states.odometry),
+        _PosesAtStates(stamps_ns, states.truth),
+    )
     increments, ranges = [], []
     last = np.zeros(3)
     for row, (detections, sigmas_m) in enumerate(ranges_of_states.of_states):
@@ -257,7 +260,7 @@ def true_ids(
     return ids
 
 
-class _Track:
+class _PosesAtStates:
     """Poses at the states, linear in between; a turn goes the short way round."""
 
     def __init__(self, stamps_ns: Array, poses: Array) -> None:
@@ -366,10 +369,10 @@ def solve_known(
     ``rig`` and ``wheels`` are as SLAM knew them; ``offset_sigma_m`` is the standard deviation of
     each radar's unknown range offset, zero if they are calibrated. Raises AppError without GTSAM.
     """
-    return _Estimator(rig, wheels, offset_sigma_m).solve(run)
+    return _FactorGraph(rig, wheels, offset_sigma_m).solve(run)
 
 
-class _Estimator:
+class _FactorGraph:
     """The growing factor graph."""
 
     def __init__(self, rig: Rig, wheels: WheelNoise, offset_sigma_m: float) -> None:

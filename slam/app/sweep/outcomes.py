@@ -34,7 +34,7 @@ CONFIDENT_M = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Carry:
+class CarryOutcome:
     """What became of a robot that was set down elsewhere; times are from then on.
 
     ``three_seen_s`` is when a third landmark had come into view, ``found_s`` when the estimate was
@@ -69,7 +69,7 @@ def carry_of(
     down_ns: int,
     info: SessionInfo,
     rig: Rig,
-) -> Carry | None:
+) -> CarryOutcome | None:
     """Return what became of a robot set down at a session time; None if no state follows.
 
     ``lost`` is that of every state, shape (n,).
@@ -98,14 +98,14 @@ def carry_of(
         & (np.hypot(errors[:, 0], errors[:, 1]) <= FOUND_M)
         & (np.abs(wrap_angles(errors[:, 2])) <= FOUND_RAD)
     )
-    return Carry(three_seen_s=three_seen_s, found_s=_begin_s(since_s, right))
+    return CarryOutcome(three_seen_s=three_seen_s, found_s=_begin_s(since_s, right))
 
 
 def confidently_wrong(
     record: RunRecord,
     lost: NDArray[np.bool_],
     carried_ns: tuple[int, int] | None,
-    carry: Carry | None,
+    carry: CarryOutcome | None,
 ) -> float:
     """Return for which share of the states the position was confidently wrong and not lost.
 

@@ -43,7 +43,7 @@ from slam.app.session.description import settings_text
 from slam.app.sweep import CLEAN, STRESSES, SceneKeys, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.app.sweep.outcomes import (
-    Carry,
+    CarryOutcome,
     LostStates,
     carry_of,
     confidently_wrong,
@@ -72,7 +72,7 @@ LARGEST = 1e12
 NO_STOP = StopFlag()
 """Of runs that no signal stops: it is never entered."""
 
-Key = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
+RunKey = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
 """Scene, preset, settings, stress, seed."""
 
 
@@ -235,7 +235,7 @@ class Case:
     room: tuple[str, int] | None = None  # family and number of a random room
 
     @property
-    def key(self) -> Key:
+    def key(self) -> RunKey:
         return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
 
     def with_seeds(self, count: int, first: int = 0) -> list[Case]:
@@ -268,14 +268,14 @@ class SweepRun(Summary):
     lost_share: float
     lost_at_end: bool
     confidently_wrong_share: float
-    carry: Carry | None
+    carry: CarryOutcome | None
 
     @property
-    def key(self) -> Key:
+    def key(self) -> RunKey:
         return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
 
     @property
-    def group(self) -> Key:
+    def group(self) -> RunKey:
         """Key of the group of `summarise_groups` that has this run."""
         return (self.family or self.scene, *self.key[1:-1], None)
 

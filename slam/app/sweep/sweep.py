@@ -26,7 +26,7 @@ from slam.app.errors import AppError, UsageError, naming
 from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.sweep import CLEAN
 from slam.app.sweep.bound import PURPOSE, load_gtsam
-from slam.app.sweep.run import Case, Key, SweepRun, make_case, program_version, run_case
+from slam.app.sweep.run import Case, RunKey, SweepRun, make_case, program_version, run_case
 from slam.app.sweep.statistics import outcomes, summarise_groups
 from slam.app.sweep.table import (
     group_line,
@@ -118,7 +118,7 @@ def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[Swe
         known = None
     if not isinstance(known, dict):
         raise _not_a_part(path, "not what a sweep leaves unfinished")
-    runs: dict[Key, SweepRun] = {}
+    runs: dict[RunKey, SweepRun] = {}
     for number, line in enumerate(rest, start=2):
         try:
             run = _RUN_READER.validate_json(line)

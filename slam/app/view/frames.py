@@ -17,9 +17,9 @@ from slam.app.rig.echoes import envelope_db
 from slam.app.view.rerun_recording import (
     FAULT_RGB,
     RADAR_RGB,
-    Recording,
+    RerunRecording,
     Rgb,
-    Stamps,
+    RowTimes,
     arrow_column,
     part,
     rr,
@@ -62,7 +62,7 @@ _NO_DETECTION = (0.0, 0.0)
 class FrameLayer:
     """Collects frames and sends them in blocks; sends detections."""
 
-    def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
+    def __init__(self, recording: RerunRecording, radars: Sequence[RadarInfo]) -> None:
         self._recording = recording
         self._radars = tuple(radars)
         self._blocks = [_FrameBlock(entity=f"radar/{part(radar.name)}") for radar in radars]
@@ -92,7 +92,7 @@ class FrameLayer:
             if block.frames and block.stamps.t_ns[0] <= t_ns:
                 self._send_frames(block)
 
-    def send_detections(self, snapshots: Sequence[Snapshot], stamps: Stamps) -> None:
+    def send_detections(self, snapshots: Sequence[Snapshot], stamps: RowTimes) -> None:
         """Send the detections of some states."""
         known = [row for row, snapshot in enumerate(snapshots) if snapshot.step is not None]
         steps = [step for snapshot in snapshots if (step := snapshot.step) is not None]
@@ -142,7 +142,7 @@ class FrameLayer:
             ends_m=(ends_m[0], ends_m[1]),
             brightest=255.0,
         )
-        block.stamps, block.frames = Stamps(), []
+        block.stamps, block.frames = RowTimes(), []
 
 
 @dataclass(slots=True, kw_only=True)
@@ -152,12 +152,15 @@ class _FrameBlock:
     entity: str
     axis: tuple[float, float, int] | None = None
     shown: deque[RadarFrame] = field(default_factory=lambda: deque(maxlen=BLOCK_FRAMES))
-    stamps: Stamps = field(default_factory=Stamps)
+    stamps: RowTimes = field(default_factory=RowTimes)
     frames: list[RadarFrame] = field(default_factory=list)
 
 
 def send_charts(
-    recording: Recording, entity: str, stamps: Stamps, charts: Mapping[str, NDArray[np.float32]]
+    recording: RerunRecording,
+    entity: str,
+    stamps: RowTimes,
+    charts: Mapping[str, NDArray[np.float32]],
 ) -> None:
     """Send frames as bar charts, a row each; the values of each chart have shape (n, n_bins)."""
     for chart, values in charts.items():
@@ -167,9 +170,9 @@ def send_charts(
 
 
 def send_bscan(
-    recording: Recording,
+    recording: RerunRecording,
     entity: str,
-    stamps: Stamps,
+    stamps: RowTimes,
     picture: NDArray[np.float32] | NDArray[np.uint8],
     *,
     lasted_ns: int,

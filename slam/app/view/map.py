@@ -36,9 +36,9 @@ from slam.app.view.rerun_recording import (
     USED_RGB,
     WALL_RGB,
     WEDGE_RGB,
-    Recording,
+    RerunRecording,
     Rgb,
-    Stamps,
+    RowTimes,
     part,
     rr,
     screen,
@@ -174,7 +174,7 @@ class Ground:
 class MapLayer:
     """Sends poses and echoes in blocks, the map once per second."""
 
-    def __init__(self, recording: Recording, info: SessionInfo) -> None:
+    def __init__(self, recording: RerunRecording, info: SessionInfo) -> None:
         self._recording = recording
         self._radars = info.radars
         self._field = info.field_of_view
@@ -185,7 +185,7 @@ class MapLayer:
         self._has_fixes = False
         self._first_ns: int | None = None
         self._next_map_ns = self._next_path_ns = 0
-        self._last: tuple[Snapshot, Stamps] | None = None
+        self._last: tuple[Snapshot, RowTimes] | None = None
         world_m = known_world_m(info)
         self._grows = not len(world_m)  # the layout shows all of a known world and no more
         self._ground = Ground.around(np.zeros((1, 2)) if self._grows else world_m)
@@ -195,7 +195,7 @@ class MapLayer:
         """Add a state to the paths; `odom` is `world_from_odom` of the first one."""
         if self._first_ns is None:
             self._first_ns = snapshot.t_ns
-        stamps = Stamps.of(snapshot.t_ns, snapshot.counter, host_ns)
+        stamps = RowTimes.of(snapshot.t_ns, snapshot.counter, host_ns)
         self._last = snapshot, stamps
         place = snapshot.world_from_map
         self._paths["odometry"].append(transform(odom, snapshot.odometry[:2]))
@@ -233,7 +233,7 @@ class MapLayer:
         )
         self._recording.row("map/smoothed/landmarks", stamps, dots)
 
-    def send(self, rows: Sequence[Snapshot], stamps: Stamps) -> None:
+    def send(self, rows: Sequence[Snapshot], stamps: RowTimes) -> None:
         """Send poses and echoes of some states."""
         world = np.array([compose(row.world_from_map, row.estimate) for row in rows])
         self._send_poses("map/robot", stamps, world)
@@ -328,7 +328,7 @@ class MapLayer:
         every = np.concatenate([snapshot.landmark_covariances_m2, pose])
         return enlargement(every, self._ground.size_m)
 
-    def _send_poses(self, entity: str, stamps: Stamps, poses: Array) -> None:
+    def _send_poses(self, entity: str, stamps: RowTimes, poses: Array) -> None:
         """Send poses (n, 3) of the world as the transform of an entity drawn in the body frame."""
         turned = -0.5 * poses[:, 2]  # a turn to the left is one to the right on the screen
         quaternions = np.zeros((len(poses), 4))
@@ -339,7 +339,7 @@ class MapLayer:
             columns = rr.Transform3D.columns(translation=places, quaternion=quaternions)
             self._recording.rows(entity, stamps, columns)
 
-    def _send_echoes(self, rows: Sequence[Snapshot], stamps: Stamps, world: Array) -> None:
+    def _send_echoes(self, rows: Sequence[Snapshot], stamps: RowTimes, world: Array) -> None:
         steps = [row.step for row in rows if row.step is not None]
         used = [used_detections(step) for step in steps]
         for index, radar in enumerate(self._radars):
@@ -378,13 +378,13 @@ class MapLayer:
             self._recording.rows(f"map/{name}", stamps, columns.partition([*map(len, shown)]))
 
     def _send_arcs(
-        self, entity: str, stamps: Stamps, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]
+        self, entity: str, stamps: RowTimes, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]
     ) -> None:
         every_m = np.array([range_m for row in ranges_m for range_m in row], dtype=np.float64)
         strips = strips_column(screen(arcs(self._field, radar, every_m)))
         self._recording.rows(entity, stamps, [strips.partition([*map(len, ranges_m)])])
 
-    def _send_landmarks(self, snapshot: Snapshot, stamps: Stamps) -> None:
+    def _send_landmarks(self, snapshot: Snapshot, stamps: RowTimes) -> None:
         points = transform(snapshot.world_from_map, snapshot.landmarks_m)
         covariances = rotate_covariances(
             snapshot.world_from_map[2], snapshot.landmark_covariances_m2
@@ -427,7 +427,7 @@ class MapLayer:
         )
         self._recording.row("map/landmarks/legend", stamps, legend)
 
-    def _send_paths(self, stamps: Stamps) -> None:
+    def _send_paths(self, stamps: RowTimes) -> None:
         for name, colour, radius_m, order in _PATHS:
             points = self._paths[name]
             if not points:

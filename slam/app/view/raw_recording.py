@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.view.frames import chart_style, send_bscan, send_charts
-from slam.app.view.rerun_recording import DEVICE_TIME, Recording, Stamps, rr, rrb
+from slam.app.view.rerun_recording import DEVICE_TIME, RerunRecording, RowTimes, rr, rrb
 from xethru_protocol.cli.recordings import message_line
 from xethru_protocol.driver.frames import complex_of
 from xethru_protocol.recordings import RecordingFault, read_recording
@@ -65,7 +65,7 @@ def draw(
     name = path.parent.name if kind == "vendor" and path.is_file() else path.name
     prefix = entity_path_prefix.strip("/")
     prefix = f"{prefix}/" if prefix else ""
-    recording = Recording(
+    recording = RerunRecording(
         None,
         _blueprint([], prefix),
         recording_id=recording_id or path.name,
@@ -140,7 +140,7 @@ def bscan(samples: Samples) -> NDArray[np.float32]:
 
 
 @dataclass(slots=True, kw_only=True)
-class _Block:
+class _UnsentFrames:
     """Frames of one kind and layout that wait to be sent together.
 
     Where bins lie [module metres], and whether a frame's values are RF or all I and then all Q, may
@@ -153,7 +153,7 @@ class _Block:
     start_m: float = 0.0
     bin_m: float = 0.0
     is_shown: bool = False
-    stamps: Stamps = field(default_factory=Stamps)
+    stamps: RowTimes = field(default_factory=RowTimes)
     samples: list[Samples] = field(default_factory=list)
 
     @property
@@ -164,14 +164,14 @@ class _Block:
 class _Drawing:
     """Sends messages to Rerun: frames in blocks, everything else as lines of a log."""
 
-    def __init__(self, recording: Recording, prefix: str) -> None:
+    def __init__(self, recording: RerunRecording, prefix: str) -> None:
         self._recording = recording
         self._prefix = prefix
         self._layouts, self._geometries = FrameLayouts(), FrameGeometries()
-        self._blocks: dict[tuple[object, ...], _Block] = {}
+        self._blocks: dict[tuple[object, ...], _UnsentFrames] = {}
         self._kinds: Counter[str] = Counter()
         self._lines: list[tuple[str, str]] = []
-        self._line_stamps = Stamps()
+        self._line_stamps = RowTimes()
         self._t_ns: int | None = None
         self._counter = 0
         self.n_frames: Counter[str] = Counter()
@@ -213,7 +213,7 @@ class _Drawing:
             self._send(block)
         self._send_lines()
 
-    def _stamp(self, stamps: Stamps, t_ns: int | None) -> None:
+    def _stamp(self, stamps: RowTimes, t_ns: int | None) -> None:
         # Before any time is known: 0 is before the epoch, where the view begins.
         stamps.add(self._t_ns or 0, self._counter, t_ns)
 
@@ -237,7 +237,7 @@ class _Drawing:
                     self.log(f"{name}: frames of further layouts are not drawn", "WARN")
                 return
             number = f"_{self._kinds[name]}" if self._kinds[name] > 1 else ""
-            block = _Block(
+            block = _UnsentFrames(
                 entity=self._prefix + name.lower().replace(" ", "_") + number,
                 is_complex=is_complex,
                 is_placed=place is not None,
@@ -251,7 +251,7 @@ class _Drawing:
         if len(block.samples) == _BLOCK_FRAMES:
             self._send(block)
 
-    def _send(self, block: _Block) -> None:
+    def _send(self, block: _UnsentFrames) -> None:
         if not block.samples:
             return
         samples: NDArray[Any] = np.stack(block.samples)
@@ -277,9 +277,9 @@ class _Drawing:
             counted_from="" if block.is_placed else " from the first bin",
         )
         self.n_frames[block.entity] += len(samples)
-        block.stamps, block.samples = Stamps(), []
+        block.stamps, block.samples = RowTimes(), []
 
-    def _ranges_m(self, block: _Block, n_bins: int) -> NDArray[np.float64]:
+    def _ranges_m(self, block: _UnsentFrames, n_bins: int) -> NDArray[np.float64]:
         """Return where bins lie; at the first time, make room for the block's views."""
         if not block.is_placed:
             block.bin_m = BASEBAND_BIN_M if block.is_complex else RF_BIN_M
@@ -305,7 +305,7 @@ class _Drawing:
             texts, levels = zip(*self._lines, strict=True)
             columns = rr.TextLog.columns(text=list(texts), level=list(levels))
             self._recording.rows(f"{self._prefix}log", self._line_stamps, columns)
-        self._lines, self._line_stamps = [], Stamps()
+        self._lines, self._line_stamps = [], RowTimes()
 
 
 def _samples_of(message: m.BasebandIq | m.BasebandAp | m.RadarMessage) -> Samples:
@@ -327,7 +327,7 @@ def _brightest(picture: NDArray[np.float32]) -> float:
     return max(float(np.quantile(known, 0.999)), 1e-12) if len(known) else 1.0
 
 
-def _blueprint(blocks: Sequence[_Block], prefix: str) -> rrb.Blueprint:
+def _blueprint(blocks: Sequence[_UnsentFrames], prefix: str) -> rrb.Blueprint:
     """Return the layout: B-scans, below them the newest frame, beside them the log."""
     scans: list[rrb.View] = []
     charts: list[rrb.View] = []

@@ -74,7 +74,7 @@ _VIEWER_CLOSE_LIMIT_S = 5.0
 
 
 @dataclass(slots=True, kw_only=True)
-class Stamps:
+class RowTimes:
     """When rows happened: session times, ticks, and nanoseconds since 1970.
 
     `host_ns` is left out of the recording as soon as one of its rows has none.
@@ -85,7 +85,7 @@ class Stamps:
     host_ns: list[int | None] = field(default_factory=list)
 
     @classmethod
-    def of(cls, t_ns: int, counter: int, host_ns: int | None) -> Stamps:
+    def of(cls, t_ns: int, counter: int, host_ns: int | None) -> RowTimes:
         """Return the stamps of one row."""
         return cls(t_ns=[t_ns], counters=[counter], host_ns=[host_ns])
 
@@ -97,8 +97,8 @@ class Stamps:
         self.counters.append(counter)
         self.host_ns.append(host_ns)
 
-    def at(self, rows: Iterable[int]) -> Stamps:
-        picked = Stamps()
+    def at(self, rows: Iterable[int]) -> RowTimes:
+        picked = RowTimes()
         for row in rows:
             picked.add(self.t_ns[row], self.counters[row], self.host_ns[row])
         return picked
@@ -116,7 +116,7 @@ class Stamps:
         return columns
 
 
-class Recording:
+class RerunRecording:
     """Sends rows to an .rrd file, to a viewer that listens or to one that reads standard output.
 
     Parameters
@@ -207,13 +207,13 @@ class Recording:
         self._open().log(entity, what, static=True)
         self.sent[f"/{entity}{_STATIC}"] += 1
 
-    def rows(self, entity: str, stamps: Stamps, columns: Iterable[rr.ComponentColumn]) -> None:
+    def rows(self, entity: str, stamps: RowTimes, columns: Iterable[rr.ComponentColumn]) -> None:
         """Send a row for each stamp, all at once."""
         if len(stamps):
             self._open().send_columns(entity, stamps.columns(self.epoch_ns), columns)
             self.sent[f"/{entity}"] += len(stamps)
 
-    def row(self, entity: str, stamps: Stamps, what: rr.AsComponents) -> None:
+    def row(self, entity: str, stamps: RowTimes, what: rr.AsComponents) -> None:
         """Send one row, of something that Rerun cannot batch."""
         stream = self._open()
         since_ns = max(stamps.t_ns[0] - self.epoch_ns, 0)

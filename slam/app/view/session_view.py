@@ -41,9 +41,9 @@ from slam.app.view.rerun_recording import (
     ODOMETRY_RGB,
     RADAR_RGB,
     SMOOTHED_RGB,
-    Recording,
+    RerunRecording,
     Rgb,
-    Stamps,
+    RowTimes,
     part,
     rr,
     rrb,
@@ -214,12 +214,12 @@ class LinkLayer:
     Lines come at any time, also from the threads that read the ports.
     """
 
-    def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
+    def __init__(self, recording: RerunRecording, radars: Sequence[RadarInfo]) -> None:
         self._recording = recording
         self._states = LinkStates(tuple(radars))
         self._lines: deque[LogLine] = deque()
         # of each kind of row and name
-        self._rows: dict[tuple[str, str], tuple[Stamps, list[Any]]] = {}
+        self._rows: dict[tuple[str, str], tuple[RowTimes, list[Any]]] = {}
         self._counter = self._t_ns = 0
         self._host_ns: int | None = None
         for index, radar in enumerate(radars):
@@ -268,7 +268,7 @@ class LinkLayer:
 
     def _add(self, kind: str, name: str, t_ns: int, value: object) -> None:
         """Add a row of the newest scan to those that wait."""
-        stamps, values = self._rows.setdefault((kind, name), (Stamps(), []))
+        stamps, values = self._rows.setdefault((kind, name), (RowTimes(), []))
         stamps.add(t_ns, self._counter, self._host_ns)
         values.append(value)
 
@@ -326,7 +326,7 @@ _BANDS: tuple[tuple[str, str, str], ...] = (
 )
 
 
-def style_numbers(recording: Recording) -> None:
+def style_numbers(recording: RerunRecording) -> None:
     """Send how the curves look."""
     for entity, name, colour, width in _SERIES:
         line = rr.SeriesLines(
@@ -346,7 +346,7 @@ def style_numbers(recording: Recording) -> None:
 
 
 def send_numbers(
-    recording: Recording, rows: Sequence[Snapshot], stamps: Stamps, odom: NDArray[np.float64]
+    recording: RerunRecording, rows: Sequence[Snapshot], stamps: RowTimes, odom: NDArray[np.float64]
 ) -> None:
     """Send the curves of some states, finite values only; `odom` is the first `world_from_odom`."""
     numbers = StateNumbers(*np.array([state_numbers(row, odom) for row in rows]).T)
@@ -381,7 +381,7 @@ def send_numbers(
 
 
 def send_curve(
-    recording: Recording, entity: str, values: NDArray[np.float64], stamps: Stamps
+    recording: RerunRecording, entity: str, values: NDArray[np.float64], stamps: RowTimes
 ) -> None:
     """Send the finite ones of some values, shape (n,), at their stamps."""
     (known,) = np.nonzero(np.isfinite(values))
@@ -428,14 +428,14 @@ class RerunView(SessionObserver):
         self._began = False
         self._waiting: list[Snapshot] = []
         # of all states
-        self._stamps = Stamps()
+        self._stamps = RowTimes()
         self._truth = PackedRows(np.dtype(np.float64), 3)
         self._world_from_map = np.zeros(3)
         self._smoothed: SmoothedRun | None = None
         self._odom: NDArray[np.float64] | None = None
         self._host_ns: int | None = None
         seed, of_seed = ("", "") if info.seed is None else (f"-{info.seed}", f", seed {info.seed}")
-        self._recording = Recording(
+        self._recording = RerunRecording(
             target,
             blueprint(info),
             recording_id=f"{info.scene}-{info.preset}{seed}",

@@ -27,7 +27,7 @@ _DEFAULT_PORT = 9876
 _CONNECT_LIMIT_S = 3.0
 
 
-class ViewerProcess(viewer.ViewerProcess):
+class SlamViewerProcess(viewer.ViewerProcess):
     """Runs a viewer; its errors are AppErrors."""
 
     error = AppError
@@ -86,7 +86,7 @@ class LiveView:
         if self._where in {SPAWN, SERVE_WEB}:
             kind = ViewerKind.WEB if self._where == SERVE_WEB else ViewerKind.WINDOW
             with ExitStack() as starting:
-                process = starting.enter_context(ViewerProcess(kind, *self._files))
+                process = starting.enter_context(SlamViewerProcess(kind, *self._files))
                 process.wait_until_ready(self._stop.check)
                 self._stack = starting.pop_all()
             self._url, self._has_ended = process.url, lambda: process.has_ended

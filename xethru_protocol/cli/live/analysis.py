@@ -135,7 +135,7 @@ class LiveUpdate:
     vital: VitalAnswer
 
 
-class VitalSigns:
+class VitalSignsAnalysis:
     """Breathing and presence from frames as they come.
 
     Attributes
@@ -206,7 +206,7 @@ class LiveAnalysis:
 
     def __init__(self, source: FrameSource, *, clutter: Clutter, window_s: float) -> None:
         self._source, self._clutter = source, clutter
-        self.vital = VitalSigns(source, window_s)
+        self.vital = VitalSignsAnalysis(source, window_s)
         self._filter = _filter_of(clutter)
         rate_hz, n_bins = source.frame_rate_hz, len(self.vital.ranges_m)
         self._n_rows = max(round(WATERFALL_S * rate_hz), 2)

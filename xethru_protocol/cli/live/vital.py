@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from typing import Any
 
-from xethru_protocol.cli.live.analysis import VitalAnswer, VitalSigns
+from xethru_protocol.cli.live.analysis import VitalAnswer, VitalSignsAnalysis
 from xethru_protocol.cli.live.sources import open_source
 from xethru_protocol.cli.output import print_json, print_line, print_text, rewriting
 from xethru_protocol.system import STDOUT
@@ -17,7 +17,7 @@ def vital(arguments: Namespace) -> int:
     """Print an answer for every second of frames."""
     rewrites = STDOUT.is_terminal and not arguments.json
     with open_source(arguments) as source:
-        signs = VitalSigns(source, arguments.window)
+        signs = VitalSignsAnalysis(source, arguments.window)
         next_s = 0.0
         try:
             for frame in source.frames:

@@ -19,10 +19,10 @@ from xethru_protocol.cli.recordings import (
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
     RecordingError,
-    RecordingOptions,
     RecordingWriter,
     Split,
     WireCapture,
+    WriterOptions,
     session_directory,
 )
 from xethru_protocol.recordings.vendor.layouts import KINDS
@@ -46,7 +46,7 @@ class RecordingFiles:
     """
 
     def __init__(
-        self, arguments: Namespace, profile_id: int | None, options: RecordingOptions
+        self, arguments: Namespace, profile_id: int | None, options: WriterOptions
     ) -> None:
         self.messages = 0  # taken
         self.failure: XeThruError | None = None  # why nothing more is written
@@ -179,7 +179,7 @@ class RecordingFiles:
         }
 
 
-def writer_options(arguments: Namespace) -> RecordingOptions:
+def writer_options(arguments: Namespace) -> WriterOptions:
     """Return the parameters of `RecordingWriter`; ends the program on wrong usage."""
     limits = (
         {name: min(value for key, value in given if key == name) for name, _ in given}
@@ -192,7 +192,7 @@ def writer_options(arguments: Namespace) -> RecordingOptions:
             arguments.refuse(
                 f"--basename: no data files are called {shown(name)}; {', '.join(kinds)}"
             )
-    options: RecordingOptions = {
+    options: WriterOptions = {
         "user_header": arguments.user_header.encode(),
         "split": split,
         "split_directories": directories,

@@ -157,7 +157,7 @@ PROFILES = {
 }
 
 
-class Profile(Listen):
+class ProfileMode(Listen):
     """Messages of a profile, about one a second, and what else its outputs bring."""
 
     def __init__(
@@ -220,7 +220,7 @@ def _may_be_on(radar: X4M300, feature: OutputFeature) -> bool:
         return True
 
 
-def profile_of(arguments: Namespace) -> Profile | None:
+def profile_of(arguments: Namespace) -> ProfileMode | None:
     """Return the profile to record, None for none; ends the program on wrong usage."""
     name = arguments.profile
     if name not in PROFILES:
@@ -249,4 +249,6 @@ def profile_of(arguments: Namespace) -> Profile | None:
                 )
     if arguments.zone is not None and arguments.zone[0] >= arguments.zone[1]:
         arguments.refuse("argument --zone: START must be smaller than END")
-    return Profile(name, outputs=names, zone_m=arguments.zone, sensitivity=arguments.sensitivity)
+    return ProfileMode(
+        name, outputs=names, zone_m=arguments.zone, sensitivity=arguments.sensitivity
+    )

@@ -89,7 +89,7 @@ class _Source:
         raise NotImplementedError
 
 
-class _Module(_Source):
+class _RecordedModule(_Source):
     noun = "message"
 
     def __init__(self, name: str, port: str, *, radar: X4M300, mode: Listen, serial: str) -> None:
@@ -143,7 +143,7 @@ class _Module(_Source):
             self._radar.listener = None
 
 
-class _Text(_Source):
+class _RecordedText(_Source):
     """Lines from standard input or a serial port; the end of standard input is not a failure."""
 
     noun = "line"
@@ -196,13 +196,13 @@ def _standard_input(timeout_s: float) -> bytes | None:
 class _Session:
     """What is recorded into one file, and until when."""
 
-    def __init__(self, path: Path, count: int | None, modules: list[_Module]) -> None:
+    def __init__(self, path: Path, count: int | None, modules: list[_RecordedModule]) -> None:
         self.path = path
         self.count = count
         self.modules = modules
         for module in modules:
             module.session = self
-        self.texts: list[_Text] = []
+        self.texts: list[_RecordedText] = []
         self.ends = threading.Event()
         self.recorder = SessionRecorder(path)
         self._began_s = self._ended_s = time.monotonic()
@@ -269,7 +269,7 @@ def record_session(arguments: Namespace, mode: Listen) -> int:
         session = _Session(path, arguments.count, modules)
         try:
             for name, port, baudrate in arguments.text:
-                session.texts.append(_Text(name, port, session, baudrate))
+                session.texts.append(_RecordedText(name, port, session, baudrate))
                 opened.callback(session.texts[-1].close)
             with stop:
                 for module in modules:
@@ -301,14 +301,14 @@ def record_session(arguments: Namespace, mode: Listen) -> int:
 
 def _opened_module(
     opened: ExitStack, name: str, port: str, arguments: Namespace, mode: Listen
-) -> "_Module":
+) -> "_RecordedModule":
     """Open a module and bring it to where it sends nothing yet."""
     with _naming(name):
         radar = opened.enter_context(module_at(port, arguments.baudrate))
         mode.prepare(radar)
         serial = None if arguments.profile == "none" else radar.info().serial_number
         print_warnings(radar)
-    return _Module(name, port, radar=radar, mode=mode, serial=serial or "")
+    return _RecordedModule(name, port, radar=radar, mode=mode, serial=serial or "")
 
 
 @contextmanager

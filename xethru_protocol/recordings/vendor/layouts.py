@@ -60,7 +60,7 @@ from xethru_protocol.wire.rows import ROWS, Response
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
+class _DataFileKind:
     """What both kinds of data file have.
 
     ``name`` stands in the file's name, between ``xethru_`` and a local time stamp; ``data_type`` is
@@ -77,7 +77,7 @@ class _Kind:
 
 
 @dataclass(frozen=True, slots=True)
-class BinaryKind(_Kind):
+class BinaryKind(_DataFileKind):
     """One kind of binary data file."""
 
     suffix: ClassVar[str] = ".dat"
@@ -186,7 +186,7 @@ class _Column(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class TextKind(_Kind):
+class TextKind(_DataFileKind):
     """One kind of text file."""
 
     suffix: ClassVar[str] = ".csv"
@@ -397,8 +397,8 @@ TEXT_KINDS = (
     ),
 )
 
-Kind = BinaryKind | TextKind
-KINDS: tuple[Kind, ...] = (*BINARY_KINDS, *TEXT_KINDS)
+DataFileKind = BinaryKind | TextKind
+KINDS: tuple[DataFileKind, ...] = (*BINARY_KINDS, *TEXT_KINDS)
 """All kinds. The vendor's bit 1 << 4 (performance status) has no row: its layout is not known."""
 KIND_OF_MESSAGE = {kind.message: kind for kind in KINDS}
 KIND_OF_TYPE = {kind.data_type: kind for kind in KINDS}
@@ -407,12 +407,12 @@ _CLOSED_AFTER = {1 << 14: 1 << 15, 1 << 18: (1 << 15) + 1}
 _LONGEST_FIRST = sorted(KINDS, key=lambda kind: -len(kind.name))
 
 
-def closing_order(kind: Kind) -> int:
+def closing_order(kind: DataFileKind) -> int:
     """Sort key of data files that end together."""
     return 2 * _CLOSED_AFTER.get(kind.data_type, kind.data_type) + (kind.data_type in _CLOSED_AFTER)
 
 
-def kind_of_file(name: str) -> Kind | None:
+def kind_of_file(name: str) -> DataFileKind | None:
     for kind in _LONGEST_FIRST:
         if name.startswith(kind.file_prefix) and name.endswith(kind.suffix):
             return kind

@@ -45,8 +45,8 @@ from xethru_protocol.recordings.vendor.layouts import (
     RECORD,
     VERSION,
     BinaryKind,
+    DataFileKind,
     Entry,
-    Kind,
     Meta,
     TextKind,
     kind_of_file,
@@ -69,7 +69,7 @@ _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Part:
+class _RecordingDirectory:
     """A directory of a recording.
 
     ``files`` are the data files to read in it; ``meta`` is None without a usable meta file, and
@@ -77,11 +77,11 @@ class _Part:
     """
 
     directory: Path
-    files: dict[Path, Kind]
+    files: dict[Path, DataFileKind]
     meta: Meta | None
     problem: str
 
-    def files_by_number(self) -> dict[tuple[int, int], tuple[Path, Kind]]:
+    def files_by_number(self) -> dict[tuple[int, int], tuple[Path, DataFileKind]]:
         """Return the data files of the index by data type and number.
 
         Where the list of files is missing, those of a type in their order.
@@ -89,7 +89,7 @@ class _Part:
         meta = self.meta or Meta()
         entries = np.frombuffer(meta.index, ENTRY)
         on_disk = _data_files(self.directory, meta)
-        found: dict[tuple[int, int], tuple[Path, Kind]] = {}
+        found: dict[tuple[int, int], tuple[Path, DataFileKind]] = {}
         for bit in map(int, np.unique(entries["data_type"])):
             kind = KIND_OF_TYPE.get(bit)
             if kind is None:
@@ -112,7 +112,7 @@ class _Part:
         return self.directory / (f"{kind.file_prefix}*" if kind else f"of data type {data_type}")
 
 
-def _part(directory: Path, files: dict[Path, Kind] | None = None) -> _Part:
+def _part(directory: Path, files: dict[Path, DataFileKind] | None = None) -> _RecordingDirectory:
     """Return a directory with its meta file; ``files``: which are read, None for all."""
     meta, problem = None, "it is missing"
     path = directory / META_NAME
@@ -123,15 +123,15 @@ def _part(directory: Path, files: dict[Path, Kind] | None = None) -> _Part:
     except RecordingError as error:
         problem = f"it is of no use: {error}"
     found = _data_files(directory, meta) if files is None else files
-    return _Part(directory=directory, files=found, meta=meta, problem=problem)
+    return _RecordingDirectory(directory=directory, files=found, meta=meta, problem=problem)
 
 
-def data_files(directory: Path) -> dict[Path, Kind]:
+def data_files(directory: Path) -> dict[Path, DataFileKind]:
     """Return the data files of a directory: by their names, others by the index."""
     return _part(directory).files
 
 
-def _data_files(directory: Path, meta: Meta | None) -> dict[Path, Kind]:
+def _data_files(directory: Path, meta: Meta | None) -> dict[Path, DataFileKind]:
     found = {
         path: kind for path in directory.iterdir() if (kind := kind_of_file(path.name)) is not None
     }
@@ -144,7 +144,7 @@ def _data_files(directory: Path, meta: Meta | None) -> dict[Path, Kind]:
     return {path: found[path] for path in sorted(found) if path.is_file()}
 
 
-def _kind_of_entry(entry: Entry) -> Kind | None:
+def _kind_of_entry(entry: Entry) -> DataFileKind | None:
     return KIND_OF_TYPE.get(entry.data_type) or KIND_OF_TYPE.get(entry.data_type ^ ALL_BITS)
 
 
@@ -152,7 +152,7 @@ def is_vendor_file(path: Path) -> bool:
     return path.name == META_NAME or kind_of_file(path.name) is not None
 
 
-def _parts_of(path: Path) -> list[_Part]:
+def _parts_of(path: Path) -> list[_RecordingDirectory]:
     """Return the directories of a recording in order."""
     with reading(path):
         if not path.exists():
@@ -172,7 +172,7 @@ def _parts_of(path: Path) -> list[_Part]:
     return parts
 
 
-def _chain(directory: Path) -> list[_Part]:
+def _chain(directory: Path) -> list[_RecordingDirectory]:
     """Return a directory and those in which its recording goes on, by their meta files."""
     found = [_part(directory)]
     while (following := _next_directory(found[-1])) is not None:
@@ -182,7 +182,7 @@ def _chain(directory: Path) -> list[_Part]:
     return found
 
 
-def _next_directory(part: _Part) -> Path | None:
+def _next_directory(part: _RecordingDirectory) -> Path | None:
     match part.meta.next_name.replace("\\", "/").split("/") if part.meta is not None else ():
         case ["..", name, str(file)] if name not in {"", ".."} and file == META_NAME:
             following = part.directory.resolve().parent / name
@@ -190,9 +190,9 @@ def _next_directory(part: _Part) -> Path | None:
     return None
 
 
-def _split_directories(path: Path) -> list[_Part]:
+def _split_directories(path: Path) -> list[_RecordingDirectory]:
     """Return the directories of recordings in a directory, and in directories of theirs."""
-    parts: list[_Part] = []
+    parts: list[_RecordingDirectory] = []
     names = (child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
     for child in sorted(filter(Path.is_dir, names), key=_by_number):
         part = _part(child)
@@ -216,10 +216,10 @@ def _by_number(path: Path) -> list[str | int]:
 # --- all messages -------------------------------------------------------------------------------
 
 
-class _DataFile:
+class _DataFileReader:
     """A data file, read from its beginning."""
 
-    def __init__(self, path: Path, kind: Kind, on_fault: FaultHandler | None) -> None:
+    def __init__(self, path: Path, kind: DataFileKind, on_fault: FaultHandler | None) -> None:
         self.path = path
         self.kind = kind
         self.position = 0  # bytes read so far
@@ -330,7 +330,7 @@ class _DataFile:
         report(fault, self._on_fault)
 
 
-def _user_header_bytes(start: bytes, size: int, kind: Kind) -> int:
+def _user_header_bytes(start: bytes, size: int, kind: DataFileKind) -> int:
     """Return the length of what precedes the first record, as far as the records show it.
 
     ``start`` is the beginning of the file of ``size`` bytes. 0 where records begin at once, and
@@ -375,7 +375,7 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
         if meta is not None and not meta.complete and whole:
             reason = "it was never completed: the recorder did not end as it should"
             _report_meta(reason, on_fault)
-        files = [_DataFile(file, kind, on_fault) for file, kind in part.files.items()]
+        files = [_DataFileReader(file, kind, on_fault) for file, kind in part.files.items()]
         try:
             if meta is not None:
                 file_of = _files_by_entry(part, files, on_fault, whole=whole)
@@ -394,7 +394,7 @@ def _report_meta(reason: str, on_fault: FaultHandler | None) -> None:
     report(RecordingFault(file=META_NAME, offset=0, reason=reason, minor=True), on_fault)
 
 
-def _along_index(meta: Meta, file_of: Callable[[Entry], _DataFile | None]) -> Iterator[Timed]:
+def _along_index(meta: Meta, file_of: Callable[[Entry], _DataFileReader | None]) -> Iterator[Timed]:
     for entry in meta.entries():
         file = file_of(entry)
         if file is None or entry.kind == CLOSED:
@@ -419,7 +419,7 @@ def _along_index(meta: Meta, file_of: Callable[[Entry], _DataFile | None]) -> It
             yield message, _time_ns(meta, entry.since_start_ms) if file.times_hold else stamp_ns
 
 
-def _rest(file: _DataFile) -> Iterator[Timed]:
+def _rest(file: _DataFileReader) -> Iterator[Timed]:
     """Read what the index does not list: recorded last, or all of it where there is no index."""
     if file.position == 0:
         file.skip_user_header()
@@ -430,17 +430,21 @@ def _rest(file: _DataFile) -> Iterator[Timed]:
 
 
 def _files_by_entry(
-    part: _Part, files: list[_DataFile], on_fault: FaultHandler | None, *, whole: bool
-) -> Callable[[Entry], _DataFile | None]:
+    part: _RecordingDirectory,
+    files: list[_DataFileReader],
+    on_fault: FaultHandler | None,
+    *,
+    whole: bool,
+) -> Callable[[Entry], _DataFileReader | None]:
     """Return a function from an entry to its file: by the list of files, else by type and order.
 
     Where the ``whole`` recording is read, a file that is listed and not there is reported once.
     """
     by_path = {file.path: file for file in files}
-    found: dict[tuple[int, int], _DataFile | None] = {}
+    found: dict[tuple[int, int], _DataFileReader | None] = {}
     known = part.files_by_number()
 
-    def file_of(entry: Entry) -> _DataFile | None:
+    def file_of(entry: Entry) -> _DataFileReader | None:
         kind = _kind_of_entry(entry)
         key = (kind.data_type if kind else entry.data_type, entry.file)
         if key in found:
@@ -548,7 +552,7 @@ class RecordingReader:
     def __init__(self, path: Path | str) -> None:
         path = Path(path)
         metas: list[Meta] = []
-        self._files: list[dict[tuple[int, int], tuple[Path, Kind]]] = []
+        self._files: list[dict[tuple[int, int], tuple[Path, DataFileKind]]] = []
         parts = _parts_of(path)
         for part in parts:
             if part.meta is None:
@@ -717,7 +721,7 @@ class RecordingReader:
         )
 
 
-def _message(path: Path, kind: Kind, data: bytes, size: int) -> Response:
+def _message(path: Path, kind: DataFileKind, data: bytes, size: int) -> Response:
     """Return the message of a record; RecordingError if it is not what the index says."""
     if len(data) < size:
         raise RecordingError(f"{path} is cut: a record of {size} bytes is not there whole")

@@ -22,8 +22,8 @@ from xethru_protocol.recordings.vendor.layouts import (
     META_NAME,
     PARAMETER_FILE_NAME,
     RECORD,
+    DataFileKind,
     Entry,
-    Kind,
     Meta,
     closing_order,
 )
@@ -76,7 +76,7 @@ FileListener = Callable[[type[Response], Path], None]
 MetaFileListener = Callable[[str, Path], None]
 
 
-class RecordingOptions(TypedDict, total=False):
+class WriterOptions(TypedDict, total=False):
     """The parameters of `RecordingWriter` but the directory."""
 
     session_id: str | None
@@ -108,10 +108,12 @@ class _Options:
     on_meta_file: MetaFileListener | None
 
 
-class _DataFile(GrowingFile):
+class _DataFileWriter(GrowingFile):
     """One data file being written; ``number`` is its place in the list of files."""
 
-    def __init__(self, path: Path, kind: Kind, number: int, first_ms: int, *, flush: bool) -> None:
+    def __init__(
+        self, path: Path, kind: DataFileKind, number: int, first_ms: int, *, flush: bool
+    ) -> None:
         super().__init__(path, flush=flush)
         self.kind = kind
         self.number = number
@@ -120,7 +122,7 @@ class _DataFile(GrowingFile):
 
 
 @dataclass(slots=True)
-class _Part:
+class _OpenDirectory:
     """One directory being written; all of its recording unless that is split into directories."""
 
     directory: Path
@@ -129,14 +131,14 @@ class _Part:
     records: int = 0
     last_ms: int = 0  # of the last record, since the start
     meta_file: GrowingFile = field(init=False)
-    files: dict[int, _DataFile] = field(init=False, default_factory=dict)
+    files: dict[int, _DataFileWriter] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         flush = self.options.flush_on_write
         self.meta_file = GrowingFile(self.directory / META_NAME, flush=flush)
         self.meta_file.append(self.meta.pack_head())
 
-    def write(self, message: Response, kind: Kind, time_ms: int) -> None:
+    def write(self, message: Response, kind: DataFileKind, time_ms: int) -> None:
         options = self.options
         since_ms = self.since(time_ms)
         data = kind.record(message, self.meta.start_ms + since_ms, options.timezone)
@@ -175,7 +177,7 @@ class _Part:
     def since(self, time_ms: int) -> int:
         return min(max(time_ms - self.meta.start_ms, 0), ALL_BITS)
 
-    def _open_file(self, kind: Kind, since_ms: int) -> _DataFile:
+    def _open_file(self, kind: DataFileKind, since_ms: int) -> _DataFileWriter:
         time_ms = self.meta.start_ms + since_ms
         base = self.options.basenames.get(kind.message, kind.file_prefix.removesuffix("_"))
         stem = f"{base}_{_local_time(time_ms, self.options.timezone):%Y%m%d_%H%M%S}"
@@ -185,7 +187,7 @@ class _Part:
         while name in self.meta.files:
             name = f"{stem}_{again_ms:03d}ms{kind.suffix}"
             again_ms += 1
-        file = _DataFile(
+        file = _DataFileWriter(
             self.directory / name,
             kind,
             len(self.meta.files),
@@ -197,7 +199,7 @@ class _Part:
         self.meta.data_types |= kind.data_type
         return file
 
-    def _append(self, file: _DataFile, data: bytes, data_type: int, since_ms: int) -> None:
+    def _append(self, file: _DataFileWriter, data: bytes, data_type: int, since_ms: int) -> None:
         begin = file.size
         file.append(data)
         self.meta.size += len(data)
@@ -205,7 +207,7 @@ class _Part:
         end = self.meta.size
         self._index(Entry(since_ms, RECORD, data_type, len(data), file.number, begin, end))
 
-    def _close_file(self, file: _DataFile, since_ms: int) -> None:
+    def _close_file(self, file: _DataFileWriter, since_ms: int) -> None:
         del self.files[file.kind.data_type]
         file.close()
         end = self.meta.size
@@ -300,7 +302,7 @@ class RecordingWriter:
         )
         self._interval_ms = 0.0 if interval_s is None else 1000 * interval_s
         self._stored_ms: dict[int, int] = {}  # when the last message of each kind was stored
-        self._part: _Part | None = None
+        self._part: _OpenDirectory | None = None
         self._parts = 0
         self._closed = False
         with writing(self.directory):
@@ -358,7 +360,7 @@ class RecordingWriter:
         closed_ms = stopped_ms if closed_ns is None else part.since(closed_ns // MS_NS)
         part.close(stopped_ms, closed_ms)
 
-    def _part_at(self, time_ms: int) -> _Part:
+    def _part_at(self, time_ms: int) -> _OpenDirectory:
         """Return the directory that takes the next record; a new one where the last is full."""
         part, split, zone = self._part, self._options.split_directories, self._options.timezone
         if part is not None and split is None:
@@ -383,7 +385,7 @@ class RecordingWriter:
             session_id=self.session_id.encode(), profile_id=self._profile_id, start_ms=time_ms
         )
         self._parts += 1
-        self._part = _Part(directory, meta, self._options)
+        self._part = _OpenDirectory(directory, meta, self._options)
         return self._part
 
     def _store_parameter_file(self, directory: Path) -> None:

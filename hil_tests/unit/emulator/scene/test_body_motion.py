@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from emulator.echo.paths import direct_reflections, viewpoint
 from emulator.echo.people import people_truth, person_scatterer
 from emulator.scene.motion import MoverSpec
-from emulator.scene.people import PersonSpec, SleepStage, facing_cosines, moves, positions_m
+from emulator.scene.people import PersonSpec, SleepDepth, facing_cosines, moves, positions_m
 from emulator.scene.scene import load_scene
 from hil_tests.unit.emulator.rooms import heard, radar_at, room
 
@@ -151,7 +151,7 @@ def test_the_echo_of_a_mover() -> None:
 def test_the_truth_of_the_shipped_scenes() -> None:
     t_ns = np.array([100, 3000], dtype=np.int64) * SECOND
     (sleeper,) = people_truth(load_scene("sleeper"), t_ns)
-    assert sleeper.sleep_stage.tolist() == [SleepStage.AWAKE, SleepStage.DEEP]
+    assert sleeper.sleep_stage.tolist() == [SleepDepth.AWAKE, SleepDepth.DEEP]
     assert sleeper.distance_m[:, 0] == pytest.approx([1.6, 1.6], abs=0.1)
     near, far = people_truth(load_scene("two_people"), t_ns)
     assert near.distance_m[0] == pytest.approx([math.hypot(1.2, 0.1), math.hypot(1.2, 0.3)])

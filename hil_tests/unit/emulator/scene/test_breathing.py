@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from emulator.scene.people import (
     STAGES,
     PersonSpec,
-    SleepStage,
+    SleepDepth,
     breathing_rate_per_min,
     chest_displacement_m,
     mean_breathing_rate_per_min,
@@ -143,24 +143,24 @@ def test_stages_follow_each_other_in_cycles() -> None:
     sleeper = person(**SLEEPS)
     t_ns = every(1.0, 120.0 + 5 * 600.0)
     stages = sleep_stages(sleeper, t_ns)
-    assert set(stages[:120].tolist()) == {SleepStage.AWAKE}
+    assert set(stages[:120].tolist()) == {SleepDepth.AWAKE}
     cycles = stages[120:].reshape(5, 600)
     assert (cycles == cycles[0]).all()
-    for stage in (SleepStage.LIGHT, SleepStage.DEEP, SleepStage.REM):
+    for stage in (SleepDepth.LIGHT, SleepDepth.DEEP, SleepDepth.REM):
         share = sum(row[1] for row in STAGES if row[0] is stage)
         assert np.mean(cycles == stage) == pytest.approx(share, abs=2 / 600)
     assert sum(row[1] for row in STAGES) == pytest.approx(1.0)
-    assert set(sleep_stages(person(), t_ns).tolist()) == {SleepStage.AWAKE}
+    assert set(sleep_stages(person(), t_ns).tolist()) == {SleepDepth.AWAKE}
 
 
 def test_deep_sleep_is_slower_and_more_regular() -> None:
     t_ns = every(1.0, 36_000.0)
     sleeper = person(**WANDERS, **SLEEPS)
     rate, stages = breathing_rate_per_min(sleeper, t_ns), sleep_stages(sleeper, t_ns)
-    spread = {stage: float(rate[stages == stage].std()) for stage in SleepStage}
-    mean = {stage: float(rate[stages == stage].mean()) for stage in SleepStage}
-    assert spread[SleepStage.DEEP] < 0.3 * spread[SleepStage.REM]
-    assert mean[SleepStage.DEEP] < mean[SleepStage.LIGHT] < mean[SleepStage.REM]
+    spread = {stage: float(rate[stages == stage].std()) for stage in SleepDepth}
+    mean = {stage: float(rate[stages == stage].mean()) for stage in SleepDepth}
+    assert spread[SleepDepth.DEEP] < 0.3 * spread[SleepDepth.REM]
+    assert mean[SleepDepth.DEEP] < mean[SleepDepth.LIGHT] < mean[SleepDepth.REM]
 
 
 @pytest.mark.parametrize("changes", [WANDERS | SLEEPS, {"apnoea": {"every_s": 30.0}}], ids=str)

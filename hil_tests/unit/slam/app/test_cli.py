@@ -17,7 +17,7 @@ from slam.app.errors import EmulatorError
 from slam.app.records import LogLine
 from slam.app.rig.emulated import EmulatorProcess
 from slam.app.rig.files import RigFile, RigRadar, write_rig
-from slam.app.run.output import Progress, note, print_table
+from slam.app.run.output import RunProgress, note, print_table
 from xethru_protocol.system import locked
 
 THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)
@@ -54,7 +54,7 @@ def test_no_control_character_reaches_the_terminal(
     info = session_info()
     radars = (replace(info.radars[0], name=f"nose{HOSTILE}", serial=HOSTILE), info.radars[1])
     info = replace(info, scene=HOSTILE, radars=radars)
-    progress = Progress(info, lambda: 0)
+    progress = RunProgress(info, lambda: 0)
     progress.on_log(LogLine(t_ns=0, radar=HOSTILE, text=HOSTILE, warning=True))
     note(HOSTILE)
     print_table(HOSTILE, None, [(HOSTILE, HOSTILE, HOSTILE)])

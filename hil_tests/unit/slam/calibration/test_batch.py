@@ -9,11 +9,11 @@ from scipy.sparse import csr_array
 
 from slam.calibration.batch import (
     CAUCHY_SCALE,
-    Layout,
     OdometryTerm,
     PriorTerm,
     RangeTerm,
     SingularProblemError,
+    StateLayout,
     Stop,
     Term,
     _costs,
@@ -24,7 +24,7 @@ from slam.calibration.calibration import UNKNOWN_WHEELS
 
 Array = NDArray[np.float64]
 
-LAYOUT = Layout(n_poses=6, n_landmarks=3, n_radars=2)
+LAYOUT = StateLayout(n_poses=6, n_landmarks=3, n_radars=2)
 
 
 def some_state(seed: int) -> Array:

@@ -30,7 +30,7 @@ from xethru_protocol.recordings import (
     read_recording,
     recording_facts,
 )
-from xethru_protocol.recordings.mcap import Record
+from xethru_protocol.recordings.mcap import LocatedRecord
 from xethru_protocol.wire import messages as m
 
 PARAMETERS = "xethru_parameter_file.par"
@@ -380,4 +380,4 @@ def test_a_record_of_mcap_that_claims_more_than_the_file_is_not_waited_for(tmp_p
 def test_a_record_that_is_too_short_is_a_value_error(length: int) -> None:
     """The body of Statistics begins with numbers of 8, 2, 4, 4, 4, 4, 8 and 8 bytes."""
     with pytest.raises(ValueError, match="a record ends"):
-        Record(at=0, code=0x0B, body=bytes(length)).content()
+        LocatedRecord(at=0, code=0x0B, body=bytes(length)).content()

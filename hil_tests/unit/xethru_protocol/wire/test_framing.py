@@ -274,13 +274,13 @@ def test_terminators_are_looked_for_once_in_every_byte(
     content = _CountingContent(framing._CONTENT)
     marked = []
 
-    class CountingWindow(framing._Window):
+    class CountingWindow(framing._MarkedBytes):
         def __init__(self, buffer: bytes, base: int, begin: int, size: int) -> None:
             super().__init__(buffer, base, begin, size)
             marked.append(self.end - base - begin)
 
     monkeypatch.setattr(framing, "_CONTENT", content)
-    monkeypatch.setattr(framing, "_Window", CountingWindow)
+    monkeypatch.setattr(framing, "_MarkedBytes", CountingWindow)
     reader = PacketReader()
     for begin in range(0, size, chunk):
         reader.receive_data(data[begin : begin + chunk])

@@ -6,7 +6,7 @@ import pytest
 
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import versions
-from xethru_protocol.wire.versions import Firmware, firmware_named
+from xethru_protocol.wire.versions import FirmwareVersions, firmware_named
 
 # Chapter 17: what an older version does not know, and the first that does.
 SINCE: list[tuple[m.Message, str, str]] = [
@@ -70,7 +70,7 @@ def test_versions_count_with_their_pre_releases() -> None:
     "text", ["", "XEP", "a;b;c", ":::", "Annapurna:new;XEP:x", "1.6.8", "\x00:;\x7f"]
 )
 def test_a_version_list_that_says_nothing_leaves_everything_to_the_module(text: str) -> None:
-    firmware = Firmware.of_list(text)
+    firmware = FirmwareVersions.of_list(text)
     assert versions.lacking(firmware) == ()
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from hil_tests.unit.slam.app.benchmarks import worlds
 from slam.app.benchmarks import BENCHMARKS, plaza
 from slam.app.benchmarks.back_end import grouped
-from slam.app.benchmarks.data_set import Observation, Run
+from slam.app.benchmarks.data_set import LandmarkMeasurement, Run
 from slam.app.benchmarks.evaluation import associated
 from slam.app.cli import main
 from slam.app.odometry.track import Trajectory, read_tum
@@ -111,8 +111,8 @@ def test_truth_of_another_drive_is_named(
 
 
 def test_detections_nearer_than_a_landmark_is_wide_are_one() -> None:
-    def seen(x_m: float, y_m: float) -> Observation:
-        return Observation(
+    def seen(x_m: float, y_m: float) -> LandmarkMeasurement:
+        return LandmarkMeasurement(
             range_m=math.hypot(x_m, y_m),
             range_sigma_m=0.3,
             bearing_rad=math.atan2(y_m, x_m),

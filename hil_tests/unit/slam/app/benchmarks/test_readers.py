@@ -12,7 +12,7 @@ from hil_tests.unit.slam.app.benchmarks import worlds
 from slam.app.benchmarks import mrclam, plaza, uwb_indoor, victoria_park
 from slam.app.benchmarks.data_set import (
     DataSet,
-    Observation,
+    LandmarkMeasurement,
     Positions,
     Run,
     increments_of,
@@ -156,7 +156,7 @@ def test_a_graph_is_a_drive_along_its_odometry(tmp_path: Path) -> None:
     assert [step.increment.tolist() for step in run.steps] == increments
     before, between, (range_only, place) = (step.observations for step in run.steps)
     assert (before, between) == ((), ())
-    assert range_only == Observation(range_m=4.5, range_sigma_m=0.3, label=3)
+    assert range_only == LandmarkMeasurement(range_m=4.5, range_sigma_m=0.3, label=3)
     assert (place.range_m, place.label) == (5.0, 7)
     assert place.bearing_rad == pytest.approx(math.atan2(4.0, 3.0))
     assert place.range_sigma_m == pytest.approx(0.2)

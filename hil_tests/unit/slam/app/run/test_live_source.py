@@ -33,9 +33,9 @@ from slam.app.rig.sources import RadarLink, sampler_limits
 from slam.app.run import live_source as run_readers
 from slam.app.run.live_source import (
     GRACE_NS,
-    Event,
     Inbox,
     LiveSource,
+    SourceEvent,
     TickAssembler,
     reading,
 )
@@ -88,10 +88,10 @@ def link_of(driver: ScriptedDriver) -> RadarLink:
 
 
 def told_until(
-    links: list[RadarLink], source: Path, done: Callable[[list[Event]], bool]
-) -> list[Event]:
+    links: list[RadarLink], source: Path, done: Callable[[list[SourceEvent]], bool]
+) -> list[SourceEvent]:
     inbox = Inbox()
-    events: list[Event] = []
+    events: list[SourceEvent] = []
     with reading(links, parse_source(str(source)), inbox):
         while not done(events):
             events.append(inbox.get(timeout=seconds(10)))

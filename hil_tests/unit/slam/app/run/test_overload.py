@@ -26,7 +26,7 @@ from slam.app.odometry.live import LiveOdometry
 from slam.app.records import LogLine, Scan, SessionInfo
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import sampler_limits
-from slam.app.run.live_source import Event, Inbox, LiveLog, LiveSource
+from slam.app.run.live_source import Inbox, LiveLog, LiveSource, SourceEvent
 from slam.app.run.replay import Comparison, recorded_source
 from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute, make_slam
 from slam.app.session.description import settings_text
@@ -278,7 +278,7 @@ def test_a_session_with_unix_stamps_lasts_as_long_as_its_run(drive: Drive, tmp_p
 
 def test_a_full_queue_holds_the_readers_back_and_refuses_lines_about_links() -> None:
     inbox, stopped = Inbox(2), threading.Event()
-    event: Event = ("odometry line", "text", 0)
+    event: SourceEvent = ("odometry line", "text", 0)
     inbox.hand_over(event, stopped)
     inbox.offer(("lost", 0, "why"))
     inbox.offer(("lost", 1, "why"))

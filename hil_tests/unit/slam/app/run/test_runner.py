@@ -20,7 +20,7 @@ from hil_tests.unit.slam.app.sessions import (
 )
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine
-from slam.app.run.output import Progress
+from slam.app.run.output import RunProgress
 from slam.app.run.runner import LinkStates, run_slam, unknown_truth
 from slam.frames import RadarFrame
 from slam.results import Belief, PoseAt, StepResult
@@ -213,7 +213,7 @@ class Terminal(io.StringIO):
 
 def test_the_line_has_time_rate_error_landmarks_and_losses() -> None:
     now = [0.0]
-    progress = Progress(session_info(), lambda: 3, end_ns=100 * FRAME_NS, clock=lambda: now[0])
+    progress = RunProgress(session_info(), lambda: 3, end_ns=100 * FRAME_NS, clock=lambda: now[0])
     for counter in range(51):
         progress.on_scan(scan(counter))
     progress.on_snapshot(snapshot(50))
@@ -228,7 +228,7 @@ def test_the_line_has_time_rate_error_landmarks_and_losses() -> None:
 def test_plain_lines_come_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     now, stream = [0.0], io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    progress = Progress(session_info(), lambda: 0, end_ns=FRAME_NS, clock=lambda: now[0])
+    progress = RunProgress(session_info(), lambda: 0, end_ns=FRAME_NS, clock=lambda: now[0])
     for counter in range(31):
         now[0] = float(counter)
         progress.on_scan(scan(counter))
@@ -241,7 +241,7 @@ def test_plain_lines_come_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_terminal_gets_one_line_rewritten(monkeypatch: pytest.MonkeyPatch) -> None:
     now, stream = [0.0], Terminal()
     monkeypatch.setattr(sys, "stderr", stream)
-    progress = Progress(session_info(), lambda: 0, end_ns=FRAME_NS, clock=lambda: now[0])
+    progress = RunProgress(session_info(), lambda: 0, end_ns=FRAME_NS, clock=lambda: now[0])
     for counter in range(20):
         now[0] = counter / 8
         progress.on_scan(scan(counter))
@@ -254,7 +254,7 @@ def test_a_terminal_gets_one_line_rewritten(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_warning_about_a_link_is_shown_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    progress = Progress(session_info(), lambda: 0, end_ns=FRAME_NS)
+    progress = RunProgress(session_info(), lambda: 0, end_ns=FRAME_NS)
     progress.on_log(LogLine(t_ns=0, radar="left", warning=False, text="Ping"))
     progress.on_log(LogLine(t_ns=0, radar="left", warning=True, text="checksum"))
     assert stream.getvalue() == "warning: radar left: checksum\n"

@@ -19,7 +19,7 @@ from emulator.x4m300 import radar_device
 from slam.app.records import RadarInfo
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
 from slam.app.rig.sources import RadarLink, RigSource
-from slam.app.run.live_source import Event, Inbox, LiveLog
+from slam.app.run.live_source import Inbox, LiveLog, SourceEvent
 from xethru_protocol.driver.radar import X4M300
 
 NS_PER_S = 1_000_000_000
@@ -32,7 +32,7 @@ class Timed:
     """An event and when it comes, virtual host time."""
 
     t_ns: int
-    event: Event
+    event: SourceEvent
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ class VirtualInbox(Inbox):
     def clock_ns(self) -> int:
         return self.now_ns
 
-    def get_nowait(self) -> Event:
+    def get_nowait(self) -> SourceEvent:
         if not self._heap or self._heap[0][0] > self.now_ns:
             raise Empty
         event = heapq.heappop(self._heap)[2]
         self.n_frames += event[0] == "frame"
         return event
 
-    def get(self, block: bool = True, timeout: float | None = None) -> Event:
+    def get(self, block: bool = True, timeout: float | None = None) -> SourceEvent:
         assert timeout is not None
         end_ns = self.now_ns + round(timeout * NS_PER_S)
         if not self._heap or self._heap[0][0] > end_ns:

@@ -13,7 +13,7 @@ from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.records import RadarInfo, SessionInfo, Snapshot
 from slam.app.run.runner import RunRecord, States
 from slam.app.sweep.outcomes import (
-    Carry,
+    CarryOutcome,
     carry_of,
     confidently_wrong,
     distance_m,
@@ -60,7 +60,9 @@ TRUTH = np.column_stack([0.1 * np.arange(60), np.zeros(60), np.zeros(60)])
 LANDMARKS = [(1.0, 1.0), (2.0, 1.0), (3.0, 1.0)]
 
 
-def found(wrong_until: int, lost_until: int, landmarks: Sequence[tuple[float, float]]) -> Carry:
+def found(
+    wrong_until: int, lost_until: int, landmarks: Sequence[tuple[float, float]]
+) -> CarryOutcome:
     """Return the outcome if the estimate is 1 m off, and lost, until these states."""
     estimate = TRUTH.copy()
     estimate[:wrong_until, 1] += 1.0
@@ -126,11 +128,11 @@ def test_after_a_carry_states_count_from_20_s_after_the_third_landmark() -> None
     record = record_of(estimate, TRUTH)
     record.states.pose_covariances[:] = 1e-4 * np.eye(3)
     lost, carried_ns = np.zeros(60, dtype=bool), (8 * S, DOWN_NS)
-    seen = Carry(three_seen_s=16.0, found_s=None)
+    seen = CarryOutcome(three_seen_s=16.0, found_s=None)
     # eight states before, those from 10 + 16 + 20 = 46 s on
     share = confidently_wrong(record, lost, carried_ns, seen)
     assert share == pytest.approx((8 + 14) / 60)
-    never = Carry(three_seen_s=None, found_s=None)
+    never = CarryOutcome(three_seen_s=None, found_s=None)
     assert confidently_wrong(record, lost, carried_ns, never) == pytest.approx(8 / 60)
 
 
@@ -138,7 +140,7 @@ RUN: SweepRun = replace(run_of(make_case("lab", "paper", 0)), ate_rmse_m=0.01)
 
 
 def test_runs_that_failed_are_counted() -> None:
-    carried = Carry(three_seen_s=1.0, found_s=30.0)
+    carried = CarryOutcome(three_seen_s=1.0, found_s=30.0)
     runs = [
         RUN,
         replace(RUN, seed=1, ate_rmse_m=0.08, lost_share=0.1),

@@ -17,7 +17,7 @@ from hil_tests.unit.full_disk import full_disk
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.errors import AppError
 from slam.app.sweep import sweep
-from slam.app.sweep.run import Case, Key, SweepRun, finite, make_case
+from slam.app.sweep.run import Case, RunKey, SweepRun, finite, make_case
 from slam.app.sweep.sweep import PartFile, run_sweep
 from xethru_protocol.system import StopFlag, StopRequestedError
 
@@ -51,7 +51,7 @@ def options_of(out: Path, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 - a
     return options | changes
 
 
-def interrupted_after(count: int, calls: list[Key]) -> Callable[..., SweepRun]:
+def interrupted_after(count: int, calls: list[RunKey]) -> Callable[..., SweepRun]:
     def run(case: Case, *, stop: StopFlag) -> SweepRun:
         if len(calls) == count:
             raise StopRequestedError(signal.SIGINT)
@@ -66,7 +66,7 @@ def test_a_stopped_sweep_goes_on_with_the_missing_runs(
 ) -> None:
     results = []
     for name, first in (("at_once", 99), ("in_two", 5)):
-        out, calls = tmp_path / name, list[Key]()
+        out, calls = tmp_path / name, list[RunKey]()
         with StopFlag() as stop:
             if first < 12:
                 monkeypatch.setattr(sweep, "run_case", interrupted_after(first, calls))
