@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from xethru_protocol.system import signal_at_parents_death
+from xethru_protocol.operating_system import signal_at_parents_death
 
 __all__ = ["control", "emulated_port"]
 

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.chip import Pace
 from xethru_protocol.cli.version import add_version
-from xethru_protocol.extras import what_is_missing
-from xethru_protocol.system import (
+from xethru_protocol.operating_system import (
     STDERR,
     STDOUT,
     StopFlag,
@@ -28,6 +27,7 @@ from xethru_protocol.system import (
     json_text,
     one_line,
 )
+from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.validation import number, shown
 
 if TYPE_CHECKING:

@@ -41,7 +41,7 @@ from xethru_protocol.recordings import (
     read_recording,
     recording_radars,
 )
-from xethru_protocol.recordings.records import TimedMessages
+from xethru_protocol.recordings.recorded_messages import TimedMessages
 from xethru_protocol.validation import shown
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import BootloaderReply, ResponseCode, SensorMode, X4Setting
@@ -54,7 +54,7 @@ from xethru_protocol.wire.messages import (
     X4DriverSet,
     X4Value,
 )
-from xethru_protocol.wire.rows import ROWS, UnknownMessage
+from xethru_protocol.wire.table import ROWS, UnknownMessage
 
 SLOWEST_RATE = 1e-6
 """Least rate above 0 that a playback in progress takes; a year for half a minute."""

@@ -20,24 +20,24 @@ from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
 from emulator.playback import PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket, People
 from emulator.ports.event_loop import Server, Service
-from emulator.ports.folders import (
+from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
+from emulator.ports.proxy import ModuleLine
+from emulator.ports.pty import LinkError, PortWatch
+from emulator.ports.runtime_folders import (
     Announcement,
     DirectoryMemory,
     link_folder,
     make_state_directory,
     socket_path,
 )
-from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
-from emulator.ports.proxy import ModuleLine
-from emulator.ports.pty import LinkError, PortWatch
 from emulator.ports.sockets import OdometryFeed
 from emulator.ports.tcp import is_loopback
 from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
 from emulator.x4m300 import PortDevice, radar_device
+from xethru_protocol.operating_system import STDOUT, StopFlag, json_text
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
-from xethru_protocol.system import STDOUT, StopFlag, json_text
 from xethru_protocol.transport import open_line
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.errors import PortUnavailable

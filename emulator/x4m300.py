@@ -29,7 +29,7 @@ from emulator.module.outbox import (
 )
 from emulator.module.settings import DeviceOptions
 from emulator.module.state import ACK_WAIT_NS, Module
-from emulator.profiles.run import ProfileStream
+from emulator.profiles.running_profile import ProfileStream
 from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.codes import SystemCode
 from xethru_protocol.wire.connection import Connection, Role

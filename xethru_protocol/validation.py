@@ -12,7 +12,7 @@ from argparse import ArgumentTypeError
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from xethru_protocol.system import one_line
+from xethru_protocol.operating_system import one_line
 
 _MUST = {
     "string_type": "be text in quotes",

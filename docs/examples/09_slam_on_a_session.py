@@ -34,7 +34,7 @@ from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
 from slam.evaluation import ate_rmse_m
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 
 def main(path: Path) -> None:

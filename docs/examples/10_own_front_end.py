@@ -21,8 +21,8 @@ import numpy as np
 from scipy.signal import find_peaks, hilbert
 
 from slam.app.rig.emulated import rig_of, wheels_of
-from slam.app.run.evaluation import summarise
 from slam.app.run.runner import execute, make_slam
+from slam.app.run.summary import summarise
 from slam.app.sweep.run import loopback_source, make_case
 from slam.frames import Detection, RadarFrame
 

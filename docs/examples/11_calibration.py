@@ -23,7 +23,7 @@ import sys
 from pathlib import Path
 
 from slam.app.cli import main as uwb_slam
-from slam.app.rig.files import load_rig
+from slam.app.rig.rig_files import load_rig
 
 
 def main(session: str, *options: str) -> None:

@@ -22,7 +22,7 @@ from slam.config import FrontEnd, load_preset, override
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.front_end.paper import PaperDetector
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 Array = NDArray[np.float64]
 Found = list[list[tuple[Detection, ...]]]  # of each position, of each frame

@@ -22,7 +22,7 @@ from emulator.chip.chip import CaptureSettings
 from emulator.echo.pulse import sum_of_pulses
 from emulator.echo.receiver import Receiver
 from emulator.scene.scene import NoiseSpec, RadarSpec, empty_room
-from slam.app.rig.sources import sampler_limits
+from slam.app.rig.frame_sources import sampler_limits
 from slam.app.run.output import print_table
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, label, picture
 from slam.config import MatchedFilterConfig, SlamConfig, override

@@ -50,7 +50,7 @@ from xethru_protocol.wire.messages import (
     X4DriverInit,
     X4DriverSet,
 )
-from xethru_protocol.wire.rows import ROWS, UnknownMessage
+from xethru_protocol.wire.table import ROWS, UnknownMessage
 
 PACKETS_PER_CALL = 32
 _RETRY_NS = 10_000_000

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scene.philox import Rng
-from emulator.scene.tables import Table
+from emulator.scene.toml_files import Table
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire.codes import ElementType, ResponseCode
 from xethru_protocol.wire.connection import Connection, Role

@@ -42,10 +42,10 @@ from pydantic import (
 
 from emulator.faults.kind import KindOfFault, Parameters, Target
 from emulator.faults.kinds import KINDS
-from emulator.scene.tables import Table, finite, load_table
+from emulator.scene.toml_files import Table, finite, load_table
 from xethru_protocol.validation import problem_text, shown
 from xethru_protocol.wire.messages import Command
-from xethru_protocol.wire.rows import ROWS
+from xethru_protocol.wire.table import ROWS
 
 _LIMITS = {
     "minimum": "at_least",

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from emulator.chip.chip import NS_PER_S
-from emulator.ports.lines import Line
+from emulator.ports.usb_and_uart import Line
 from emulator.x4m300 import ByteDevice
 
 PACKETS_PER_TURN = 8

@@ -20,9 +20,9 @@ from typing import Literal
 
 from emulator.module.settings import DEFAULT_BAUDRATE
 from emulator.ports.event_loop import Port, Service, wait_for
-from emulator.ports.lines import UartLine, UsbLine
 from emulator.ports.pty import LinkError, PortWatch, PtyLink
 from emulator.ports.tcp import TcpLink
+from emulator.ports.usb_and_uart import UartLine, UsbLine
 from emulator.x4m300 import ByteDevice
 
 LOOK_AGAIN_NS = 20_000_000

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from emulator.scene.tables import Number, Table, matching
+from emulator.scene.toml_files import Number, Table, matching
 
 AMPLITUDE_OF_1_M2 = 0.06
 """Echo of 1 m**2 on boresight at 1 m, normalised units at TX power 2.

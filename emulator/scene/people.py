@@ -63,7 +63,7 @@ from pydantic import Field, model_validator
 from emulator.chip.chip import NS_PER_S
 from emulator.scene.motion import Degrees, Metres, Name
 from emulator.scene.philox import WORDS_PER_BLOCK, Purpose, stream_of, uniforms
-from emulator.scene.tables import Number, Table
+from emulator.scene.toml_files import Number, Table
 
 _Seconds = Annotated[Number, Field(ge=0, le=86_400)]
 _Size = Annotated[Number, Field(gt=0, le=1)]

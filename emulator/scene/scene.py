@@ -30,7 +30,7 @@ from emulator.scene.motion import (
 )
 from emulator.scene.people import PersonSpec
 from emulator.scene.rooms import FAMILIES, MOST_ROOMS, room_of, room_tables
-from emulator.scene.tables import Number, SerialNumber, Table, is_name, load_table
+from emulator.scene.toml_files import Number, SerialNumber, Table, is_name, load_table
 from xethru_protocol.validation import shown
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)

@@ -29,7 +29,7 @@ from slam.app.cli import main as uwb_slam
 from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG
 from slam.app.run.runner import run_slam
-from slam.app.session.log import SessionLog
+from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import make_case, source_of
 
 ROOT = REPOSITORY

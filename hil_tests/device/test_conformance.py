@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.cassette import EMULATED, Cassette, ask_all, differences
 from hil_tests.plugin.findings import Measure
 from hil_tests.plugin.options import CHOICES
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import target_of
 from hil_tests.plugin.requirements import leave_out
+from hil_tests.plugin.session_radars import RadarUnderTest
 
 
 def emulator() -> RadarUnderTest:

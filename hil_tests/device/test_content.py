@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.findings import Limit, Measure
 from hil_tests.plugin.requirements import leave_out
+from hil_tests.plugin.session_radars import RadarUnderTest
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.x4 import CARRIER_HZ, SAMPLING_RATE_HZ

@@ -6,8 +6,8 @@ import itertools
 import numpy as np
 import pytest
 
-from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.findings import Measure
+from hil_tests.plugin.session_radars import RadarUnderTest
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.errors import ResponseTimeout

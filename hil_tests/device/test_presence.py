@@ -7,8 +7,8 @@ the module's flash (Protocol reference 8.2), so those tests run on real modules 
 import numpy as np
 import pytest
 
-from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.findings import Measure
+from hil_tests.plugin.session_radars import RadarUnderTest
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (

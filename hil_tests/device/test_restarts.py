@@ -4,8 +4,8 @@ import contextlib
 
 import pytest
 
-from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.findings import Measure
+from hil_tests.plugin.session_radars import RadarUnderTest
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m

@@ -24,7 +24,7 @@ from xethru_protocol.wire.framing import (
     Packet,
 )
 from xethru_protocol.wire.messages import DeleteNoiseMap, Message, UnknownMessage, X4DriverSet
-from xethru_protocol.wire.rows import ROWS
+from xethru_protocol.wire.table import ROWS
 
 DOCUMENTED = load()
 HAND_MADE = load_hand_made()

@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.findings import Findings, Measurement
 from hil_tests.plugin.radar_targets import Way, WireBytes, WireTap
+from hil_tests.plugin.session_radars import RadarUnderTest
 from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
 from xethru_protocol.wire.codec import describe, encode
 from xethru_protocol.wire.connection import Connection, Role

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from hil_tests.plugin.bench import RadarUnderTest
     from hil_tests.plugin.radar_targets import InjectedFault
+    from hil_tests.plugin.session_radars import RadarUnderTest
 
 
 Limit = tuple[float | None, float | None]

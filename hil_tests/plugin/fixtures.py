@@ -12,9 +12,9 @@ from hil_tests.plugin.options import CHOICES
 from hil_tests.plugin.requirements import gate, lacking
 
 if TYPE_CHECKING:
-    from hil_tests.plugin.bench import Bench, RadarUnderTest
     from hil_tests.plugin.radar_specs import RadarArgument
     from hil_tests.plugin.radar_targets import RadarTarget
+    from hil_tests.plugin.session_radars import Bench, RadarUnderTest
     from xethru_protocol.driver.radar import X4M300
 
 RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
@@ -23,9 +23,9 @@ RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
 @pytest.fixture(scope="session")
 def hil_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     """All radars of the session."""
-    from hil_tests.plugin.bench import Bench
     from hil_tests.plugin.radar_targets import RadarTarget, TargetError
-    from xethru_protocol.extras import what_is_missing
+    from hil_tests.plugin.session_radars import Bench
+    from xethru_protocol.optional_packages import what_is_missing
 
     config = request.config
 
@@ -108,7 +108,7 @@ def radar_rig(
 
     With ``--rig`` by the names of its file; each module is found by its serial number there.
     """
-    from hil_tests.plugin.bench import matched
+    from hil_tests.plugin.session_radars import matched
 
     found = gate(request, hil_bench, hil_bench.rig(rig_name))
     rig = request.config.stash[CHOICES].rig

@@ -258,7 +258,7 @@ def pytest_runtest_makereport(
 
 
 def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> None:
-    from xethru_protocol.extras import what_is_missing
+    from xethru_protocol.optional_packages import what_is_missing
 
     try:
         from hil_tests.plugin.artifacts import folder_name, write_bundle

@@ -11,7 +11,7 @@ import pytest
 from hil_tests.plugin.findings import findings_of
 
 if TYPE_CHECKING:
-    from hil_tests.plugin.bench import Bench, RadarUnderTest
+    from hil_tests.plugin.session_radars import Bench, RadarUnderTest
 
 
 def gate(
@@ -23,8 +23,8 @@ def gate(
     fails if a radar does not answer; later tests are skipped, or fail, without trying again. A test
     that ends here leaves no line open.
     """
-    from hil_tests.plugin.bench import BrokenRadarError, PortBusyError
     from hil_tests.plugin.radar_targets import TargetError
+    from hil_tests.plugin.session_radars import BrokenRadarError, PortBusyError
     from xethru_protocol.wire.errors import XeThruError
 
     item: pytest.Item = request.node

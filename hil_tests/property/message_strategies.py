@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from xethru_protocol.wire import fields as wire_kinds
 from xethru_protocol.wire.messages import REGISTERS, X4DriverGet
-from xethru_protocol.wire.rows import ROWS, Message
+from xethru_protocol.wire.table import ROWS, Message
 
 FLOATS = st.floats(width=32, allow_nan=False)
 BYTES = st.binary(max_size=40)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hil_tests.patience import catches, wait_until
-from xethru_protocol.system import signal_at_parents_death
+from xethru_protocol.operating_system import signal_at_parents_death
 
 _REPORTER = """
 import runpy, sys, threading, traceback

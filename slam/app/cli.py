@@ -20,8 +20,7 @@ from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
 from slam.app.sweep import FAMILIES, STRESSES
 from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
 from xethru_protocol.cli.version import add_version
-from xethru_protocol.extras import what_is_missing
-from xethru_protocol.system import (
+from xethru_protocol.operating_system import (
     STDERR,
     STDOUT,
     StopFlag,
@@ -30,6 +29,7 @@ from xethru_protocol.system import (
     one_line,
     open_closed_streams,
 )
+from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.validation import shown
 
 _BY_A_SIGNAL = 128
@@ -533,7 +533,7 @@ _COMMANDS = (
     ),
     _Subcommand(
         "evaluate",
-        "slam.app.run.results:run_evaluate",
+        "slam.app.run.result_files:run_evaluate",
         "compare two trajectories",
         _add_evaluate,
         "Absolute trajectory error of EST against REF, two TUM files: associated by "

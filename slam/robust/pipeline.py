@@ -14,7 +14,7 @@ from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.geometry import Rig, between, has_moved
-from slam.packed import PackedRows
+from slam.growing_arrays import PackedRows
 from slam.results import Belief, PoseAt, SmoothedRun, StepResult
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd

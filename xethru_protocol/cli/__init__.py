@@ -7,7 +7,12 @@ Results go to stdout, everything else to stderr. Exit 0 done, 1 failed, 2 wrong 
 from collections.abc import Sequence
 from importlib import import_module
 
-from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
+from xethru_protocol.operating_system import (
+    StopFlag,
+    StopRequestedError,
+    flush_streams,
+    open_closed_streams,
+)
 
 _BY_A_SIGNAL = 128
 """Exit codes from here on are of signals."""

@@ -22,7 +22,7 @@ from xethru_protocol.cli.port_probe import (
     PortProbe,
     run_checks,
 )
-from xethru_protocol.system import one_line
+from xethru_protocol.operating_system import one_line
 from xethru_protocol.transport import find_ports, is_private, is_running, run_directory
 from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, ProfileId, SensorMode
 from xethru_protocol.wire.errors import XeThruError

@@ -13,7 +13,7 @@ from types import CodeType, ModuleType, TracebackType
 
 import xethru_protocol
 from xethru_protocol import legacy as pymoduleconnector
-from xethru_protocol.system import StopRequestedError
+from xethru_protocol.operating_system import StopRequestedError
 from xethru_protocol.wire.errors import XeThruError
 
 _OURS = str(Path(xethru_protocol.__file__).parent)

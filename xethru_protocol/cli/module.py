@@ -24,7 +24,7 @@ from xethru_protocol.cli.output import (
 from xethru_protocol.driver.firmware import UNFINISHED, FirmwareImage
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import STDOUT
+from xethru_protocol.operating_system import STDOUT
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import XeThruError

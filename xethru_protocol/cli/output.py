@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, TextIO
 
-from xethru_protocol.system import STDERR, STDOUT, json_text, one_line
+from xethru_protocol.operating_system import STDERR, STDOUT, json_text, one_line
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 

@@ -27,7 +27,7 @@ from xethru_protocol.wire.codes import POWER_UP_BAUD, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import DeviceError, Disconnected, PortUnavailable, XeThruError
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault
-from xethru_protocol.wire.rows import Command, Message, Response
+from xethru_protocol.wire.table import Command, Message, Response
 
 SubjectT = TypeVar("SubjectT")
 

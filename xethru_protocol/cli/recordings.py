@@ -24,6 +24,13 @@ from xethru_protocol.cli.output import (
 )
 from xethru_protocol.export.kaitai import structure
 from xethru_protocol.export.wireshark import dissector
+from xethru_protocol.operating_system import (
+    PathInUseError,
+    built_aside,
+    one_line,
+    sync,
+    written_whole,
+)
 from xethru_protocol.recordings import (
     FrameLayout,
     RecordingError,
@@ -35,10 +42,9 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.recordings import convert as convert_recording
 from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file
-from xethru_protocol.recordings.records import writing
+from xethru_protocol.recordings.recorded_messages import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
-from xethru_protocol.system import PathInUseError, built_aside, one_line, sync, written_whole
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
@@ -53,7 +59,7 @@ from xethru_protocol.wire.framing import (
     PacketReader,
 )
 from xethru_protocol.wire.messages import Ack, DataFloat, Message, Pong, Response, UnknownMessage
-from xethru_protocol.wire.rows import ROWS
+from xethru_protocol.wire.table import ROWS
 
 _CHUNK_BYTES = 65536
 

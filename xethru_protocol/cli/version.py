@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from xethru_protocol.system import STDOUT
+from xethru_protocol.operating_system import STDOUT
 
 _PACKAGE = "xethru-hil"
 

@@ -21,7 +21,7 @@ from xethru_protocol.driver.link import (
     Steps,
     sends_once,
 )
-from xethru_protocol.system import read_bounded
+from xethru_protocol.operating_system import read_bounded
 from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode

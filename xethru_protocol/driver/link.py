@@ -57,7 +57,7 @@ from xethru_protocol.wire.errors import (
     RemoteProtocolError,
     ResponseTimeout,
 )
-from xethru_protocol.wire.rows import ROWS, Command, Response
+from xethru_protocol.wire.table import ROWS, Command, Response
 from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, FirmwareVersions, needed_by
 
 

@@ -21,7 +21,7 @@ from xethru_protocol.wire.errors import (
     XeThruError,
 )
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault, LinkStatistics
-from xethru_protocol.wire.rows import ROWS, Command, Response, UnknownMessage
+from xethru_protocol.wire.table import ROWS, Command, Response, UnknownMessage
 
 FRAMES = (m.DataFloat, m.BasebandIq)  # a tuple is the faster argument of isinstance
 _ENDLESS_S = 1e9

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 from xethru_protocol.wire import fields
-from xethru_protocol.wire import messages as messages  # importing them enters all rows
-from xethru_protocol.wire.rows import ROWS, Command, Message, Row
+from xethru_protocol.wire import messages as messages  # importing them enters all table
+from xethru_protocol.wire.table import ROWS, Command, Message, Row
 
 TYPES = {"B": "u1", "I": "u4", "i": "s4", "f": "f4", "a": "f4", "c": "bytes", "s": "text"}
 TYPES |= {"H": "u2be"}

@@ -17,7 +17,7 @@ from typing import Protocol, TypeVar
 from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout, XeThruError
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 T = TypeVar("T")
 Taker = Callable[[Response, int], None]

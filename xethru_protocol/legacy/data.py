@@ -14,7 +14,7 @@ import numpy as np
 from xethru_protocol.recordings.vendor.layouts import ALL_BITS, KINDS
 from xethru_protocol.wire import codes
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 _X2 = "it is of modules with the X2 chip, to which this driver does not speak"
 _CONFIGURATION = "read and write registers by X4M300.registers"

@@ -37,7 +37,7 @@ from xethru_protocol.wire.codes import (
     X4Setting,
 )
 from xethru_protocol.wire.errors import DeviceError, XeThruError
-from xethru_protocol.wire.rows import Command, Response
+from xethru_protocol.wire.table import Command, Response
 
 Rows = Mapping[str, Callable[..., Any]]
 

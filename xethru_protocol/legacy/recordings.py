@@ -18,13 +18,13 @@ from xethru_protocol.recordings import (
     WriterOptions,
     session_directory,
 )
-from xethru_protocol.recordings.records import MS_NS
+from xethru_protocol.recordings.recorded_messages import MS_NS
 from xethru_protocol.recordings.vendor.layouts import ALL_BITS, KIND_OF_MESSAGE, KIND_OF_TYPE
 from xethru_protocol.recordings.vendor.writer import new_session_id
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.errors import XeThruError
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 MessageType = type[Response]
 OnFile = Callable[[int, str], object]

@@ -19,13 +19,13 @@ from xethru_protocol.recordings.formats import (
 )
 from xethru_protocol.recordings.frame_layout import FrameLayout
 from xethru_protocol.recordings.loading import RadarArrays, Recording, TextColumn, load
-from xethru_protocol.recordings.recorder import Recorder, SessionRecorder
-from xethru_protocol.recordings.records import (
+from xethru_protocol.recordings.recorded_messages import (
     RadarFacts,
     RecordingError,
     RecordingFacts,
     RecordingFault,
 )
+from xethru_protocol.recordings.recorder import Recorder, SessionRecorder
 from xethru_protocol.recordings.vendor.reader import Record, RecordingReader
 from xethru_protocol.recordings.vendor.writer import (
     RecordingWriter,

@@ -45,10 +45,15 @@ from numpy.lib.format import (
     write_array_header_1_0,
 )
 
-from xethru_protocol.extras import what_is_missing
-from xethru_protocol.recordings.records import NO_TIME_NS, RecordingError, reading, writing
+from xethru_protocol.operating_system import written_whole
+from xethru_protocol.optional_packages import what_is_missing
+from xethru_protocol.recordings.recorded_messages import (
+    NO_TIME_NS,
+    RecordingError,
+    reading,
+    writing,
+)
 from xethru_protocol.recordings.vendor.layouts import kind_of_file
-from xethru_protocol.system import written_whole
 from xethru_protocol.validation import reason_of, shown
 
 Samples = npt.NDArray[Any]

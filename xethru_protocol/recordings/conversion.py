@@ -27,7 +27,7 @@ from xethru_protocol.recordings.formats import (
     refuse_name,
 )
 from xethru_protocol.recordings.loading import load
-from xethru_protocol.recordings.records import (
+from xethru_protocol.recordings.recorded_messages import (
     RecordingError,
     RecordingFacts,
     RecordingFault,

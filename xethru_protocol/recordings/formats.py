@@ -9,11 +9,11 @@ from itertools import starmap
 from pathlib import Path
 from typing import Any, Literal
 
-from xethru_protocol.extras import what_is_missing
+from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.recordings import wire_capture
 from xethru_protocol.recordings.array_files import SUFFIXES
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
-from xethru_protocol.recordings.records import (
+from xethru_protocol.recordings.recorded_messages import (
     FaultHandler,
     RadarFacts,
     RecordingContent,
@@ -25,7 +25,7 @@ from xethru_protocol.recordings.records import (
 )
 from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
-from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
+from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
 from xethru_protocol.wire.x4 import RF_BIN_M
 
 RecordingFormat = Literal["vendor", "wire", "mcap"]

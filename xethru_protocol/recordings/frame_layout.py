@@ -18,7 +18,7 @@ import numpy.typing as npt
 from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.messages import DataFloat, ReplyFloat, ReplyInt, X4Value
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 _MOST_BASEBAND_BINS = 188  # Protocol reference 9.4
 _ENOUGH_FRAMES = 64

@@ -41,7 +41,7 @@ from xethru_protocol.recordings.formats import (
     refuse_name,
 )
 from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayout, FrameLayouts
-from xethru_protocol.recordings.records import (
+from xethru_protocol.recordings.recorded_messages import (
     MODULE_METRES,
     NO_TIME_NS,
     FaultHandler,

@@ -40,8 +40,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.operating_system import written_whole
 from xethru_protocol.recordings.frame_layout import FrameGeometries
-from xethru_protocol.recordings.records import (
+from xethru_protocol.recordings.recorded_messages import (
     MODULE_METRES,
     FaultHandler,
     RecordingContent,
@@ -54,7 +55,6 @@ from xethru_protocol.recordings.records import (
     report,
     writing,
 )
-from xethru_protocol.system import written_whole
 from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.messages import (
@@ -62,7 +62,7 @@ from xethru_protocol.wire.messages import (
     BasebandIq,
     DataFloat,
 )
-from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
+from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
 
 FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"
 DOUBLE_ARRAY = "std_msgs/msg/Float64MultiArray"

@@ -10,7 +10,7 @@ is unknown, 0 if none is known.
 import struct
 from pathlib import Path
 
-from xethru_protocol.recordings.records import FaultHandler, writing
+from xethru_protocol.recordings.recorded_messages import FaultHandler, writing
 from xethru_protocol.recordings.wire_capture import Chunk, Way, read_chunks
 from xethru_protocol.wire.framing import Direction, NeedData, Packet, PacketReader
 

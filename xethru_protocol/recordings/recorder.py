@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
 from xethru_protocol.driver.matching import Listener
 from xethru_protocol.recordings.formats import optional_packages
-from xethru_protocol.recordings.records import GrowingFile, RecordingError
+from xethru_protocol.recordings.recorded_messages import GrowingFile, RecordingError
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE
 from xethru_protocol.recordings.vendor.writer import (
     RecordingWriter,
@@ -16,7 +16,7 @@ from xethru_protocol.recordings.vendor.writer import (
     new_session_id,
     session_directory,
 )
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 if TYPE_CHECKING:
     from xethru_protocol.recordings.mcap import RadarTopics

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-from xethru_protocol.recordings.records import (
+from xethru_protocol.recordings.recorded_messages import (
     NO_TIME_NS,
     FaultHandler,
     GrowingFile,

@@ -15,7 +15,7 @@ from xethru_protocol.wire.codes import BootloaderCode, CommandCode, ElementType,
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.fields import FLOAT32, hex_bytes
 from xethru_protocol.wire.messages import DataFloat  # importing messages enters all rows
-from xethru_protocol.wire.rows import (
+from xethru_protocol.wire.table import (
     COMMANDS,
     RESPONSES,
     ROWS,

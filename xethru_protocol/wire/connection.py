@@ -19,7 +19,7 @@ from xethru_protocol.wire.framing import (
     encode_normal,
     is_misread,
 )
-from xethru_protocol.wire.rows import ROWS, Command, Message, Response, UnknownMessage
+from xethru_protocol.wire.table import ROWS, Command, Message, Response, UnknownMessage
 
 
 class Role(Enum):

@@ -41,11 +41,11 @@ from xethru_protocol.wire.codes import (
     error_name,
 )
 from xethru_protocol.wire.fields import hex_bytes
-from xethru_protocol.wire.rows import ROWS, command, id32, response
-from xethru_protocol.wire.rows import Command as Command
-from xethru_protocol.wire.rows import Message as Message
-from xethru_protocol.wire.rows import Response as Response
-from xethru_protocol.wire.rows import UnknownMessage as UnknownMessage
+from xethru_protocol.wire.table import ROWS, command, id32, response
+from xethru_protocol.wire.table import Command as Command
+from xethru_protocol.wire.table import Message as Message
+from xethru_protocol.wire.table import Response as Response
+from xethru_protocol.wire.table import UnknownMessage as UnknownMessage
 
 FloatArray = npt.NDArray[np.float32]
 

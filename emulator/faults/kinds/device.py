@@ -23,7 +23,7 @@ from emulator.faults.kind import (
     response_bytes,
 )
 from emulator.scene.philox import Rng
-from emulator.scene.tables import SerialNumber
+from emulator.scene.toml_files import SerialNumber
 from xethru_protocol.wire.codes import DirCode, InfoItem, PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.messages import (
     GetProfileId,

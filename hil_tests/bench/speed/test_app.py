@@ -23,11 +23,11 @@ from slam.app.rig.emulated import (
     scene_and_config,
 )
 from slam.app.run.runner import execute, run_slam
-from slam.app.session.log import SessionLog
+from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.session_view import RerunView
 from slam.paper.pipeline import UwbRadarSlam
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 N_SCANS = 512
 Result = TypeVar("Result")

@@ -30,7 +30,7 @@ from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.ekf import predict, update
 from slam.paper.trilateration import Trilaterator
 from slam.results import Belief, Fix
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 Array = NDArray[np.float64]
 Q = np.diag([0.15**2, 1.0])

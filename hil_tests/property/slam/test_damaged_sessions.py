@@ -10,12 +10,12 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of
 from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
-from slam.app.records import LogLine
-from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
 from slam.app.session.repair import repair
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import LogLine
 from slam.frames import RadarFrame
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 N_BINS = 16
 N_SCANS = 20

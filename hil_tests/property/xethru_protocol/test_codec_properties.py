@@ -22,7 +22,7 @@ from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import NEED_DATA
 from xethru_protocol.wire.messages import X4DriverSet
-from xethru_protocol.wire.rows import (
+from xethru_protocol.wire.table import (
     COMMANDS,
     RESPONSES,
     ROWS,

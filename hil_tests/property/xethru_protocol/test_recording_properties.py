@@ -29,7 +29,7 @@ from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.rows import RESPONSES
+from xethru_protocol.wire.table import RESPONSES
 
 STORED = [kind.message for kind in KINDS]
 """Message types that the vendor's format has a place for."""

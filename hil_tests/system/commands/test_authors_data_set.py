@@ -12,8 +12,8 @@ from hil_tests.unit.slam.app.convert.authors_bag import AuthorsBag
 from slam.app.cli import main
 from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
-from slam.app.run.results import evaluate
-from xethru_protocol.system import StopFlag
+from slam.app.run.result_files import evaluate
+from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow
 

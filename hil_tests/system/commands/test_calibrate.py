@@ -7,7 +7,7 @@ import pytest
 
 from hil_tests.paths import FIXTURES
 from slam.app.cli import main
-from slam.app.rig.files import load_rig
+from slam.app.rig.rig_files import load_rig
 
 SCENES = FIXTURES / "scenes"
 

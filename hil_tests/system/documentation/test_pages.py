@@ -48,7 +48,7 @@ from hil_tests.system.documentation.markdown_blocks import Block, Prompt, blocks
 from hil_tests.system.recorded_session import record_session
 from slam.app import cli as slam_cli
 from slam.app.cli import main as slam_main
-from slam.app.rig.files import load_rig
+from slam.app.rig.rig_files import load_rig
 from xethru_protocol.cli import arguments as xethru_cli
 from xethru_protocol.cli import main as xethru_main
 

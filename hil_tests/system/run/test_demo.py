@@ -15,9 +15,9 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.odometry.track import read_tum
-from slam.app.run.evaluation import summarise
-from slam.app.run.results import evaluate
+from slam.app.run.result_files import evaluate
 from slam.app.run.runner import execute
+from slam.app.run.summary import summarise
 from slam.app.session import cdr as ros
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.rerun_recording import count_rows

@@ -18,7 +18,7 @@ from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.full_disk import child_on_full_disk
 from hil_tests.unit.slam.app.sessions import surviving_counters
 from slam.app.cli import main
-from slam.app.run import results
+from slam.app.run import result_files
 from slam.app.view.rerun_recording import count_rows
 
 pytestmark = [
@@ -145,13 +145,13 @@ def test_a_signal_after_the_last_scan_costs_no_result(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    real = getattr(results, step)
+    real = getattr(result_files, step)
 
     def interrupted(*arguments: object, **options: object) -> object:
         os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(results, step, interrupted)
+    monkeypatch.setattr(result_files, step, interrupted)
     out = tmp_path / "out"
     command = [
         "demo",
@@ -168,8 +168,8 @@ def test_a_signal_after_the_last_scan_costs_no_result(
     assert {path.name for path in out.iterdir()} == {
         "session.mcap",
         "session.rrd",
-        *results.RESULTS,
-    } - {results.SMOOTHED}
+        *result_files.RESULTS,
+    } - {result_files.SMOOTHED}
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ import pytest
 
 from emulator.cli import ask
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.records import Scan
-from slam.app.rig import sources
+from slam.app.rig import frame_sources
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -19,7 +18,8 @@ from slam.app.rig.emulated import (
     rig_of,
     scene_and_config,
 )
-from xethru_protocol.system import StopFlag
+from slam.app.session_records import Scan
+from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +29,7 @@ def test_frames_after_a_restart_are_those_of_their_time(
 ) -> None:
     """Protocol reference 6.1: the counter begins anew; content is that of scene time."""
     # A restart takes a second, on a loaded machine several: that is no silence here.
-    monkeypatch.setattr(sources, "SILENCE_S", 10.0)
+    monkeypatch.setattr(frame_sources, "SILENCE_S", 10.0)
     scene_file = str(write_short_scene(tmp_path))
     scene, _ = scene_and_config(scene_file, "paper")
     ticks = min(end_tick(scene.trajectory().duration_ns), 60)

@@ -22,7 +22,7 @@ from hil_tests.paths import REPOSITORY
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
-from slam.app.rig.files import RigFile, RigRadar, write_rig
+from slam.app.rig.rig_files import RigFile, RigRadar, write_rig
 from slam.app.session.reader import open_session
 from slam.results import SmoothedRun
 

@@ -14,14 +14,14 @@ from hil_tests.system.recorded_session import record_session, write_shorter_scen
 from hil_tests.unit.slam.app.session.test_state_rows import assert_same_step
 from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.cli import main
-from slam.app.records import Snapshot
 from slam.app.run import replay
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
 from slam.app.session.constants import slam_constants
 from slam.app.session.reader import open_session
+from slam.app.session_records import Snapshot
 from slam.robust.parameters import BackEndParameters, TrackletRule
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow
 

@@ -22,7 +22,7 @@ from slam.app.run import output
 from slam.app.view.rerun_recording import count_rows
 from slam.paper.pipeline import UwbRadarSlam
 from slam.robust.pipeline import RobustSlam
-from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 pytestmark = pytest.mark.slow
 

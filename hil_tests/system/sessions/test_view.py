@@ -31,7 +31,7 @@ from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording
 from slam.app.view.rerun_recording import RrdReader, count_rows, rr
 from slam.app.view.viewer import LiveView, SlamViewerProcess
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow
 

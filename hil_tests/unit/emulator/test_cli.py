@@ -16,7 +16,7 @@ import pytest
 
 from emulator.cli import main
 from hil_tests.patience import seconds
-from xethru_protocol.system import locked
+from xethru_protocol.operating_system import locked
 
 
 def test_the_link_directory_of_a_running_emulator_is_refused(

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from hil_tests.device.test_content import CHECKS, range_errors_m
-from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import RadarTarget, target_of
+from hil_tests.plugin.session_radars import RadarUnderTest
 from xethru_protocol.driver.frames import Frame
 
 

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from hil_tests.plugin.bench import Bench, BrokenRadarError
 from hil_tests.plugin.findings import Measure, Measurement, findings_of
 from hil_tests.plugin.radar_specs import RadarArgument, parse_specs
 from hil_tests.plugin.radar_targets import InProcessTarget, TargetError
 from hil_tests.plugin.requirements import gate
+from hil_tests.plugin.session_radars import Bench, BrokenRadarError
 from xethru_protocol.transport import Transport
 from xethru_protocol.wire.errors import PortUnavailable
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from hil_tests.plugin import power, radar_targets
-from hil_tests.plugin.bench import Bench, PortBusyError, PortLock
 from hil_tests.plugin.findings import Measure, findings_of
 from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import TappedTransport, WireTap
 from hil_tests.plugin.requirements import gate
+from hil_tests.plugin.session_radars import Bench, PortBusyError, PortLock
 
 
 def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
@@ -23,7 +23,7 @@ def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
     port.touch()
     link = tmp_path / "by-id"
     link.symlink_to(port)
-    program = f"from hil_tests.plugin.bench import PortLock; PortLock({str(link)!r})"
+    program = f"from hil_tests.plugin.session_radars import PortLock; PortLock({str(link)!r})"
     lock = PortLock(str(port))
     refused = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False

@@ -19,7 +19,7 @@ from hil_tests.unit.slam.app.sessions import session_info, write_session
 from hil_tests.unit.transcripts.test_transcripts import check_transcript
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.session.description import METADATA_NAME, session_table
-from slam.app.session.log import SessionLog
+from slam.app.session.writer import SessionLog
 from slam.app.view.rerun_recording import rr
 
 TEXTS = Path(__file__).parent / "uwb_slam"

@@ -14,7 +14,7 @@ import pytest
 from emulator.faults.plan import FaultPlanError, load_plan
 from emulator.scene.scene import SceneError, load_scene
 from slam.app.errors import AppError
-from slam.app.rig.files import load_rig
+from slam.app.rig.rig_files import load_rig
 from slam.config import ConfigError, SlamConfig, config_from_tables, override
 from xethru_protocol.validation import shown
 

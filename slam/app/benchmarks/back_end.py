@@ -23,7 +23,7 @@ from slam.robust.parameters import (
     RelinearisationRule,
     TrackletRule,
 )
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 _SIGMA_M = 0.1  # of ranges without one; all have one here
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from slam.app.benchmarks.data_set import DataSet
-from slam.app.benchmarks.evaluation import (
+from slam.app.benchmarks.path_errors import (
     ODOMETRY,
     WITH_IDS,
     WITHOUT_IDS,
@@ -34,7 +34,7 @@ from slam.app.run.pictures import (
     picture,
 )
 from slam.app.run.pictures import ODOMETRY as ODOMETRY_COLOUR
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 _PANELS = 4
 _PANEL_IN = 3.4

@@ -33,7 +33,7 @@ from slam.app.benchmarks.data_set import (
     step_times,
     steps_at,
 )
-from slam.app.benchmarks.tables import REMEDY, folder_at, read_table
+from slam.app.benchmarks.text_columns import REMEDY, folder_at, read_table
 from slam.app.errors import AppError
 from slam.config import WheelNoise
 

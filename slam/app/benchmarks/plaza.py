@@ -34,7 +34,7 @@ from slam.app.benchmarks.data_set import (
     Sensor,
     steps_of,
 )
-from slam.app.benchmarks.tables import TableRow, found, number_of, read_rows
+from slam.app.benchmarks.text_columns import TableRow, found, number_of, read_rows
 from slam.app.errors import AppError
 from slam.app.odometry.track import NS_PER_S
 from slam.config import WheelNoise

@@ -30,7 +30,7 @@ from slam.app.benchmarks.data_set import (
     positions_of,
     steps_at,
 )
-from slam.app.benchmarks.tables import check_ascending, found, read_rows
+from slam.app.benchmarks.text_columns import check_ascending, found, read_rows
 from slam.app.errors import AppError
 from slam.config import WheelNoise
 

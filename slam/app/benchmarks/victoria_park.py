@@ -49,7 +49,7 @@ from slam.app.benchmarks.data_set import (
     steps_at,
     steps_of,
 )
-from slam.app.benchmarks.tables import (
+from slam.app.benchmarks.text_columns import (
     REMEDY,
     TableRow,
     check_ascending,

@@ -16,10 +16,10 @@ from threadpoolctl import threadpool_limits
 from emulator.scene.scene import Scene, SceneError, load_scene
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import SessionInfo
-from slam.app.rig.files import RigFile, RigPulse, RigRadar, write_rig
+from slam.app.rig.rig_files import RigFile, RigPulse, RigRadar, write_rig
 from slam.app.run.output import print_progress, print_text
 from slam.app.session.reader import RecordedSession, open_session
+from slam.app.session_records import SessionInfo
 from slam.calibration.calibration import Calibration, Drive, calibrate, make_drive
 from slam.calibration.observability import (
     OFFSET_LIMIT_M,
@@ -36,7 +36,7 @@ from slam.frames import Detection, RadarFrame
 from slam.front_end.matched_filter import MatchedFilterDetector
 from slam.front_end.pulse_estimation import PulseEstimator
 from slam.geometry import Rig
-from xethru_protocol.system import StopFlag, json_text, one_line, read_bounded
+from xethru_protocol.operating_system import StopFlag, json_text, one_line, read_bounded
 from xethru_protocol.transport import is_network_port
 
 Array = NDArray[np.float64]

@@ -11,7 +11,6 @@ from typing import Literal
 
 from slam.app.errors import AppError, EmulatorError, RadarSilentError
 from slam.app.odometry.track import read_odometry_socket
-from slam.app.records import Scan, SessionInfo, SessionObserver
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -25,18 +24,27 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.rig.sources import RigSource
+from slam.app.rig.frame_sources import RigSource
 from slam.app.run.output import RunProgress, note
-from slam.app.run.results import REPORT, RESULTS, SESSION, VIEW, finish, hold_folder, remove_earlier
+from slam.app.run.result_files import (
+    REPORT,
+    RESULTS,
+    SESSION,
+    VIEW,
+    finish,
+    hold_folder,
+    remove_earlier,
+)
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.description import settings_text
-from slam.app.session.log import SessionLog
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import Scan, SessionInfo, SessionObserver
 from slam.app.view.viewer import LiveView
-from slam.compiled import compile_kernels
 from slam.config import BackEnd
-from xethru_protocol.extras import install_command, what_is_missing
-from xethru_protocol.system import StopFlag, StopRequestedError
+from slam.numba_functions import compile_kernels
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
+from xethru_protocol.optional_packages import install_command, what_is_missing
 
 _OUTPUTS = (SESSION, VIEW, REPORT, *RESULTS)
 

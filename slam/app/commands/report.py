@@ -19,17 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
-from slam.app.run.evaluation import (
-    POSE_DOF,
-    StateNumbers,
-    Summary,
-    bands_95,
-    smoothed_errors,
-    state_numbers,
-    summarise,
-    world_from_odom,
-)
 from slam.app.run.output import print_text, run_rows, summary_rows
 from slam.app.run.pictures import (
     ESTIMATE,
@@ -44,13 +33,24 @@ from slam.app.run.pictures import (
     svg_of,
 )
 from slam.app.run.replay import play, refuse_overwriting, session_file
-from slam.app.run.results import REPORT
+from slam.app.run.result_files import REPORT
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
+from slam.app.run.summary import (
+    POSE_DOF,
+    StateNumbers,
+    Summary,
+    bands_95,
+    smoothed_errors,
+    state_numbers,
+    summarise,
+    world_from_odom,
+)
 from slam.app.session.reader import RecordedSession, open_session
+from slam.app.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
-from slam.packed import PackedRows
-from xethru_protocol.system import StopFlag, each_line, one_line, written_whole
+from slam.growing_arrays import PackedRows
+from xethru_protocol.operating_system import StopFlag, each_line, one_line, written_whole
 
 _KEPT_WARNINGS = 200
 

@@ -21,10 +21,9 @@ from slam.app.errors import AppError, UsageError
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LineSource, LiveOdometry, parse_source
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import SessionInfo, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, versions
-from slam.app.rig.files import are_emulated, load_rig, open_rig
-from slam.app.rig.sources import RigSource, sampler_limits
+from slam.app.rig.frame_sources import RigSource, sampler_limits
+from slam.app.rig.rig_files import are_emulated, load_rig, open_rig
 from slam.app.run.live_source import (
     MOST_WAIT_NS,
     Inbox,
@@ -34,7 +33,7 @@ from slam.app.run.live_source import (
     reading,
 )
 from slam.app.run.output import ResultRow, RunProgress, note
-from slam.app.run.results import (
+from slam.app.run.result_files import (
     REPORT,
     RESULTS,
     SESSION,
@@ -55,12 +54,13 @@ from slam.app.run.runner import (
 )
 from slam.app.session.constants import slam_constants
 from slam.app.session.description import settings_text
-from slam.app.session.log import SessionLog
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import SessionInfo, SessionObserver
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.frames import RadarFrame
 from slam.results import PoseAt, Slam, SmoothedRun, StepResult
-from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 _STALE = (VIEW, REPORT)
 """Made from a session by other commands; those of an earlier session would mislead."""

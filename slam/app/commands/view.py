@@ -23,13 +23,13 @@ from slam.app.run.replay import (
     refuse_overwriting,
     session_file,
 )
-from slam.app.run.results import VIEW
+from slam.app.run.result_files import VIEW
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
 from slam.app.view.viewer import LiveView, SlamViewerProcess
 from xethru_protocol.cli.live.viewer import ViewerKind
-from xethru_protocol.system import StopFlag, one_line, written_whole
+from xethru_protocol.operating_system import StopFlag, one_line, written_whole
 
 _MAGIC = b"RRF"
 _OLDEST = (0, 23)

@@ -9,13 +9,13 @@ from pathlib import Path
 from slam.app.convert.matlab import convert_mat, write_detections
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import AppError, UsageError, naming
-from slam.app.rig.files import load_rig
+from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_text
 from slam.app.run.replay import recorded_config
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
+from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
 from xethru_protocol.recordings import RecordingError, WireCapture
-from xethru_protocol.system import PathInUseError, StopFlag, built_aside, sync
 from xethru_protocol.validation import shown
 
 

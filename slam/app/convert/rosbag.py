@@ -35,8 +35,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSample
-from slam.app.records import RadarInfo, Scan, SessionInfo, TruthAt
-from slam.app.rig.sources import recorded_frame
+from slam.app.rig.frame_sources import recorded_frame
 from slam.app.session import cdr
 from slam.app.session.description import (
     imported_info,
@@ -46,12 +45,13 @@ from slam.app.session.description import (
     read_session_table,
     session_table,
 )
-from slam.app.session.log import SessionLog
 from slam.app.session.reader import RecordedSession, ScanEnd
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import RadarInfo, Scan, SessionInfo, TruthAt
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, STRING, pack_array, pack_string
-from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import frame_area

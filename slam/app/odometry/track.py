@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError, OdometryError
 from slam.geometry import wrap_angle
-from xethru_protocol.system import read_bounded
+from xethru_protocol.operating_system import read_bounded
 from xethru_protocol.validation import shown
 
 NS_PER_S = 1_000_000_000

@@ -31,13 +31,13 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scen
 from emulator.x4m300 import radar_device
 from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.track import NS_PER_S
-from slam.app.rig.files import rig_file_of
-from slam.app.rig.sources import RadarLink, RecordObserver, RigSource, StreamBegins
+from slam.app.rig.frame_sources import RadarLink, RecordObserver, RigSource, StreamBegins
+from slam.app.rig.rig_files import rig_file_of
 from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Rig, transform
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import StopFlag, signal_at_parents_death
+from xethru_protocol.operating_system import StopFlag, signal_at_parents_death
 from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import real_frame_rate

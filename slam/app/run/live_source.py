@@ -33,15 +33,15 @@ from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.arrival import ArrivalClock
 from slam.app.odometry.live import MOST_STAMP_NS, LineSource, LiveOdometry, read_lines
 from slam.app.odometry.track import NS_PER_S, TumSample
-from slam.app.records import LogLine, RadarInfo, Scan, Snapshot
-from slam.app.rig.sources import RadarLink, radar_frame
+from slam.app.rig.frame_sources import RadarLink, radar_frame
 from slam.app.run.runner import LinkLog, frames_between
-from slam.app.session.log import CannotWriteError, SessionLog
+from slam.app.session.writer import CannotWriteError, SessionLog
+from slam.app.session_records import LogLine, RadarInfo, Scan, Snapshot
 from slam.frames import RadarFrame
 from slam.results import SmoothedRun
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.matching import ProtocolRecord
-from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.validation import reason_of
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from slam.app.errors import naming
-from slam.app.records import SessionInfo, Snapshot
-from slam.app.run.evaluation import Summary
 from slam.app.run.runner import LinkState, RunRecord
+from slam.app.run.summary import Summary
+from slam.app.session_records import SessionInfo, Snapshot
 from slam.geometry import between, compose, transform
-from xethru_protocol.system import each_line, written_whole
+from xethru_protocol.operating_system import each_line, written_whole
 
 # What is drawn alike differs also for those who see two colours only.
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#9aa0a8", "#e08a2c", "#1f6fd0", "#c2255c"

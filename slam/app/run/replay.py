@@ -19,9 +19,8 @@ from pydantic import ValidationError
 
 from slam.app.errors import AppError, OdometryError, UsageError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import RunProgress, note
-from slam.app.run.results import SESSION, VIEW, finish, hold_folder, saying_what_is_left
+from slam.app.run.result_files import SESSION, VIEW, finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import (
     LinkLog,
     LostFrames,
@@ -35,12 +34,13 @@ from slam.app.run.runner import (
 from slam.app.session.constants import different_constants, recorded_rules
 from slam.app.session.reader import RecordedScan, RecordedSession, open_session
 from slam.app.session.state_rows import smoothed_row, state_row
+from slam.app.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
-from slam.packed import RowsByTime
+from slam.growing_arrays import RowsByTime
 from slam.results import PoseAt, Slam, SmoothedRun, StepResult
+from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
-from xethru_protocol.system import StopFlag
 from xethru_protocol.validation import problem_text
 
 _END = b"FOOT"

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.app.records import (
+from slam.app.session_records import (
     LogLine,
     RadarInfo,
     Scan,
@@ -26,12 +26,12 @@ from slam.app.records import (
     Snapshot,
     TruthAt,
 )
-from slam.compiled import compile_kernels
 from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import TrueAssociationNis, true_range_nis
 from slam.frames import Detector, RadarFrame
 from slam.geometry import Rig
-from slam.packed import PackedRows, RowsByTime
+from slam.growing_arrays import PackedRows, RowsByTime
+from slam.numba_functions import compile_kernels
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from slam.app.odometry.track import NS_PER_S, TumSample
-from slam.app.records import LogLine, Snapshot
+from slam.app.session_records import LogLine, Snapshot
 from slam.results import SmoothedRun
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from slam.app.errors import AppError
-from slam.app.records import RadarInfo, SessionInfo
 from slam.app.session.constants import slam_constants
+from slam.app.session_records import RadarInfo, SessionInfo
 from slam.config import SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount
 from xethru_protocol.validation import reason_of, shown

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
-from slam.app.rig.sources import recorded_frame, sampler_limits
+from slam.app.rig.frame_sources import recorded_frame, sampler_limits
 from slam.app.session import cdr
 from slam.app.session.description import (
     GAP_TOPIC,
@@ -36,10 +35,12 @@ from slam.app.session.description import (
 )
 from slam.app.session.lost_messages import read_gap
 from slam.app.session.state_rows import smoothed_of, snapshot_of, with_step
+from slam.app.session_records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Rig
 from slam.results import SmoothedRun
 from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,
     DOUBLE_ARRAY,
@@ -56,7 +57,6 @@ from xethru_protocol.recordings.mcap import (
     unpack_string,
 )
 from xethru_protocol.recordings.mcap import read_entries as entries_of
-from xethru_protocol.system import StopFlag
 from xethru_protocol.validation import reason_of
 
 _KINDS = {

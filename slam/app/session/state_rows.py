@@ -51,7 +51,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.records import Snapshot
+from slam.app.session_records import Snapshot
 from slam.frames import Detection
 from slam.results import (
     LANDMARK_SIZE,

@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import RadarInfo, Scan, SessionInfo, Snapshot
-from slam.app.rig.echoes import envelope_db, wedge
-from slam.app.rig.sources import TRUE_PER_MODULE_METRE
+from slam.app.rig.echo_arcs import envelope_db, wedge
+from slam.app.rig.frame_sources import TRUE_PER_MODULE_METRE
 from slam.app.session import cdr
 from slam.app.session.cdr import Marker, Shape
+from slam.app.session_records import RadarInfo, Scan, SessionInfo, Snapshot
 from slam.config import WheelNoise
 from slam.frames import RadarFrame
 from slam.geometry import between, compose

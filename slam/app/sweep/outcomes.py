@@ -11,9 +11,9 @@ from scipy.special import chdtri
 
 from emulator.scene.scene import Scene
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import SessionInfo, SessionObserver, Snapshot
 from slam.app.rig.emulated import outlines_m
 from slam.app.run.runner import RunRecord
+from slam.app.session_records import SessionInfo, SessionObserver, Snapshot
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import Rig, between, transform, wrap_angles
 

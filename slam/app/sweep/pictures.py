@@ -41,7 +41,7 @@ from slam.app.sweep.table import (
     table_of,
     times_clean,
 )
-from xethru_protocol.system import StopFlag, read_bounded
+from xethru_protocol.operating_system import StopFlag, read_bounded
 from xethru_protocol.validation import problem_text
 
 TARGETS = {

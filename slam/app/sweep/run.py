@@ -21,11 +21,10 @@ import numpy as np
 from emulator.scene.philox import counter_normals, uniforms
 from emulator.scene.rooms import MOST_ROOMS, room_of
 from emulator.scene.scene import CarriedSpec, Scene
-from emulator.scene.tables import TableT, is_name
+from emulator.scene.toml_files import TableT, is_name
 from emulator.scene.wheels import scene_odometry
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import NS_PER_S, OdometryTrack
-from slam.app.records import Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -37,9 +36,10 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.runner import RunSource, execute, make_slam
+from slam.app.run.summary import Summary, summarise
 from slam.app.session.description import settings_text
+from slam.app.session_records import Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.sweep import CLEAN, STRESSES, SceneKeys, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.app.sweep.outcomes import (
@@ -53,7 +53,7 @@ from slam.config import ConfigError, SlamConfig, override
 from slam.frames import Detection, Detector, RadarFrame
 from slam.front_end import make_detector
 from slam.results import Slam, StepResult
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.wire.x4 import FIRST_COUNTER
 
 # Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the

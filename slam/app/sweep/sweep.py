@@ -36,7 +36,7 @@ from slam.app.sweep.table import (
     stress_tables,
 )
 from slam.app.sweep.workers import dask_results, worker_results
-from xethru_protocol.system import (
+from xethru_protocol.operating_system import (
     PathInUseError,
     StopFlag,
     StopRequestedError,

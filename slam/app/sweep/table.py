@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from slam.app.run.evaluation import ratio
 from slam.app.run.output import mm_text, share_text
+from slam.app.run.summary import ratio
 from slam.app.sweep import CLEAN
 from slam.app.sweep.outcomes import FOUND_WITHIN_S
 from slam.app.sweep.statistics import HARMED, Group, in_band, nis_in_band

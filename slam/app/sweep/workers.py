@@ -22,8 +22,8 @@ import joblib
 from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from slam.app.errors import AppError, UsageError
-from xethru_protocol.extras import install_command
-from xethru_protocol.system import signal_at_parents_death
+from xethru_protocol.operating_system import signal_at_parents_death
+from xethru_protocol.optional_packages import install_command
 
 _LEFT_TO_THE_PARENT = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 

@@ -12,8 +12,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import RadarInfo, Scan, Snapshot
-from slam.app.rig.echoes import envelope_db
+from slam.app.rig.echo_arcs import envelope_db
+from slam.app.session_records import RadarInfo, Scan, Snapshot
 from slam.app.view.rerun_recording import (
     FAULT_RGB,
     RADAR_RGB,

@@ -16,11 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
+from xethru_protocol.operating_system import (
+    STDERR,
+    STDOUT,
+    flush_streams,
+    one_line,
+    open_closed_streams,
+)
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.formats import recording_format
 from xethru_protocol.recordings.vendor.layouts import META_NAME
 from xethru_protocol.recordings.wire_capture import SUFFIX, read_note
-from xethru_protocol.system import STDERR, STDOUT, flush_streams, one_line, open_closed_streams
 
 INCOMPATIBLE = 66
 """Exit code by which Rerun learns that a file is for other importers."""

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import RadarInfo, SessionInfo, Snapshot
-from slam.app.rig.echoes import arcs, wedge
+from slam.app.rig.echo_arcs import arcs, wedge
 from slam.app.run.pictures import (
     ellipse_95,
     ellipse_text,
@@ -20,6 +19,7 @@ from slam.app.run.pictures import (
     extent_m,
     rotate_covariances,
 )
+from slam.app.session_records import RadarInfo, SessionInfo, Snapshot
 from slam.app.view.rerun_recording import (
     ESTIMATE_RGB,
     FIX_RGB,
@@ -45,7 +45,7 @@ from slam.app.view.rerun_recording import (
     strips_column,
 )
 from slam.geometry import compose, transform
-from slam.packed import PackedRows
+from slam.growing_arrays import PackedRows
 from slam.results import Fix, Observation, SmoothedRun, StepResult
 
 Array = NDArray[np.float64]

@@ -18,12 +18,12 @@ from slam.app.view.frames import chart_style, send_bscan, send_charts
 from slam.app.view.rerun_recording import DEVICE_TIME, RerunRecording, RowTimes, rr, rrb
 from xethru_protocol.cli.recordings import message_line
 from xethru_protocol.driver.frames import complex_of
+from xethru_protocol.operating_system import one_line
 from xethru_protocol.recordings import RecordingFault, read_recording
 from xethru_protocol.recordings.formats import message_name, recording_facts, recording_format
 from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayouts
-from xethru_protocol.system import one_line
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 from xethru_protocol.wire.x4 import BASEBAND_BIN_M, RF_BIN_M
 
 Samples = NDArray[np.float32] | NDArray[np.complex64]

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
-from slam.app.run.evaluation import (
+from slam.app.run.pictures import LINK_COLOURS, half_axes_95_m
+from slam.app.run.runner import LinkChange, LinkStates
+from slam.app.run.summary import (
     POSE_DOF,
     StateNumbers,
     bands_95,
@@ -28,8 +29,14 @@ from slam.app.run.evaluation import (
     state_numbers,
     world_from_odom,
 )
-from slam.app.run.pictures import LINK_COLOURS, half_axes_95_m
-from slam.app.run.runner import LinkChange, LinkStates
+from slam.app.session_records import (
+    LogLine,
+    RadarInfo,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+)
 from slam.app.view.frames import BLOCK_FRAMES, FrameLayer
 from slam.app.view.map import TRAIL_STATES, Ground, MapLayer, known_world_m
 from slam.app.view.rerun_recording import (
@@ -49,7 +56,7 @@ from slam.app.view.rerun_recording import (
     rrb,
     screen,
 )
-from slam.packed import PackedRows
+from slam.growing_arrays import PackedRows
 from slam.results import SmoothedRun
 
 _ABOUT = """\

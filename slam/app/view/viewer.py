@@ -15,13 +15,13 @@ from typing import Self
 from urllib.parse import urlsplit
 
 from slam.app.errors import AppError
-from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.output import note
+from slam.app.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.results import SmoothedRun
 from xethru_protocol.cli.live import viewer
 from xethru_protocol.cli.live.viewer import HERE, ViewerKind
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 _DEFAULT_PORT = 9876
 _CONNECT_LIMIT_S = 3.0

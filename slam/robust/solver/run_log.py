@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import wrap_angle, wrap_angles
-from slam.packed import PackedRows
+from slam.growing_arrays import PackedRows
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.state import HEAD_SIZE, Array, Indices, Layout, Motion, State, quarter_turn
 

@@ -23,7 +23,7 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from xethru_protocol.cli.live.analysis import LiveUpdate
-from xethru_protocol.cli.live.picture import STEPS, in_decibels, levels, scale_of, ticks_m
+from xethru_protocol.cli.live.terminal_picture import STEPS, in_decibels, levels, scale_of, ticks_m
 from xethru_protocol.processing.doppler import SPEED_OF_LIGHT_MPS
 
 _WIDTH = 1000.0

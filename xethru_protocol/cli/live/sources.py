@@ -19,7 +19,7 @@ from xethru_protocol.driver.frames import Samples
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings.loading import RadarArrays, load
-from xethru_protocol.recordings.records import NO_TIME_NS, RecordingFault
+from xethru_protocol.recordings.recorded_messages import NO_TIME_NS, RecordingFault
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.x4 import CARRIER_HZ, real_frame_rate

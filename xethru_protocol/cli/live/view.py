@@ -19,12 +19,12 @@ from threading import Event, Thread
 from typing import Any, Protocol
 
 from xethru_protocol.cli.live.analysis import LiveAnalysis, LiveUpdate
-from xethru_protocol.cli.live.picture import Style, picture
 from xethru_protocol.cli.live.sources import FrameSource, open_source
+from xethru_protocol.cli.live.terminal_picture import Style, picture
 from xethru_protocol.cli.live.viewer import ViewerError, ViewerKind, ViewerProcess
 from xethru_protocol.cli.output import check_output, print_line, print_text, warn
-from xethru_protocol.extras import what_is_missing
-from xethru_protocol.system import STDOUT
+from xethru_protocol.operating_system import STDOUT
+from xethru_protocol.optional_packages import what_is_missing
 
 _WINDOW_PERIOD_S, _BROWSER_PERIOD_S = 0.1, 0.2
 _TERMINAL_PERIOD_S = 0.2

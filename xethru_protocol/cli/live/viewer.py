@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import ClassVar, Self
 from urllib.parse import quote
 
-from xethru_protocol.extras import install_command
-from xethru_protocol.system import signal_at_parents_death
+from xethru_protocol.operating_system import signal_at_parents_death
+from xethru_protocol.optional_packages import install_command
 from xethru_protocol.wire.errors import XeThruError
 
 HERE = "127.0.0.1"

@@ -8,7 +8,7 @@ from typing import Any
 from xethru_protocol.cli.live.analysis import VitalAnswer, VitalSignsAnalysis
 from xethru_protocol.cli.live.sources import open_source
 from xethru_protocol.cli.output import print_json, print_line, print_text, rewriting
-from xethru_protocol.system import STDOUT
+from xethru_protocol.operating_system import STDOUT
 
 _EVERY_S = 1.0
 

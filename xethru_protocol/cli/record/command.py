@@ -19,11 +19,11 @@ from xethru_protocol.cli.output import (
     print_warnings,
     warn,
 )
-from xethru_protocol.cli.record.files import RecordingFiles, writer_options
 from xethru_protocol.cli.record.modes import POLL_S, Listen, RawFrames, profile_of
+from xethru_protocol.cli.record.output_files import RecordingFiles, writer_options
 from xethru_protocol.cli.record.session import record_session
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.wire.errors import (
     ResponseTimeout,
     XeThruError,

@@ -22,20 +22,20 @@ from xethru_protocol.cli.output import (
     print_warnings,
     warn,
 )
-from xethru_protocol.cli.record.files import writer_options
 from xethru_protocol.cli.record.modes import ANSWERS, POLL_S, Listen
+from xethru_protocol.cli.record.output_files import writer_options
 from xethru_protocol.cli.recordings import files_to_replace, remove_older, remove_unfinished
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings import (
     SessionRecorder,
 )
-from xethru_protocol.system import StopFlag
 from xethru_protocol.transport import open_line
 from xethru_protocol.wire.errors import (
     ResponseTimeout,
     XeThruError,
 )
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 _MOST_MODULES = 8
 _LONGEST_LINE = 65536  # bytes; a line without end is cut there

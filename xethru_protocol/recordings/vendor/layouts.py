@@ -52,11 +52,16 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from xethru_protocol.recordings.records import EARLIEST_MS, LATEST_MS, MS_NS, RecordingError
+from xethru_protocol.recordings.recorded_messages import (
+    EARLIEST_MS,
+    LATEST_MS,
+    MS_NS,
+    RecordingError,
+)
 from xethru_protocol.validation import shown
 from xethru_protocol.wire import fields, messages
 from xethru_protocol.wire.codec import encode
-from xethru_protocol.wire.rows import ROWS, Response
+from xethru_protocol.wire.table import ROWS, Response
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from typing import BinaryIO, Self
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol.recordings.records import (
+from xethru_protocol.recordings.recorded_messages import (
     MS_NS,
     FaultHandler,
     RecordingError,
@@ -55,7 +55,7 @@ from xethru_protocol.recordings.vendor.layouts import (
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.errors import LocalProtocolError
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 _LONGEST_USER_HEADER = 4096  # bytes; searched where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16

@@ -14,7 +14,7 @@ from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Self, TypedDict
 
-from xethru_protocol.recordings.records import MS_NS, GrowingFile, RecordingError, writing
+from xethru_protocol.recordings.recorded_messages import MS_NS, GrowingFile, RecordingError, writing
 from xethru_protocol.recordings.vendor.layouts import (
     ALL_BITS,
     CLOSED,
@@ -28,7 +28,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     closing_order,
 )
 from xethru_protocol.validation import shown
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ from emulator.faults.plan import (
     fault_spec,
     load_plan,
 )
-from emulator.scene.tables import parse_table, shipped_names
+from emulator.scene.toml_files import parse_table, shipped_names
 
 
 def test_shipped_scenarios_load() -> None:

@@ -11,7 +11,7 @@ from hil_tests.golden.test_protocol_vectors import KNOWN
 from hil_tests.golden.vectors import Vector
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.rows import ROWS, Command
+from xethru_protocol.wire.table import ROWS, Command
 
 UNHANDLED = [v for v in KNOWN if v.from_host and type(message_of(v)) not in HANDLERS]
 

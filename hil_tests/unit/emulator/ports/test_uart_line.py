@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from emulator.chip import Pace
 from emulator.module.settings import received_bytes
 from emulator.ports.event_loop import Port
-from emulator.ports.lines import Line, UartLine, UsbLine
+from emulator.ports.usb_and_uart import Line, UartLine, UsbLine
 from emulator.x4m300 import Device
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol.wire import messages as m

@@ -8,7 +8,7 @@ from emulator.chip.chip import Chip, ModuleClock
 from emulator.echo.echo import SceneEcho
 from emulator.module.settings import DeviceOptions, ProfileSettings
 from emulator.module.state import Module
-from emulator.profiles.run import ProfileStream
+from emulator.profiles.running_profile import ProfileStream
 from emulator.scene.people import PersonSpec
 from emulator.scene.scene import LeakageSpec, NoiseSpec, Scene, empty_room
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource

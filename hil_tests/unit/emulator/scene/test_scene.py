@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from emulator.scene.scene import Scene, SceneError, empty_room, load_scene
-from emulator.scene.tables import shipped_names
+from emulator.scene.toml_files import shipped_names
 
 RADAR = '[[radars]]\nname = "left"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.2\nyaw_deg = 90.0\n'
 HEAD = 'name = "mine"\nenvironment = "lab"\ndescription = "a scene"\n'

@@ -11,9 +11,16 @@ from numpy.typing import NDArray
 
 from slam.app.cli import main
 from slam.app.odometry.track import OdometryTrack, format_tum_line
-from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.runner import RunRecord, RunRecorder, snapshot_of_step
-from slam.app.session.log import SessionLog
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import (
+    LogLine,
+    RadarInfo,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+)
 from slam.config import load_preset
 from slam.frames import Detection, RadarFrame
 from slam.results import PoseAt, SmoothedRun, StepResult

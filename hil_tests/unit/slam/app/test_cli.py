@@ -14,11 +14,11 @@ import pytest
 from hil_tests.unit.slam.app.sessions import session_info, write_session
 from slam.app.cli import main
 from slam.app.errors import EmulatorError
-from slam.app.records import LogLine
 from slam.app.rig.emulated import EmulatorProcess
-from slam.app.rig.files import RigFile, RigRadar, write_rig
+from slam.app.rig.rig_files import RigFile, RigRadar, write_rig
 from slam.app.run.output import RunProgress, note, print_table
-from xethru_protocol.system import locked
+from slam.app.session_records import LogLine
+from xethru_protocol.operating_system import locked
 
 THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)
 
@@ -126,7 +126,7 @@ def test_a_signal_after_a_commands_last_check_counts_too(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     interrupted = lambda *_, **__: os.kill(os.getpid(), which)  # noqa: E731 - used once, below
-    monkeypatch.setattr("slam.app.run.results.run_evaluate", interrupted)
+    monkeypatch.setattr("slam.app.run.result_files.run_evaluate", interrupted)
     assert main(["evaluate", "one.tum", "two.tum"]) == code
     assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"
 

@@ -15,8 +15,8 @@ from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main, output
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.operating_system import one_line
 from xethru_protocol.recordings import describe_recording
-from xethru_protocol.system import one_line
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
 XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]

@@ -19,7 +19,7 @@ from hil_tests.unit.xethru_protocol.recordings.messages import counters
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
-from xethru_protocol.cli.record.files import RecordingFiles
+from xethru_protocol.cli.record.output_files import RecordingFiles
 from xethru_protocol.recordings import (
     describe_recording,
     read_note,

@@ -28,7 +28,7 @@ from hil_tests.unit.xethru_protocol.driver.test_driver_firmware import (
 )
 from xethru_protocol.recordings import RecordingWriter, read_recording
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 DOCUMENT = REPOSITORY / "docs" / "legacy.md"
 X4M200 = ("--model", "x4m200")

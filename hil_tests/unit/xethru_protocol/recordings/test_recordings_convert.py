@@ -20,7 +20,7 @@ from hil_tests.unit.xethru_protocol.recordings.messages import (
     write_capture,
 )
 from slam.app.odometry.track import OdometryTrack, format_tum_line
-from slam.app.session.log import SessionLog
+from slam.app.session.writer import SessionLog
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingWriter,

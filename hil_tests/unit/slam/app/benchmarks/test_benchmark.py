@@ -12,7 +12,7 @@ from hil_tests.unit.slam.app.benchmarks import worlds
 from slam.app.benchmarks import BENCHMARKS, plaza
 from slam.app.benchmarks.back_end import grouped
 from slam.app.benchmarks.data_set import LandmarkMeasurement, Run
-from slam.app.benchmarks.evaluation import associated
+from slam.app.benchmarks.path_errors import associated
 from slam.app.cli import main
 from slam.app.odometry.track import Trajectory, read_tum
 

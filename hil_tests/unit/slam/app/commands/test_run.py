@@ -19,16 +19,16 @@ from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
 from slam.app.odometry.track import OdometryTrack, TumSample, parse_tum_line, read_tum
-from slam.app.records import Scan
 from slam.app.run.live_source import LiveLog
 from slam.app.run.runner import run_slam, unknown_truth
 from slam.app.session import cdr as ros
 from slam.app.session.cdr import wheel_odometry
-from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
+from slam.app.session.writer import CannotWriteError, SessionLog
+from slam.app.session_records import Scan
 from slam.frames import RadarFrame
 from slam.results import PoseAt, SmoothedRun
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 
 def pose(number: int) -> TumSample:

@@ -17,9 +17,9 @@ from slam.app.cli import main
 from slam.app.convert.matlab import MAT_RIG, MatDrive, read_mat, write_mat
 from slam.app.errors import AppError
 from slam.app.odometry.track import OdometryTrack, format_tum_line
-from slam.app.records import SessionInfo
 from slam.app.session.description import settings_text
 from slam.app.session.reader import open_session
+from slam.app.session_records import SessionInfo
 from slam.config import SlamConfig, load_preset
 from slam.frames import Detection
 from slam.paper.trilateration import Trilaterator

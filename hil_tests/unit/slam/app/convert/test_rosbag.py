@@ -33,9 +33,9 @@ from hil_tests.unit.slam.app.sessions import (
 )
 from slam.app.convert.convert import run_convert
 from slam.app.odometry.track import OdometryTrack, format_tum_line
-from slam.app.session.log import SessionLog
 from slam.app.session.reader import RecordedSession, open_session
-from xethru_protocol.system import StopFlag, StopRequestedError
+from slam.app.session.writer import SessionLog
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 KINDS = ("bag.bag", "bag")
 

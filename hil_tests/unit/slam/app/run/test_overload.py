@@ -23,19 +23,19 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
 from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry
-from slam.app.records import LogLine, Scan, SessionInfo
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
-from slam.app.rig.sources import sampler_limits
+from slam.app.rig.frame_sources import sampler_limits
 from slam.app.run.live_source import Inbox, LiveLog, LiveSource, SourceEvent
 from slam.app.run.replay import Comparison, recorded_source
 from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute, make_slam
 from slam.app.session.description import settings_text
-from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import LogLine, Scan, SessionInfo
 from slam.config import load_preset
 from slam.frames import RadarFrame
 from slam.results import PoseAt, Slam, StepResult
-from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 MOST_WAIT_S = 2.0
 PERIOD_S = 0.2

@@ -14,7 +14,6 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from hil_tests.unit.slam.app.sessions import session_info, snapshot
-from slam.app.run.evaluation import Summary
 from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
@@ -29,6 +28,7 @@ from slam.app.run.pictures import (
     rotate_covariances,
 )
 from slam.app.run.runner import RunRecord, States
+from slam.app.run.summary import Summary
 from slam.app.view import rerun_recording as view
 from slam.evaluation import LandmarkScore
 

@@ -19,15 +19,15 @@ from hil_tests.unit.slam.app.sessions import (
     write_scans,
     write_session,
 )
-from slam.app.records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.replay import Comparison, play_states, recorded_source
 from slam.app.session.constants import different_constants, recorded_rules, slam_constants
 from slam.app.session.description import settings_text
 from slam.app.session.reader import open_session
+from slam.app.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.config import WheelNoise, load_preset
 from slam.robust.parameters import BackEndParameters, MapRule, TrackletRule
 from slam.robust.pipeline import RobustSlam
-from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 SETTINGS: dict[str, Any] = {
     "config_json": settings_text(load_preset("robust")),

@@ -19,9 +19,9 @@ from hil_tests.unit.slam.app.sessions import (
     snapshot,
 )
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import LogLine
 from slam.app.run.output import RunProgress
 from slam.app.run.runner import LinkStates, run_slam, unknown_truth
+from slam.app.session_records import LogLine
 from slam.frames import RadarFrame
 from slam.results import Belief, PoseAt, StepResult
 

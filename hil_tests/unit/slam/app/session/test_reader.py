@@ -21,16 +21,16 @@ from hil_tests.unit.slam.app.sessions import (
 )
 from slam.app.errors import AppError
 from slam.app.odometry.track import TumSample
-from slam.app.records import LogLine, Scan, Snapshot
 from slam.app.run.replay import play_states
 from slam.app.session.description import settings_text
-from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
 from slam.app.session.state_rows import smoothed_of, smoothed_row, snapshot_of, state_row
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import LogLine, Scan, Snapshot
 from slam.config import SlamConfig, load_preset
 from slam.frames import RadarFrame
 from slam.results import SmoothedRun
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 N_SCANS = 60
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8

@@ -13,12 +13,12 @@ from mcap.reader import make_reader
 
 from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of, rewrite
 from hil_tests.unit.slam.app.sessions import FRAME_NS, run, write_session
-from slam.app.records import Gap
 from slam.app.session.reader import ScanEnd, open_session
 from slam.app.session.repair import repair
+from slam.app.session_records import Gap
 from slam.frames import RadarFrame
+from xethru_protocol.operating_system import StopFlag, StopRequestedError, locked
 from xethru_protocol.recordings.mcap import is_latched
-from xethru_protocol.system import StopFlag, StopRequestedError, locked
 
 
 @pytest.fixture

@@ -27,10 +27,10 @@ from hil_tests.unit.slam.app.sessions import (
     snapshot,
 )
 from slam.app.odometry.track import TumSample
-from slam.app.records import Scan, SessionInfo, Snapshot
 from slam.app.session import cdr
-from slam.app.session.log import SessionLog
 from slam.app.session.viewer_topics import Drawings
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import Scan, SessionInfo, Snapshot
 
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
 Messages = dict[str, list[tuple[int, Any]]]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
-from slam.app.records import RadarInfo, SessionInfo, Snapshot
 from slam.app.run.runner import RunRecord, States
+from slam.app.session_records import RadarInfo, SessionInfo, Snapshot
 from slam.app.sweep.outcomes import (
     CarryOutcome,
     carry_of,

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from emulator.scene.scene import BurstSpec, PulseSpec, Scene, WanderSpec, load_scene
-from emulator.scene.tables import shipped_names
+from emulator.scene.toml_files import shipped_names
 from emulator.scene.wheels import scene_odometry
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.odometry.track import OdometryTrack
-from slam.app.records import Scan
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
+from slam.app.session_records import Scan
 from slam.app.sweep import CLEAN, FAMILIES, STRESSES, Stress
 from slam.app.sweep.run import DisturbedDetector, stressed_scans, stressed_scene
 from slam.config import RobustConfig, SlamConfig

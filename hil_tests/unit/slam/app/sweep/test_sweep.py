@@ -19,7 +19,7 @@ from slam.app.errors import AppError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, RunKey, SweepRun, finite, make_case
 from slam.app.sweep.sweep import PartFile, run_sweep
-from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 
 @pytest.mark.parametrize("folder", [".", "new"])

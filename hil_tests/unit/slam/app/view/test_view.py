@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info, smoothed_run, snapshot
 from slam.app.errors import AppError
-from slam.app.records import LogLine, Scan, SessionInfo, Snapshot
+from slam.app.session_records import LogLine, Scan, SessionInfo, Snapshot
 from slam.app.view.frames import bscan_picture
 from slam.app.view.rerun_recording import count_rows
 from slam.app.view.session_view import RerunView

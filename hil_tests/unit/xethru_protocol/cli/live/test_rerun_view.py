@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.unit.xethru_protocol.cli.live.test_picture import update
+from hil_tests.unit.xethru_protocol.cli.live.test_terminal_picture import update
 
 rr = pytest.importorskip("rerun")
 

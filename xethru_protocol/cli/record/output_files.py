@@ -32,7 +32,7 @@ from xethru_protocol.wire.errors import (
     XeThruError,
 )
 from xethru_protocol.wire.framing import LinkStatistics
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 
 class RecordingFiles:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.records import RadarInfo
+from slam.app.session_records import RadarInfo
 from slam.geometry import FieldOfView
 
 _ARC_POINTS = 17

@@ -17,7 +17,7 @@ from pydantic import (
     ValidationError,
 )
 
-from xethru_protocol.system import read_bounded
+from xethru_protocol.operating_system import read_bounded
 from xethru_protocol.validation import problem_text, shown
 
 # Beside this package, in the repository and in the wheel alike. Not importlib.resources on the

@@ -20,7 +20,7 @@ from emulator.faults.plan import FaultPlanError, load_plan
 from emulator.scene.scene import SceneError, load_scene
 from hil_tests.patience import seconds
 from slam.app.cli import main
-from xethru_protocol.system import (
+from xethru_protocol.operating_system import (
     Outlet,
     PathInUseError,
     StopFlag,
@@ -55,14 +55,14 @@ def test_while_waiting_a_signal_raises_where_it_arrives() -> None:
 _TWICE = """\
 import os, sys
 from signal import Signals
-from xethru_protocol import system
-which, system._TWICE_S = Signals[sys.argv[1]], float(sys.argv[2])
-with system.StopFlag() as stop:
+from xethru_protocol import operating_system
+which, operating_system._TWICE_S = Signals[sys.argv[1]], float(sys.argv[2])
+with operating_system.StopFlag() as stop:
     os.kill(os.getpid(), which)
     os.kill(os.getpid(), which)
     try:
         stop.check()
-    except system.StopRequestedError as stopped:
+    except operating_system.StopRequestedError as stopped:
         sys.exit(stopped.exit_code)
 """
 
@@ -165,7 +165,7 @@ def test_one_owner_at_a_time_and_no_trace(tmp_path: Path) -> None:
 def test_a_killed_owner_holds_nothing(tmp_path: Path) -> None:
     code = (
         "import pathlib, sys, time\n"
-        "from xethru_protocol.system import locked\n"
+        "from xethru_protocol.operating_system import locked\n"
         "with locked(pathlib.Path(sys.argv[1])): print(flush=True); time.sleep(60)\n"
     )
     with subprocess.Popen(
@@ -250,7 +250,7 @@ def test_the_next_writer_replaces_what_a_killed_one_left(tmp_path: Path) -> None
     result = tmp_path / "out.json"
     code = (
         "import os, pathlib, sys\n"
-        "from xethru_protocol.system import written_whole\n"
+        "from xethru_protocol.operating_system import written_whole\n"
         "with written_whole(pathlib.Path(sys.argv[1])) as fresh:\n"
         "    fresh.write_text('a long text of a killed process')\n"
         "    os.kill(os.getpid(), 9)\n"
@@ -274,7 +274,7 @@ def test_two_do_not_write_one_file_at_a_time(tmp_path: Path) -> None:
 def test_what_is_printed_is_not_lost_where_the_result_goes_to_the_same_file(tmp_path: Path) -> None:
     code = (
         "import pathlib\n"
-        "from xethru_protocol.system import written_whole\n"
+        "from xethru_protocol.operating_system import written_whole\n"
         "with written_whole(pathlib.Path('/dev/stdout')) as fresh:\n"
         "    fresh.open('a').write('result\\n')\n"
         "print('the table behind it')\n"
@@ -423,7 +423,7 @@ def test_a_signal_during_imports_ends_the_process_whatever_they_catch(
     kill = "os.kill(os.getpid(), signal.SIGTERM)\n"
     code = (
         "import os, signal\n"
-        "from xethru_protocol.system import StopFlag\n"
+        "from xethru_protocol.operating_system import StopFlag\n"
         "with StopFlag() as stop:\n"
         f"    {kill if is_early else ''}\n"
         f"    with stop.leaving({exit_code}, program='xethru'):\n"

@@ -27,10 +27,10 @@ from hil_tests.unit.slam.app.sessions import (
     write_scans,
     write_session,
 )
-from slam.app.records import LogLine
 from slam.app.session import cdr
-from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
+from slam.app.session.writer import CannotWriteError, SessionLog
+from slam.app.session_records import LogLine
 from slam.geometry import ReceivedPulse
 from xethru_protocol.recordings.mcap import McapWriter
 
@@ -298,7 +298,7 @@ import sys
 from pathlib import Path
 from hil_tests.unit.full_disk import full_disk
 from hil_tests.unit.slam.app.sessions import feed, session_info
-from slam.app.session.log import CannotWriteError, SessionLog
+from slam.app.session.writer import CannotWriteError, SessionLog
 
 with full_disk(1_000_000):
     log = SessionLog(Path(sys.argv[1]), session_info(), clock_ns=lambda: 0)

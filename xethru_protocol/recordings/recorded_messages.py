@@ -10,7 +10,7 @@ from typing import Any, Self, get_type_hints
 
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.errors import XeThruError
-from xethru_protocol.wire.rows import Response
+from xethru_protocol.wire.table import Response
 
 
 class RecordingError(XeThruError):

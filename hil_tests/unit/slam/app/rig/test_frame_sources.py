@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from emulator.scene.scene import PathSpec, Scene, load_scene
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.errors import AppError, RadarSilentError
-from slam.app.rig import sources
+from slam.app.rig import frame_sources
 from slam.app.rig.emulated import RAW_CONFIG, end_tick, open_loopback, rig_of
-from slam.app.rig.sources import RadarLink, RigSource, radar_frame
+from slam.app.rig.frame_sources import RadarLink, RigSource, radar_frame
 from slam.geometry import Mount
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import StopFlag, StopRequestedError
+from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
 
 MS = 1_000_000
@@ -205,7 +205,7 @@ def test_a_radar_that_does_not_come_back_ends_the_run() -> None:
 @given(st.integers(0, 10**11), st.floats(1.0, 400.0))
 def test_every_frame_lies_in_the_period_of_its_scan(start_skew_ns: int, rate_hz: float) -> None:
     period = Fraction(10**9) / Fraction(rate_hz)
-    late_ns = start_skew_ns - sources.whole_periods(start_skew_ns, rate_hz) * period
+    late_ns = start_skew_ns - frame_sources.whole_periods(start_skew_ns, rate_hz) * period
     assert -1 < late_ns < period + 1  # times are rounded to nanoseconds
 
 
@@ -220,7 +220,7 @@ def test_every_frame_lies_in_the_period_of_its_scan(start_skew_ns: int, rate_hz:
 def test_a_radar_that_fails_is_named(
     monkeypatch: pytest.MonkeyPatch, end: type[Exception], error: type[AppError], words: str
 ) -> None:
-    monkeypatch.setattr(sources, "SILENCE_S", 0.0)
+    monkeypatch.setattr(frame_sources, "SILENCE_S", 0.0)
     with pytest.raises(error, match=words):
         radars_of(rig_source(Canned(range(9)), Canned(range(3), end)), 9)
 

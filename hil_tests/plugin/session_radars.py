@@ -23,7 +23,7 @@ from hil_tests.plugin.radar_targets import (
     target_of,
 )
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import one_line
+from xethru_protocol.operating_system import one_line
 from xethru_protocol.transport import Transport
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, SensorMode, X4Setting
@@ -114,7 +114,7 @@ def matched(path: Path, drivers: Mapping[str, X4M300]) -> Mapping[str, X4M300]:
     The test fails if they are not its modules.
     """
     from slam.app.errors import AppError
-    from slam.app.rig.files import load_rig
+    from slam.app.rig.rig_files import load_rig
 
     try:
         wanted = {radar.serial: radar.name for radar in load_rig(path).radars}

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
-from slam.app.records import SessionInfo
-from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.output import ResultRow, print_result, print_text
 from slam.app.run.runner import RunRecord, RunSource
+from slam.app.run.summary import Summary, summarise
+from slam.app.session_records import SessionInfo
 from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
 from slam.results import SmoothedRun
-from xethru_protocol.system import (
+from xethru_protocol.operating_system import (
     PathInUseError,
     StopFlag,
     StopRequestedError,

@@ -12,10 +12,10 @@ from slam.app.benchmarks.back_end import BenchmarkRun, solve
 from slam.app.benchmarks.data_set import Array, DataSet, Positions, Run
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
-from slam.app.run.results import write_path
+from slam.app.run.result_files import write_path
 from slam.evaluation import ate_rmse_m
 from slam.geometry import align_se2, transform
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 
 ODOMETRY = "odometry"
 WITH_IDS, WITHOUT_IDS = "with_ids", "without_ids"

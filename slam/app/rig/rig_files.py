@@ -34,14 +34,14 @@ from typing import Annotated, Self
 from pydantic import Field, StrictFloat, model_validator
 
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
-from emulator.scene.tables import SerialNumber, Table, is_name, load_table
+from emulator.scene.toml_files import SerialNumber, Table, is_name, load_table
 from slam.app.errors import AppError, UsageError, naming
-from slam.app.rig.sources import RadarLink, RecordObserver
+from slam.app.rig.frame_sources import RadarLink, RecordObserver
 from slam.config import WheelNoise
 from slam.geometry import Mount, ReceivedPulse, Rig
 from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
-from xethru_protocol.system import written_whole
+from xethru_protocol.operating_system import written_whole
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import InfoItem
 from xethru_protocol.wire.errors import PortUnavailable, XeThruError

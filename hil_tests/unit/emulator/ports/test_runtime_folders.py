@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from emulator.ports import folders
-from emulator.ports.folders import Announcement, DirectoryMemory, fresh_port_folder
+from emulator.ports import runtime_folders
 from emulator.ports.pty import LinkError
+from emulator.ports.runtime_folders import Announcement, DirectoryMemory, fresh_port_folder
 from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m
@@ -27,7 +27,9 @@ LONG = "long" * 30
 def test_a_short_folder_holds_its_socket(tmp_path: Path) -> None:
     short = Path("/run/links")
     with contextlib.ExitStack() as cleanup:
-        assert folders.socket_path(short, cleanup, "odometry.sock") == short / "odometry.sock"
+        assert (
+            runtime_folders.socket_path(short, cleanup, "odometry.sock") == short / "odometry.sock"
+        )
 
 
 def test_where_links_and_tmpdir_are_long_the_socket_is_short_and_goes(
@@ -36,7 +38,7 @@ def test_where_links_and_tmpdir_are_long_the_socket_is_short_and_goes(
     (tmp_path / LONG).mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / LONG))
     with contextlib.ExitStack() as cleanup:
-        path = folders.socket_path(tmp_path / LONG, cleanup, "odometry.sock")
+        path = runtime_folders.socket_path(tmp_path / LONG, cleanup, "odometry.sock")
         assert len(os.fsencode(path)) <= 100
         assert path.parent.stat().st_mode & 0o077 == 0, "nobody else's business"
         assert list((tmp_path / LONG).iterdir()) == []
@@ -46,12 +48,12 @@ def test_where_links_and_tmpdir_are_long_the_socket_is_short_and_goes(
 def test_nowhere_short_enough_is_one_clear_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folders, "LONGEST_SOCKET_PATH", 10)
+    monkeypatch.setattr(runtime_folders, "LONGEST_SOCKET_PATH", 10)
     with (
         contextlib.ExitStack() as cleanup,
         pytest.raises(LinkError, match=r"too long for the odometry socket.*shorter --link-dir"),
     ):
-        folders.socket_path(tmp_path, cleanup, "odometry.sock")
+        runtime_folders.socket_path(tmp_path, cleanup, "odometry.sock")
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 from emulator.module.memory import SavedState
 from emulator.ports.pty import LinkError
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.operating_system import PathInUseError, locked
 from xethru_protocol.transport import is_private, is_running, run_directory
 from xethru_protocol.validation import problem_text, reason_of
 

@@ -13,10 +13,10 @@ import pytest
 from hil_tests.unit.slam.app.sessions import record_of_steps, session_info
 from slam.app.cli import main
 from slam.app.odometry.track import Trajectory, write_tum
-from slam.app.run.evaluation import NEES_AT, Summary, summarise
 from slam.app.run.output import summary_rows, table_text
-from slam.app.run.results import evaluate
+from slam.app.run.result_files import evaluate
 from slam.app.run.runner import RunRecord
+from slam.app.run.summary import NEES_AT, Summary, summarise
 from slam.app.session.description import settings_text
 from slam.config import BackEnd, DetectionConfig, RobustConfig, SlamConfig, TrilaterationConfig
 from slam.evaluation import LandmarkScore

@@ -28,7 +28,7 @@ from xethru_protocol.wire.codes import (
     error_name,
 )
 from xethru_protocol.wire.errors import LocalProtocolError
-from xethru_protocol.wire.rows import ROWS, Command, Prefixes, command
+from xethru_protocol.wire.table import ROWS, Command, Prefixes, command
 
 # Every row of 5.1 as (code, name by space); "" where the reference has no meaning.
 PROTOCOL, X4, FILES, PINS = ErrorCode, X4Error, FileError, IoPinError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from xethru_protocol.cli.live.analysis import LiveUpdate, VitalAnswer
-from xethru_protocol.cli.live.picture import Style, picture
+from xethru_protocol.cli.live.terminal_picture import Style, picture
 from xethru_protocol.processing.doppler import RangeDoppler
 
 COLOUR = re.compile(r"\x1b\[[\d;]*m")

@@ -15,9 +15,10 @@ from emulator.x4m300 import radar_device
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from slam.app.errors import AppError, UsageError
-from slam.app.rig import files as rig_match
+from slam.app.rig import rig_files as rig_match
 from slam.app.rig.emulated import rig_of
-from slam.app.rig.files import (
+from slam.app.rig.frame_sources import RadarLink
+from slam.app.rig.rig_files import (
     RigFile,
     RigPulse,
     RigRadar,
@@ -27,7 +28,6 @@ from slam.app.rig.files import (
     open_rig,
     write_rig,
 )
-from slam.app.rig.sources import RadarLink
 from slam.config import WheelNoise
 from slam.geometry import ReceivedPulse
 from xethru_protocol.driver.matching import Observer, ProtocolRecord

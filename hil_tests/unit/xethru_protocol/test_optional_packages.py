@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.paths import REPOSITORY
-from xethru_protocol.extras import INCLUDED, PACKAGES, what_is_missing
+from xethru_protocol.optional_packages import INCLUDED, PACKAGES, what_is_missing
 
 _PROJECT = REPOSITORY / "pyproject.toml"
 _NOT_INSTALLED = """\

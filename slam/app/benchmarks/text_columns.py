@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError
-from xethru_protocol.system import read_bounded
+from xethru_protocol.operating_system import read_bounded
 from xethru_protocol.validation import reason_of, shown
 
 Array = NDArray[np.float64]

@@ -23,14 +23,6 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import (
-    LogLine,
-    Scan,
-    SessionInfo,
-    SessionObserver,
-    Snapshot,
-    TruthAt,
-)
 from slam.app.session import cdr
 from slam.app.session.description import (
     METADATA_NAME,
@@ -40,6 +32,14 @@ from slam.app.session.description import (
 )
 from slam.app.session.state_rows import smoothed_row, state_row, step_row
 from slam.app.session.viewer_topics import Drawings, WheelMotion
+from slam.app.session_records import (
+    LogLine,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+    TruthAt,
+)
 from slam.geometry import between, compose
 from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import (

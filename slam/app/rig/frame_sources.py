@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError, RadarSilentError
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import RadarInfo, Scan
+from slam.app.session_records import RadarInfo, Scan
 from slam.frames import RadarFrame
 from slam.geometry import Mount
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import StopFlag
+from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout, XeThruError
 from xethru_protocol.wire.x4 import (
     FIRST_COUNTER,

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import SessionInfo, Snapshot
 from slam.app.run.runner import RunRecord
+from slam.app.session_records import SessionInfo, Snapshot
 from slam.evaluation import (
     LandmarkScore,
     ate_rmse_m,
