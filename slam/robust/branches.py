@@ -74,7 +74,8 @@ from slam.robust.proposals.constellation import (
     find_placements,
     stands_out,
 )
-from slam.robust.state import Array, quarter_turn
+from slam.robust.proposals.doubts import Doubt, doubted_covariance
+from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
 _IDS_APART = 1000
@@ -181,19 +182,6 @@ def _answered(
         if child.answer(asked, asked.options[k]):
             found.append(child)
     return [back_end, *found] if back_end.answer(question, first) else found
-
-
-def covered_share(probability: float) -> float:
-    """Return the share of a motion's variance that allows for a motion of a probability.
-
-    With probability p the position is away by a normal error of variance V, else it is right. The
-    region that a normal distribution of variance s V leaves with the probability q is left with q
-    by that, too, if s = ln(p / q) / ln(1 / q) (two dimensions; q is `TAIL_PROBABILITY`); p V is the
-    least, the variance of such a mixture.
-    """
-    if probability <= TAIL_PROBABILITY:
-        return probability
-    return max(probability, 1.0 - math.log(probability) / math.log(TAIL_PROBABILITY))
 
 
 def evidence_table(report: UpdateReport) -> Array:
@@ -310,48 +298,6 @@ class Place(Alternative):
         self.price_nats = price_nats  # how unlikely it is that the robot came there
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
-class Doubt:
-    """Motions that the wheels may not have reported, until known landmarks confirm the pose."""
-
-    next_id: int  # landmarks known before them have smaller ids
-    position_m: Array  # shape (2,), where the newest of them may have been
-    # shape (3, 3), of x, y [m] and heading for a pose there, their probabilities counted
-    covariance: Array
-    variances: Array  # shape (3,), if they happened, at the position
-    lost_share: float = 0.0  # how much of the variances of a lost robot that has
-    nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
-    # landmarks, and how often `BranchRule.most_for` they say, that were found to fit elsewhere, too
-    alike: tuple[frozenset[int], int] | None = None
-
-    def take(self, evidence: Array, rule: BranchRule) -> bool:
-        """Add the evidence of a step; return whether known landmarks fit the pose."""
-        for landmark, nats in evidence.tolist():
-            if landmark < self.next_id:
-                total = self.nats.get(int(landmark), 0.0) + nats / rule.correlated_steps
-                self.nats[int(landmark)] = min(max(total, -rule.most_against), rule.most_for)
-        return sum(self.nats.values()) > rule.price_nats
-
-    def at(self, position_m: Array) -> Array:
-        """Return what they add to the covariance (3, 3) of a pose at a position (2,)."""
-        T = np.eye(3)
-        T[:2, 2] = quarter_turn(position_m - self.position_m)
-        return np.asarray(T @ self.covariance @ T.T)
-
-    def add(self, newer: Doubt) -> None:
-        """Add a doubt with the same evidence."""
-        self.covariance = self.at(newer.position_m) + newer.covariance
-        self.variances = self.variances + newer.variances
-        self.lost_share += newer.lost_share
-        self.position_m = newer.position_m
-
-    def join(self, newer: Doubt) -> None:
-        """Add a doubt with other evidence: what confirms both confirms either."""
-        self.add(newer)
-        self.nats = {id_: nats for id_, nats in newer.nats.items() if id_ < self.next_id}
-        self.alike = None
-
-
 @dataclass(slots=True, kw_only=True)
 class Carry:
     """The question whether the robot was carried before a step, and to which place."""
@@ -415,11 +361,9 @@ class Branches:
     def doubted_covariance(self) -> Array:
         """Return what doubts of the wheels add to the covariance of the pose, (3, 3).
 
-        A robot that stopped often is no more lost than one that was carried.
+        The map frame is that of ``main``.
         """
-        position_m = self.main.state.position_m
-        total = sum((one.at(position_m) for one in self._doubts), np.zeros((3, 3)))
-        return total / max(sum(one.lost_share for one in self._doubts), 1.0)
+        return doubted_covariance(self._doubts, self.main.state.position_m)
 
     def predict(self, increment: Array, elapsed_s: float = 1.0, stood_s: float = 0.0) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
@@ -453,7 +397,7 @@ class Branches:
             carry_nats=carry_nats,
         )
         self._steps[self._now] = step
-        self._doubt(step, position_m)
+        self._doubt(step, report, position_m)
         self._now += 1
         was_lost = self.is_lost
         moved = self._carry is not None and self._decide(self._carry)
@@ -462,28 +406,28 @@ class Branches:
         carried = (moved or self.is_lost) and not was_lost
         return replace(report, carried=carried, lost=self.is_lost)
 
-    def _doubt(self, step: Step, position_m: Array) -> None:
+    def _doubt(self, step: Step, report: UpdateReport, position_m: Array) -> None:
         """Keep what is doubtful of the wheels, until it is confirmed."""
         rule, slipped = self._rule, self.main.slip_probability
         looks = self._now % self._look_every == 0
-        doubts = [
-            one
-            for one in self._doubts
-            if not one.take(step.evidence, rule) or not looks or self._is_alike_elsewhere(one)
-        ]
+        doubts: list[Doubt] = []
+        for one in self._doubts:
+            one.take(step.evidence, rule)
+            one.measure(report, self.main.pose, rule)
+            if not one.is_confirmed(rule) or not looks or self._is_alike_elsewhere(one):
+                doubts.append(one)
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
         if slipped + carried > 0.0:
-            covariance = slipped * np.diag(rule.hidden_variances)
-            lost_share = covered_share(carried)
-            covariance += lost_share * np.diag(rule.lost_variances)
+            probabilities = np.array([slipped, carried])
+            variances = [np.diag(rule.hidden_variances), np.diag(rule.lost_variances)]
             newest = Doubt(
                 next_id=step.next_id,
                 position_m=position_m,
-                covariance=covariance,
-                variances=np.array(rule.lost_variances if carried else rule.hidden_variances),
-                lost_share=lost_share,
+                probabilities=probabilities,
+                covariances=probabilities[:, None, None] * variances,
+                variances=np.diag(variances[int(carried > 0.0)]),
             )
             doubts.append(newest)
         # Those with the same evidence end together: they are one, so a long run needs few.

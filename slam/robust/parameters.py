@@ -374,6 +374,9 @@ class BranchRule:
     """How many scans an alternative that lags behind takes at a time."""
     most_doubts: Annotated[int, Origin.BUDGET, "doubts"] = 20
     """How many doubts of the wheels are kept apart; of more, the oldest two become one."""
+    open_share: Annotated[float, Origin.CHOSEN] = 0.1
+    """Share of the variance of a doubtful motion below which ranges must leave it, in every
+    direction, to end the doubt."""
     newest: Annotated[int, Origin.BUDGET, "landmarks"] = 8
     """How many of the newest landmarks are looked for among all others."""
     base_m: Annotated[float, Origin.CHOSEN] = 0.3

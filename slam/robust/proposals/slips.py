@@ -6,7 +6,7 @@ step are compared under each of these motions. A slip that explains those of sev
 better by its price and `MARGIN_NATS` is believed: the pose becomes as uncertain as after a motion
 that the wheels do not report (`BranchRule.hidden_m`, `BranchRule.hidden_rad`), and the ranges
 correct it. If not, the solution over all poses may find it. Either way a doubt remains
-(`slam.robust.branches.Doubt`).
+(`slam.robust.proposals.doubts.Doubt`).
 
 The limits of view are widened by the difference of the motions: all are judged by the same
 landmarks.

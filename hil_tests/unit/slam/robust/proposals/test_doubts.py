@@ -1,0 +1,178 @@
+"""What doubts of the wheels add to a covariance, and when they end."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.slam.robust.range_world import Array
+from slam.geometry import compose
+from slam.results import PredictedRange, UpdateReport
+from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
+from slam.robust.proposals.doubts import Doubt, covered_share, doubted_covariance
+
+RULE = BranchRule()
+MUCH = 2.0 * RULE.correlated_steps * RULE.most_for
+SLIP = np.diag([1e-4, 1e-4, 0.01])
+LEVER_M = 0.1
+
+
+def doubtful(x_m: float, slipped: float = 1.0, carried: float = 0.0) -> Doubt:
+    """Return a doubt at a place on the x axis: a motion of covariance SLIP, or a carry."""
+    return Doubt(
+        next_id=9,
+        position_m=np.array([x_m, 0.0]),
+        probabilities=np.array([slipped, carried]),
+        covariances=np.array([slipped * SLIP, carried * np.diag(RULE.lost_variances)]),
+        variances=np.array(RULE.lost_variances if carried else RULE.hidden_variances),
+    )
+
+
+def at(doubt: Doubt, x_m: float) -> Array:
+    return doubted_covariance([doubt], np.array([x_m, 0.0]))
+
+
+def seen_from(pose: Array, points_m: list[tuple[float, float]], variance: float) -> UpdateReport:
+    """Return a report of ranges of landmarks 0, 1, ... by an antenna LEVER_M ahead of the pose."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    predicted = []
+    for number, (x, y) in enumerate(points_m):
+        dx, dy = x - pose[0], y - pose[1]
+        point_m = (c * dx + s * dy, -s * dx + c * dy)
+        predicted.append(
+            PredictedRange(
+                radar=0,
+                landmark_id=number,
+                range_m=math.hypot(point_m[0] - LEVER_M, point_m[1]),
+                variance=variance,
+                antenna_m=(LEVER_M, 0.0),
+                point_m=point_m,
+            )
+        )
+    continued = tuple((0, number, number) for number in range(len(points_m)))
+    return UpdateReport(continued=continued, nis=0.0, dof=0, predicted=tuple(predicted))
+
+
+@pytest.mark.parametrize("probability", [2e-3, 0.05, 0.5, 1.0])
+def test_a_doubt_covers_what_may_have_happened(probability: float) -> None:
+    """What lies outside a region of it: exp(-r^2 / 2 V) for a variance V, in two dimensions."""
+    limit = -2.0 * covered_share(probability) * math.log(TAIL_PROBABILITY)  # r^2 / V
+    assert probability * math.exp(-limit / 2.0) == pytest.approx(TAIL_PROBABILITY)
+
+
+def test_a_doubt_below_the_tail_adds_what_its_mixture_has() -> None:
+    assert covered_share(TAIL_PROBABILITY / 2.0) == TAIL_PROBABILITY / 2.0
+
+
+@pytest.mark.parametrize("probability", [5e-4, 0.02, 0.3, 1.0])
+def test_what_a_possible_slip_and_a_possible_carry_add(probability: float) -> None:
+    share = covered_share(probability)
+    np.testing.assert_allclose(at(doubtful(0.0, probability), 0.0), share * SLIP)
+    carry = doubtful(0.0, 0.0, probability)
+    np.testing.assert_allclose(at(carry, 0.0), share * np.diag(RULE.lost_variances))
+
+
+@pytest.mark.parametrize(("n", "each"), [(1, 0.04), (3, 0.04), (3, 0.6), (10, 1.0)])
+def test_slips_add_up_and_many_stops_are_no_more_than_one_carry(n: int, each: float) -> None:
+    share = n * covered_share(each)
+    slips = doubted_covariance([doubtful(0.0, each) for _ in range(n)], np.zeros(2))
+    np.testing.assert_allclose(slips, share * SLIP)
+    carries = doubted_covariance([doubtful(0.0, 0.0, each) for _ in range(n)], np.zeros(2))
+    np.testing.assert_allclose(carries, min(share, 1.0) * np.diag(RULE.lost_variances))
+
+
+@pytest.mark.parametrize(("n", "each"), [(3, 0.04), (3, 0.6)])
+def test_motions_that_one_doubt_holds_are_one_or_several(n: int, each: float) -> None:
+    """Their probabilities add up; where they reach 1, so do the covariances of slips."""
+    slips, carries, total = doubtful(0.0, each), doubtful(0.0, 0.0, each), n * each
+    for _ in range(n - 1):
+        slips.add(doubtful(0.0, each))
+        carries.add(doubtful(0.0, 0.0, each))
+    np.testing.assert_allclose(at(slips, 0.0), max(covered_share(min(total, 1.0)), total) * SLIP)
+    expected = covered_share(min(total, 1.0)) * np.diag(RULE.lost_variances)
+    np.testing.assert_allclose(at(carries, 0.0), expected)
+
+
+def test_a_doubtful_turn_is_a_doubtful_position_far_from_it() -> None:
+    np.testing.assert_allclose(
+        at(doubtful(1.0), 3.0),
+        [[1e-4, 0.0, 0.0], [0.0, 1e-4 + 4.0 * 0.01, 2.0 * 0.01], [0.0, 0.02, 0.01]],
+    )
+
+
+def test_doubts_of_two_places_add_up_as_independent_ones_do() -> None:
+    both = doubtful(0.0)
+    both.add(doubtful(1.0))
+    expected = [[2e-4, 0.0, 0.0], [0.0, 2e-4 + 0.09 + 0.04, 0.05], [0.0, 0.05, 0.02]]
+    np.testing.assert_allclose(at(both, 3.0), expected)
+    apart = doubted_covariance([doubtful(0.0), doubtful(1.0)], np.array([3.0, 0.0]))
+    np.testing.assert_allclose(apart, expected)
+
+
+def test_doubts_that_are_joined_need_what_both_need() -> None:
+    older, newer = doubtful(0.0), doubtful(1.0)
+    older.next_id, newer.next_id = 3, 9
+    older.nats, newer.nats = {0: 9.0, 1: 9.0}, {1: 2.0, 5: 9.0}
+    older.information, newer.information = 2.0 * np.eye(3), np.eye(3)
+    older.join(newer)
+    assert (older.next_id, older.nats) == (3, {1: 2.0})
+    np.testing.assert_array_equal(older.information, np.eye(3))
+    np.testing.assert_allclose(older.variances, 2.0 * np.array(RULE.hidden_variances))
+
+
+def test_what_ranges_tell_of_a_motion_is_as_ranges_change_with_it() -> None:
+    """Against differences of ranges after a motion at the doubt's place, and the way since."""
+    doubt, way = doubtful(1.0), np.array([0.4, 0.1, 0.3])
+    pose = compose(np.array([1.0, 0.0, 0.0]), way)
+    points_m = [(1.5, 1.0), (2.0, -0.4), (0.3, 0.5)]
+    doubt.measure(seen_from(pose, points_m, 4e-4), pose, RULE)
+
+    def ranges_m(motion: Array) -> Array:
+        moved = compose(compose(np.array([1.0, 0.0, 0.0]), motion), way)
+        antenna = compose(moved, np.array([LEVER_M, 0.0, 0.0]))[:2]
+        away = np.array(points_m) - antenna
+        return np.hypot(away[:, 0], away[:, 1])
+
+    step = 1e-6
+    J = np.column_stack(
+        [(ranges_m(step * e) - ranges_m(-step * e)) / (2 * step) for e in np.eye(3)]
+    )
+    variance = RULE.correlated_steps * (RULE.model_sigma_m**2 + 4e-4)
+    np.testing.assert_allclose(doubt.information, J.T @ J / variance, rtol=1e-6)
+
+
+ABEAM = [(0.0, 0.9), (0.0, -0.8), (0.02, 0.7)]
+AROUND = [(0.0, 0.9), (0.8, -0.3), (-0.6, 0.5)]
+
+
+@pytest.mark.parametrize(
+    ("points_m", "step_m", "ends"),
+    [(ABEAM, 1e-3, False), (AROUND, 0.0, False), (AROUND, 0.01, True)],
+    ids=["abeam", "at one place", "around"],
+)
+def test_a_doubt_ends_where_ranges_leave_no_motion_open(
+    points_m: list[tuple[float, float]], step_m: float, ends: bool
+) -> None:
+    """Landmarks abeam leave the way along the course open; from one place, all leave the turn."""
+    doubt = doubtful(0.0, 0.02)
+    for step in range(20):
+        pose = np.array([step_m * step, 0.0, 0.0])
+        doubt.take(np.array([[0, MUCH], [1, MUCH], [2, MUCH]]), RULE)
+        doubt.measure(seen_from(pose, points_m, 0.0), pose, RULE)
+    assert doubt.is_confirmed(RULE) is ends
+
+
+def test_landmarks_known_before_end_a_doubt_and_new_ones_do_not() -> None:
+    """Three of them, each with no more evidence than one may give."""
+    doubt = doubtful(0.0)
+    doubt.information = 1e9 * np.eye(3)
+    for ids, ends in (((10, 11, 12), False), ((0, 1), False), ((2,), True)):
+        doubt.take(np.array([[id_, MUCH] for id_ in ids]), RULE)
+        assert doubt.is_confirmed(RULE) is ends
+
+
+def test_ranges_of_new_landmarks_tell_nothing_of_a_motion_before_them() -> None:
+    doubt = doubtful(0.0)
+    doubt.next_id = 0
+    doubt.measure(seen_from(np.zeros(3), AROUND, 0.0), np.zeros(3), RULE)
+    assert not doubt.information.any()

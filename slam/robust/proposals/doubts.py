@@ -1,0 +1,121 @@
+"""Doubts: motions that the wheels may not have reported, until known landmarks confirm the pose.
+
+A slip of the wheels (`slam.robust.proposals.slips`), believed or only possible, and a carry that is
+possible during a stop add to the reported covariance. The pose itself stays where it is. A doubt
+ends when landmarks known before it fit the pose, and their ranges leave no direction of the motion
+open: two landmarks abeam of the robot say nothing of where it is along its course.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam.geometry import transform
+from slam.results import UpdateReport
+from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
+from slam.robust.state import Array, quarter_turn
+
+
+def covered_share(probability: float) -> float:
+    """Return the share of a motion's variance that allows for a motion of a probability.
+
+    With probability p the position is away by a normal error of variance V, else it is right. The
+    region that a normal distribution of variance s V leaves with the probability q is left with q
+    by that, too, if s = ln(p / q) / ln(1 / q) (two dimensions; q is `TAIL_PROBABILITY`); p V is the
+    least, the variance of such a mixture.
+    """
+    if probability <= TAIL_PROBABILITY:
+        return probability
+    return max(probability, 1.0 - math.log(probability) / math.log(TAIL_PROBABILITY))
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Doubt:
+    """Motions that the wheels may not have reported. First of a pair are slips, then carries."""
+
+    next_id: int  # landmarks known before them have smaller ids
+    position_m: Array  # shape (2,), where the newest of them may have been
+    probabilities: Array  # shape (2,), added up
+    # shape (2, 3, 3), of x, y [m] and heading for a pose at the position: each probability times
+    # the variances
+    covariances: Array
+    variances: Array  # shape (3,), of x, y [m] and heading if they happened, at the position
+    nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
+    # shape (3, 3), of the ranges since about such a motion, at the position
+    information: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    # landmarks, and how often `BranchRule.most_for` they say, that were found to fit elsewhere, too
+    alike: tuple[frozenset[int], int] | None = None
+
+    def take(self, evidence: Array, rule: BranchRule) -> None:
+        """Add the evidence of a step, ids and nats of shape (k, 2)."""
+        for landmark, nats in evidence.tolist():
+            if landmark < self.next_id:
+                total = self.nats.get(int(landmark), 0.0) + nats / rule.correlated_steps
+                self.nats[int(landmark)] = min(max(total, -rule.most_against), rule.most_for)
+
+    def measure(self, report: UpdateReport, pose: Array, rule: BranchRule) -> None:
+        """Add what the ranges of a step tell of such a motion; ``pose`` (3,) is that behind it.
+
+        A motion (dx, dy, turn) at the position moves an antenna at a by (dx, dy) + turn J (a - p).
+        """
+        of_known = {(radar, id_) for radar, _, id_ in report.continued if id_ < self.next_id}
+        seen = [one for one in report.predicted if (one.radar, one.landmark_id) in of_known]
+        if not seen:
+            return
+        antennas = transform(pose, np.array([one.antenna_m for one in seen]))
+        points = transform(pose, np.array([one.point_m for one in seen]))
+        along = (antennas - points) / np.linalg.norm(antennas - points, axis=1, keepdims=True)
+        turned = np.sum(along * quarter_turn(antennas - self.position_m), axis=1)
+        rows = np.column_stack([along, turned])
+        variances = rule.model_sigma_m**2 + np.array([one.variance for one in seen])
+        self.information += rows.T @ (rows / (rule.correlated_steps * variances)[:, None])
+
+    def is_confirmed(self, rule: BranchRule) -> bool:
+        """Return whether known landmarks fit the pose, and leave no such motion open."""
+        if sum(self.nats.values()) <= rule.price_nats:
+            return False
+        sigmas = np.sqrt(self.variances)
+        gained = np.linalg.eigvalsh(sigmas[:, None] * self.information * sigmas)
+        return bool(1.0 / (1.0 + gained[0]) < rule.open_share)
+
+    def at(self, position_m: Array) -> Array:
+        """Return the covariances (2, 3, 3) for a pose at a position (2,)."""
+        T = np.eye(3)
+        T[:2, 2] = quarter_turn(position_m - self.position_m)
+        return np.asarray(T @ self.covariances @ T.T)
+
+    def add(self, newer: Doubt) -> None:
+        """Add a doubt with the same evidence; what is measured of the newer one counts."""
+        self.covariances = self.at(newer.position_m) + newer.covariances
+        self.variances = self.variances + newer.variances
+        self.probabilities = self.probabilities + newer.probabilities
+        self.position_m, self.information = newer.position_m, newer.information
+
+    def join(self, newer: Doubt) -> None:
+        """Add a doubt with other evidence: what confirms both confirms either."""
+        self.add(newer)
+        self.nats = {id_: nats for id_, nats in newer.nats.items() if id_ < self.next_id}
+        self.alike = None
+
+
+def doubted_covariance(doubts: Sequence[Doubt], position_m: Array) -> Array:
+    """Return what doubts add to the covariance of a pose at a position (2,), (3, 3).
+
+    Of each doubt the mean motion is covered (`covered_share`). Several slips add up; a robot that
+    stopped often is no more lost than one that was carried.
+    """
+    slips, carries, lost_share = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
+    for doubt in doubts:
+        slipped, carried = doubt.probabilities.tolist()
+        of_slips, of_carries = doubt.at(position_m)
+        if slipped > 0.0:
+            slips += of_slips * max(covered_share(min(slipped, 1.0)) / slipped, 1.0)
+        if carried > 0.0:
+            share = covered_share(min(carried, 1.0))
+            carries += of_carries * share / carried
+            lost_share += share
+    return slips + carries / max(lost_share, 1.0)
