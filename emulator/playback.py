@@ -480,7 +480,7 @@ class PlayedChip(Chip):
         super().__init__(echo_source(empty_room(), 0, 0))
 
     def get(self, setting: X4Setting) -> X4Value:
-        downconverted = bool(self.settings.downconversion)
+        downconverted = self.settings.is_baseband
         n_bins = self._n_values // 2 if downconverted else self._n_values
         if setting is X4Setting.FRAMEBINCOUNT:
             return n_bins

@@ -27,11 +27,12 @@ from emulator.module.outbox import (
     Outbox,
     StreamBegin,
 )
+from emulator.module.parser import VendorConnection
 from emulator.module.settings import DeviceOptions
 from emulator.module.state import ACK_WAIT_NS, Module
 from emulator.profiles.running_profile import ProfileStream
 from xethru_protocol.wire.codec import decode_response, encode
-from xethru_protocol.wire.codes import SystemCode
+from xethru_protocol.wire.codes import ErrorCode, SystemCode
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import Framing, NeedData
 from xethru_protocol.wire.messages import (
@@ -39,6 +40,8 @@ from xethru_protocol.wire.messages import (
     BasebandIq,
     Command,
     DataFloat,
+    DataString,
+    Error,
     InjectFrame,
     PresenceSingle,
     Response,
@@ -66,6 +69,11 @@ NORMAL_BUFFER = 8000
 """Bytes of a Normal packet, escapes included, that a module can send (protocol reference 1.1)."""
 LARGEST_POOL_BLOCK = 7000
 """Payload bytes of the largest command that a module processes (protocol reference 1.1)."""
+LARGEST_REPLY = LARGEST_POOL_BLOCK - 24 + 15
+"""Payload bytes of the largest answer: its elements lie behind 24 bytes in a block of the message
+pool, and have 15 around them on the line. A larger one is not sent (protocol reference 1.1)."""
+BASE_FIRMWARE_FRAMES = 2
+"""Radar frames that find a block in the base firmware's message pool (protocol reference 1.1)."""
 COMMANDS_AT_ONCE = 16
 """How many commands one visit carries out; the modules beside this one have their turn then."""
 _LONG_COMMANDS = (
@@ -267,6 +275,8 @@ class Device:
         self._stream = stream
         self._outbox = outbox
         self._connection = Connection(Role.MODULE)
+        self._received = self._fresh_parser()
+        self._damaged = False  # since the last command
         self._reset_ns: int | None = None
         self._ready_ns: int | None = None
         # until when the command task sleeps, and the reply it sends then; commands wait behind it
@@ -321,15 +331,19 @@ class Device:
                 self._outbox.put(MessageKind.REPLY, decode_response(payload), now_ns)
             self._plan_restart(now_ns)
             return
-        self._connection.receive_data(data)
+        self._received.receive_data(data)
         if self._held is not None:
             self._waiting_bytes += len(data)
         self._carry_out_commands(now_ns)
 
+    def _fresh_parser(self) -> Connection | VendorConnection:
+        strict = self.module.options.parser == "strict"
+        return Connection(Role.MODULE) if strict else VendorConnection()
+
     def _carry_out_commands(self, now_ns: int) -> None:
         left = COMMANDS_AT_ONCE
         while self._takes_commands and left:
-            event = self._connection.next_event()
+            event = self._received.next_event()
             if isinstance(event, NeedData):
                 self._backlog = False
                 return
@@ -339,18 +353,27 @@ class Device:
                     self._carry_out(event, now_ns)
             else:
                 self.faults_seen += 1
+                self._damaged = True
         waits = self._held is not None or self.module.asleep
-        self._backlog = self._connection.buffered > 0 and not waits
+        self._backlog = self._received.buffered > 0 and not waits
 
     @property
     def _takes_commands(self) -> bool:
         return self._held is None and not self.module.asleep and self._outbox.takes_replies
 
     def _carry_out(self, command: Command[Response], now_ns: int) -> None:
-        reply = answer(self.module, command)
+        reply: Response | None
+        if self._damaged and self.module.options.after_damage == "error":
+            reply = Error(code=ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+        else:
+            reply = answer(self.module, command)
+        self._damaged = False
         for notice in self.module.notices:
-            self._outbox.put(MessageKind.DEBUG, notice, now_ns)
+            is_text = isinstance(notice, DataString)
+            self._outbox.put(MessageKind.DEBUG if is_text else MessageKind.REPLY, notice, now_ns)
         self.module.notices.clear()
+        if reply is not None and len(encode(reply)) > LARGEST_REPLY:
+            reply = None
         wait, self.module.wait = self.module.wait, None
         replies_now = wait is None or not wait.before_reply
         if reply is not None and replies_now:
@@ -400,6 +423,8 @@ class Device:
         self._waiting_bytes = 0
         self._outbox.clear()
         self._connection = Connection(Role.MODULE)
+        self._received = self._fresh_parser()
+        self._damaged = False
         self.module.power_up(into_bootloader=restart is not None and restart.into_bootloader)
         self._stream.restarted(self._ready_ns)
 
@@ -424,7 +449,7 @@ class Device:
         """Return how old firmware frames baseband; None: as usual."""
         if BAUD_RATE.is_in(self.module.firmware):
             return None
-        raw = isinstance(message, DataFloat) and self.module.chip.settings.downconversion
+        raw = isinstance(message, DataFloat) and self.module.chip.settings.is_baseband
         return Framing.NORMAL if raw or isinstance(message, (BasebandIq, BasebandAp)) else None
 
     def wake_ns(self, now_ns: int) -> int | None:
@@ -499,5 +524,7 @@ def radar_device(
     module.noise_maps = profile.noise_map_files
     chip_stream = ChipStream(module, pace=pace, clock=clock, scene_time_zero_ns=scene_time_zero_ns)
     stream = CombinedStream(chip_stream, profile)
-    outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
+    known = BASE_FIRMWARE_FRAMES if firmware.sensor is None else FirmwareOutbox.SLOTS
+    frames = options.waiting_frames or known
+    outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox(frames)
     return Device(module, stream, outbox)

@@ -21,7 +21,6 @@ and chapter 9.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -244,7 +243,7 @@ class ChipSettings:
     Attributes
     ----------
     downconversion
-        0 for RF frames, anything else for baseband.
+        1 for baseband, anything else for RF frames.
     start_m, end_m
         Requested frame area, shortened to the chip's maximum, module metres.
     dac_step
@@ -269,6 +268,10 @@ class ChipSettings:
     tx_power: int = 2
     prf_div: int = 16
 
+    @property
+    def is_baseband(self) -> bool:
+        return self.downconversion == 1
+
 
 def _number(value: X4Value) -> float:
     if isinstance(value, tuple):
@@ -288,16 +291,9 @@ def _set_frame_area(settings: ChipSettings, value: X4Value) -> ChipSettings:
     if not isinstance(value, tuple):
         raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
     start_m, end_m = value
-    if not (math.isfinite(start_m) and math.isfinite(end_m)) or start_m > end_m:
+    if start_m > end_m:
         raise Refusal(X4Error.FRAME_AREA_END_OUT_OF_SCOPE)
     return replace(settings, start_m=start_m, end_m=end_m)
-
-
-def _set_offset(settings: ChipSettings, value: X4Value) -> ChipSettings:
-    offset_m = _number(value)
-    if not math.isfinite(offset_m):
-        raise Refusal(X4Error.GENERAL_FAILURE)
-    return replace(settings, offset_m=offset_m)
 
 
 def _set_dac_step(settings: ChipSettings, value: X4Value) -> ChipSettings:
@@ -342,7 +338,7 @@ SETTERS: dict[X4Setting, Callable[[ChipSettings, X4Value], ChipSettings]] = {
     X4Setting.DACSTEP: _set_dac_step,
     X4Setting.DACMIN: lambda s, v: replace(s, dac_min=_dac_level(v)),
     X4Setting.DACMAX: lambda s, v: replace(s, dac_max=_dac_level(v)),
-    X4Setting.FRAMEAREAOFFSET: _set_offset,
+    X4Setting.FRAMEAREAOFFSET: lambda s, v: replace(s, offset_m=_number(v)),
     X4Setting.TXCENTERFREQUENCY: _set_tx_center_frequency,
     X4Setting.TXPOWER: _set_tx_power,
     X4Setting.PRFDIV: _set_prf_div,
@@ -382,11 +378,8 @@ READ_ONLY = frozenset({(X4Setting.SPIREGISTER, address) for address in range(4)}
 
 
 def _area(settings: ChipSettings) -> x4.FrameArea:
-    return x4.frame_area(
-        settings.start_m,
-        settings.end_m,
-        settings.offset_m,
-        downconversion=settings.downconversion != 0,
+    return x4.quantised_area(
+        settings.start_m, settings.end_m, settings.offset_m, settings.is_baseband
     )
 
 
@@ -430,6 +423,11 @@ _AREA_SETTINGS = frozenset(
     {X4Setting.FRAMEAREA, X4Setting.FRAMEAREAOFFSET, X4Setting.DOWNCONVERSION}
 )
 """Those with which the driver sets up the frame area anew."""
+_SET_WITHOUT_POWER = frozenset(
+    {X4Setting.FRAMEAREA, X4Setting.FRAMEAREAOFFSET, X4Setting.TXPOWER, X4Setting.PRFDIV}
+)
+_READ_WITHOUT_POWER = frozenset({X4Setting.TXPOWER, X4Setting.PRFDIV, X4Setting.TXCENTERFREQUENCY})
+"""Settings of which the driver drops the error of a chip that is off."""
 
 
 def _parse(text: str) -> dict[int, int]:
@@ -517,14 +515,18 @@ class Chip:
     def set(self, setting: X4Setting, value: X4Value) -> None:
         """Change one setting at once, or raise `Refusal` and change nothing."""
         if setting is X4Setting.ENABLE:
-            self.powered = self.powered and value != 0
+            self.powered = self.powered and value == 1
         elif setting in REGISTERS and isinstance(value, tuple):
             address, byte = value
             self.write_register(setting, int(address), int(byte))
         elif setting in SETTERS:
             changed = SETTERS[setting](self.settings, value)
-            self._check_powered()
-            self._write_setting(setting, changed)
+            if self.powered:
+                self._write_setting(setting, changed)
+            elif setting not in _SET_WITHOUT_POWER:
+                if setting is X4Setting.FPS:  # the driver notes it before it turns to the chip
+                    self._apply(changed)
+                raise Refusal(X4Error.REGISTER_TIMEOUT)
             self._apply(changed)
         else:
             raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
@@ -532,6 +534,8 @@ class Chip:
     def get(self, setting: X4Setting) -> X4Value:
         """Return what GET answers, or raise `Refusal` for a setting without getter."""
         if setting in FIELDS:
+            if not self.powered and setting in _READ_WITHOUT_POWER:
+                return 0
             self._check_powered()
             return self._held(setting)
         getter = _GETTERS.get(setting)
@@ -540,12 +544,19 @@ class Chip:
         return getter(self)
 
     def read_register(self, space: X4Setting, address: int) -> int:
-        """Return a register's byte, 0 where none is known; raise `Refusal` if the chip is off."""
+        """Return a register's byte, 0 where none is known.
+
+        While the chip is off, SPI is a plain bus and reads 0 (assumed); others raise `Refusal`.
+        """
+        if space is X4Setting.SPIREGISTER and not self.powered:
+            return 0
         self._check_powered()
         return self._registers[space].get(address & 0xFF, 0)
 
     def write_register(self, space: X4Setting, address: int, value: int) -> None:
-        """Write a register's byte, or raise `Refusal` if the chip is off."""
+        """Write a register's byte; lost on SPI while the chip is off, others raise `Refusal`."""
+        if space is X4Setting.SPIREGISTER and not self.powered:
+            return
         self._check_powered()
         address &= 0xFF
         if (space, address) not in READ_ONLY:
@@ -638,11 +649,10 @@ class Chip:
         if setting in _AREA_SETTINGS:
             registers[RX_WAIT] = (_area(settings).rx_wait - 1 + registers[TX_WAIT]) & 0xFF
         if setting is X4Setting.DOWNCONVERSION:
-            mode = Bits(SAMPLER_MODE, count=1, alone=False)
-            registers[SAMPLER_MODE] = mode.put_into(
-                registers.get(SAMPLER_MODE, 0), settings.downconversion
-            )
-            registers[COUNTER_BYTES] = 6 if settings.downconversion else 3
+            # the driver masks what stays of the register, and not what it puts there
+            kept = registers.get(SAMPLER_MODE, 0) & ~1
+            registers[SAMPLER_MODE] = kept | settings.downconversion
+            registers[COUNTER_BYTES] = 6 if settings.is_baseband else 3
 
     def _discard_frames(self) -> None:
         self._block = None
@@ -667,9 +677,9 @@ class Chip:
             raw = np.zeros((n_frames, capture.n_samples), dtype=np.int64)
         else:
             raw = self._source.rf_counters(capture, indices, scene_times_ns)
-        convert = _baseband_values if settings.downconversion else _rf_values
+        convert = _baseband_values if settings.is_baseband else _rf_values
         values = convert(raw, settings, self.area)
-        if settings.downconversion and not self._negates_q:
+        if settings.is_baseband and not self._negates_q:
             values[:, self.area.n_bins :] *= -1
         is_zero = np.array([_is_zero(frame) for frame in values], dtype=np.bool_)
         return _SynthesisedFrames(first_index=first_index, values=values, is_zero=is_zero)
@@ -684,7 +694,7 @@ class Chip:
         # an absurd offset can label bins far outside the 1536 samples there are
         first_sample = min(area.first_index, x4.FRAME_SAMPLES - 1)
         n_samples = area.n_bins
-        if settings.downconversion:
+        if settings.is_baseband:
             lead = CHANNELS[settings.tx_center_frequency].lead_samples
             first_sample = x4.BASEBAND_DECIMATION * first_sample - lead
             n_samples = x4.BASEBAND_DECIMATION * (n_samples - 1) + TAP_COUNT

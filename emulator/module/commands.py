@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from emulator.chip.chip import Refusal, Silence
-from emulator.module.memory import FileKey
+from emulator.module.memory import ERASED, FileKey
 from emulator.module.modes import Group, ModuleState, check_permission, group_of
 from emulator.module.settings import ZONE_LIMITS_M
 from emulator.module.state import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
@@ -42,8 +42,11 @@ SLOWEST_BAUDRATE, FASTEST_BAUDRATE = 600, 10_000_000
 """The firmware acknowledges and ignores any other rate."""
 TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
+LONGEST_DUMP = 8192
+"""Bytes of a crash dump that are worth making; no reply is as long."""
 LONGEST_READ = 4096
 """Bytes that one READ_I2C may ask for; assumed, no source has the command."""
+_WORD = 0xFFFFFFFF
 _FEATURES: frozenset[int] = frozenset(OutputFeature)
 _BYTE_REPLIES = frozenset(
     {
@@ -75,8 +78,10 @@ Handler = Callable[[Module, Any], m.Response | None]
 HandlerT = TypeVar("HandlerT", bound=Handler)
 
 
-def _signed(value: int) -> int:
-    return value - (1 << 32) if value >> 31 else value
+def _reply_int(*values: int, content_id: int = 0) -> m.Response:
+    """Return a REPLY INT of 32-bit values, which it carries as signed ones."""
+    signed = tuple((value & _WORD) - (value << 1 & 1 << 32) for value in values)
+    return m.ReplyInt(content_id=content_id, values=signed)
 
 
 def _key(command: Any) -> FileKey:  # noqa: ANN401 - of any command with a file
@@ -84,7 +89,7 @@ def _key(command: Any) -> FileKey:  # noqa: ANN401 - of any command with a file
 
 
 def _ints(value: Callable[[Module], Sequence[int]], content_id: int = 0) -> Handler:
-    return lambda module, _: m.ReplyInt(content_id=content_id, values=tuple(value(module)))
+    return lambda module, _: _reply_int(*value(module), content_id=content_id)
 
 
 def _known(feature: int) -> int:
@@ -94,7 +99,7 @@ def _known(feature: int) -> int:
 
 
 def _control_reply(outputs: Mapping[int, int], feature: int) -> m.Response:
-    return m.ReplyInt(values=(_signed(outputs.get(_known(feature), 0)),))
+    return _reply_int(outputs.get(_known(feature), 0))
 
 
 def _accepted(module: Module, command: m.Message) -> None:
@@ -105,16 +110,16 @@ HANDLERS: dict[type[m.Message], Handler] = {
     # restarts, modes (4.1, 4.2)
     m.ModReset: lambda module, _: module.request_restart(),
     m.GetMode: lambda module, _: m.ReplyByte(values=bytes([module.modes.mode])),
-    m.GetProfileId: _ints(lambda module: [_signed(module.modes.profile_id)]),
+    m.GetProfileId: _ints(lambda module: [module.modes.profile_id]),
     # files (4.11)
     m.OpenFile: lambda module, c: module.files.open(_key(c)),
     m.CloseFile: lambda module, c: module.files.close(_key(c)),
-    m.GetFileLength: lambda module, c: m.ReplyInt(values=(module.files.length(_key(c)),)),
+    m.GetFileLength: lambda module, c: _reply_int(module.files.length(_key(c))),
     m.GetFileData: lambda module, c: m.ReplyByte(
         values=module.files.read(_key(c), c.offset, c.length)
     ),
-    m.SearchFileType: lambda module, c: m.ReplyInt(
-        values=tuple(_signed(name) for kind, name in module.files.names() if kind == c.file_type)
+    m.SearchFileType: lambda module, c: _reply_int(
+        *(name for kind, name in module.files.names() if kind == c.file_type)
     ),
     m.GetCrashDumpLength: _ints(
         lambda module: [len(module.files.get(CRASH_DUMP) or b"")],
@@ -124,13 +129,14 @@ HANDLERS: dict[type[m.Message], Handler] = {
     m.IoPinSetControl: lambda module, c: module.pins.set_control(
         c.pin_id, c.pin_setup, c.pin_feature
     ),
-    m.IoPinGetControl: lambda module, c: m.ReplyInt(
+    m.IoPinGetControl: lambda module, c: _reply_int(
+        module.pins.control(c.pin_id).setup,
+        module.pins.control(c.pin_id).feature,
         content_id=IoPinCode.XTS_SPCIOP_GETCONTROL,
-        values=(module.pins.control(c.pin_id).setup, module.pins.control(c.pin_id).feature),
     ),
     m.IoPinSetValue: lambda module, c: module.pins.set_value(c.pin_id, c.pin_value),
-    m.IoPinGetValue: lambda module, c: m.ReplyInt(
-        content_id=IoPinCode.XTS_SPCIOP_GETVALUE, values=(module.pins.value(c.pin_id),)
+    m.IoPinGetValue: lambda module, c: _reply_int(
+        module.pins.value(c.pin_id), content_id=IoPinCode.XTS_SPCIOP_GETVALUE
     ),
     # profile settings (4.4, 4.5)
     m.SetDetectionZone: lambda module, c: module.profile.set_zone(
@@ -272,7 +278,7 @@ def _find_all(module: Module, command: m.FindAllFiles) -> m.Response:
     keys = module.files.names()
     types = [kind for kind, _ in keys]
     identifiers = [identifier for _, identifier in keys]
-    return m.ReplyInt(values=tuple(_signed(value) for value in types + identifiers))
+    return _reply_int(*types, *identifiers)
 
 
 @answers(m.DeleteFile)
@@ -295,14 +301,19 @@ def _clear_crash_dump(module: Module, command: m.ClearCrashDump) -> None:
 
 @answers(m.GetCrashDump)
 def _crash_dump(module: Module, command: m.GetCrashDump) -> m.Response:
+    """Answer a part of the dump; the firmware goes on behind each error.
+
+    What lies outside the dump, or where there is none, is assumed to be erased.
+    """
     dump = module.files.get(CRASH_DUMP)
-    if dump is None:
-        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    end = command.offset + command.length
-    if end > len(dump):
-        raise Refusal(ErrorCode.XTS_SPRE_USER)
-    content_id = DirCode.XTS_SDC_GET_CRASH_DUMP
-    return m.ReplyByte(content_id=content_id, values=dump[command.offset : end])
+    errors = [ErrorCode.XTS_SPRE_NOT_RECOGNIZED] * 2 if dump is None else []
+    dump = dump or b""
+    if command.offset + command.length & _WORD > len(dump):
+        errors.append(ErrorCode.XTS_SPRE_USER)
+    module.notices += [m.Error(code=code) for code in errors]
+    length = min(command.length, LONGEST_DUMP)
+    part = dump[command.offset : command.offset + length].ljust(length, ERASED)
+    return m.ReplyByte(content_id=DirCode.XTS_SDC_GET_CRASH_DUMP, values=part)
 
 
 # --- profile settings, noise maps, outputs (4.4 to 4.7)
@@ -424,7 +435,7 @@ def _x4_get(module: Module, command: m.X4DriverGet) -> m.Response:
         return m.ReplyFloat(content_id=setting, values=(value,))
     if setting in _BYTE_REPLIES:
         return m.ReplyByte(content_id=setting, values=bytes([value]))
-    return m.ReplyInt(content_id=setting, values=(value,))
+    return _reply_int(value, content_id=setting)
 
 
 @answers(m.X4DriverWrite)
@@ -436,6 +447,9 @@ def _x4_write(module: Module, command: m.X4DriverWrite) -> None:
 @answers(m.X4DriverRead)
 def _x4_read(module: Module, command: m.X4DriverRead) -> m.Response:
     _check_block_access(command.setting)
+    if command.length == 0:  # the firmware takes the empty block that it gets for lack of memory
+        module.crash("out of memory", module.now_ns)
+        raise Silence
     values = module.chip.read_burst(command.address, command.length)
     return m.ReplyByte(content_id=command.setting, values=values)
 
@@ -472,7 +486,7 @@ def _get_postprocessing(module: Module, command: m.FramePostprocessingGet) -> m.
     if isinstance(value, tuple):
         return m.ReplyFloat(content_id=setting, values=(value[1],))
     if setting is FramePostprocessing.DECIMATION_FACTOR:
-        return m.ReplyInt(content_id=setting, values=(_signed(value),))
+        return _reply_int(value, content_id=setting)
     return m.ReplyByte(content_id=setting, values=bytes([value]))
 
 

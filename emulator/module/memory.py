@@ -27,6 +27,8 @@ MAX_FILES = 20
 MAX_OPEN = 10
 BLOCK_BYTES = 8192
 """What the flash erases at once; the first block holds the table of files."""
+LONGEST_READ = BLOCK_BYTES
+"""Bytes of one GET_FILE_DATA that are worth making; no reply is as long."""
 _WORD = 0xFFFFFFFF
 ERASED = b"\xff"
 
@@ -218,14 +220,16 @@ class FileSystem:
         return self._find(key).length
 
     def read(self, key: FileKey, offset: int, length: int) -> bytes:
-        file = self._opened(key, offset, length)
-        # of a file that is larger than the storage, no more than that is worth making
-        return bytes(file.data[offset : offset + length]).ljust(
-            min(length, self._data_bytes), ERASED
-        )
+        """Return bytes of an open file; erased ones where none are kept."""
+        file, offset = self._opened(key, offset, length)
+        length = min(length, LONGEST_READ)
+        before = ERASED * min(max(-offset, 0), length)
+        part = bytes(file.data[max(offset, 0) : max(offset + length, 0)])
+        return (before + part).ljust(length, ERASED)
 
     def write(self, key: FileKey, offset: int, data: bytes) -> None:
-        file = self._opened(key, offset, len(data))
+        file, offset = self._opened(key, offset, len(data))
+        data, offset = data[max(-offset, 0) :], max(offset, 0)
         kept = data[: max(len(file.data) - offset, 0)]
         file.data[offset : offset + len(kept)] = kept
 
@@ -291,12 +295,13 @@ class FileSystem:
                 return file
         raise Refusal(FileError.NOT_FOUND)
 
-    def _opened(self, key: FileKey, offset: int, length: int) -> _File:
+    def _opened(self, key: FileKey, offset: int, length: int) -> tuple[_File, int]:
+        """Return an open file, and an offset in it, below 0 where the firmware's sum wraps."""
         self._check_open(key)
         file = self._find(key)
-        if offset + length > file.length:
+        if offset + length & _WORD > file.length:
             raise Refusal(FileError.OUT_OF_RANGE)
-        return file
+        return file, offset - (1 << 32) if offset + length > _WORD else offset
 
     def _check_handle(self, key: FileKey) -> None:
         """Refuse what needs a handle of its own for a file."""

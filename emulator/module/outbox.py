@@ -173,8 +173,9 @@ class FirmwareOutbox(Outbox):
     until a quarter of the slots is free. A full queue whose host still reads has no slot for
     another frame: it is lost, and the gap in the counters shows it. A reply displaces the oldest
     message instead, so a command is always answered (an assumption; the reference is silent).
+    Radar frames need blocks of the message pool, too, of which there may be fewer than slots.
 
-    Source: protocol reference 8.4.
+    Source: protocol reference 1.1 and 8.4.
     """
 
     SLOTS = 50
@@ -183,8 +184,9 @@ class FirmwareOutbox(Outbox):
     # One visit takes no more steps than this, so that one fast radar cannot hold up the others.
     STEPS_PER_REFILL = 8
 
-    def __init__(self) -> None:
+    def __init__(self, most_frames: int = SLOTS) -> None:
         super().__init__()
+        self._most_frames = most_frames
         self._waiting_since_ns = 0
 
     @property
@@ -211,7 +213,7 @@ class FirmwareOutbox(Outbox):
         stream.skip_due_before(now_ns - self.STALL_NS)
         for _ in range(self.STEPS_PER_REFILL):
             stalled = now_ns - self._waiting_since_ns >= self.STALL_NS
-            if len(self._queue) >= self.SLOTS and not stalled:
+            if (len(self._queue) >= self.SLOTS and not stalled) or not self._takes_frames:
                 stream.skip_due_before(now_ns + 1)
             due_ns = stream.next_due_ns()
             if due_ns is None or due_ns > now_ns:
@@ -225,6 +227,13 @@ class FirmwareOutbox(Outbox):
         if self._queue:
             self._waiting_since_ns = now_ns
         return super().take(now_ns)
+
+    @property
+    def _takes_frames(self) -> bool:
+        if len(self._queue) < self._most_frames or self._most_frames >= self.SLOTS:
+            return True
+        frames = sum(isinstance(queued.message, m.DataFloat) for queued in self._queue)
+        return frames < self._most_frames
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
         """Return the next due time, which may be past when a refill was cut short."""

@@ -40,11 +40,24 @@ from xethru_protocol.wire.versions import FIRMWARE_NAMES, firmware_named
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProductModel:
-    """A product: its order code, and the profile and message that are on as shipped."""
+    """A product.
+
+    Attributes
+    ----------
+    profile, output
+        The profile and the message that are on as shipped.
+    more_profiles
+        Others that it has.
+    output_while_running
+        Whether it takes OUTPUT control of profile messages after RUN. Of an X4M200 the vendor's
+        example X4M200_sleep_record.py and public scripts expect it.
+    """
 
     order_code: str
     profile: ProfileId
     output: OutputFeature
+    more_profiles: tuple[ProfileId, ...] = ()
+    output_while_running: bool = False
 
 
 MODELS = {
@@ -57,8 +70,22 @@ MODELS = {
         order_code="X4M200",
         profile=ProfileId.XTS_ID_APP_RESPIRATION_2,
         output=OutputFeature.RESP_STATUS,
+        more_profiles=(ProfileId.XTS_ID_APP_RESPIRATION_3,),
+        output_while_running=True,
     ),
 }
+RESPIRATION_PROFILES = frozenset(
+    {
+        ProfileId.XTS_ID_APP_RESPIRATION_2,
+        ProfileId.XTS_ID_APP_RESPIRATION_3,
+        ProfileId.XTS_ID_APP_RESPIRATION_4,
+        ProfileId.XTS_ID_APP_RESPIRATION_5,
+        ProfileId.XTS_ID_APP_HEARTRATE,
+        ProfileId.XTS_ID_APP_RESP,
+        ProfileId.XTS_ID_APP_SLEEP,
+    }
+)
+"""Profiles whose messages are those of the respiration family; all others report presence."""
 STOCK_MODEL = "x4m300"
 """Where neither the scene nor the user names one."""
 X4M300_PROFILES = frozenset({MODELS["x4m300"].profile})
@@ -117,6 +144,20 @@ class DeviceOptions(BaseModel):
     """The profile that runs in a module as shipped (8.2)."""
     default_output: OutputFeature = OutputFeature.PRESENCE_SINGLE
     """The message that is on in a module as shipped (15, question 3)."""
+    parser: Literal["strict", "vendor"] = "strict"
+    """How commands are found in received bytes. "strict": a packet has its start byte, a command
+    its fields (3, 1.4). "vendor": as the firmware's parser, which needs no start byte, goes on
+    reading in what earlier packets left in its buffer where a command is too short, and takes four
+    7C, or 51 at the start, for other framings (1.2, 3)."""
+    after_damage: Literal["answer", "error"] = "answer"
+    """What the first command after a damaged packet gets: what it asks for, or ERROR 1 without
+    being carried out. The firmware's source has no such error. Public logs of a real X4M03 show it:
+    of 55 sessions that began with X4 INIT and a checksum error in what the line still held, 42
+    report ERROR 1 to INIT."""
+    waiting_frames: int = 0
+    """How many radar frames wait for a host that does not read, at pace realtime; 0: with the base
+    firmware as many as its message pool has blocks of that size, 2 (1.1), else as many as the queue
+    has slots, 50 (8.4), because the sensor firmware's pool is not known."""
     port_on_reset: Literal["stay", "vanish"] = "stay"
     """Whether a reset keeps the port ("stay") or takes it away until the USB is back ("vanish")."""
     bad_value: Literal["refuse", "clamp"] = "refuse"
@@ -134,8 +175,12 @@ class DeviceOptions(BaseModel):
     """Whether GETs other than of sensitivity and band stay without answer ("silence", as observed)
     or get ERROR 1 ("error") when no profile is loaded (4.4)."""
     presence_output_while_running: bool = False
-    """Whether OUTPUT control takes presence messages while the profile runs; baseband,
-    pulse-Doppler and noise maps are taken in any case (8.3)."""
+    """Whether OUTPUT control takes presence and respiration messages while the profile runs;
+    baseband, pulse-Doppler and noise maps are taken in any case (8.3). true with --model x4m200."""
+    matrix_messages: Literal["whole", "halves"] = "whole"
+    """Whether a range bin of a pulse-Doppler matrix or noise map comes in one message (7.2), or in
+    two, of the negative and of the other frequencies, as two of the vendor's Python examples put
+    them together."""
     run_to_manual: Literal["accept", "refuse"] = "accept"
     """Whether SETMODE MANUAL is taken from a running profile ("accept") or answered with
     `busy_profile_error` ("refuse") (8.3)."""
@@ -168,9 +213,10 @@ class DeviceOptions(BaseModel):
         """Return the options of a product of `MODELS`, with changes."""
         shipped = MODELS[model]
         of_product: dict[str, Any] = {
-            "profiles": frozenset({shipped.profile}),
+            "profiles": frozenset({shipped.profile, *shipped.more_profiles}),
             "shipped_profile": shipped.profile,
             "default_output": shipped.output,
+            "presence_output_while_running": shipped.output_while_running,
         }
         return cls(**of_product | changes)
 
@@ -414,7 +460,10 @@ class ProfileSettings(BaseModel):
 
     @classmethod
     def shipped(cls, profile_id: int, options: DeviceOptions) -> ProfileSettings:
-        return cls(profile_id=profile_id, outputs={int(options.default_output): 1})
+        # the vendor's example X4M200_sleep_record.py reads sleep messages without switching them on
+        sleep = profile_id == ProfileId.XTS_ID_APP_RESPIRATION_3
+        outputs = {options.default_output, *([OutputFeature.SLEEP_STATUS] if sleep else [])}
+        return cls(profile_id=profile_id, outputs={int(output): 1 for output in outputs})
 
     def after_reset(self) -> ProfileSettings:
         """Return a copy without the messages that a reset switches off."""

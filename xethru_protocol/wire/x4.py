@@ -113,6 +113,21 @@ def frame_area(
     if not (math.isfinite(start) and math.isfinite(end) and math.isfinite(offset)):
         raise LocalProtocolError("a frame area must have finite limits; give metres")
     check_setting(X4Setting.FRAMEAREA, "frame area", (start, end))
+    return quantised_area(start, end, offset, downconversion)
+
+
+def quantised_area(
+    start_m: float, end_m: float, offset_m: float, downconversion: bool = False
+) -> FrameArea:
+    """Return what the firmware makes of any area, also one that `frame_area` refuses.
+
+    An end that is not a number is as far as the chip samples. Where the start or the offset is not
+    finite there are no RF bins, or one baseband bin, and such limits are read back.
+
+    >>> quantised_area(0.4, math.inf, 0.18).n_bins, quantised_area(0.4, 5.0, math.nan).n_bins
+    (1501, 0)
+    """
+    start, end, offset = _f32(start_m), _f32(end_m), _f32(offset_m)
     longest = _MAX_LENGTH_M[downconversion]
     if end - start > longest:
         end = _f32(start + longest)
@@ -122,10 +137,12 @@ def frame_area(
         discarded, decimation = BASEBAND_DISCARDED_LINES, BASEBAND_DECIMATION
         bin_m = BASEBAND_BIN_M
     lines = FRAME_SAMPLES // decimation
-    delay_steps = max(math.floor((start - offset) / COARSE_STEP_M), -1)
+    delay_steps = float(np.floor((start - offset) / COARSE_STEP_M))
+    delay_steps = -1.0 if delay_steps < -1 else delay_steps
     base = delay_steps * COARSE_STEP_M + offset
-    first_m = max(start, base)
-    last_m = max(min(end, bin_m * (lines - discarded - 1) + base), first_m)
+    # what is not a number gives way to the other one, as in C
+    first_m = float(np.fmax(start, base))
+    last_m = float(np.fmax(np.fmin(end, bin_m * (lines - discarded - 1) + base), first_m))
     first = _snap_down((first_m - base) / bin_m)
     last = _snap_up((last_m - base) / bin_m)
     return FrameArea(
@@ -135,7 +152,7 @@ def frame_area(
         bin_length_m=bin_m,
         base_m=base,
         first_index=first,
-        rx_wait=(1 + delay_steps) % 256,
+        rx_wait=int(1 + delay_steps) % 256 if math.isfinite(delay_steps) else 0,
         requested_start_m=start,
         requested_end_m=end,
     )
@@ -289,8 +306,12 @@ def _f32(value: float) -> float:
 
 
 def _snap_down(x: float) -> int:
+    if math.isnan(x):  # as the microcontroller converts it
+        return 0
     return math.ceil(x) if abs(x - math.ceil(x)) < _SNAP else math.floor(x)
 
 
 def _snap_up(x: float) -> int:
+    if math.isnan(x):
+        return 0
     return math.floor(x) if abs(x - math.floor(x)) < _SNAP else math.ceil(x)

@@ -16,7 +16,7 @@ from xethru_protocol.wire.messages import X4Value
 
 # Protocol reference 4.9, column "Range / check (error)"; others are in hil_tests/device.
 REFUSED: list[tuple[X4Setting, X4Value, int]] = [
-    (X4Setting.FRAMEAREA, (math.nan, 1.0), 17),
+    (X4Setting.FRAMEAREA, (math.inf, 1.0), 17),
     (X4Setting.TXCENTERFREQUENCY, 2, 20),
     (X4Setting.FRAMEBINCOUNT, 7, 1),
 ]

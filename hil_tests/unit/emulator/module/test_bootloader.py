@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from emulator.module.bootloader import PacketParser
+from emulator.module.parser import PacketParser
 from emulator.module.settings import DeviceOptions
 from hil_tests.golden.test_protocol_vectors import MESSAGES, STREAMS
 from hil_tests.golden.vectors import Vector, load
