@@ -33,6 +33,7 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ from numpy.typing import NDArray
 from emulator.chip import Pace
 from emulator.chip.chip import NS_PER_S, EchoSource, ModuleClock, Refusal
 from emulator.module.outbox import MessageStream
+from emulator.module.settings import RESPIRATION_PROFILES
 from emulator.module.state import NOISE_MAPS, Module
 from emulator.profiles import respiration
 from emulator.profiles.doppler import (
@@ -63,7 +65,6 @@ from xethru_protocol.wire.codes import (
     NoiseMapControl,
     OutputFeature,
     PresenceDirection,
-    ProfileId,
     SensorMode,
 )
 from xethru_protocol.wire.messages import Command, Response
@@ -154,8 +155,9 @@ def matrix_reports(
     *,
     counter: int,
     matrix_counter: int,
+    splits: tuple[int, ...] = (),
 ) -> Iterator[m.Response]:
-    """Yield the messages of one matrix, a range bin each.
+    """Yield the messages of one matrix, a range bin each, or one of its parts.
 
     Parameters
     ----------
@@ -165,6 +167,8 @@ def matrix_reports(
         Of the newest frame in it.
     matrix_counter
         Matrices of this kind since the profile started.
+    splits
+        Indices of frequencies at which another message begins.
     """
     message = MATRIX_REPORTS[feature]
     levels = None
@@ -172,12 +176,13 @@ def matrix_reports(
         decibels = 10 * np.log10(np.maximum(power, np.finfo(np.float64).tiny))
         steps = np.rint((decibels - BYTE_START_DB) / BYTE_STEP_DB)
         levels = np.clip(steps, 0, 255).astype(np.uint8)
-    for index, range_m in enumerate(sweep.range_m.tolist()):
+    parts = list(pairwise((0, *splits, matrix.pulses)))
+    for (index, range_m), (first, end) in product(enumerate(sweep.range_m.tolist()), parts):
         content = (
-            {"power": power[index].astype(np.float32)}
+            {"power": power[index, first:end].astype(np.float32)}
             if levels is None
             else {
-                "levels": levels[index].tobytes(),
+                "levels": levels[index, first:end].tobytes(),
                 "byte_step_start_db": BYTE_START_DB,
                 "byte_step_size_db": BYTE_STEP_DB,
             }
@@ -187,11 +192,11 @@ def matrix_reports(
             matrix_counter=matrix_counter & 0xFFFFFFFF,
             range_idx=index,
             range_bins=sweep.n_bins,
-            frequency_count=matrix.pulses,
+            frequency_count=end - first,
             pulsedoppler_instance=int(matrix.instance),
             fps=FRAME_RATE_HZ,
             fps_decimated=matrix.rate_hz,
-            frequency_start_hz=matrix.start_hz,
+            frequency_start_hz=matrix.start_hz + first * matrix.step_hz,
             frequency_step_hz=matrix.step_hz,
             range_m=range_m,
             **content,
@@ -251,7 +256,7 @@ class ProfileRun:
     @property
     def _reports(self) -> tuple[OutputFeature, ...]:
         """What the loaded profile says once a tick, if it is on."""
-        breathing = self._module.modes.profile_id == ProfileId.XTS_ID_APP_RESPIRATION_2
+        breathing = self._module.modes.profile_id in RESPIRATION_PROFILES
         return _RESPIRATION if breathing else _PRESENCE
 
     def take(self) -> Response | None:
@@ -312,8 +317,13 @@ class ProfileRun:
                             power.copy(),
                             counter=counter,
                             matrix_counter=self._taken // matrix.period,
+                            splits=(matrix.pulses // 2,) if self._halves else (),
                         )
                     )
+
+    @property
+    def _halves(self) -> bool:
+        return self._module.options.matrix_messages == "halves"
 
     def _report(
         self, feature: OutputFeature, counter: int, presence: ZoneState, sensitivity: int
@@ -353,7 +363,7 @@ class ProfileRun:
         for (feature, matrix), waiting in self._spread.items():
             if matrix not in self._instances(feature):
                 waiting.clear()
-            share = -(-self._sweep.n_bins // matrix.period)
+            share = -(-self._sweep.n_bins * (1 + self._halves) // matrix.period)
             for _ in range(min(share, len(waiting))):
                 self._ready.append(waiting.popleft())
 

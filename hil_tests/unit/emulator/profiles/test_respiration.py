@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from emulator.chip import Pace
-from emulator.module.settings import DeviceOptions
+from emulator.module.settings import RESPIRATION_PROFILES, DeviceOptions
 from emulator.profiles.doppler import SLOW
 from emulator.profiles.respiration import breathing_rate_hz, displacement_m
 from emulator.scene.scene import Scene
@@ -208,6 +208,32 @@ def test_lists_say_where() -> None:
     assert 0.3 < max(normalized.movement_slow) <= 1
     assert moving.movement_slow[0] == pytest.approx(np.mean(moving.movement_slow[1:]), rel=1e-5)
     assert 1 + int(np.argmax(moving.movement_slow[1:])) == 1 + strongest // 10
+
+
+@pytest.mark.parametrize("profile_id", sorted(RESPIRATION_PROFILES))
+def test_every_respiration_profile_reports_breathing(profile_id: ProfileId) -> None:
+    options = DeviceOptions.of_model("x4m200", profiles=frozenset({profile_id}))
+    host = BareHost(ramp_device(Pace.REALTIME, options=options))
+    host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP), m.LoadApp(profile_id=profile_id))
+    host.command(m.SetMode(mode=SensorMode.XTID_SM_RUN))
+    (report, *more) = host.at(3 * SECOND // 2)
+    assert isinstance(report, m.RespStatus)
+    sleeps = profile_id is ProfileId.XTS_ID_APP_RESPIRATION_3
+    assert [type(one) for one in more] == [m.SleepStatus] * sleeps
+
+
+@pytest.mark.parametrize(("model", "taken"), [("x4m200", True), ("x4m300", False)])
+def test_outputs_after_run_are_taken_by_an_x4m200(model: str, taken: bool) -> None:
+    options = DeviceOptions.of_model(model)
+    host = BareHost(ramp_device(Pace.REALTIME, options=options))
+    host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP))
+    host.command(m.LoadApp(profile_id=options.shipped_profile), m.SetMode(mode=1))
+    answer = host.ask(m.OutputSetControl(feature=options.default_output, control=1))
+    assert answer == (m.Ack() if taken else m.Error(code=0x21))
+    # before RUN both take it
+    host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP))
+    host.command(m.LoadApp(profile_id=options.shipped_profile))
+    host.command(m.OutputSetControl(feature=options.default_output, control=1))
 
 
 def test_an_x4m200_runs_the_respiration_profile_and_an_x4m300_refuses_it() -> None:

@@ -114,3 +114,10 @@ def test_respiration(runtime: Path, tmp_path: Path) -> None:
         code, lines, errors = run("respiration.py", tmp_path, port)
     assert (code, errors) == (0, "")
     assert lines == ["state True 0", "lists True"]
+
+
+def test_output_after_run(runtime: Path, tmp_path: Path) -> None:
+    with emulated_port(None, "--model", "x4m200", "--pace", "asap") as port:
+        code, lines, errors = run("output_after_run.py", tmp_path, port)
+    assert (code, errors) == (0, "")
+    assert lines == ["sleep True True"] * 2
