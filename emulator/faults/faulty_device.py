@@ -115,6 +115,11 @@ class Armed:
     def spent(self) -> bool:
         return 0 < self.spec.count <= self.injected
 
+    @property
+    def continuous(self) -> bool:
+        """Whether it is due at every opportunity."""
+        return self.spec.every == 1 and self.spec.probability >= 1
+
     def over(self, time_ns: int) -> bool:
         until_s = self.spec.until_s
         if until_s is not None and time_ns >= round(until_s * NS_PER_S):
@@ -265,7 +270,7 @@ class Watch:
         """Values that samples have under the settings seen; None while one is not known."""
         if self._lattice is None and len(self._settings) == len(_LATTICE_SETTINGS):
             values = dict(self._settings)
-            downconversion = bool(values.pop("downconversion"))
+            downconversion = values.pop("downconversion") == 1
             try:
                 self._lattice = Lattice.of(**values, downconversion=downconversion)
             except LocalProtocolError:
@@ -563,24 +568,22 @@ class FaultyDevice:
             if not armed.concerns(opportunity):
                 continue
             fires = armed.due(opportunity)
+            lasts = armed.kind.lasting and armed.injected > 0
+            if fires and lasts and armed.continuous:
+                going_on = self._context(armed, opportunity, now_ns, fires=False)
+                fires = armed.kind.again == "adds" or (
+                    armed.kind.again == "ends"
+                    and _spoiled(armed, pieces, going_on) in (None, pieces)
+                )
             if armed.kind.target is Target.MOMENT:
                 if fires:
                     self._start(armed, now_ns)
                 continue
-            lasts = armed.kind.lasting and armed.injected > 0
             if not fires and not lasts:
                 continue
-            context = Context(
-                now_ns=now_ns,
-                since_ns=now_ns if fires else armed.since_ns,
-                firings=armed.injected + fires,
-                packets_since=0 if fires else armed.packets_since + 1,
-                first_counter=self._watch.counter if fires else armed.first_counter,
-                command=opportunity.command,
-                previous_frame=self._watch.previous_frame,
-                lattice=self._watch.lattice,
+            spoiled = _spoiled(
+                armed, pieces, self._context(armed, opportunity, now_ns, fires=fires)
             )
-            spoiled = _spoiled(armed, pieces, context)
             if spoiled is None:
                 continue
             pieces = spoiled
@@ -590,6 +593,20 @@ class FaultyDevice:
                 armed.packets_since += 1
         self._disarm_what_is_over(now_ns)
         return pieces
+
+    def _context(
+        self, armed: Armed, opportunity: Opportunity, now_ns: int, *, fires: bool
+    ) -> Context:
+        return Context(
+            now_ns=now_ns,
+            since_ns=now_ns if fires else armed.since_ns,
+            firings=armed.injected + fires,
+            packets_since=0 if fires else armed.packets_since + 1,
+            first_counter=self._watch.counter if fires else armed.first_counter,
+            command=opportunity.command,
+            previous_frame=self._watch.previous_frame,
+            lattice=self._watch.lattice,
+        )
 
     # --- moments --------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -254,6 +254,7 @@ PacketEffect = Callable[[bytes, Any, Rng, Context], Pieces]
 CommandEffect = Callable[[bytes, Any, Rng, Context], Handling | None]
 MomentEffect = Callable[[Any, Rng], Sequence[Action]]
 Effect = PacketEffect | CommandEffect | MomentEffect
+Again = Literal["", "adds", "ends"]
 EffectT = TypeVar("EffectT", bound=Callable[..., Any])
 
 
@@ -281,6 +282,10 @@ class KindOfFault:
         What an X4M300 driver counts for each one injected.
     lasting
         Whether, once fired, it acts on all later packets too.
+    again
+        What another injection of a lasting fault does: "adds" to the last one, or waits until that
+        "ends" by itself; "" if it means nothing, so that one due at every opportunity is injected
+        once.
     hidden
         Why the counters of a driver cannot show it; empty if they do.
     """
@@ -293,6 +298,7 @@ class KindOfFault:
     effect: Effect
     parameters: type[Parameters]
     lasting: bool
+    again: Again
     hidden: str
 
 
@@ -316,6 +322,7 @@ class Catalogued:
         parameters: type[Parameters] = Parameters,
         *,
         lasting: bool = False,
+        again: Again = "",
         hidden: str = "",
     ) -> Callable[[EffectT], EffectT]:
         def enter(effect: EffectT) -> EffectT:
@@ -328,6 +335,7 @@ class Catalogued:
                 effect=effect,
                 parameters=parameters,
                 lasting=lasting,
+                again=again,
                 hidden=hidden,
             )
             ENTERED.append(row)

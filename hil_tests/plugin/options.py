@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ INI = "xethru_radars"
 WORKER_KEY = "xethru_radars"
 RIG_ENVIRONMENT, RIG_INI = "XETHRU_RIG", "xethru_rig"
 POWER_ENVIRONMENT, POWER_INI = "XETHRU_POWER_CMD", "xethru_power_cmd"
+_CLOSE = 0.85  # a letter or two of a dozen; xethru_pages is no misspelling of xethru_radars
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +99,7 @@ def add_options(parser: pytest.Parser) -> None:
 
 def choose(config: pytest.Config) -> Choices:
     """Read and check the options; `pytest.UsageError` if they make no sense."""
+    _check_names(config)
     rig = _setting(config, "rig", RIG_ENVIRONMENT, RIG_INI)
     power = _setting(config, "hil_power_cmd", POWER_ENVIRONMENT, POWER_INI)
     worker: dict[str, list[str]] = getattr(config, "workerinput", {})
@@ -127,6 +131,31 @@ def choose(config: pytest.Config) -> Choices:
         artifacts=Path(config.invocation_params.dir, config.getoption("hil_artifacts")),
         json=Path(config.invocation_params.dir, report) if report else None,
     )
+
+
+def _check_names(config: pytest.Config) -> None:
+    """Reject misspelt keys and variables: the emulator would be tested in a radar's place."""
+    file = config.inipath
+    text = "" if file is None else file.read_text("utf-8", errors="replace")
+    keys = re.findall(r"^\s*([\w-]+)\s*=", text, re.MULTILINE)
+    keys += [pair.partition("=")[0] for pair in config.getoption("override_ini") or ()]
+    for key in keys:
+        if (match := _meant(key, (INI, RIG_INI, POWER_INI))) is not None:
+            try:
+                config.getini(key)  # another plugin's
+            except ValueError:
+                raise pytest.UsageError(
+                    f"{file or '-o'}: unknown key {key}; did you mean {match}?"
+                ) from None
+    for name in os.environ:
+        if (match := _meant(name, (ENVIRONMENT, RIG_ENVIRONMENT, POWER_ENVIRONMENT))) is not None:
+            raise pytest.UsageError(f"environment: unknown {name}; did you mean {match}?")
+
+
+def _meant(name: str, known: tuple[str, ...]) -> str | None:
+    """Return the name for which another one is a misspelling; None if it is right or none."""
+    close = get_close_matches(name, known, n=1, cutoff=_CLOSE)
+    return close[0] if close and name not in known else None
 
 
 def _setting(config: pytest.Config, option: str, environment: str, ini: str) -> str:

@@ -221,6 +221,7 @@ def usb_latency(packet: bytes, wanted: _Poll, rng: Rng, context: Context) -> Pie
     "ResponseTimeout where something was waited for; afterwards the frames lost meanwhile",
     _SilenceLength,
     lasting=True,
+    again="ends",
 )
 def silent(packet: bytes, wanted: _SilenceLength, rng: Rng, context: Context) -> Pieces:
     """Nothing comes from the module, though its port is there."""

@@ -109,13 +109,19 @@ def _distorted(
     return changed_frame(packet, lambda samples: lattice.nearest(distort(samples)))
 
 
-@of_frame("frames_lost += frames", _FrameCount, lasting=True)
+@of_frame("frames_lost += frames", _FrameCount, lasting=True, again="adds")
 def counter_jump(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps ahead, and goes on from there."""
     return _renumbered(packet, lambda counter: counter + wanted.frames * context.firings)
 
 
-@of_frame("nothing; the counters of the frames show it", _FrameCount, lasting=True, hidden=_BACK)
+@of_frame(
+    "nothing; the counters of the frames show it",
+    _FrameCount,
+    lasting=True,
+    again="adds",
+    hidden=_BACK,
+)
 def counter_back(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps back, and goes on from there."""
     return _renumbered(packet, lambda counter: counter - wanted.frames * context.firings)
@@ -145,7 +151,7 @@ def duplicate_frame(packet: bytes, wanted: _Copies, rng: Rng, context: Context) 
     return [Piece(packet)] * (1 + wanted.copies)
 
 
-@of_frame("frames_lost += frames", _FrameCount, lasting=True)
+@of_frame("frames_lost += frames", _FrameCount, lasting=True, again="ends")
 def missing_frames(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """Frames are missing."""
     return [] if context.packets_since < wanted.frames else [Piece(packet)]
@@ -168,6 +174,7 @@ def slow_rate(packet: bytes, wanted: _Slower, rng: Rng, context: Context) -> Pie
     "nothing; the arrival times show it, and ResponseTimeout if someone waits for less",
     _Seconds,
     lasting=True,
+    again="ends",
     hidden=_TIMING,
 )
 def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces:

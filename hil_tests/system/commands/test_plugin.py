@@ -50,6 +50,31 @@ LOUDEST = "measurement loudest_sample"
 RIG_RADAR = '[[radars]]\nname = "{}"\nserial = "{}"\nx_m = 0.1\ny_m = 0.2\nyaw_deg = 90\n'
 
 
+@pytest.mark.parametrize(
+    ("ini", "environment", "named"),
+    [
+        ("xethru_radar = serial=1", {}, "xethru_radars"),
+        ("xethru_rigs = lab.toml", {}, "xethru_rig"),
+        ("", {"XETHRU_RADAR": "auto"}, "XETHRU_RADARS"),
+    ],
+)
+def test_a_misspelt_name_is_refused(
+    ini: str,
+    environment: dict[str, str],
+    named: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else the emulator would be tested in the place of somebody's radar."""
+    (tmp_path / "pytest.ini").write_text(f"[pytest]\n{ini}\n")
+    (tmp_path / "test_own.py").write_text(OWN_TEST)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    done = run(tmp_path, "-q")
+    assert done.returncode == pytest.ExitCode.USAGE_ERROR
+    assert f"did you mean {named}?" in done.stderr
+
+
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     with emulator("serve", "--bare", "--count", "2", "--tcp", "0") as served:
