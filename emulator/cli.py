@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import socket
 import sys
 from collections.abc import Callable, Sequence
@@ -37,6 +38,7 @@ TIMEOUT_S = 10.0
 _INTERRUPTED = 130
 """Exit code after SIGINT, as of a shell."""
 MOST_BARE = 64
+SERIAL_DIGITS = 12
 LAST_PORT = 65535
 _LINKS = {"usb": (0, 1000), "uart": (600, 10_000_000)}
 """Links and the numbers they take: latency in ms, baud rate."""
@@ -259,9 +261,18 @@ def socket_of(path: Path) -> Path:
             control = announced["control"]
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             continue  # no announcement, or one that is just being written
-        if path.absolute() in ports and isinstance(control, str):
+        if any(_is_same_port(path, port) for port in ports) and isinstance(control, str):
             return Path(control)
     return path
+
+
+def _is_same_port(path: Path, port: Path) -> bool:
+    """Whether two paths lead to one link, or to one terminal; a port may be unplugged."""
+
+    def places(link: Path) -> set[str]:
+        return {os.path.join(os.path.realpath(link.parent), link.name), os.path.realpath(link)}
+
+    return not places(path).isdisjoint(places(port))
 
 
 def ask(path: Path, request: dict[str, Any]) -> bytes:
@@ -470,7 +481,11 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="port of the module: /dev/ttyACM0, tcp://HOST:PORT, rfc2217://HOST:PORT",
     )
     proxy.add_argument(
-        "--baud", type=int, default=115_200, metavar="B", help="of a UART (default 115200)"
+        "--baud",
+        type=_whole(*_LINKS["uart"]),
+        default=115_200,
+        metavar="B",
+        help="of a UART (default 115200)",
     )
     _add_faults(proxy)
     proxy.add_argument(
@@ -528,6 +543,13 @@ def _add_product(serve: argparse.ArgumentParser) -> None:
         choices=["x4m300", "x4m200"],
         help="product: with the presence profile, or with the respiration profile (default: what "
         "the scene says of each module, else x4m300)",
+    )
+    serve.add_argument(
+        "--serial",
+        type=_serial,
+        metavar="NUMBER",
+        help="serial number of the first module, 12 digits; the others count on (default: those of "
+        "the scene; with --bare those kept in --state-dir, else new ones)",
     )
     serve.add_argument(
         "--option",
@@ -592,6 +614,12 @@ def _option(text: str) -> tuple[str, object]:
         return option_of(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _serial(text: str) -> int:
+    if len(text) != SERIAL_DIGITS or not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{shown(text)} must be {SERIAL_DIGITS} digits")
+    return int(text)
 
 
 def _host(text: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import time
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
@@ -46,6 +47,9 @@ NS_PER_MS = 1_000_000
 SOCKET_NAME = "odometry.sock"
 CONTROL_NAME = "control.sock"
 PROXY_NAME = "proxy"
+FIRST_BARE, BARE_SERIALS = 100_000_000_000, 100
+"""Bare modules have serial numbers from it to twice as much; a process has so many of them."""
+MOST_SERIALS = 10**12
 Warn = Callable[[str], None]
 """Gets a warning in one line."""
 
@@ -164,7 +168,8 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             if options.firmware is not None:
                 changes["firmware"] = options.firmware
             devices = []
-            for index, radar in enumerate(scene.radars):
+            serials = _serials(options, [radar.serial for radar in scene.radars])
+            for index, (radar, serial) in enumerate(zip(scene.radars, serials, strict=True)):
                 model = options.model or radar.model or STOCK_MODEL
                 device_options = DeviceOptions.of_model(model, **changes)
                 if device_options.shipped_profile not in device_options.profiles:
@@ -172,21 +177,19 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                         "--option: shipped_profile must be one of profiles", exit_code=2
                     )
                 device = radar_device(
-                    Identity(serial=radar.serial, order_code=MODELS[model].order_code),
+                    Identity(serial=serial, order_code=MODELS[model].order_code),
                     echo_source(scene, index, options.seed),
                     options.pace,
                     scene_time_zero_ns=zero_ns,
                     clock=radar.clock,
                     options=device_options,
-                    memory=None
-                    if state_dir is None
-                    else DirectoryMemory(state_dir, radar.serial, warn),
+                    memory=None if state_dir is None else DirectoryMemory(state_dir, serial, warn),
                 )
                 faulty = session.wrap(device, radar.name)
                 devices.append(
                     NamedDevice(
                         name=radar.name,
-                        serial=radar.serial,
+                        serial=serial,
                         device=faulty,
                         start_skew_ns=radar.clock.skew_ns,
                         present=faulty.port_present,
@@ -212,6 +215,27 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         except (SceneError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
         _run(ports, [control], stop, cleanup, zero_ns=zero_ns, control=control.path, feed=feed)
+
+
+def _serials(options: Namespace, of_scene: Sequence[str]) -> list[str]:
+    """Return the modules' serial numbers; their noise is that of the scene's, whatever they are.
+
+    Bare modules have numbers that no other emulator has, so that a host that looks for one by its
+    number finds that one.
+    """
+    if not options.bare and options.serial is None:
+        return list(of_scene)
+    first = options.serial
+    if first is None:
+        first = FIRST_BARE + BARE_SERIALS * secrets.randbelow(FIRST_BARE // BARE_SERIALS)
+        kept = [] if options.state_dir is None else options.state_dir.glob(f"1{'[0-9]' * 11}.json")
+        first = min((int(path.stem) // BARE_SERIALS * BARE_SERIALS for path in kept), default=first)
+    if first + len(of_scene) > MOST_SERIALS:
+        raise CannotServeError(
+            f"--serial {first}: {len(of_scene)} modules count beyond 12 digits; give a lower one",
+            exit_code=2,
+        )
+    return [f"{first + index:012d}" for index in range(len(of_scene))]
 
 
 def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:

@@ -76,7 +76,8 @@ _SHELL = set("|&<>$`*?~")
 def module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """Serve the module that the pages talk to."""
     folder = tmp_path_factory.mktemp("served")
-    with emulator("serve", "--bare", "--link-dir", folder, "--tcp", "0") as served:
+    serve = ("serve", "--bare", "--serial", "100000000000")
+    with emulator(*serve, "--link-dir", folder, "--tcp", "0") as served:
         yield served
 
 

@@ -70,7 +70,7 @@ def test_an_x4m200_is_served() -> None:
 
 def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
     links = tmp_path / "links"
-    serve = ("serve", "--bare", "--link-dir", links)
+    serve = ("serve", "--bare", "--serial", "100000000000", "--link-dir", links)
     with emulator(*serve) as first:
         radar = open_radar(first.paths[0], reconnect_s=15.0)
         geometry = radar.configure_raw(MEDIUM)
@@ -87,6 +87,20 @@ def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
         away_s = (frame.arrival_ns - before.arrival_ns) * 1e-9
         assert radar.frames_lost == max(round(away_s * TIMER_HZ_AT_17) - 1, 0)
         assert radar.statistics.off_lattice_samples == 0
+
+
+def test_bare_modules_have_serial_numbers_of_their_own(tmp_path: Path) -> None:
+    """Two emulators on one machine, one that is given numbers, one that keeps them."""
+    two = ("serve", "--bare", "--count", "2")
+    with emulator(*two) as one, emulator(*two) as other:
+        assert len({*one.serials, *other.serials}) == 4
+        with open_radar(one.paths[1]) as radar:
+            assert radar.info().serial_number == one.serials[1]
+    with emulator("serve", "lab", "--serial", "000000000007") as given:
+        assert given.serials == tuple(f"{number:012d}" for number in range(7, 11))
+    (tmp_path / "100000012301.json").touch()  # of the second module
+    with emulator(*two, "--state-dir", tmp_path) as kept:
+        assert kept.serials == ("100000012300", "100000012301")
 
 
 def test_a_file_survives_the_emulator(tmp_path: Path) -> None:

@@ -138,3 +138,27 @@ def test_ctrl_c_ends_a_request_without_answer(tmp_path: Path) -> None:
                 asking.send_signal(signal.SIGINT)
                 _, said = asking.communicate(timeout=seconds(5))
     assert (asking.returncode, said) == (130, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "allowed"),
+    [
+        (["proxy", "--port", "p", "--baud", "-5"], "600...10000000"),
+        (["proxy", "--port", "p", "--baud", "0"], "600...10000000"),
+        (["proxy", "--port", "p", "--baud", "fast"], "600...10000000"),
+        (["serve", "--bare", "--serial", "5"], "12 digits"),
+        (["serve", "--bare", "--serial", "-00000000001"], "12 digits"),
+    ],
+)
+def test_a_number_out_of_range_is_wrong_usage(
+    arguments: list[str], allowed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert allowed in capsys.readouterr().err
+
+
+def test_serial_numbers_have_12_digits(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "--bare", "--count", "2", "--serial", "9" * 12]) == 2
+    assert "--serial" in capsys.readouterr().err

@@ -45,6 +45,27 @@ def test_a_running_emulator_is_controlled_by_its_port(tmp_path: Path) -> None:
         control(tmp_path / "port", "state")
 
 
+def test_any_path_to_a_port_finds_its_emulator(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    with emulated_port() as port:
+        place = Path(port)
+        folder = tmp_path / "folder"
+        folder.symlink_to(place.parent)
+        link, second = tmp_path / "link", tmp_path / "second"
+        link.symlink_to(place)
+        second.symlink_to(link)
+        roundabout = tmp_path / "elsewhere" / ".." / "link"
+        terminal = place.resolve()
+        for path in (link, second, folder / place.name, roundabout, terminal):
+            assert control(path, "state")["ok"], path
+        control(port, "unplug")
+        for path in (link, folder / place.name):
+            assert control(path, "state")["radars"]["radar_1"]["present"] is False
+        # another folder has no such port, even by the same name
+        with pytest.raises(OSError, match="no emulator answers"):
+            control(tmp_path / "elsewhere" / place.name, "state")
+
+
 def test_a_scene_says_what_its_modules_are_and_what_is_true_of_its_people() -> None:
     with emulated_port("two_people", "--pace", "asap") as port:
         for name, product in (("respiration", "X4M200"), ("presence", "X4M300")):
