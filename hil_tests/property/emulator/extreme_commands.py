@@ -39,7 +39,7 @@ from xethru_protocol.wire.codes import FORMAT_KEY, BootloaderKey
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import NeedData, encode_no_escape, encode_normal
 from xethru_protocol.wire.messages import Ping, Pong
-from xethru_protocol.wire.rows import ROWS, Command
+from xethru_protocol.wire.table import ROWS, Command
 
 Result = TypeVar("Result")
 LONGEST_CALL_S = 5.0
@@ -99,7 +99,7 @@ def _number(rng: random.Random, code: str, known: list[int]) -> bytes:
     return _packed(code, rng.choice(EXTREMES.get(code, BYTES)))
 
 
-def _field(rng: random.Random, name: str, kind: kinds.Kind, chosen: dict[str, int]) -> bytes:  # noqa: PLR0911 - one return per kind
+def _field(rng: random.Random, name: str, kind: kinds.FieldKind, chosen: dict[str, int]) -> bytes:  # noqa: PLR0911 - one return per kind
     match kind:
         case kinds.Number(code=code, enum=enum):
             if name == "file_type":
