@@ -74,7 +74,7 @@ from slam.robust.proposals.constellation import (
     find_placements,
     stands_out,
 )
-from slam.robust.proposals.doubts import Doubt, doubted_covariance
+from slam.robust.proposals.doubts import Doubt, doubted_covariance, seen_ranges
 from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
@@ -411,9 +411,11 @@ class Branches:
         rule, slipped = self._rule, self.main.slip_probability
         looks = self._now % self._look_every == 0
         doubts: list[Doubt] = []
+        seen = seen_ranges(report, self.main.pose, rule) if self._doubts else None
         for one in self._doubts:
             one.take(step.evidence, rule)
-            one.measure(report, self.main.pose, rule)
+            if seen is not None:
+                one.measure(seen)
             if not one.is_confirmed(rule) or not looks or self._is_alike_elsewhere(one):
                 doubts.append(one)
         # Alike ranges before and behind a stop tell little where the world repeats itself.

@@ -33,6 +33,33 @@ def covered_share(probability: float) -> float:
     return max(probability, 1.0 - math.log(probability) / math.log(TAIL_PROBABILITY))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenRanges:
+    """Ranges of landmarks, k of them, map frame."""
+
+    ids: Array  # shape (k,), of the landmarks
+    antennas_m: Array  # shape (k, 2)
+    along: Array  # shape (k, 2), unit vectors from the landmarks to the antennas
+    variances: Array  # shape (k,), of ranges [m^2]: one over the information in each
+
+
+def seen_ranges(report: UpdateReport, pose: Array, rule: BranchRule) -> SeenRanges | None:
+    """Return the ranges of landmarks at a pose (3,), those that were heard; None if none was."""
+    continued = {(radar, id_) for radar, _, id_ in report.continued}
+    heard = [one for one in report.predicted if (one.radar, one.landmark_id) in continued]
+    if not heard:
+        return None
+    antennas = transform(pose, np.array([one.antenna_m for one in heard]))
+    away = antennas - transform(pose, np.array([one.point_m for one in heard]))
+    variances = rule.model_sigma_m**2 + np.array([one.variance for one in heard])
+    return SeenRanges(
+        ids=np.array([one.landmark_id for one in heard], dtype=np.float64),
+        antennas_m=antennas,
+        along=away / np.linalg.norm(away, axis=1, keepdims=True),
+        variances=rule.correlated_steps * variances,
+    )
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class Doubt:
     """Motions that the wheels may not have reported. First of a pair are slips, then carries."""
@@ -57,22 +84,16 @@ class Doubt:
                 total = self.nats.get(int(landmark), 0.0) + nats / rule.correlated_steps
                 self.nats[int(landmark)] = min(max(total, -rule.most_against), rule.most_for)
 
-    def measure(self, report: UpdateReport, pose: Array, rule: BranchRule) -> None:
-        """Add what the ranges of a step tell of such a motion; ``pose`` (3,) is that behind it.
+    def measure(self, seen: SeenRanges) -> None:
+        """Add what the ranges of a step tell of such a motion.
 
-        A motion (dx, dy, turn) at the position moves an antenna at a by (dx, dy) + turn J (a - p).
+        A motion (dx, dy, turn) at a position p moves an antenna at a by (dx, dy) + turn J (a - p).
         """
-        of_known = {(radar, id_) for radar, _, id_ in report.continued if id_ < self.next_id}
-        seen = [one for one in report.predicted if (one.radar, one.landmark_id) in of_known]
-        if not seen:
-            return
-        antennas = transform(pose, np.array([one.antenna_m for one in seen]))
-        points = transform(pose, np.array([one.point_m for one in seen]))
-        along = (antennas - points) / np.linalg.norm(antennas - points, axis=1, keepdims=True)
-        turned = np.sum(along * quarter_turn(antennas - self.position_m), axis=1)
-        rows = np.column_stack([along, turned])
-        variances = rule.model_sigma_m**2 + np.array([one.variance for one in seen])
-        self.information += rows.T @ (rows / (rule.correlated_steps * variances)[:, None])
+        known = seen.ids < self.next_id
+        along = seen.along[known]
+        levers = quarter_turn(seen.antennas_m[known] - self.position_m)
+        rows = np.column_stack([along, np.sum(along * levers, axis=1)])
+        self.information += rows.T @ (rows / seen.variances[known, None])
 
     def is_confirmed(self, rule: BranchRule) -> bool:
         """Return whether known landmarks fit the pose, and leave no such motion open."""

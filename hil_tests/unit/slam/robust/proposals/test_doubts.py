@@ -9,7 +9,13 @@ from hil_tests.unit.slam.robust.range_world import Array
 from slam.geometry import compose
 from slam.results import PredictedRange, UpdateReport
 from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
-from slam.robust.proposals.doubts import Doubt, covered_share, doubted_covariance
+from slam.robust.proposals.doubts import (
+    Doubt,
+    SeenRanges,
+    covered_share,
+    doubted_covariance,
+    seen_ranges,
+)
 
 RULE = BranchRule()
 MUCH = 2.0 * RULE.correlated_steps * RULE.most_for
@@ -32,8 +38,8 @@ def at(doubt: Doubt, x_m: float) -> Array:
     return doubted_covariance([doubt], np.array([x_m, 0.0]))
 
 
-def seen_from(pose: Array, points_m: list[tuple[float, float]], variance: float) -> UpdateReport:
-    """Return a report of ranges of landmarks 0, 1, ... by an antenna LEVER_M ahead of the pose."""
+def seen_from(pose: Array, points_m: list[tuple[float, float]], variance: float) -> SeenRanges:
+    """Return ranges of landmarks 0, 1, ... by an antenna LEVER_M ahead of the pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     predicted = []
     for number, (x, y) in enumerate(points_m):
@@ -50,7 +56,10 @@ def seen_from(pose: Array, points_m: list[tuple[float, float]], variance: float)
             )
         )
     continued = tuple((0, number, number) for number in range(len(points_m)))
-    return UpdateReport(continued=continued, nis=0.0, dof=0, predicted=tuple(predicted))
+    report = UpdateReport(continued=continued, nis=0.0, dof=0, predicted=tuple(predicted))
+    found = seen_ranges(report, pose, RULE)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("probability", [2e-3, 0.05, 0.5, 1.0])
@@ -125,7 +134,7 @@ def test_what_ranges_tell_of_a_motion_is_as_ranges_change_with_it() -> None:
     doubt, way = doubtful(1.0), np.array([0.4, 0.1, 0.3])
     pose = compose(np.array([1.0, 0.0, 0.0]), way)
     points_m = [(1.5, 1.0), (2.0, -0.4), (0.3, 0.5)]
-    doubt.measure(seen_from(pose, points_m, 4e-4), pose, RULE)
+    doubt.measure(seen_from(pose, points_m, 4e-4))
 
     def ranges_m(motion: Array) -> Array:
         moved = compose(compose(np.array([1.0, 0.0, 0.0]), motion), way)
@@ -158,7 +167,7 @@ def test_a_doubt_ends_where_ranges_leave_no_motion_open(
     for step in range(20):
         pose = np.array([step_m * step, 0.0, 0.0])
         doubt.take(np.array([[0, MUCH], [1, MUCH], [2, MUCH]]), RULE)
-        doubt.measure(seen_from(pose, points_m, 0.0), pose, RULE)
+        doubt.measure(seen_from(pose, points_m, 0.0))
     assert doubt.is_confirmed(RULE) is ends
 
 
@@ -174,5 +183,10 @@ def test_landmarks_known_before_end_a_doubt_and_new_ones_do_not() -> None:
 def test_ranges_of_new_landmarks_tell_nothing_of_a_motion_before_them() -> None:
     doubt = doubtful(0.0)
     doubt.next_id = 0
-    doubt.measure(seen_from(np.zeros(3), AROUND, 0.0), np.zeros(3), RULE)
+    doubt.measure(seen_from(np.zeros(3), AROUND, 0.0))
     assert not doubt.information.any()
+
+
+def test_a_scan_without_ranges_of_landmarks_has_no_sightings() -> None:
+    report = UpdateReport(continued=(), nis=0.0, dof=0)
+    assert seen_ranges(report, np.zeros(3), RULE) is None
