@@ -19,6 +19,11 @@ INI = "xethru_radars"
 WORKER_KEY = "xethru_radars"
 RIG_ENVIRONMENT, RIG_INI = "XETHRU_RIG", "xethru_rig"
 POWER_ENVIRONMENT, POWER_INI = "XETHRU_POWER_CMD", "xethru_power_cmd"
+_SECTION = re.compile(
+    r"^\[(?:pytest|tool:pytest|tool\.pytest(?:\.ini_options)?)\](.*?)(?=^\[|\Z)",
+    re.MULTILINE | re.DOTALL,
+)
+"""What pytest itself reads of its configuration file; other tools' keys may be called anything."""
 _CLOSE = 0.85  # a letter or two of a dozen; xethru_pages is no misspelling of xethru_radars
 
 
@@ -137,7 +142,8 @@ def _check_names(config: pytest.Config) -> None:
     """Reject misspelt keys and variables: the emulator would be tested in a radar's place."""
     file = config.inipath
     text = "" if file is None else file.read_text("utf-8", errors="replace")
-    keys = re.findall(r"^\s*([\w-]+)\s*=", text, re.MULTILINE)
+    section = "".join(_SECTION.findall(text))
+    keys = re.findall(r"^([\w-]+)\s*[=:]", section, re.MULTILINE)
     keys += [pair.partition("=")[0] for pair in config.getoption("override_ini") or ()]
     for key in keys:
         if (match := _meant(key, (INI, RIG_INI, POWER_INI))) is not None:

@@ -75,6 +75,17 @@ def test_a_misspelt_name_is_refused(
     assert f"did you mean {named}?" in done.stderr
 
 
+def test_keys_of_other_tools_may_have_any_name(tmp_path: Path) -> None:
+    """Every pytest of the machine loads the plugin."""
+    (tmp_path / "pyproject.toml").write_text(
+        '[project.scripts]\nxethru-radar = "radar:main"\n'
+        "[tool.pytest.ini_options]\nxfail_strict = true\n"
+        '[tool.uv.sources]\nxethru-rig = { path = "rig" }\n'
+    )
+    (tmp_path / "test_own.py").write_text("def test_nothing(): pass\n")
+    assert run(tmp_path, "-q").returncode == 0
+
+
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     with emulator("serve", "--bare", "--count", "2", "--tcp", "0") as served:
