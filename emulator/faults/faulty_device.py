@@ -129,7 +129,7 @@ class Armed:
     def concerns(self, opportunity: Opportunity) -> bool:
         """Whether it is the sort of thing that the fault hits, now or later."""
         spec, packet_class = self.spec, opportunity.packet_class
-        match self.target:
+        match self.spec.target:
             case Target.PACKET:
                 fits = packet_class is not None and spec.packet in ("any", packet_class.value)
             case Target.FRAME:
@@ -141,17 +141,6 @@ class Armed:
             case Target.MOMENT:
                 fits = packet_class is None and opportunity.command is None
         return fits and (spec.command is None or _is_command(opportunity.command, spec.command))
-
-    @property
-    def target(self) -> Target:
-        """What it waits for: a moment may be that of a frame or of an answer."""
-        spec, target = self.spec, self.kind.target
-        if target is not Target.MOMENT:
-            return target
-        if spec.command is not None:
-            return Target.REPLY
-        by_frame = spec.frame is not None or spec.every > 1 or spec.probability < 1
-        return Target.FRAME if by_frame else Target.MOMENT
 
     def due(self, opportunity: Opportunity) -> bool:
         """Whether it wants to be injected here; every call counts as one opportunity."""
@@ -436,7 +425,7 @@ class FaultyDevice:
             return
         if isinstance(self.inner, Device) and not self.inner.listens:
             return
-        holds = any(armed.target is Target.COMMAND for armed in self.armed)
+        holds = any(armed.spec.target is Target.COMMAND for armed in self.armed)
         begun = self._passed
         for piece, command in self._watch.host_pieces(data):
             fresh, touched = piece[begun:], begun > 0
@@ -522,7 +511,7 @@ class FaultyDevice:
         moments = [
             self._zero_ns + round(armed.spec.at_s * NS_PER_S)
             for armed in self.armed
-            if armed.target is Target.MOMENT and not armed.over(now_ns - self._zero_ns)
+            if armed.spec.target is Target.MOMENT and not armed.over(now_ns - self._zero_ns)
         ]
         candidates = [
             self.inner.wake_ns(now_ns),

@@ -15,7 +15,7 @@ file, key and what is allowed::
     every = 50                 # every 50th opportunity
     probability = 0.01         # each opportunity with this chance
     packet = "frame"           # faults of any packet: frame, reply, system or data only
-    count = 3                  # how often; 1 if left out, 0: without end
+    count = 3                  # how often; 1 if left out, 0: without end, at every opportunity
     parameters = { }           # of the kind
 
 The truth log is JSON lines, one object per injected fault: ``t_ns`` (device time), ``radar``,
@@ -161,6 +161,15 @@ class FaultSpec(Table):
         return self
 
     @model_validator(mode="after")
+    def _has_occasions(self) -> FaultSpec:
+        if self.count == 0 and self.target is Target.MOMENT:
+            raise ValueError(
+                f"count: {self.kind} without end needs frame, every, probability or command, "
+                "which say when it comes again"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _parameters_fit(self) -> FaultSpec:
         try:
             self.kind_parameters()
@@ -175,6 +184,16 @@ class FaultSpec(Table):
     @property
     def row(self) -> KindOfFault:
         return KINDS[self.kind]
+
+    @property
+    def target(self) -> Target:
+        """What it waits for: a moment may be that of a frame or of an answer."""
+        if self.row.target is not Target.MOMENT:
+            return self.row.target
+        if self.command is not None:
+            return Target.REPLY
+        by_frame = self.frame is not None or self.every > 1 or self.probability < 1
+        return Target.FRAME if by_frame else Target.MOMENT
 
     def kind_parameters(self) -> Parameters:
         return self.row.parameters.model_validate(self.parameters)

@@ -73,4 +73,4 @@ def test_a_fault_of_a_moment_with_a_probability_waits_for_frames() -> None:
     for probability, target in ((1.0, Target.MOMENT), (0.5, Target.FRAME)):
         armed = Armed(0, fault_spec("unplug", probability=probability), "front", 1)
         assert armed.kind.target is Target.MOMENT
-        assert armed.target is target
+        assert armed.spec.target is target

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from emulator.faults.kind import Target
 from emulator.faults.kinds import KINDS
 from emulator.faults.plan import (
     FaultPlan,
@@ -69,6 +70,19 @@ def test_a_mistake_is_one_line_that_names_the_place(text: str, place: str) -> No
     assert place in str(caught.value)
     assert "\n" not in str(caught.value).replace(text, "")
     assert str(caught.value).startswith("scenario: ")
+
+
+@pytest.mark.parametrize(
+    "kind", [name for name, row in KINDS.items() if row.target is Target.MOMENT]
+)
+def test_a_moment_without_end_needs_occasions(kind: str) -> None:
+    """Else it would come again at every call, and a truth log would grow without end."""
+    with pytest.raises(FaultPlanError, match="count: "):
+        fault_spec(kind, count=0)
+    with pytest.raises(FaultPlanError, match="count: "):
+        fault_spec(kind, count=0, until_s=5.0)
+    for occasion in ({"frame": 3}, {"every": 2}, {"probability": 0.5}, {"command": "PING"}):
+        assert fault_spec(kind, count=0, **occasion).target is not Target.MOMENT
 
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
