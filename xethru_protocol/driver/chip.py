@@ -193,7 +193,7 @@ def _postprocessing(link: Link, setting: FramePostprocessing) -> Steps[float]:
 
 
 def _flag(answer: m.X4Value) -> bool:
-    return bool(answer)
+    return answer == 1  # with any other value the firmware goes on as without
 
 
 def _pair(answer: tuple[float, float]) -> tuple[float, float]:

@@ -110,7 +110,11 @@ def read_geometry(link: Link, downconversion: bool) -> Steps[FrameGeometry]:
     """Ask where the bins of the frames lie that come from now on."""
     area = yield from link.x4_get(X4Setting.FRAMEAREA)
     n_bins = yield from link.x4_get(X4Setting.FRAMEBINCOUNT)
-    if not isinstance(area, tuple) or not isinstance(n_bins, int) or n_bins <= 0:
+    if (
+        not (isinstance(area, tuple) and all(map(math.isfinite, area)))
+        or not isinstance(n_bins, int)
+        or n_bins <= 0
+    ):
         raise RemoteProtocolError(f"{link.name} reads back frame area {area} with {n_bins} bins")
     return FrameGeometry.from_read_back(
         area_m=(float(area[0]), float(area[1])), n_bins=n_bins, downconversion=downconversion
@@ -162,7 +166,7 @@ def _take_over(link: Link) -> Steps[None]:
     values: dict[str, X4Value] = {}
     for name, setting in CONFIG_SETTINGS.items():
         values[name] = yield from link.x4_get(setting)
-    values["downconversion"] = bool(values["downconversion"])
+    values["downconversion"] = values["downconversion"] == 1  # as `X4.downconversion`
     config = RawConfig(**values)  # type: ignore[arg-type] # by the answers' types
     link.frames.geometry = yield from read_geometry(link, config.downconversion)
     link.frames.lattice = config.lattice

@@ -320,6 +320,32 @@ def test_start_takes_the_settings_that_it_finds(emulated: Emulated) -> None:
     assert radar.read_frame().samples.shape == (716,)
 
 
+def test_a_downconversion_other_than_one_is_that_of_rf_frames(emulated: Emulated) -> None:
+    """Another program may have set it: the firmware compares with 1."""
+    radar, line, module = emulated
+    radar.set_mode(SensorMode.XTID_SM_MANUAL)
+    radar.x4.init()
+    module(m.X4DriverSet(setting=X4Setting.DOWNCONVERSION, value=2))
+    assert radar.x4.downconversion is False
+    radar.start(17)
+    line.say(frame(1, 1467))
+    assert radar.read_frame().samples.dtype == np.float32
+
+
+@pytest.mark.parametrize("downconversion", [0, 1])
+@pytest.mark.parametrize("start_m", [math.nan, math.inf])
+def test_start_refuses_bins_that_are_nowhere(
+    emulated: Emulated, start_m: float, downconversion: int
+) -> None:
+    radar, _, module = emulated
+    radar.set_mode(SensorMode.XTID_SM_MANUAL)
+    module(m.X4DriverSet(setting=X4Setting.DOWNCONVERSION, value=downconversion))
+    module(m.X4DriverSet(setting=X4Setting.FRAMEAREA, value=(start_m, math.inf)))
+    with pytest.raises(RemoteProtocolError, match="reads back frame area"):
+        radar.start(17)
+    assert radar.x4.fps == 0
+
+
 @pytest.mark.parametrize(("stopped", "mode"), [(True, "STOP"), (False, "RUN")])
 def test_start_in_another_mode_says_what_to_call(
     driver_on: DriverOn, stopped: bool, mode: str
