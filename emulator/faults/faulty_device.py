@@ -559,11 +559,7 @@ class FaultyDevice:
             fires = armed.due(opportunity)
             lasts = armed.kind.lasting and armed.injected > 0
             if fires and lasts and armed.continuous:
-                going_on = self._context(armed, opportunity, now_ns, fires=False)
-                fires = armed.kind.again == "adds" or (
-                    armed.kind.again == "ends"
-                    and _spoiled(armed, pieces, going_on) in (None, pieces)
-                )
+                fires = self._comes_again(armed, pieces, opportunity, now_ns)
             if armed.kind.target is Target.MOMENT:
                 if fires:
                     self._start(armed, now_ns)
@@ -582,6 +578,15 @@ class FaultyDevice:
                 armed.packets_since += 1
         self._disarm_what_is_over(now_ns)
         return pieces
+
+    def _comes_again(
+        self, armed: Armed, pieces: Sequence[Piece], opportunity: Opportunity, now_ns: int
+    ) -> bool:
+        """Whether a lasting fault that is always due is injected once more."""
+        if armed.kind.again != "ends":
+            return armed.kind.again == "adds"
+        going_on = self._context(armed, opportunity, now_ns, fires=False)
+        return _spoiled(armed, pieces, going_on) in (None, pieces)
 
     def _context(
         self, armed: Armed, opportunity: Opportunity, now_ns: int, *, fires: bool

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from emulator.chip.chip import Refusal, Silence
-from emulator.module.memory import ERASED, FileKey
+from emulator.module.memory import FileKey, part_limits, stored_part
 from emulator.module.modes import Group, ModuleState, check_permission, group_of
 from emulator.module.settings import ZONE_LIMITS_M
 from emulator.module.state import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
@@ -42,8 +42,6 @@ SLOWEST_BAUDRATE, FASTEST_BAUDRATE = 600, 10_000_000
 """The firmware acknowledges and ignores any other rate."""
 TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
-LONGEST_DUMP = 8192
-"""Bytes of a crash dump that are worth making; no reply is as long."""
 LONGEST_READ = 4096
 """Bytes that one READ_I2C may ask for; assumed, no source has the command."""
 _WORD = 0xFFFFFFFF
@@ -80,8 +78,12 @@ HandlerT = TypeVar("HandlerT", bound=Handler)
 
 def _reply_int(*values: int, content_id: int = 0) -> m.Response:
     """Return a REPLY INT of 32-bit values, which it carries as signed ones."""
-    signed = tuple((value & _WORD) - (value << 1 & 1 << 32) for value in values)
-    return m.ReplyInt(content_id=content_id, values=signed)
+    return m.ReplyInt(content_id=content_id, values=tuple(map(_signed, values)))
+
+
+def _signed(value: int) -> int:
+    value &= _WORD
+    return value - (1 << 32) if value >> 31 else value
 
 
 def _key(command: Any) -> FileKey:  # noqa: ANN401 - of any command with a file
@@ -308,11 +310,11 @@ def _crash_dump(module: Module, command: m.GetCrashDump) -> m.Response:
     dump = module.files.get(CRASH_DUMP)
     errors = [ErrorCode.XTS_SPRE_NOT_RECOGNIZED] * 2 if dump is None else []
     dump = dump or b""
-    if command.offset + command.length & _WORD > len(dump):
+    begin, end = part_limits(command.offset, command.length)
+    if end > len(dump):
         errors.append(ErrorCode.XTS_SPRE_USER)
     module.notices += [m.Error(code=code) for code in errors]
-    length = min(command.length, LONGEST_DUMP)
-    part = dump[command.offset : command.offset + length].ljust(length, ERASED)
+    part = stored_part(dump, begin, command.length)
     return m.ReplyByte(content_id=DirCode.XTS_SDC_GET_CRASH_DUMP, values=part)
 
 

@@ -28,7 +28,7 @@ MAX_OPEN = 10
 BLOCK_BYTES = 8192
 """What the flash erases at once; the first block holds the table of files."""
 LONGEST_READ = BLOCK_BYTES
-"""Bytes of one GET_FILE_DATA that are worth making; no reply is as long."""
+"""Bytes of a file that are worth making at once; no reply is as long."""
 _WORD = 0xFFFFFFFF
 ERASED = b"\xff"
 
@@ -157,6 +157,23 @@ class _File:
         return (self.offset + _blocks(self.length)) & _WORD
 
 
+def part_limits(offset: int, length: int) -> tuple[int, int]:
+    """Return where a part of a file begins and ends.
+
+    The firmware adds offset and length in 32 bits; where the sum wraps, the part begins below 0.
+    """
+    end = (offset + length) & _WORD
+    return end - length, end
+
+
+def stored_part(data: bytes | bytearray, begin: int, length: int) -> bytes:
+    """Return a part of stored data, with erased bytes where there are none."""
+    length = min(length, LONGEST_READ)
+    before = ERASED * min(max(-begin, 0), length)
+    part = bytes(data[max(begin, 0) : max(begin + length, 0)])
+    return (before + part).ljust(length, ERASED)
+
+
 def _blocks(length: int) -> int:
     """Return the size of the blocks that a file takes; the firmware counts in 32 bits."""
     return -(-length // BLOCK_BYTES) * BLOCK_BYTES & _WORD
@@ -221,17 +238,14 @@ class FileSystem:
 
     def read(self, key: FileKey, offset: int, length: int) -> bytes:
         """Return bytes of an open file; erased ones where none are kept."""
-        file, offset = self._opened(key, offset, length)
-        length = min(length, LONGEST_READ)
-        before = ERASED * min(max(-offset, 0), length)
-        part = bytes(file.data[max(offset, 0) : max(offset + length, 0)])
-        return (before + part).ljust(length, ERASED)
+        file, begin = self._opened(key, offset, length)
+        return stored_part(file.data, begin, length)
 
     def write(self, key: FileKey, offset: int, data: bytes) -> None:
-        file, offset = self._opened(key, offset, len(data))
-        data, offset = data[max(-offset, 0) :], max(offset, 0)
-        kept = data[: max(len(file.data) - offset, 0)]
-        file.data[offset : offset + len(kept)] = kept
+        file, begin = self._opened(key, offset, len(data))
+        data, begin = data[max(-begin, 0) :], max(begin, 0)
+        kept = data[: max(len(file.data) - begin, 0)]
+        file.data[begin : begin + len(kept)] = kept
 
     def delete(self, key: FileKey) -> None:
         if key not in self._open:
@@ -296,12 +310,13 @@ class FileSystem:
         raise Refusal(FileError.NOT_FOUND)
 
     def _opened(self, key: FileKey, offset: int, length: int) -> tuple[_File, int]:
-        """Return an open file, and an offset in it, below 0 where the firmware's sum wraps."""
+        """Return an open file, and where in it a part begins, as of `part_limits`."""
         self._check_open(key)
         file = self._find(key)
-        if offset + length & _WORD > file.length:
+        begin, end = part_limits(offset, length)
+        if end > file.length:
             raise Refusal(FileError.OUT_OF_RANGE)
-        return file, offset - (1 << 32) if offset + length > _WORD else offset
+        return file, begin
 
     def _check_handle(self, key: FileKey) -> None:
         """Refuse what needs a handle of its own for a file."""

@@ -154,10 +154,10 @@ class DeviceOptions(BaseModel):
     being carried out. The firmware's source has no such error. Public logs of a real X4M03 show it:
     of 55 sessions that began with X4 INIT and a checksum error in what the line still held, 42
     report ERROR 1 to INIT."""
-    waiting_frames: int = 0
+    waiting_frames: int = Field(0, ge=0)
     """How many radar frames wait for a host that does not read, at pace realtime; 0: with the base
     firmware as many as its message pool has blocks of that size, 2 (1.1), else as many as the queue
-    has slots, 50 (8.4), because the sensor firmware's pool is not known."""
+    has slots, 50 (8.4), because the sensor firmware's pool is not known. More than 50 never do."""
     port_on_reset: Literal["stay", "vanish"] = "stay"
     """Whether a reset keeps the port ("stay") or takes it away until the USB is back ("vanish")."""
     bad_value: Literal["refuse", "clamp"] = "refuse"
