@@ -34,7 +34,7 @@ from emulator.profiles.running_profile import ProfileStream
 from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.codes import ErrorCode, SystemCode
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.framing import Framing, NeedData
+from xethru_protocol.wire.framing import FaultKind, Framing, FramingFault, NeedData
 from xethru_protocol.wire.messages import (
     BasebandAp,
     BasebandIq,
@@ -276,7 +276,7 @@ class Device:
         self._outbox = outbox
         self._connection = Connection(Role.MODULE)
         self._received = self._fresh_parser()
-        self._damaged = False  # since the last command
+        self._damaged = False  # by a wrong checksum, since the last command
         self._reset_ns: int | None = None
         self._ready_ns: int | None = None
         # until when the command task sleeps, and the reply it sends then; commands wait behind it
@@ -353,7 +353,8 @@ class Device:
                     self._carry_out(event, now_ns)
             else:
                 self.faults_seen += 1
-                self._damaged = True
+                if isinstance(event, FramingFault) and event.kind is FaultKind.CHECKSUM:
+                    self._damaged = True
         waits = self._held is not None or self.module.asleep
         self._backlog = self._received.buffered > 0 and not waits
 

@@ -145,7 +145,9 @@ class VendorConnection:
     def receive_data(self, data: bytes) -> None:
         for found in self._parser.receive(data):
             if isinstance(found, BootloaderFraming):
-                self._events.append(FramingFault(kind=FaultKind.GARBAGE, offset=0))
+                is_sum = found is BootloaderFraming.CRC
+                kind = FaultKind.CHECKSUM if is_sum else FaultKind.GARBAGE
+                self._events.append(FramingFault(kind=kind, offset=0))
                 continue
             buffer, length = found
             command = decode_command(bytes(buffer[:length]))

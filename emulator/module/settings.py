@@ -150,7 +150,7 @@ class DeviceOptions(BaseModel):
     reading in what earlier packets left in its buffer where a command is too short, and takes four
     7C, or 51 at the start, for other framings (1.2, 3)."""
     after_damage: Literal["answer", "error"] = "answer"
-    """What the first command after a damaged packet gets: what it asks for, or ERROR 1 without
+    """What the first command after a wrong checksum gets: what it asks for, or ERROR 1 without
     being carried out. The firmware's source has no such error. Public logs of a real X4M03 show it:
     of 55 sessions that began with X4 INIT and a checksum error in what the line still held, 42
     report ERROR 1 to INIT."""

@@ -269,10 +269,13 @@ def test_the_vendors_parser_needs_no_start_and_reads_on() -> None:
     assert reply.values[:2] == b"ab"
 
 
+@pytest.mark.parametrize("parser", ["strict", "vendor"])
 @pytest.mark.parametrize("option", ["answer", "error"])
-def test_the_first_command_after_damage(option: str) -> None:
-    """Public logs of an X4M03 show ERROR 1 to INIT there."""
-    host = host_with(firmware="xep", after_damage=option)
+def test_the_first_command_after_damage(option: str, parser: str) -> None:
+    """Public logs of an X4M03 show ERROR 1 to INIT behind a wrong checksum."""
+    host = host_with(firmware="xep", after_damage=option, parser=parser)
+    assert answers_to(host, b"\x00\x01\x02") == []
+    assert host.ask(m.X4DriverInit()) == ACK, "other bytes are no wrong checksum"
     damaged = encode_normal(b"\x50\x20")[:-2] + b"\x00\x7e"
     assert answers_to(host, damaged) == []
     assert host.ask(m.X4DriverInit()) == (ACK if option == "answer" else m.Error(code=1))
