@@ -74,7 +74,7 @@ from slam.robust.proposals.constellation import (
     find_placements,
     stands_out,
 )
-from slam.robust.proposals.doubts import Doubt, doubted_covariance, seen_ranges
+from slam.robust.proposals.doubts import Doubt, doubted_covariance, seen_ranges, slipped_nats
 from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
@@ -597,12 +597,16 @@ class Branches:
         ]
         # Where the map lies, most of what is seen must be known.
         fewest, is_shown = max(rule.least_landmarks, 2 * account.n_new), carry.price_nats < 0.0
+        # After a slip that is still doubted the robot may be where it has never been.
+        saved_nats = found.price_nats - slipped_nats(self._doubts)
+        if is_shown or found is carry.hidden:
+            saved_nats = 0.0
         is_there = (
             account.n_seen > account.n_new
             and (found is carry.hidden or account.n_seen >= fewest)
             and (is_shown or account.misses - stay.misses > found.price_nats + MARGIN_NATS)
             and gains[best] > MARGIN_NATS
-            and advantage(account, elsewhere, rule) > MARGIN_NATS
+            and advantage(account, elsewhere, rule) - max(saved_nats, 0.0) > MARGIN_NATS
             and all(margin > rule.placement_nats for margin in margins)
         )
         return found if is_there and self._is_only_there(carry, found, account) else None

@@ -140,3 +140,9 @@ def doubted_covariance(doubts: Sequence[Doubt], position_m: Array) -> Array:
             carries += of_carries * share / carried
             lost_share += share
     return slips + carries / max(lost_share, 1.0)
+
+
+def slipped_nats(doubts: Sequence[Doubt]) -> float:
+    """Return how unlikely a slip is where one is doubted; infinite if none is."""
+    slipped = sum(float(doubt.probabilities[0]) for doubt in doubts)
+    return -math.log(min(slipped, 1.0)) if slipped > 0.0 else math.inf

@@ -15,6 +15,7 @@ from slam.robust.proposals.doubts import (
     covered_share,
     doubted_covariance,
     seen_ranges,
+    slipped_nats,
 )
 
 RULE = BranchRule()
@@ -190,3 +191,11 @@ def test_ranges_of_new_landmarks_tell_nothing_of_a_motion_before_them() -> None:
 def test_a_scan_without_ranges_of_landmarks_has_no_sightings() -> None:
     report = UpdateReport(continued=(), nis=0.0, dof=0)
     assert seen_ranges(report, np.zeros(3), RULE) is None
+
+
+@pytest.mark.parametrize(
+    ("each", "nats"), [((), math.inf), ((0.1, 0.15), math.log(4.0)), ((0.9, 0.9), 0.0)]
+)
+def test_how_unlikely_a_doubted_slip_is(each: tuple[float, ...], nats: float) -> None:
+    doubts = [doubtful(0.0, slipped) for slipped in each]
+    assert slipped_nats([*doubts, doubtful(0.0, 0.0, 1.0)]) == pytest.approx(nats)
