@@ -19,7 +19,7 @@ import asyncio
 import itertools
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from typing import Any, Literal, Self
+from typing import Self, TypeVarTuple
 
 from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame
@@ -55,6 +55,7 @@ from xethru_protocol.wire.errors import Disconnected, XeThruError
 from xethru_protocol.wire.messages import Command, Response
 
 _LONGEST_WAIT_S = 86400.0
+Ts = TypeVarTuple("Ts")
 
 
 class AsyncX4M300(RadarState[Awaited]):
@@ -175,22 +176,22 @@ class AsyncX4M300(RadarState[Awaited]):
     async def _carry(self, procedure: Steps[T]) -> T:
         self._refuse_reentry()
         try:
-            step = self._advance(procedure.send, None)
+            step = self._work(next, procedure)
             while True:
                 try:
                     came = await self._carry_out(step)
                 except BaseException as error:  # the procedure decides
-                    step = self._advance(procedure.throw, error)
+                    step = self._work(procedure.throw, error)
                 else:
-                    step = self._advance(procedure.send, came)
+                    step = self._work(procedure.send, came)
         except StopIteration as end:
             result: T = end.value
             return result
 
-    def _advance(self, advance: Callable[[Any], Step], what: object) -> Step:
+    def _work(self, work: Callable[[*Ts], T], *what: *Ts) -> T:
         self._at_work = True
         try:
-            return advance(what)
+            return work(*what)
         finally:
             self._at_work = False
 
@@ -199,7 +200,7 @@ class AsyncX4M300(RadarState[Awaited]):
             return await self._pump(step.timeout_s)
         match step:
             case Write(data):
-                self._hear("tx", data, self._link.clock())
+                self._work(self._link.conversation.hear, "tx", data, self._link.clock())
                 await self._transport.write(data)
             case Sleep(seconds):
                 await self._sleep(seconds)
@@ -232,22 +233,8 @@ class AsyncX4M300(RadarState[Awaited]):
             self._reading = None
         if not data:
             return False
-        arrival_ns = self._link.clock()
-        self._hear("rx", data, arrival_ns)
-        self._at_work = True
-        try:
-            self._link.conversation.receive(data, arrival_ns)
-        finally:
-            self._at_work = False
+        self._work(self._link.conversation.receive, data, self._link.clock())
         return True
-
-    def _hear(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
-        if self.raw_listener is not None:
-            self._at_work = True
-            try:
-                self.raw_listener(direction, data, t_ns)
-            finally:
-                self._at_work = False
 
 
 def _close(opening: asyncio.Future[Transport | AsyncTransport]) -> None:

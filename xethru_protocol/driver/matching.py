@@ -7,8 +7,9 @@ a `Matcher`, all else to the reader of the stream; faults are counted.
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal, ParamSpec
 
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import describe
@@ -53,6 +54,38 @@ class ProtocolRecord:
 Observer = Callable[[ProtocolRecord], None]
 Listener = Callable[[Response, int], None]
 RawListener = Callable[[Literal["rx", "tx"], bytes, int], None]
+
+
+P = ParamSpec("P")
+
+
+class Listeners(Generic[P]):
+    """Functions that are called with what comes, in the order in which they were added.
+
+    Each is called although one before it raises; that error is raised behind the last.
+
+    Attributes
+    ----------
+    all
+        The functions.
+    """
+
+    def __init__(self) -> None:
+        self.all: tuple[Callable[P, object], ...] = ()
+
+    def add(self, listener: Callable[P, object]) -> None:
+        """Call a function from now on; adding it again has no effect."""
+        if listener not in self.all:
+            self.all = (*self.all, listener)
+
+    def remove(self, listener: Callable[P, object] | None) -> None:
+        """Do not call a function any more; no effect if it is not called."""
+        self.all = tuple(each for each in self.all if each != listener)
+
+    def __call__(self, *what: P.args, **named: P.kwargs) -> None:
+        with ExitStack() as calls:
+            for listener in reversed(self.all):
+                calls.callback(listener, *what, **named)
 
 
 class Matcher:
@@ -243,12 +276,14 @@ class Conversation:
         take_data: Listener,
     ) -> None:
         self.name = name
-        self.listener: Listener | None = None
+        self.listeners = Listeners[Response, int]()
+        self.raw_listeners = Listeners[Literal["rx", "tx"], bytes, int]()
         self.statistics = LinkStatistics()
         self.matcher = Matcher()
         self.fault_count = 0
         self.reboots = 0
         self.readies = 0
+        self.is_known = True  # whether it is the module that is meant; see `new_line`
         self._clock = clock
         self._observer = observer
         self._take_data = take_data
@@ -271,7 +306,13 @@ class Conversation:
             self.report("tx", summary(command))
         return data
 
+    def hear(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
+        """Hand bytes of the line to the raw listeners, unless another module may have sent them."""
+        if self.raw_listeners.all and self.is_known:
+            self.raw_listeners(direction, data, t_ns)
+
     def receive(self, data: bytes, arrival_ns: int) -> None:
+        self.hear("rx", data, arrival_ns)
         connection = self._connection
         try:
             connection.receive_data(data)
@@ -279,18 +320,22 @@ class Conversation:
                 if isinstance(event, Response):
                     self._sort(event, arrival_ns)
                 elif isinstance(event, FramingFault) and not self._winding_down:
-                    self.fault_count += 1
                     self._damaged_since = True
-                    self.report("fault", f"{event.kind.value} at byte {event.offset}")
+                    if self.is_known:
+                        self.fault_count += 1
+                        self.report("fault", f"{event.kind.value} at byte {event.offset}")
         except Exception:  # of a listener or an observer
             raise
         except BaseException:  # an interrupt, perhaps while the receiver moved its bytes
-            self._connection = Connection(Role.HOST, self.statistics)
+            self._connection = Connection(Role.HOST, self.statistics if self.is_known else None)
             raise
 
     def _sort(self, message: Response, arrival_ns: int) -> None:
-        if self.listener is not None:
-            self.listener(message, arrival_ns)
+        if not self.is_known and not isinstance(message, _ANSWERS):
+            self._frames_since |= isinstance(message, FRAMES)
+            return
+        if self.listeners.all and self.is_known:
+            self.listeners(message, arrival_ns)
         if isinstance(message, FRAMES):
             self._damaged_since = self._rebooted_since = False
             self._frames_since = True
@@ -310,13 +355,24 @@ class Conversation:
             if row is None or not row.bulk:
                 self.report("rx", summary(message))
 
-    def new_line(self, name: str) -> None:
-        """Begin anew on a line that was just opened: no answer is due and no packet half-read."""
+    def new_line(self, name: str, *, is_known: bool = True) -> None:
+        """Begin anew on a line that was just opened: no answer is due and no packet half-read.
+
+        ``is_known`` False: another module may answer there. Until `recognise` is called, all but
+        answers is ignored, and nothing of it is counted.
+        """
         self.name = name
-        self.statistics.junk_bytes += self._connection.buffered  # the rest of them never came
-        self._connection = Connection(Role.HOST, self.statistics)
+        if self.is_known:
+            self.statistics.junk_bytes += self._connection.buffered  # the rest of them never came
+        self._connection = Connection(Role.HOST, self.statistics if is_known else None)
+        self.is_known = is_known
         self.matcher.forget()
         self._damaged_since = self._rebooted_since = False
+
+    def recognise(self) -> None:
+        """Take what comes from now on for what the module sends."""
+        self._connection.count_in(self.statistics)
+        self.is_known = True
 
     def wind_down(self) -> None:
         """Read answers only from now on.

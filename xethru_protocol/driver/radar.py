@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 from xethru_protocol.driver import profiles, raw_mode, reconnect
 from xethru_protocol.driver.board import Diagnostics, Pins
@@ -43,7 +43,7 @@ from xethru_protocol.driver.link import (
     sends,
     sends_once,
 )
-from xethru_protocol.driver.matching import Listener, Observer, RawListener
+from xethru_protocol.driver.matching import Listener, Listeners, Observer, RawListener
 from xethru_protocol.driver.profiles import MESSAGE_TIMEOUT_S, MessageT
 from xethru_protocol.transport import (
     AsyncTransport,
@@ -80,12 +80,6 @@ class RadarState(Part[KindT]):
     """What both drivers have: methods, counters and settings.
 
     A listener, observer or other callback must not call the driver: `LocalProtocolError`.
-
-    Attributes
-    ----------
-    raw_listener
-        Called with ``"rx"`` or ``"tx"``, the bytes as they went over the line, and the driver's
-        time [ns]; may be None.
     """
 
     _is_awaited: ClassVar[bool] = False
@@ -106,7 +100,8 @@ class RadarState(Part[KindT]):
             name = type(self).__name__
             raise TypeError(f"{name} needs an open line; {name}.open({transport!r}) opens a port")
         self._transport = transport
-        self.raw_listener: RawListener | None = None
+        self._listener: Listener | None = None
+        self._raw_listener: RawListener | None = None
         self._link = Link(
             transport.name,
             clock=clock,
@@ -187,13 +182,44 @@ class RadarState(Part[KindT]):
         return self._link.warnings
 
     @property
+    def listeners(self) -> Listeners[Response, int]:
+        """Called with every message from the module, frames included, and its arrival [ns].
+
+        ``listeners.add(function)`` adds one, ``listeners.remove(function)`` takes it away.
+        """
+        return self._link.conversation.listeners
+
+    @property
+    def raw_listeners(self) -> Listeners[Literal["rx", "tx"], bytes, int]:
+        """Called with ``"rx"`` or ``"tx"``, the bytes as they went over the line, and the time.
+
+        It is that of the driver's clock [ns]. ``add`` and ``remove`` as of `listeners`.
+        """
+        return self._link.conversation.raw_listeners
+
+    @property
     def listener(self) -> Listener | None:
-        """Called with every message from the module, frames included, and its arrival [ns]."""
-        return self._link.conversation.listener
+        """One of `listeners`: setting it replaces the one that was set before, None removes it."""
+        return self._listener
 
     @listener.setter
     def listener(self, listener: Listener | None) -> None:
-        self._link.conversation.listener = listener
+        self.listeners.remove(self._listener)
+        self._listener = listener
+        if listener is not None:
+            self.listeners.add(listener)
+
+    @property
+    def raw_listener(self) -> RawListener | None:
+        """One of `raw_listeners`; as `listener`."""
+        return self._raw_listener
+
+    @raw_listener.setter
+    def raw_listener(self, listener: RawListener | None) -> None:
+        self.raw_listeners.remove(self._raw_listener)
+        self._raw_listener = listener
+        if listener is not None:
+            self.raw_listeners.add(listener)
 
     @property
     def geometry(self) -> FrameGeometry | None:
@@ -468,8 +494,8 @@ class X4M300(RadarState[Blocking]):
 
     - begin and end: `open`, `ping`, `info`, `close`
     - raw frames: `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
-    - all other messages: `messages`, `read_message`, `messages_waiting`; `listener` is called with
-      every one, `raw_listener` with the bytes of both directions
+    - all other messages: `messages`, `read_message`, `messages_waiting`; `listeners` are called
+      with every one, `raw_listeners` with the bytes of both directions
     - the module and its line: `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`,
       `find_baud_rate`
     - any command of the protocol: `request`
@@ -675,8 +701,7 @@ class X4M300(RadarState[Blocking]):
             return self._pump(step.timeout_s)
         match step:
             case Write(data):
-                if self.raw_listener is not None:
-                    self.raw_listener("tx", data, self._link.clock())
+                self._link.conversation.hear("tx", data, self._link.clock())
                 self._unlocked(self._transport.write, data)
             case Sleep(seconds):
                 self._unlocked(self._sleep, seconds)
@@ -719,7 +744,5 @@ class X4M300(RadarState[Blocking]):
         if not data:
             return False
         arrival_ns = self._link.clock()
-        if self.raw_listener is not None:
-            self.raw_listener("rx", data, arrival_ns)
         self._link.conversation.receive(data, arrival_ns)
         return True

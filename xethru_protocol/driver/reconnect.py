@@ -183,27 +183,37 @@ def find_again(
 
 
 def _open_ours(link: Link, path: str, is_ours: Recognise) -> Steps[bool]:
-    """Open a port; returns whether our module answers there."""
+    """Open a port; returns whether our module answers there, and leaves it open only then."""
     wanted = link.baudrate
     rates = (
         (wanted,)
         if math.isinf(link.bytes_per_s) or wanted == POWER_UP_BAUD
         else (POWER_UP_BAUD, wanted)
     )
+    ours = False
     for baudrate in rates:
         yield OpenLine(path, baudrate)
-        link.conversation.new_line(path)
+        link.conversation.new_line(path, is_known=False)
         try:
             ours = yield from is_ours(link, path)
         except ResponseTimeout:
             if baudrate == rates[-1]:
                 raise
             continue
+        except GeneratorExit:
+            raise
+        except BaseException:  # an interrupt: the next read must not be of another module
+            yield CloseLine()
+            raise
         if ours and baudrate != wanted:
             link.baudrate = baudrate
             yield from link.set_baud_rate(wanted, force=True)
-        return ours
-    return False
+        break
+    if ours:
+        link.conversation.recognise()
+    else:
+        yield CloseLine()
+    return ours
 
 
 def _is_ours(link: Link, path: str) -> Steps[bool]:

@@ -69,7 +69,7 @@ class ModuleSource:
         )
 
     def attach(self, take: Taker) -> None:
-        self.radar.listener = take
+        self.radar.listeners.add(take)
         self._thread.start()
 
     def close(self) -> None:

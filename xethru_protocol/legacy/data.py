@@ -22,7 +22,7 @@ _WHOLE = "all directories of a recording are read; xethru_protocol.read_recordin
 MISSING: Final[Mapping[str, str]] = {
     "ModuleConnector.get_x2": _X2,
     "ModuleConnector.get_x2m200": _X2,
-    "ModuleConnector.get_transport": "send packets by X4M300.request, receive by X4M300.listener",
+    "ModuleConnector.get_transport": "send packets by X4M300.request, receive by X4M300.listeners",
     "ModuleConnector.get_not_supported": "what it did is in get_xep() and get_x4m300()",
     "DataReader.open with a depth": _WHOLE,
     "DataPlayer with a depth": _WHOLE,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
-from xethru_protocol.driver.matching import Listener
+from xethru_protocol.driver.matching import Listeners
 from xethru_protocol.recordings.formats import optional_packages
 from xethru_protocol.recordings.recorded_messages import GrowingFile, RecordingError
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE
@@ -22,18 +22,19 @@ if TYPE_CHECKING:
     from xethru_protocol.recordings.mcap import RadarTopics
 
 
-class HasListener(Protocol):
-    """A driver: `listener` is called with every message and its arrival on its clock [ns]."""
+class HasListeners(Protocol):
+    """A driver: `listeners` are called with every message and its arrival on its clock [ns]."""
 
-    listener: Listener | None
+    @property
+    def listeners(self) -> Listeners[Response, int]: ...
 
 
 class Recorder:
     """Records what a driver receives, from `start` to `stop`; a context manager that does both.
 
-    Messages go on to the listener that the driver had. An error of a file ends the recording; it is
-    kept in ``failure`` and reported to ``on_error``, not raised: the driver is in the middle of
-    receiving.
+    Other listeners of the driver, and other recorders, hear the same. An error of a file ends the
+    recording; it is kept in ``failure`` and reported to ``on_error``, not raised: the driver is in
+    the middle of receiving.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ class Recorder:
 
     def __init__(
         self,
-        radar: HasListener,
+        radar: HasListeners,
         folder: Path | str,
         *,
         kinds: Iterable[type[Response]] | None = None,
@@ -96,7 +97,6 @@ class Recorder:
         self._options = options
         self._since_1970_ns = 0
         self._writer: RecordingWriter | None = None
-        self._before: Listener | None = None
         # One thread may stop it while another receives; a callback of a file may stop it, too.
         self._lock = threading.RLock()
 
@@ -118,9 +118,7 @@ class Recorder:
             self._folder, session_id, time.time_ns(), options.get("timezone")
         )
         self._writer = RecordingWriter(self.directory, **options)
-        if self._radar.listener != self._take:  # one that stayed behind another recorder's
-            self._before = self._radar.listener
-            self._radar.listener = self._take
+        self._radar.listeners.add(self._take)
 
     def stop(self) -> None:
         """Complete the files; calling it again does nothing."""
@@ -128,8 +126,7 @@ class Recorder:
             writer, self._writer = self._writer, None
             if writer is None:
                 return
-            if self._radar.listener == self._take:
-                self._radar.listener = self._before
+            self._radar.listeners.remove(self._take)
             try:
                 writer.close()
             except RecordingError as error:
@@ -151,8 +148,6 @@ class Recorder:
                     self.messages += self._writer.write(message, arrival_ns + self._since_1970_ns)
                 except RecordingError as error:
                     self._fail(error)
-        if self._before is not None:
-            self._before(message, arrival_ns)
 
     def _fail(self, error: RecordingError) -> None:
         if self.failure is None:

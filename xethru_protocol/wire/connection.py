@@ -58,6 +58,11 @@ class Connection:
     def receive_data(self, data: bytes) -> None:
         self._reader.receive_data(data)
 
+    def count_in(self, statistics: LinkStatistics) -> None:
+        """Count in ``statistics`` from now on, also what was received and not judged yet."""
+        statistics.bytes += self.buffered
+        self.statistics = self._reader.statistics = statistics
+
     def next_event(self) -> Event:
         """Next message or `FramingFault`; NEED_DATA if more bytes are needed.
 

@@ -226,7 +226,7 @@ class RigSource:
     def listen(self, listener: Callable[[str, Literal["rx", "tx"], bytes, int], None]) -> None:
         """Hand on the bytes of every port: radar, way, bytes, time of the driver's clock [ns]."""
         for link in self._links:
-            link.driver.raw_listener = partial(listener, link.mount.name)
+            link.driver.raw_listeners.add(partial(listener, link.mount.name))
 
     def start(self, config: RawConfig, fps: int) -> None:
         """Configure raw RF on every radar and start all streams; AppError names the radar."""

@@ -59,7 +59,7 @@ def record(arguments: Namespace) -> int:
         recorder.check()
         try:
             with module_at(arguments.port, arguments.baudrate) as radar:
-                radar.raw_listener = recorder.take_bytes
+                radar.raw_listeners.add(recorder.take_bytes)
                 mode.prepare(radar)
                 print_warnings(radar)
                 recorder.open(mode.parameter_file)

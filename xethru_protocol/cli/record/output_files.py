@@ -113,11 +113,11 @@ class RecordingFiles:
         """Take the module's messages from now on; the time of the recording begins."""
         self._statistics = radar.statistics
         self._began_ns = self._newest_ns = time.monotonic_ns()
-        radar.listener = self.take
+        radar.listeners.add(self.take)
 
     def stop_listening(self, radar: X4M300) -> None:
         """Take nothing more; what the module sends while it is stopped is not recorded."""
-        radar.listener = None
+        radar.listeners.remove(self.take)
         self._statistics = deepcopy(radar.statistics)
 
     def fail(self, error: XeThruError) -> None:

@@ -104,7 +104,7 @@ class _RecordedModule(_Source):
     def let_it_send(self) -> None:
         """Start what it sends, which is recorded from now on."""
         self._newest_ns = time.monotonic_ns()
-        self._radar.listener = self._take
+        self._radar.listeners.add(self._take)
         try:
             self._silence_s = self._mode.start(self._radar)
         finally:
@@ -140,7 +140,7 @@ class _RecordedModule(_Source):
                         f"the module sent nothing to record for {self._silence_s:g} s; did it stop?"
                     )
         finally:
-            self._radar.listener = None
+            self._radar.listeners.remove(self._take)
 
 
 class _RecordedText(_Source):

@@ -12,6 +12,7 @@ from xethru_protocol.driver.link import Link, RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
 
 Said = Sequence[m.Message | bytes]
@@ -435,3 +436,112 @@ def test_closing_after_the_module_vanished_does_not_look_for_it(
         unplug(line)
     assert line.now_ns - began_ns < 1_000_000
     assert machine.lines == []
+
+
+# --- another radar ------------------------------------------------------------------------------
+
+
+class Streaming(PlainModule):
+    """Another module, which sends frames, texts and damage without being asked."""
+
+    def __call__(self, command: m.Message) -> Said:
+        said = [frame(n) for n in range(500, 600, 7)]
+        text = m.DataString(content_id=0, info=0, text="of another module")
+        return [*said, text, BOOTING, READY, b"\x7d\x01\x7e", *super().__call__(command), said[0]]
+
+
+@pytest.mark.parametrize("place", [HOME, DECOY, ELSEWHERE])
+@pytest.mark.parametrize("returns", [True, False], ids=["returns", "stays away"])
+def test_nothing_of_another_module_reaches_the_caller(
+    plugged: DriverOn, machine: Machine, place: str, returns: bool
+) -> None:
+    """Not its frames, texts, restarts, damage, counters or bytes."""
+    path = next(path for path in (ELSEWHERE, HOME) if path != place)
+    machine.plug(place, Streaming("999999999999"))
+    back = PlainModule()
+    back.stream = (frame(1), frame(2))
+    if returns:
+        machine.plug(path, back, from_s=2.0)
+    radar, line = plugged(reconnect_s=9.0)
+    heard: list[Any] = []
+    radar.listener = lambda message, t_ns: heard.append(message)
+    radar.raw_listener = lambda direction, data, t_ns: heard.append(data)
+    radar.configure_raw()
+    radar.start(17.0)
+    line.say(frame(40))
+    assert radar.read_frame().counter == 40
+    before = radar.statistics.summary()
+    unplug(line)
+    heard.clear()
+    if returns:
+        assert [(got.counter, got.stream) for got in radar.frames(2)] == [(1, 1), (2, 1)]
+        assert (radar.port, radar.messages_waiting()) == (path, 0)
+    else:
+        with pytest.raises(Disconnected, match="did not come back within 9 s"):
+            radar.read_frame()
+        assert heard == []
+        assert radar.statistics.summary() == before
+    assert machine.asked(place)
+    assert {one.info for one in heard if isinstance(one, m.DataFloat)} <= {1, 2}
+    assert not [one for one in heard if isinstance(one, m.DataString | m.System)]
+    assert not [
+        one for one in heard if isinstance(one, bytes) and frame(500).values.tobytes() in one
+    ]
+    assert (radar.fault_count, radar.reboots, radar.stray_count) == (0, 0, 0)
+    assert radar.frames_discarded == 0
+
+
+def test_bytes_behind_the_answer_by_which_a_module_is_recognised_count(
+    plugged: DriverOn, machine: Machine
+) -> None:
+    """The rest of a frame whose beginning came before is neither damage nor a gap."""
+    plain = PlainModule()
+    cut = line_bytes(frame(8))
+
+    def streaming(command: m.Message) -> Said:
+        if command == m.SystemGetInfo(item=6):
+            return [*plain(command), cut[:4000]]
+        if isinstance(command, m.Ping) and len(machine.lines[-1].received) == 3:
+            return [cut[4000:], *plain(command)]
+        return plain(command)
+
+    machine.plug(HOME, streaming)
+    radar, line = plugged(reconnect_s=9.0)
+    radar.configure_raw()
+    unplug(line)
+    radar.ping()
+    assert (radar.fault_count, radar.reconnects) == (0, 1)
+    assert radar.statistics.junk_bytes == 0
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_interrupted_search_leaves_no_other_module_s_line_open(
+    plugged: DriverOn, machine: Machine, number: int
+) -> None:
+    """Else the next read would be from that module."""
+    other = Streaming("999999999999")
+    asked: list[m.Message] = []
+
+    def interrupting(command: m.Message) -> Said:
+        asked.append(command)
+        if len(asked) == number + 1:
+            raise KeyboardInterrupt
+        return other(command)
+
+    machine.plug(HOME, interrupting)
+    machine.plug(ELSEWHERE, back := PlainModule())
+    back.stream = (frame(1),)
+    radar, line = plugged(reconnect_s=9.0)
+    radar.configure_raw()
+    radar.start(17.0)
+    unplug(line)
+    if number < 2:
+        with pytest.raises(KeyboardInterrupt):
+            radar.read_frame()
+        assert all(opened.closed for opened in machine.lines)
+    assert radar.read_frame().counter == 1
+    assert radar.port == ELSEWHERE
+
+
+def line_bytes(message: m.Message) -> bytes:
+    return Connection(Role.MODULE).send(message)

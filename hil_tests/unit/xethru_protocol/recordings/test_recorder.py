@@ -13,7 +13,7 @@ from emulator.loopback import LoopbackTransport
 from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import ramp_device
 from hil_tests.unit.xethru_protocol.recordings.messages import frame
-from xethru_protocol.driver.matching import Listener
+from xethru_protocol.driver.matching import Listeners
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
     Recorder,
@@ -137,6 +137,46 @@ def test_recorders_end_in_any_order(radar: X4M300, line: LoopbackTransport, tmp_
     first.stop()
 
 
+@pytest.mark.parametrize("order", ["abAa", "abBb", "abAaBb", "abcBbACca"])
+def test_recorders_of_one_radar_start_and_stop_in_any_order(tmp_path: Path, order: str) -> None:
+    """Each stores every frame of its time once; a capital letter stops one."""
+    radar = Radar()
+    heard: list[m.Response] = []
+    radar.listeners.add(lambda message, t_ns: heard.append(message))
+    recorders = {name: Recorder(radar, tmp_path / name) for name in "abc"}
+    wanted: dict[str, list[int]] = {}
+    for counter, action in enumerate(order):
+        recorder = recorders[action.lower()]
+        if action.islower():
+            recorder.start()
+            wanted[action] = []
+        else:
+            recorder.stop()
+            assert counters(recorder.directory) == wanted[action.lower()]
+        radar.listeners(frame(counter), counter * 10**9)
+        for name, each in recorders.items():
+            if each.is_recording():
+                wanted[name].append(counter)
+    assert heard == [frame(counter) for counter in range(len(order))]
+    for name, counted in wanted.items():
+        recorders[name].stop()
+        assert counters(recorders[name].directory) == counted
+
+
+def test_a_listener_that_raises_costs_a_recording_nothing(tmp_path: Path) -> None:
+    def fail(message: m.Response, arrival_ns: int) -> None:
+        raise ValueError("a listener's")
+
+    radar = Radar()
+    radar.listeners.add(fail)
+    with Recorder(radar, tmp_path) as recorder:
+        with pytest.raises(ValueError, match="a listener's"):
+            radar.listeners(frame(1), 10**9)
+        radar.listeners.remove(fail)
+        radar.listeners(frame(2), 2 * 10**9)
+    assert counters(recorder.directory) == [1, 2]
+
+
 def test_another_thread_stops_a_recorder_between_two_records(tmp_path: Path) -> None:
     radar = Radar()
     stops: list[threading.Thread] = []
@@ -150,18 +190,18 @@ def test_another_thread_stops_a_recorder_between_two_records(tmp_path: Path) -> 
     recorder = Recorder(radar, tmp_path, split=Split(seconds=1), on_file=stop_meanwhile)
     recorder.start()
     for second in (1, 3):
-        assert radar.listener is not None
-        radar.listener(frame(second), second * 10**9)
+        radar.listeners(frame(second), second * 10**9)
     stops[0].join(seconds(30))
     assert recorder.failure is None
-    assert radar.listener is None
+    assert radar.listeners.all == ()
     assert counters(recorder.directory) == [1, 3]
 
 
 class Radar:
     """Something that is listened to."""
 
-    listener: Listener | None = None
+    def __init__(self) -> None:
+        self.listeners = Listeners[m.Response, int]()
 
 
 def test_an_error_ends_the_recording_and_not_the_driver(
