@@ -19,6 +19,7 @@ import asyncio
 import itertools
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import suppress
 from typing import Self, TypeVarTuple
 
 from xethru_protocol.driver import raw_mode, reconnect
@@ -26,6 +27,7 @@ from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
     Awaited,
+    AwaitGate,
     Link,
     OpenLine,
     P,
@@ -65,6 +67,7 @@ class AsyncX4M300(RadarState[Awaited]):
     """
 
     _is_awaited = True
+    _make_gate = asyncio.Event
     _port_type = staticmethod(AsyncSerialTransport)
     _transport: AsyncTransport
 
@@ -204,6 +207,10 @@ class AsyncX4M300(RadarState[Awaited]):
                 await self._transport.write(data)
             case Sleep(seconds):
                 await self._sleep(seconds)
+            case AwaitGate(gate, timeout_s):
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(min(timeout_s, _LONGEST_WAIT_S)):
+                        await gate.wait()
             case OpenLine(path, baudrate) if is_network_port(path):
                 self._transport.close()
                 self._use(await self._opened(path, baudrate))

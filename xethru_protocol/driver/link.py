@@ -8,7 +8,7 @@ the steps out on a line that blocks, `AsyncX4M300` on one that is awaited. `raw_
 import functools
 import inspect
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Coroutine, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -101,7 +101,21 @@ class SetLineRate:
     baudrate: int
 
 
-Step: TypeAlias = Read | Write | Sleep | CloseLine | OpenLine | SetLineRate
+class Gate(Protocol):
+    """`threading.Event` or `asyncio.Event`."""
+
+    def set(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class AwaitGate:
+    """Wait up to ``timeout_s`` until a gate is set."""
+
+    gate: Any
+    timeout_s: float
+
+
+Step: TypeAlias = Read | Write | Sleep | CloseLine | OpenLine | SetLineRate | AwaitGate
 P = ParamSpec("P")
 T = TypeVar("T")
 Steps: TypeAlias = Generator[Step, bool, T]
@@ -244,6 +258,33 @@ class ModuleInfo:
     mode: str | None
 
 
+class Turn:
+    """A place among those who wait for the same thing: first come, first served.
+
+    ``line`` are their gates; that of the first may be None, since it need not wait.
+    """
+
+    __slots__ = ("gate", "line")
+
+    def __init__(self, line: deque[Gate | None], make_gate: Callable[[], Gate]) -> None:
+        self.line = line
+        self.gate = make_gate() if line else None
+
+    def __enter__(self) -> "Turn":
+        self.line.append(self.gate)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.line.remove(self.gate)
+        if self.line and (first := self.line[0]) is not None:
+            first.set()
+
+    def come(self, left_s: Callable[[], float]) -> Steps[None]:
+        """Wait until it is this one's turn, or no time is left."""
+        while self.line[0] is not self.gate and (timeout_s := left_s()) > 0:
+            yield AwaitGate(self.gate, timeout_s)
+
+
 _BOOTLOADER_REPLIES = ((m.BootloaderSuccess,), (m.BootloaderEchoed,))
 
 
@@ -261,6 +302,8 @@ class Link:
     ----------
     path, clock, observer, queue_frames, reconnect_s, candidates
         As of `X4M300`.
+    make_gate
+        Makes what a thread or task of the driver waits for.
 
     Attributes
     ----------
@@ -292,6 +335,7 @@ class Link:
         queue_frames: int,
         reconnect_s: float,
         candidates: Callable[[], Sequence[str]],
+        make_gate: Callable[[], Gate],
     ) -> None:
         self.home = self.path = path
         self.clock = clock
@@ -312,6 +356,8 @@ class Link:
         self.reconnects = 0
         self.raw_mode = False
         self.closed = False
+        self._make_gate = make_gate
+        self._lines: defaultdict[type, deque[Gate | None]] = defaultdict(deque)
         self._version_list: tuple[tuple[int, int], str | None] | None = None  # and of which start
         self._warned = False  # of frames whose geometry is not known
 
@@ -619,18 +665,29 @@ class Link:
     # --- frames -----------------------------------------------------------------------------------
 
     def next_frame(self, timeout_s: float) -> Steps[Frame]:
-        frames = self.frames
-        if not frames:
-            began_ns, discarded = self.clock(), frames.discarded
-            yield Read(timeout_s)
-            if not frames:  # a frame takes two reads at most, unless the line is slow
-                yield from self._await_frame(timeout_s, began_ns, discarded)
-        return frames.pop()
+        frames, line = self.frames, self._lines[Frame]
+        if frames and not line:
+            return frames.pop()
+        began_ns, discarded = self.clock(), frames.discarded
+        with Turn(line, self._make_gate) as turn:
+            if turn.gate is None:
+                yield Read(timeout_s)
+            if not frames or turn.gate is not None:
+                # a frame takes two reads at most, unless the line is slow
+                yield from self._await_frame(turn, timeout_s, began_ns, discarded)
+            return frames.pop()
 
-    def _await_frame(self, timeout_s: float, began_ns: int, discarded: int) -> Steps[None]:
+    def turn(self, kind: type) -> Turn:
+        """Return the last place among those who wait for a kind of message."""
+        return Turn(self._lines[kind], self._make_gate)
+
+    def _await_frame(
+        self, turn: Turn, timeout_s: float, began_ns: int, discarded: int
+    ) -> Steps[None]:
         frames = self.frames
         conversation = self.conversation
         deadline_ns = conversation.deadline_ns(timeout_s, began_ns)
+        yield from turn.come(lambda: self.left_s(deadline_ns))
         left_s = self.left_s(deadline_ns)
         while not frames:
             if left_s > 0:

@@ -413,13 +413,16 @@ def wait_for_message(link: Link, kind: type[MessageT], timeout_s: float) -> Step
     def find() -> MessageT | None:
         return next((message for message in waiting if isinstance(message, kind)), None)
 
-    if find() is None:
-        yield from link.listen(lambda: find() is not None, timeout_s)
-    message = find()
-    if message is None:
-        raise _no_message(link, timeout_s)
-    waiting.remove(message)
-    return message
+    deadline_ns = link.conversation.deadline_ns(timeout_s)
+    with link.turn(kind) as turn:
+        yield from turn.come(lambda: link.left_s(deadline_ns))
+        if find() is None:
+            yield from link.listen(lambda: find() is not None, link.left_s(deadline_ns))
+        message = find()
+        if message is None:
+            raise _no_message(link, timeout_s)
+        waiting.remove(message)
+        return message
 
 
 def messages_waiting(link: Link, kind: type[m.Response]) -> Steps[int]:

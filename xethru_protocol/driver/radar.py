@@ -21,8 +21,10 @@ from xethru_protocol.driver.firmware import Firmware
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
+    AwaitGate,
     Blocking,
     CloseLine,
+    Gate,
     KindT,
     Link,
     ModuleInfo,
@@ -83,6 +85,7 @@ class RadarState(Part[KindT]):
     """
 
     _is_awaited: ClassVar[bool] = False
+    _make_gate: ClassVar[type[Gate]]
     _port_type: "ClassVar[staticmethod[[str, int], Transport | AsyncTransport]]"
     _open_port: Callable[[str, int], Transport | AsyncTransport]
 
@@ -109,6 +112,7 @@ class RadarState(Part[KindT]):
             queue_frames=queue_frames,
             reconnect_s=reconnect_s,
             candidates=candidates,
+            make_gate=self._make_gate,
         )
         super().__init__(self)
         self.x4: X4[KindT] = X4(self)
@@ -538,6 +542,7 @@ class X4M300(RadarState[Blocking]):
         Waits [s] while the line is closed.
     """
 
+    _make_gate = threading.Event
     _port_type = staticmethod(open_line)
     _transport: Transport
 
@@ -705,6 +710,8 @@ class X4M300(RadarState[Blocking]):
                 self._unlocked(self._transport.write, data)
             case Sleep(seconds):
                 self._unlocked(self._sleep, seconds)
+            case AwaitGate(gate, timeout_s):
+                self._unlocked(gate.wait, min(timeout_s, threading.TIMEOUT_MAX))
             case _:
                 if self._reading and not isinstance(step, SetLineRate):
                     self._transport.close()  # the thread that reads leaves it

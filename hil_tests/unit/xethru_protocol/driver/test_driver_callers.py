@@ -1,5 +1,7 @@
 """Who calls a driver: its own callbacks, several threads, programs that drop it."""
 
+import asyncio
+import contextlib
 import gc
 import queue
 import threading
@@ -17,13 +19,16 @@ from hil_tests.patience import seconds
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.emulated import Emulated
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
+from xethru_protocol.driver.async_radar import AsyncX4M300
+from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.errors import Disconnected, LocalProtocolError
+from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, ResponseTimeout
 from xethru_protocol.wire.framing import NEED_DATA
 
+GEOMETRY = FrameGeometry(range_start_m=0.2, bin_length_m=0.0064, n_bins=1431, downconversion=False)
 SET_POWER = m.X4DriverSet(setting=X4Setting.TXPOWER, value=1)
 
 # --- callbacks ----------------------------------------------------------------------------------
@@ -226,6 +231,124 @@ def test_closing_wakes_the_thread_that_reads() -> None:
         wait_for_reader(wire)
         radar.close()
     assert result == ["woken"]
+
+
+# --- several readers ----------------------------------------------------------------------------
+
+
+class Trickle:
+    """A line that gives one packet a read, until ``stopped``."""
+
+    def __init__(self, message: m.Response) -> None:
+        self.name = "the line"
+        self.stopped = False
+        self._packet = Connection(Role.MODULE).send(message)
+
+    def read(self, timeout_s: float) -> bytes:
+        if timeout_s <= 0:
+            return b""
+        if self.stopped:
+            raise Disconnected("all have read enough")
+        time.sleep(0.0002)
+        return self._packet
+
+    def write(self, data: bytes) -> None:
+        """Hear nothing."""
+
+    def close(self) -> None:
+        """Stay open."""
+
+
+class AsyncTrickle(Trickle):
+    async def read(self, timeout_s: float) -> bytes:  # type: ignore[override]
+        await asyncio.sleep(0)
+        return super().read(timeout_s)
+
+    async def write(self, data: bytes) -> None:  # type: ignore[override]
+        """Hear nothing."""
+
+
+MESSAGE = m.DataString(content_id=0, info=0, text="one")
+
+
+@pytest.mark.parametrize("message", [frame(1), MESSAGE], ids=["frames", "messages"])
+@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("readers", [2, 3])
+def test_several_readers_share_what_comes(message: m.Response, kind: str, readers: int) -> None:
+    """None takes more than its turn while others wait."""
+    log: list[int] = []
+
+    def note(reader: int, line: Trickle) -> bool:
+        log.append(reader)
+        line.stopped = line.stopped or min(map(log.count, range(readers))) >= 50
+        return not line.stopped and len(log) < 5000
+
+    read = "read_frame" if isinstance(message, m.DataFloat) else "read_message"
+    what: list[Any] = [] if read == "read_frame" else [m.DataString]
+    if kind == "sync":
+        line = Trickle(message)
+        radar = X4M300(line)
+        radar.geometry = GEOMETRY
+
+        def reader_thread(reader: int) -> None:
+            with contextlib.suppress(ResponseTimeout, Disconnected):
+                while getattr(radar, read)(*what, seconds(1)) and note(reader, line):
+                    pass
+
+        with contextlib.ExitStack() as threads:
+            for reader in range(readers):
+                threads.enter_context(thread(partial(reader_thread, reader)))
+    else:
+
+        async def run() -> None:
+            line = AsyncTrickle(message)
+            radar = AsyncX4M300(line)
+            radar.geometry = GEOMETRY
+
+            async def reader_task(reader: int) -> None:
+                with contextlib.suppress(ResponseTimeout, Disconnected):
+                    while await getattr(radar, read)(*what, seconds(1)) and note(reader, line):
+                        pass
+
+            await asyncio.gather(*map(reader_task, range(readers)))
+
+        asyncio.run(run())
+    together = log[max(map(log.index, range(readers))) :]  # from when the last one began
+    counts = [together.count(reader) for reader in range(readers)]
+    assert min(counts) > 40
+    assert max(counts) - min(counts) < 10
+
+
+def test_reader_that_gives_up_leaves_its_place_to_the_next(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    radar.geometry = GEOMETRY
+    for _ in range(3):
+        with pytest.raises(ResponseTimeout):
+            radar.read_frame(0.5)
+    assert 1.4e9 < line.now_ns < 1.7e9
+    line.say(frame(3))
+    assert radar.read_frame().counter == 3
+
+
+def test_task_whose_turn_does_not_come_gives_up_in_time() -> None:
+    async def run() -> float:
+        line = AsyncTrickle(MESSAGE)
+        radar = AsyncX4M300(line)
+        first = asyncio.create_task(radar.read_frame(60.0))
+        await asyncio.sleep(0)
+        began_s = time.monotonic()
+        with pytest.raises(ResponseTimeout):
+            await radar.read_frame(0.05)
+        took_s = time.monotonic() - began_s
+        third = asyncio.create_task(radar.read_frame(60.0))
+        await asyncio.sleep(0.01)
+        for task in (first, third):  # a cancelled one leaves its place, too
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+        return took_s
+
+    assert 0.04 < asyncio.run(run()) < seconds(1)
 
 
 # --- dropped ------------------------------------------------------------------------------------
