@@ -447,6 +447,10 @@ def is_network_port(port: str) -> bool:
     return re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", port) is not None
 
 
+def _is_rfc2217(port: str) -> bool:
+    return port.lower().startswith("rfc2217:")
+
+
 def open_line(port: str, baudrate: int = POWER_UP_BAUD) -> LineTransport:
     """Open a port by its name: a serial port, ``tcp://``, ``socket://`` or ``rfc2217://``.
 
@@ -455,7 +459,7 @@ def open_line(port: str, baudrate: int = POWER_UP_BAUD) -> LineTransport:
     """
     if not is_network_port(port):
         return SerialTransport(port, baudrate)
-    if port.lower().startswith("rfc2217:"):
+    if _is_rfc2217(port):
         return Rfc2217Transport(port, baudrate)
     return SocketTransport(port)
 
@@ -480,7 +484,7 @@ def _why_unreachable(url: str, host: str, error: Exception) -> str:
         reason = getattr(error, "strerror", None) or "no such name can exist"
         return f"{url} cannot be reached: there is no host {host} ({reason})"
     if isinstance(error, ConnectionRefusedError):
-        plain = not url.lower().startswith("rfc2217:")
+        plain = not _is_rfc2217(url)
         servers = "ser2net, an adapter, or 'xethru-emulator serve --tcp'"
         return (
             f"{url} cannot be reached: nothing listens there; does "
@@ -506,10 +510,10 @@ def carried_rate_hz(wanted_hz: float, bytes_per_s: float, frame_bytes: int) -> f
     return min(wanted_hz, float(max(math.floor(bytes_per_s * _SHARE / frame_bytes), 1)))
 
 
-def set_rate(line: object, baudrate: int) -> None:
+def set_rate(line: object, baudrate: int) -> object:
+    """Change the rate of a line that has one; what is returned is awaitable for one of asyncio."""
     change = getattr(line, "set_baudrate", None)
-    if change is not None:
-        change(baudrate)
+    return None if change is None else change(baudrate)
 
 
 def _whole_ms(timeout_s: float) -> int:
@@ -555,44 +559,101 @@ class AsyncTransport(Protocol):
 
 
 class AsyncSerialTransport:
-    """A port whose descriptor the running event loop watches; ports as of `open_line`."""
+    """A port whose descriptor the running event loop watches; ports as of `open_line`.
+
+    What may take seconds is done in a thread, so that other tasks go on: connecting to a network
+    port, by the first read or write unless `connect` was called before, and a change of its rate.
+    """
 
     def __init__(self, path: str, baudrate: int = POWER_UP_BAUD) -> None:
         self.name = path
-        self._port = open_line(path, baudrate)
+        self._baudrate = baudrate
+        self._port: LineTransport | None = None
+        if is_network_port(path):
+            _address(path)  # a name that cannot be is refused at once
+        else:
+            self._port = open_line(path, baudrate)
+        self._closed = False
+        self._connecting: asyncio.Future[LineTransport] | None = None
+        self._changing: asyncio.Future[None] | None = None  # its rate; the port is a thread's
         # Tasks that wait for the descriptor, which must not be watched once it is closed.
         self._waiting: dict[asyncio.Future[bool], Callable[[int], object]] = {}
         self._turn_ends_s = 0.0
 
+    async def connect(self) -> LineTransport:
+        """Open the port if that was not done yet; raises PortUnavailable."""
+        if self._port is None:
+            if self._connecting is None:
+                self._raise_if_closed()
+                opening = asyncio.to_thread(open_line, self.name, self._baudrate)
+                self._connecting = asyncio.ensure_future(opening)
+                self._connecting.add_done_callback(self._connected)
+            self._port = await asyncio.shield(self._connecting)
+            self._raise_if_closed()
+        return self._port
+
+    def _connected(self, done: asyncio.Future[LineTransport]) -> None:
+        self._connecting = None
+        if not done.cancelled() and done.exception() is None:
+            self._port = done.result()
+            if self._closed:
+                self._port.close()
+
+    def _raise_if_closed(self) -> None:
+        if self._closed:
+            raise Disconnected(f"{self.name} was closed")
+
     @property
     def bytes_per_s(self) -> float:
+        if self._port is None:
+            return self._baudrate / _BITS_PER_BYTE if _is_rfc2217(self.name) else math.inf
         return self._port.bytes_per_s
 
-    def set_baudrate(self, baudrate: int) -> None:
-        self._port.set_baudrate(baudrate)
+    async def set_baudrate(self, baudrate: int) -> None:
+        port = await self.connect()
+        if not _is_rfc2217(self.name):
+            port.set_baudrate(baudrate)
+            return
+        self._changing = asyncio.ensure_future(asyncio.to_thread(port.set_baudrate, baudrate))
+        self._changing.add_done_callback(self._changed)
+        await asyncio.shield(self._changing)
+
+    def _changed(self, done: asyncio.Future[None]) -> None:
+        self._changing = None
+        for ready in self._waiting:  # the thread may have read what they wait for
+            if not ready.done():
+                ready.set_result(True)
 
     async def read(self, timeout_s: float) -> bytes:
+        port = self._port or await self.connect()
         loop = asyncio.get_running_loop()
         if loop.time() > self._turn_ends_s:  # a line that never pauses: now the other tasks
             await asyncio.sleep(0)  # before reading: a task cancelled here must lose no bytes
             self._turn_ends_s = loop.time() + _TURN_S
-        data = self._port.read(0.0)
+        if self._changing is not None:
+            await asyncio.wait({self._changing}, timeout=min(max(timeout_s, 0.0), _LONGEST_WAIT_S))
+            return b""
+        data = port.read(0.0)
         if data or timeout_s <= 0:
             return data
         ready = await self._wait(loop.add_reader, loop.remove_reader, timeout_s)
         self._turn_ends_s = loop.time() + _TURN_S
-        return self._port.read(0.0) if ready else b""
+        return port.read(0.0) if ready and self._changing is None else b""
 
     async def write(self, data: bytes) -> None:
+        port = self._port or await self.connect()
         loop = asyncio.get_running_loop()
         rest = memoryview(data)
         deadline_s = loop.time() + _WRITE_TIMEOUT_S
-        while (rest := rest[self._port.write_some(rest) :]) or self._port.unsent:
+        while (rest := rest[port.write_some(rest) :]) or port.unsent:
             left_s = deadline_s - loop.time()
             if not await self._wait(loop.add_writer, loop.remove_writer, left_s):
                 raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
 
     def close(self) -> None:
+        self._closed = True
+        if self._port is None:
+            return
         while self._waiting:
             ready, unwatch = self._waiting.popitem()
             unwatch(self._port.fileno())
@@ -607,6 +668,7 @@ class AsyncSerialTransport:
         timeout_s: float,
     ) -> bool:
         """Wait until the descriptor is ready; False if it is not in time."""
+        assert self._port is not None, "connected before"
         loop = asyncio.get_running_loop()
         descriptor = self._port.fileno()
         ready: asyncio.Future[bool] = loop.create_future()

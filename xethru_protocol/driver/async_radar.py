@@ -9,13 +9,15 @@
         async for frame in radar.frames():
             ...
 
-No threads: the port's descriptor is watched by the event loop while a task waits for it.
+The port's descriptor is watched by the event loop while a task waits for it. A network port is
+connected to at ``async with``, or by the first call, and `PortUnavailable` is raised there.
 
 Several tasks may use one driver, for example one that reads frames and one that sends commands:
 commands wait for each other, and what one task reads reaches the others.
 """
 
 import asyncio
+import inspect
 import itertools
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -28,12 +30,14 @@ from xethru_protocol.driver.link import (
     TIMEOUT_S,
     Awaited,
     AwaitGate,
+    CloseLine,
     Link,
     OpenLine,
     P,
     Procedure,
     Read,
     ReplyT,
+    SetLineRate,
     Sleep,
     Step,
     Steps,
@@ -51,7 +55,7 @@ from xethru_protocol.transport import (
     AsyncSerialTransport,
     AsyncTransport,
     Transport,
-    is_network_port,
+    set_rate,
 )
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 from xethru_protocol.wire.messages import Command, Response
@@ -98,6 +102,7 @@ class AsyncX4M300(RadarState[Awaited]):
         self._at_work = False  # never while a task waits
 
     async def __aenter__(self) -> Self:
+        await _connect(self._transport)
         return self
 
     async def __aexit__(self, *error: object) -> None:
@@ -211,21 +216,19 @@ class AsyncX4M300(RadarState[Awaited]):
                 with suppress(TimeoutError):
                     async with asyncio.timeout(min(timeout_s, _LONGEST_WAIT_S)):
                         await gate.wait()
-            case OpenLine(path, baudrate) if is_network_port(path):
+            case OpenLine(path, baudrate):
                 self._transport.close()
-                self._use(await self._opened(path, baudrate))
-            case _:
-                self._change_line(step)
+                transport = self._open_port(path, baudrate)
+                await _connect(transport)
+                self._use(transport)
+            case SetLineRate(baudrate):
+                changing = set_rate(self._transport, baudrate)
+                if inspect.isawaitable(changing):
+                    await changing
+                self._use(self._transport)
+            case CloseLine():
+                self._transport.close()
         return False
-
-    async def _opened(self, path: str, baudrate: int) -> Transport | AsyncTransport:
-        """Open a network port in a thread: connecting may take seconds, and others go on."""
-        opening = asyncio.ensure_future(asyncio.to_thread(self._open_port, path, baudrate))
-        try:
-            return await asyncio.shield(opening)
-        except asyncio.CancelledError:
-            opening.add_done_callback(_close)
-            raise
 
     async def _pump(self, timeout_s: float) -> bool:
         """Read once and sort what came, or wait for the task that does; False if nothing came."""
@@ -244,7 +247,12 @@ class AsyncX4M300(RadarState[Awaited]):
         return True
 
 
-def _close(opening: asyncio.Future[Transport | AsyncTransport]) -> None:
-    """Close a line whose opening was cancelled."""
-    if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()
+async def _connect(transport: Transport | AsyncTransport) -> None:
+    """Connect now to what would connect at the first read or write."""
+    connect = getattr(transport, "connect", None)
+    if connect is not None:
+        try:
+            await connect()
+        except BaseException:
+            transport.close()
+            raise

@@ -461,17 +461,6 @@ class RadarState(Part[KindT]):
         self._transport = transport
         self._link.bytes_per_s = capacity_bytes_per_s(transport)
 
-    def _change_line(self, step: Step) -> None:
-        match step:
-            case CloseLine():
-                self._transport.close()
-            case OpenLine(path, baudrate):
-                self._transport.close()
-                self._use(self._open_port(path, baudrate))
-            case SetLineRate(baudrate):
-                set_rate(self._transport, baudrate)
-                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
-
 
 class X4M300(RadarState[Blocking]):
     """One radar module on a port: X4M300, X4M200, or any other with XeThru's X4 firmware.
@@ -712,11 +701,15 @@ class X4M300(RadarState[Blocking]):
                 self._unlocked(self._sleep, seconds)
             case AwaitGate(gate, timeout_s):
                 self._unlocked(gate.wait, min(timeout_s, threading.TIMEOUT_MAX))
-            case _:
-                if self._reading and not isinstance(step, SetLineRate):
-                    self._transport.close()  # the thread that reads leaves it
+            case SetLineRate(baudrate):
+                set_rate(self._transport, baudrate)
+                self._use(self._transport)
+            case CloseLine() | OpenLine():
+                self._transport.close()
+                if self._reading:  # the thread that reads leaves it
                     self._await_reader(_LEAVE_S)
-                self._change_line(step)
+                if isinstance(step, OpenLine):
+                    self._use(self._open_port(step.path, step.baudrate))
         return False
 
     def _await_reader(self, timeout_s: float) -> bool:

@@ -26,7 +26,12 @@ from xethru_protocol.cli import main
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.transport import AsyncSerialTransport, capacity_bytes_per_s, open_line
+from xethru_protocol.transport import (
+    AsyncSerialTransport,
+    LineTransport,
+    capacity_bytes_per_s,
+    open_line,
+)
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
@@ -262,23 +267,23 @@ def test_a_server_that_hangs_up_is_found_again(served: Served) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("is_cancelled", [False, True])
 def test_other_tasks_go_on_while_a_network_port_is_opened(
-    is_cancelled: bool, served: Served
+    is_cancelled: bool, served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"tcp://127.0.0.1:{served.tcp_ports[0]}"
     _opened(url).close()
     entered, released = threading.Event(), threading.Event()
-    opened: list[AsyncSerialTransport] = []
+    opened: list[LineTransport] = []
 
-    def open_slowly(path: str, baudrate: int) -> AsyncSerialTransport:
+    def open_slowly(path: str, baudrate: int) -> LineTransport:
         entered.set()
         assert released.wait(seconds(2)), "the loop was held up"
-        opened.append(AsyncSerialTransport(path, baudrate))
+        opened.append(open_line(path, baudrate))
         return opened[-1]
 
     async def reconnect() -> None:
-        radar = AsyncX4M300(
-            AsyncSerialTransport(url), clock=patient_ns, open_port=open_slowly, candidates=list
-        )
+        radar = AsyncX4M300(AsyncSerialTransport(url), clock=patient_ns, candidates=list)
+        assert await radar.ping(seconds(1)) is PongCode.XTS_SPRP_READY
+        monkeypatch.setattr("xethru_protocol.transport.open_line", open_slowly)
         reconnecting = asyncio.create_task(radar.reconnect(seconds(3)))
         while not entered.is_set():
             await asyncio.sleep(0.001)
@@ -289,7 +294,7 @@ def test_other_tasks_go_on_while_a_network_port_is_opened(
             released.set()
             while not opened:
                 await asyncio.sleep(0.001)
-            await asyncio.sleep(0)
+            await asyncio.sleep(0.05)
         else:
             released.set()
             assert await reconnecting == url
@@ -298,7 +303,7 @@ def test_other_tasks_go_on_while_a_network_port_is_opened(
     asyncio.run(reconnect())
     for line in opened:
         with pytest.raises(Disconnected, match="was closed"):
-            line._port.fileno()
+            line.fileno()
 
 
 @pytest.mark.parametrize(
@@ -462,3 +467,135 @@ def test_raw_tcp_has_no_rate() -> None:
     ):
         line.set_baudrate(9600)
         assert line.bytes_per_s == math.inf
+
+
+# --- other tasks of asyncio ---------------------------------------------------------------------
+
+
+@contextmanager
+def _server(serve: Callable[[socket.socket], None]) -> Iterator[int]:
+    """Run a server for one client; its port."""
+    with closing(socket.create_server(("127.0.0.1", 0))) as listener:
+
+        def run() -> None:
+            with contextlib.suppress(OSError), listener.accept()[0] as client:
+                serve(client)
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        yield listener.getsockname()[1]
+        thread.join(seconds(2))
+
+
+def _until(client: socket.socket, awaited: bytes) -> None:
+    got = b""
+    while awaited not in got:
+        got += client.recv(4096)
+
+
+RATE_921600 = bytes((IAC, SB, COM, 1, 0x00, 0x0E, 0x10, 0x00, IAC, SE))
+RATE_IS_921600 = bytes((IAC, SB, COM, 101, 0x00, 0x0E, 0x10, 0x00, IAC, SE))
+
+
+@pytest.mark.parametrize("opens", ["async with", "the first call"])
+def test_other_tasks_go_on_while_a_silent_server_is_opened(opens: str) -> None:
+    """It agrees to RFC 2217 only when another task has had its turn."""
+    went_on = threading.Event()
+
+    def serve(client: socket.socket) -> None:
+        assert went_on.wait(seconds(3))
+        for awaited, said in POLITE:
+            _until(client, awaited)
+            client.sendall(said)
+        _until(client, b"\x7d")
+        client.sendall(bytes.fromhex("7d01eaaeeeaa7c7e"))
+
+    async def run(url: str) -> PongCode:
+        async def other() -> None:
+            await asyncio.sleep(0.01)
+            went_on.set()
+
+        task = asyncio.create_task(other())
+        await asyncio.sleep(0)
+        radar = AsyncX4M300.open(url, clock=patient_ns)
+        assert radar.bytes_per_s == 11520.0
+        if opens == "async with":
+            async with radar:
+                state = await radar.ping(seconds(1))
+        else:
+            state = await radar.ping(seconds(1))
+            await radar.close()
+        await task
+        return state
+
+    with _server(serve) as port:
+        assert asyncio.run(run(f"rfc2217://127.0.0.1:{port}")) is PongCode.XTS_SPRP_READY
+
+
+def test_other_tasks_go_on_while_the_rate_of_a_server_is_changed() -> None:
+    """Bytes that come meanwhile reach the task that reads, in their order."""
+    went_on = threading.Event()
+
+    def serve(client: socket.socket) -> None:
+        for awaited, said in POLITE:
+            _until(client, awaited)
+            client.sendall(said)
+        _until(client, RATE_921600)
+        client.sendall(b"one ")
+        assert went_on.wait(seconds(3))
+        client.sendall(b"two " + RATE_IS_921600 + b"three")
+        with contextlib.suppress(OSError):
+            client.recv(1)
+
+    async def run(url: str) -> bytes:
+        line = AsyncSerialTransport(url)
+        await line.connect()
+        came = b""
+
+        async def read() -> None:
+            nonlocal came
+            while not came.endswith(b"three"):
+                came += await line.read(seconds(1))
+
+        async def other() -> None:
+            await asyncio.sleep(0.01)
+            went_on.set()
+
+        reading = asyncio.create_task(read())
+        await asyncio.sleep(0)
+        waiting = asyncio.create_task(other())
+        await line.set_baudrate(921600)
+        assert line.bytes_per_s == 92160.0
+        await asyncio.gather(reading, waiting)
+        line.close()
+        return came
+
+    with _server(serve) as port:
+        came = asyncio.run(run(f"rfc2217://127.0.0.1:{port}"))
+    assert came.removeprefix(b"old bytes") == b"one two three"
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("http://pi:80", "is no kind of port"),
+        ("tcp://no-such-host.invalid:5", "there is no host no-such-host.invalid"),
+    ],
+)
+def test_what_is_wrong_with_a_name_is_said_to_tasks_too(url: str, words: str) -> None:
+    async def run() -> None:
+        async with AsyncX4M300.open(url):
+            pass
+
+    with pytest.raises(PortUnavailable, match=words):
+        asyncio.run(run())
+
+
+def test_closed_before_it_connected_stays_closed() -> None:
+    async def run(url: str) -> None:
+        line = AsyncSerialTransport(url)
+        line.close()
+        with pytest.raises(Disconnected, match="was closed"):
+            await line.read(1.0)
+
+    asyncio.run(run("tcp://127.0.0.1:9"))
