@@ -24,6 +24,7 @@ from xethru_protocol.driver.link import (
     KindT,
     Link,
     Part,
+    RawConfig,
     Steps,
     sends,
 )
@@ -126,7 +127,11 @@ class X4Row(Setting[V]):
             moves = bool(x4.timer_rate(wanted))
             yield from (raw_mode.start(link, wanted) if moves else raw_mode.stop(link))
             return
-        fps = link.plan.fps if isinstance(link.plan, raw_mode.RawPlan) else None
+        fps = None
+        if isinstance(link.plan, raw_mode.RawPlan):  # refused before anything is sent
+            fps, config = link.plan.fps, self._changed(link.plan.config, wanted)
+            if fps is not None:
+                raw_mode.check_start(link, config, fps)
         if fps is None:
             yield from self._change(link, wanted)
             return
@@ -143,8 +148,7 @@ class X4Row(Setting[V]):
         yield from link.request(m.X4DriverSet(setting=self.setting, value=wanted))
         plan, geometry = link.plan, link.frames.geometry
         if isinstance(plan, raw_mode.RawPlan):
-            changed: dict[str, Any] = {self.name: self.of_answer(wanted)}
-            config = replace(plan.config, **changed)
+            config = self._changed(plan.config, wanted)
             link.plan = replace(plan, config=config)
             link.frames.lattice = config.lattice
         if self.setting in _MOVES_BINS and geometry is not None:
@@ -152,6 +156,10 @@ class X4Row(Setting[V]):
             if self.setting is X4Setting.DOWNCONVERSION:
                 baseband = bool(wanted)
             link.frames.geometry = yield from raw_mode.read_geometry(link, baseband)
+
+    def _changed(self, config: RawConfig, wanted: Any) -> RawConfig:  # noqa: ANN401 - likewise
+        changed: dict[str, Any] = {self.name: self.of_answer(wanted)}
+        return replace(config, **changed)
 
     def _checked(self, value: Any) -> Any:  # noqa: ANN401 - a user may give anything
         """Return what is sent for ``value``; `LocalProtocolError` if it cannot be."""

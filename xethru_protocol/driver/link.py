@@ -162,7 +162,8 @@ class RawConfig:
     ``frame_area_m`` and ``offset_m`` are module metres. ``offset_m`` None keeps the calibration
     of the module's own antenna; another value moves every range. ``dac_step`` 0 ... 3 means steps
     of 1, 2, 4, 8 levels; ``prf_div`` divides the 243 MHz clock (16: the one regulators allow).
-    Numbers outside `x4.LIMITS` raise `LocalProtocolError`. Protocol reference 4.9, 9.3.
+    Numbers outside `x4.LIMITS`, and ``dac_min`` above ``dac_max``, raise `LocalProtocolError`.
+    Protocol reference 4.9, 9.3.
     """
 
     frame_area_m: tuple[float, float] = (0.2, 9.4)
@@ -181,6 +182,22 @@ class RawConfig:
         for name, setting in CONFIG_SETTINGS.items():
             if setting in x4.LIMITS:
                 x4.check_setting(setting, name, getattr(self, name))
+        if self.dac_min > self.dac_max:
+            raise LocalProtocolError(
+                f"dac_min {self.dac_min} is above dac_max {self.dac_max}, so no threshold lies "
+                "between them; to move both up, set dac_max first"
+            )
+
+    def check_rate(self, fps: float) -> None:
+        """Raise `LocalProtocolError` if a sweep takes longer than a frame at this rate [Hz]."""
+        highest: float = self.fps_max / x4.SWEEP_SHARE
+        if x4.real_frame_rate(fps) > highest:
+            thresholds = (self.dac_max - self.dac_min + 1) / 2**self.dac_step
+            raise LocalProtocolError(
+                f"{fps:g} frames/s cannot be: a sweep of {self.iterations} iterations x "
+                f"{self.pulses_per_step} pulses x {thresholds:g} thresholds takes "
+                f"{1e3 / highest:.1f} ms, so there are at most {highest:.1f}/s"
+            )
 
     def settings(self) -> tuple[tuple[X4Setting, m.X4Value], ...]:
         """X4 settings in the order in which they are sent; None keeps what the module has."""
@@ -194,8 +211,14 @@ class RawConfig:
     def area(self, offset_m: float) -> x4.FrameArea:
         """Return the frame area as a module with this offset [module metres] quantises it.
 
-        Raises `LocalProtocolError` if it would make no bin of it.
+        Raises `LocalProtocolError` if it would make no bin of it, or lies too far away.
         """
+        farthest_m = offset_m + x4.MOST_COARSE_STEPS * x4.COARSE_STEP_M
+        if self.frame_area_m[0] >= farthest_m:
+            raise LocalProtocolError(
+                f"frame area {self.frame_area_m[0]:g} ... {self.frame_area_m[1]:g} m begins behind "
+                f"{farthest_m:.1f} m, where the chip's delay begins at 0 again"
+            )
         area = x4.frame_area(*self.frame_area_m, offset_m, self.downconversion)
         if area.n_bins <= 0:
             start_m, end_m = self.frame_area_m

@@ -419,8 +419,13 @@ class RadarState(Part[KindT]):
         Frames of an earlier stream that were not read yet are dropped. Without `configure_raw`, the
         settings that a module in mode MANUAL has are taken for those that are wanted.
 
-        A rate above what the settings allow or the line carries is tried, with a warning: the
-        firmware does not refuse it (Protocol reference 9.6, 10).
+        A rate with less than the recommended 5 % reserve, or above what the line carries, is tried
+        with a warning (Protocol reference 9.6, 10).
+
+        Raises
+        ------
+        LocalProtocolError
+            If a sweep of these settings takes longer than a frame.
         """
         return raw_mode.start(link, fps)
 

@@ -8,7 +8,7 @@ import numpy as np
 from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.driver.link import CONFIG_SETTINGS, SLOW_TIMEOUT_S, Link, RawConfig, Steps
 from xethru_protocol.wire import x4
-from xethru_protocol.wire.codes import ErrorCode, PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.codes import ErrorCode, PongCode, SensorMode, TxPower, X4Setting
 from xethru_protocol.wire.errors import DeviceError, LocalProtocolError, RemoteProtocolError
 from xethru_protocol.wire.messages import X4DriverInit, X4DriverSet, X4Value
 from xethru_protocol.wire.versions import X4_GETS
@@ -146,7 +146,9 @@ def start(link: Link, fps: float) -> Steps[float]:
         )
     if link.frames.geometry is None:
         yield from _take_over(link)
-    _warn_of_rate(link, fps)
+    if isinstance(link.plan, RawPlan):
+        check_start(link, link.plan.config, fps)
+    _warn_of_line(link, fps)
     yield from link.take_stale_input()
     link.frames.clear()  # a late frame of before would make a false gap
     return (yield from run_at(link, fps))
@@ -200,18 +202,24 @@ def leave(link: Link) -> Steps[None]:
         yield from link.set_mode_if_known(SensorMode.XTID_SM_STOP)
 
 
-def _warn_of_rate(link: Link, fps: float) -> None:
-    whole = x4.timer_rate(fps)
-    if fps != whole:
-        link.warn(
-            f"the module's timer takes whole numbers of 16 bits: {fps:g} frames/s will be {whole}"
-        )
-    config = link.plan.config if isinstance(link.plan, RawPlan) else None
-    if config is not None and fps > config.fps_max:
+def check_start(link: Link, config: RawConfig, fps: float) -> None:
+    """Refuse a rate at which these settings cannot work, and warn of what is hardly meant."""
+    config.check_rate(fps)
+    if fps > config.fps_max:
         link.warn(
             f"{fps:g} frames/s are more than the {config.fps_max:.1f} that "
             f"{config.iterations} iterations x {config.pulses_per_step} pulses "
             "leave time for; a real module may not keep up"
+        )
+    if config.tx_power == TxPower.OFF:
+        link.warn("tx_power is 0: the transmitter is off, so frames hold noise only")
+
+
+def _warn_of_line(link: Link, fps: float) -> None:
+    whole = x4.timer_rate(fps)
+    if fps != whole:
+        link.warn(
+            f"the module's timer takes whole numbers of 16 bits: {fps:g} frames/s will be {whole}"
         )
     geometry = link.frames.geometry
     if geometry is not None and fps > link.bytes_per_s / geometry.frame_bytes:

@@ -24,6 +24,7 @@ BASEBAND_DECIMATION = 8
 BASEBAND_BIN_M = BASEBAND_DECIMATION * RF_BIN_M
 COARSE_STEP_SAMPLES = 96
 COARSE_STEP_M = COARSE_STEP_SAMPLES * RF_BIN_M  # one step of the receive delay
+MOST_COARSE_STEPS = 255  # the chip keeps one more than them in 8 bits (9.4)
 FRAME_SAMPLES = 1536  # RF samples the chip captures per frame
 BASEBAND_DISCARDED_LINES = 4  # filter fill at the start of a downconverted frame
 COMMON_PLL_HZ = 243e6

@@ -25,7 +25,7 @@ from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
 pytestmark = pytest.mark.slow
 
-SHORT = RawConfig(frame_area_m=(0.4, 1.0))
+SHORT = RawConfig(frame_area_m=(0.4, 1.0), iterations=4)
 MEDIUM = RawConfig(frame_area_m=(0.4, 5.0))
 FILE = FileName(file_type=0x80000001, identifier=7)
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")

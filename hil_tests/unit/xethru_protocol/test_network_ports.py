@@ -35,7 +35,7 @@ from xethru_protocol.transport import (
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
-SHORT = RawConfig(frame_area_m=(0.4, 1.0))
+SHORT = RawConfig(frame_area_m=(0.4, 1.0), iterations=4)
 
 
 class _PtyPort(serial.Serial):

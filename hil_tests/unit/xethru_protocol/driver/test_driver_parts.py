@@ -206,7 +206,7 @@ def test_numbers_beyond_float32_are_not_sent(raw: Scripted) -> None:
     for name in ("fps", "offset_m"):
         with pytest.raises(LocalProtocolError, match=f"^{name} cannot be"):
             setattr(radar.x4, name, 10**400)
-    with pytest.raises(LocalProtocolError, match="cannot carry value=1e"):
+    with pytest.raises(LocalProtocolError, match=r"1e\+39 frames/s cannot be"):
         radar.x4.fps = 1e39
     assert line.received == []
 
@@ -294,7 +294,7 @@ def test_frames_go_on_after_a_setting_that_the_module_refuses(
     line._answer = refusing
     radar.start(17)
     with pytest.raises(error):
-        radar.x4.dac_min = 0
+        radar.x4.dac_min = 950
     assert getattr(radar._link.plan, "fps", None) == 17.0
     assert line.received[-2] == m.X4DriverSet(setting=X4Setting.FPS, value=17.0)
 

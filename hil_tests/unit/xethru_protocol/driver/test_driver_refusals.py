@@ -51,9 +51,92 @@ def test_rate_that_the_timer_cannot_make_is_warned_of(
     raw: Scripted, fps: float, made: str | None
 ) -> None:
     radar, _ = raw
+    radar.configure_raw(RawConfig(iterations=1, pulses_per_step=1))
     radar.start(fps)
     warned = [text for text in radar.warnings if "whole numbers" in text]
     assert [text.rpartition(" ")[2] for text in warned] == ([] if made is None else [made])
+
+
+@pytest.mark.parametrize(
+    ("config", "possible", "impossible"),
+    [
+        (RawConfig(), 20, 21),  # sweeps of 16 x 300 x 152 pulses at 15.1875 MHz: 20.8/s
+        (RawConfig(iterations=64, pulses_per_step=87), 17, 18),  # 17.95/s
+        (RawConfig(iterations=64, pulses_per_step=5), 312, 313),
+        (RawConfig(dac_min=0, dac_max=2047, iterations=8, pulses_per_step=10), 92, 93),
+        (RawConfig(dac_step=3), 166, 167),
+        (RawConfig(prf_div=4), 83, 84),
+        (RawConfig(pulses_per_step=65535), 0, 1),
+    ],
+)
+def test_rate_at_which_a_sweep_does_not_end_is_refused(
+    driver_on: DriverOn, config: RawConfig, possible: int, impossible: int
+) -> None:
+    """Highest rates of Protocol reference 9.6, D = 1."""
+    radar, line = driver_on()
+    radar.configure_raw(config)
+    line.received.clear()
+    with pytest.raises(LocalProtocolError, match=rf"{impossible} frames/s .* at most {possible}\."):
+        radar.start(impossible)
+    assert line.received == []
+    if possible:
+        radar.start(possible)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("iterations", 32), ("pulses_per_step", 400), ("dac_min", 800), ("dac_max", 2047)],
+)
+def test_setting_that_the_running_rate_has_no_time_for_is_refused(
+    raw: Scripted, name: str, value: int
+) -> None:
+    radar, line = raw
+    radar.start(17)
+    line.received.clear()
+    with pytest.raises(LocalProtocolError, match="17 frames/s cannot be"):
+        setattr(radar.x4, name, value)
+    assert line.received == []
+    radar.stop()
+    setattr(radar.x4, name, value)
+    with pytest.raises(LocalProtocolError, match="17 frames/s cannot be"):
+        radar.start(17)
+
+
+def test_thresholds_in_the_wrong_order_are_refused(raw: Scripted) -> None:
+    radar, line = raw
+    line.received.clear()
+    with pytest.raises(LocalProtocolError, match="dac_min 1101 is above dac_max 1100"):
+        RawConfig(dac_min=1101)
+    for name, value in (("dac_min", 1101), ("dac_max", 948)):
+        with pytest.raises(LocalProtocolError, match="is above dac_max"):
+            setattr(radar.x4, name, value)
+    assert line.received == []
+    radar.x4.dac_max, radar.x4.dac_min = 1300, 1200
+    radar.x4.dac_min = 1300  # one threshold is a sweep
+
+
+@pytest.mark.parametrize("name", ["configured", "set", "set while it runs"])
+def test_transmitter_that_is_off_is_warned_of(raw: Scripted, name: str) -> None:
+    radar, _ = raw
+    if name == "configured":
+        radar.configure_raw(RawConfig(tx_power=0))
+    elif name == "set":
+        radar.x4.tx_power = 0
+    assert radar.warnings == []
+    radar.start(17)
+    if name == "set while it runs":
+        radar.x4.tx_power = 0
+    assert [text for text in radar.warnings if "transmitter is off" in text]
+
+
+def test_frame_area_behind_the_longest_delay_is_refused(driver_on: DriverOn) -> None:
+    """The chip keeps its receive delay, 0.6173 m a step, in eight bits. Protocol reference 9.4."""
+    radar, line = driver_on()
+    for start_m in (157.6, 200.0):
+        with pytest.raises(LocalProtocolError, match=r"begins behind 157\.6 m"):
+            radar.configure_raw(RawConfig(frame_area_m=(start_m, start_m + 5.0), offset_m=0.18))
+    assert line.received == []
+    assert RawConfig(frame_area_m=(157.5, 160.0)).area(0.18).rx_wait == 255
 
 
 @pytest.mark.parametrize(("name", "largest"), [("iterations", 255), ("pulses_per_step", 65535)])
