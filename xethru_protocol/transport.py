@@ -196,6 +196,13 @@ class SerialTransport(LineTransport):
     """
 
     def __init__(self, path: str, baudrate: int = POWER_UP_BAUD) -> None:
+        patched_by = serial.Serial.read.__module__
+        if patched_by != serial.Serial.__module__:
+            raise PortUnavailable(
+                f"{path} is not opened: {patched_by} has replaced methods of serial.Serial, and "
+                "this driver reads the port itself; record with 'xethru record --out X.mcap' and "
+                "replay with 'xethru-emulator play X.mcap', or pytest's --radar replay:X.mcap"
+            )
         try:
             self._port = serial.Serial(path, baudrate, timeout=0, exclusive=True)
         # SerialException is an OSError; no rate can have more than 32 bits

@@ -230,14 +230,14 @@ def _write_chunks(link: Link, part: m.SetFileData, on_progress: OnProgress | Non
         if on_progress is not None:
             on_progress(done, total)
         data = bytes(part.data[done : done + CHUNK_BYTES])
-        piece = _receivable(replace(part, offset=part.offset + done, data=data))
+        piece = receivable(replace(part, offset=part.offset + done, data=data))
         yield from link.request(piece, SLOW_TIMEOUT_S)
         done += len(piece.data)
     if on_progress is not None:
         on_progress(total, total)
 
 
-def _receivable(piece: m.SetFileData) -> m.SetFileData:
+def receivable(piece: m.SetFileData) -> m.SetFileData:
     """Return as much of a piece as a module does not misread."""
     begin = piece.data.find(NO_ESCAPE_START)
     if begin >= 0:

@@ -15,7 +15,7 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any, Final
 
-from xethru_protocol.driver.files import CHUNK_BYTES
+from xethru_protocol.driver.files import CHUNK_BYTES, receivable
 from xethru_protocol.driver.link import SLOW_TIMEOUT_S
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.legacy.connection import (
@@ -151,25 +151,30 @@ def _all_files(radar: X4M300) -> Data:
 def _get_file_data(radar: X4M300, type: int, identifier: int, offset: int, length: int) -> Vector:
     data = b""
     while len(data) < length:
-        data += radar.request(
-            m.GetFileData(
-                file_type=type & _ID,
-                identifier=identifier,
-                offset=offset + len(data),
-                length=min(CHUNK_BYTES, length - len(data)),
+        at, wanted = offset + len(data), min(CHUNK_BYTES, length - len(data))
+        command = m.GetFileData(
+            file_type=type & _ID, identifier=identifier, offset=at, length=wanted
+        )
+        got = radar.request(command).values
+        if not 0 < len(got) <= wanted:
+            raise ModuleConnectorError(
+                f"get_file_data: {radar.port} sent {len(got)} bytes from {at} on, not {wanted}"
             )
-        ).values
+        data += got
     return Vector(data)
 
 
 def _set_file_data(radar: X4M300, type: int, identifier: int, offset: int, data: Any) -> None:
-    content = _bytes(data)
-    for at in range(0, len(content), CHUNK_BYTES):
+    content, at = _bytes(data), 0
+    while at < len(content):
         piece = content[at : at + CHUNK_BYTES]
-        command = m.SetFileData(
-            file_type=type & _ID, identifier=identifier, offset=offset + at, data=piece
+        command = receivable(
+            m.SetFileData(
+                file_type=type & _ID, identifier=identifier, offset=offset + at, data=piece
+            )
         )
         _slow(radar, command)
+        at += len(command.data)
 
 
 def _bytes(data: Any) -> bytes:

@@ -52,6 +52,26 @@ def line() -> Iterator[Line]:
     line.unplug()
 
 
+@pytest.mark.parametrize("replays", [True, False])
+def test_programs_that_replace_methods_of_pyserial_are_named(
+    line: Line, monkeypatch: pytest.MonkeyPatch, replays: bool
+) -> None:
+    """pytest-reserial 0.6 patches these; its replay has no descriptor, its record no bytes."""
+
+    def read(port: serial.Serial, size: int = 1) -> bytes:
+        return b""
+
+    def no_open(port: serial.Serial) -> None:
+        port.is_open, port.fd = True, None
+
+    monkeypatch.setattr(serial.Serial, "read", read)
+    if replays:
+        monkeypatch.setattr(serial.Serial, "open", no_open)
+    path = "/dev/none" if replays else line.path
+    with pytest.raises(PortUnavailable, match=rf"{__name__} has replaced .*xethru-emulator play"):
+        X4M300.open(path)
+
+
 @pytest.fixture
 def port(line: Line) -> Iterator[SerialTransport]:
     port = SerialTransport(line.path)

@@ -24,6 +24,7 @@ from xethru_protocol.legacy.module_connector import STREAMS, ModuleConnector, cr
 from xethru_protocol.recordings import Split, read_recording
 from xethru_protocol.transport import open_line
 from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import X4Setting
 
 EVERY_KIND = FIXTURES / "recordings/every_kind/xethru_recording_meta.dat"
@@ -224,6 +225,34 @@ def test_commands_are_the_vendors_own(module: PtyModule) -> None:
     assert m.SetMode(mode=0x12) in module.received
     assert m.DeleteFile(file_type=0x80000000, identifier=5) in module.received
     assert sum(not isinstance(one, m.SystemGetInfo) for one in module.received) == 4
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x7c" * 4, b"ab" + b"\x7c" * 300 + b"c", bytes(255) + b"\x7c" * 6, b"\x7d\x7c\x7c\x7c"],
+)
+def test_file_data_that_a_module_would_misread_are_sent_in_pieces(content: bytes) -> None:
+    """No packet has four 7C, in its payload or with its checksum. Protocol reference 1.2."""
+    with PtyModule() as module, create_mc(module.path) as mc:
+        mc.get_xep().set_file_data(0x80000000, 5, 100, content)
+        sent = [each for each in module.received if isinstance(each, m.SetFileData)]
+    written = bytearray(len(content))
+    for piece in sent:
+        written[piece.offset - 100 : piece.offset - 100 + len(piece.data)] = piece.data
+        assert b"\x7c" * 4 not in encode(piece)
+    assert bytes(written) == content
+    assert sum(len(piece.data) for piece in sent) == len(content)
+
+
+@pytest.mark.parametrize("answered", [b"", bytes(300)], ids=["nothing", "too much"])
+def test_file_data_that_do_not_come_end_with_an_error(answered: bytes) -> None:
+    plain = PlainModule(instead={m.GetFileData: [m.ReplyByte(values=answered)]})
+    with (
+        PtyModule(plain) as module,
+        create_mc(module.path) as mc,
+        pytest.raises(RuntimeError, match=f"sent {len(answered)} bytes from 7 on, not 256"),
+    ):
+        mc.get_xep().get_file_data(0x80000000, 5, 7, 1000)
 
 
 def test_auto_finds_emulated_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
