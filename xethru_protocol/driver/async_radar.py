@@ -243,7 +243,7 @@ class AsyncX4M300(RadarState[Awaited]):
             self._reading = None
         if not data:
             return False
-        self._work(self._link.conversation.receive, data, self._link.clock())
+        self._work(self._link.receive, data, self._link.clock())
         return True
 
 

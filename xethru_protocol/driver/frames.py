@@ -375,6 +375,7 @@ class FrameQueue:
         self._frames: deque[Frame] = deque()
         self._in_burst = False
         self._gap = (0, 0)  # the last one: counter before it, frames missing in it
+        self._not_judged: list[Float32s] = []  # samples of radar frames
         self._off_lattice = False  # more than half of the newest radar frame
         self._restarted = False
         self._outage_hz = 0.0  # rate of the stream that a broken line cut; 0: none was
@@ -433,10 +434,25 @@ class FrameQueue:
             self._discard(message)
             return
         if self.lattice is not None:
-            self._statistics.off_lattice_samples += self._count_off(self.lattice, values)
+            self._not_judged.append(values)
         n = geometry.n_bins
         samples = complex_of(values[:n], values[n:]) if geometry.downconversion else values
         self._queue(message.info, samples, geometry, arrival_ns)
+
+    def judge(self) -> None:
+        """Count the samples off the lattice in what was taken since the last call.
+
+        Many frames at once take half the time, and nearly all of them are whole.
+        """
+        frames, self._not_judged = self._not_judged, []
+        if self.lattice is None or (
+            len(frames) > 1
+            and not self._off_lattice
+            and not self.lattice.off_lattice(np.concatenate(frames))
+        ):
+            return
+        for values in frames:
+            self._statistics.off_lattice_samples += self._count_off(self.lattice, values)
 
     def _count_off(self, lattice: Lattice, values: Float32s) -> int:
         """Count the samples off the lattice; a lower bound where most are."""

@@ -384,6 +384,13 @@ class Link:
         self._version_list: tuple[tuple[int, int], str | None] | None = None  # and of which start
         self._warned = False  # of frames whose geometry is not known
 
+    def receive(self, data: bytes, arrival_ns: int) -> None:
+        """Sort what the line gave."""
+        try:
+            self.conversation.receive(data, arrival_ns)
+        finally:
+            self.frames.judge()
+
     def _take(self, message: Response, arrival_ns: int) -> None:
         if isinstance(message, FRAMES):
             self.frames.take(message, arrival_ns)

@@ -612,7 +612,7 @@ class X4M300(RadarState[Blocking]):
         The line is read only when no frame waits, so a slow reader holds a lossless line back.
         """
         for _ in itertools.count() if count is None else range(count):
-            yield self.read_frame(timeout_s)
+            yield self._listen(Link.next_frame, timeout_s)
 
     def read_message(self, kind: type[MessageT], timeout_s: float = MESSAGE_TIMEOUT_S) -> MessageT:
         """Next message of a class of `xethru_protocol.wire.messages`, such as `DataString`.
@@ -749,5 +749,5 @@ class X4M300(RadarState[Blocking]):
         if not data:
             return False
         arrival_ns = self._link.clock()
-        self._link.conversation.receive(data, arrival_ns)
+        self._link.receive(data, arrival_ns)
         return True

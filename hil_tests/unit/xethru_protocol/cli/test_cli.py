@@ -196,3 +196,18 @@ def test_list_passes_over_what_can_be_no_path(
     (folder / "1.json").write_text(json.dumps({"pid": 1, "devices": [device]}))
     (folder / "2.json").write_text("[" * 100_000)
     assert emulated_ports(capsys) == []
+
+
+def test_rate_at_which_no_sweep_ends_is_refused_with_the_values(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with PtyModule() as module:
+        assert main(["stream", "--port", module.path, "--fps", "1000", "--count", "1"]) == 1
+        assert not [
+            one for one in module.received if isinstance(one, m.X4DriverSet) and one.value == 1000
+        ]
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    for value in ("1000 frames/s", "16 iterations", "300 pulses", "152 thresholds", "20.8/s"):
+        assert value in captured.err

@@ -191,6 +191,24 @@ def test_sound_frame_behind_one_that_is_none_is_judged_in_full(driver_on: Driver
     assert radar.statistics.off_lattice_samples == 1431 + 1 + 1
 
 
+@pytest.mark.parametrize("damaged", [{}, {0: 1}, {4: 3}, {1: 1, 3: 1431, 4: 2}])
+def test_frames_that_come_together_are_judged_one_by_one(
+    driver_on: DriverOn, damaged: dict[int, int]
+) -> None:
+    """``damaged`` samples by frame; behind a clear frame the first 128 are judged (above)."""
+    radar, line = driver_on()
+    counts = np.linspace(0, 729_600, 1431).astype(np.uint32)
+    radar.configure_raw()
+    frames = []
+    for counter in range(6):
+        values = on_lattice(counter, counts).values.copy()
+        values[: damaged.get(counter, 0)] = 0.08
+        frames.append(line._bytes(m.DataFloat(info=counter, values=values)))
+    line.say(b"".join(frames))
+    assert radar.frames_waiting() == 6
+    assert radar.statistics.off_lattice_samples == sum(damaged.values())
+
+
 # --- configuring --------------------------------------------------------------------------------
 
 
