@@ -287,8 +287,6 @@ class Turn:
     ``line`` are their gates; that of the first may be None, since it need not wait.
     """
 
-    __slots__ = ("gate", "line")
-
     def __init__(self, line: deque[Gate | None], make_gate: Callable[[], Gate]) -> None:
         self.line = line
         self.gate = make_gate() if line else None
@@ -695,11 +693,11 @@ class Link:
     # --- frames -----------------------------------------------------------------------------------
 
     def next_frame(self, timeout_s: float) -> Steps[Frame]:
-        frames, line = self.frames, self._lines[Frame]
-        if frames and not line:
+        frames = self.frames
+        if frames and not self._lines[Frame]:
             return frames.pop()
         began_ns, discarded = self.clock(), frames.discarded
-        with Turn(line, self._make_gate) as turn:
+        with self.turn(Frame) as turn:
             if turn.gate is None:
                 yield Read(timeout_s)
             if not frames or turn.gate is not None:

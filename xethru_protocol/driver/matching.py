@@ -62,12 +62,8 @@ P = ParamSpec("P")
 class Listeners(Generic[P]):
     """Functions that are called with what comes, in the order in which they were added.
 
-    Each is called although one before it raises; that error is raised behind the last.
-
-    Attributes
-    ----------
-    all
-        The functions.
+    Each is called although one before it raises; that error is raised behind the last. ``all``
+    are the functions.
     """
 
     def __init__(self) -> None:
