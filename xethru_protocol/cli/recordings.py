@@ -169,6 +169,7 @@ def dump(arguments: Namespace) -> int:
     """Print every message of a recording; 1 if a part could not be read."""
     file, radar = arguments.file, arguments.radar
     faults: list[RecordingFault] = []
+    recording_facts(file, faults.append)
     if arguments.json:
         for message, t_ns in read_recording(file, faults.append, radar=radar):
             bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk

@@ -30,7 +30,7 @@ import zlib
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -47,10 +47,14 @@ from numpy.lib.format import (
 
 from xethru_protocol.operating_system import written_whole
 from xethru_protocol.optional_packages import what_is_missing
+from xethru_protocol.recordings.clock import steady_times
 from xethru_protocol.recordings.recorded_messages import (
     NO_TIME_NS,
+    FaultHandler,
     RecordingError,
+    RecordingFault,
     reading,
+    report,
     writing,
 )
 from xethru_protocol.recordings.vendor.layouts import kind_of_file
@@ -117,13 +121,31 @@ def is_array_file(path: Path) -> bool:
     return path.suffix in SUFFIXES and path.is_file() and kind_of_file(path.name) is None
 
 
-def read_array_file(path: Path) -> Frames:
+def read_array_file(path: Path, on_fault: FaultHandler | None = None) -> Frames:
     """Return what a file of arrays holds; its samples are read by ``chunks``, of ``.mat`` at once.
 
-    RecordingError if it cannot be read or lacks ``iq`` and ``rf``.
+    Times do not fall: where the recorder's clock was set back, the counter tells how much later
+    they are. That is reported, and so are lines of ``.csv`` that are damaged and left out.
+    RecordingError if it cannot be read, or lacks ``iq`` and ``rf``.
     """
+
+    def note(reason: str, *, minor: bool = False) -> None:
+        report(RecordingFault(file=path.name, offset=0, reason=reason, minor=minor), on_fault)
+
+    def note_time(number: int, text: str) -> None:
+        note(f"frame {number}: {text}", minor=True)
+
     with _naming(path):
-        return {".csv": _read_csv, ".mat": _read_mat, ".npz": _read_npz}[path.suffix](path)
+        if path.suffix == ".csv":
+            frames = _read_csv(path, note)
+        else:
+            frames = {".mat": _read_mat, ".npz": _read_npz}[path.suffix](path)
+    if frames.t_ns is None:
+        return frames
+    counters: Iterable[tuple[str, int] | None] = itertools.repeat(None)
+    if frames.counter is not None:
+        counters = (("frame", int(count)) for count in frames.counter)
+    return replace(frames, t_ns=steady_times(frames.t_ns, counters, note_time))
 
 
 def write_array_file(path: Path, frames: Frames) -> None:
@@ -476,9 +498,10 @@ def _seconds(t_ns: int) -> str:
     return f"{'-' if t_ns < 0 else ''}{seconds}.{rest:09}"
 
 
-def _read_csv(path: Path) -> Frames:
+def _read_csv(path: Path, note: Callable[[str], None]) -> Frames:
+    damaged: set[int] = set()  # lines
     with _csv_rows(path) as rows:
-        titles = next(rows, [])
+        _, titles = next(rows, (1, []))
         columns: dict[str, list[int]] = {"rf": [], "i": [], "q": []}
         ranges: dict[str, list[str | None]] = {"rf": [], "i": [], "q": []}
         for at, title in enumerate(titles):
@@ -494,23 +517,35 @@ def _read_csv(path: Path) -> Frames:
             )
         places = {name: titles.index(name) for name in ("t_ns", "counter") if name in titles}
         vectors = {name: array("q") for name in places}
+        wanted = columns["rf"] or columns["i"] + columns["q"]
         n_frames = 0
-        for row in rows:
+        for number, row in rows:
+            try:
+                if len(row) != len(titles):
+                    raise ValueError(f"it has {len(row)} cells, the first {len(titles)}")
+                array("f", (float(row[at]) for at in wanted))
+                cells = {name: row[at] for name, at in places.items()}
+                if not cells.get("t_ns", "0"):
+                    cells["t_ns"] = str(NO_TIME_NS)
+                numbers = array("q", map(int, cells.values()))
+            except (ValueError, OverflowError) as error:
+                note(f"line {number} cannot be read: {reason_of(error)}")
+                damaged.add(number)
+                continue
             n_frames += 1
-            for name, at in places.items():
-                is_unknown = name == "t_ns" and not row[at]
-                vectors[name].append(NO_TIME_NS if is_unknown else int(row[at]))
+            for vector, value in zip(vectors.values(), numbers, strict=True):
+                vector.append(value)
     beside: dict[str, Any] = {name: np.array(vectors[name], np.int64) for name in vectors}
     known = [text for text in ranges[part] if text is not None]
     if len(known) == len(columns[part]):
         beside["ranges_m"] = np.array([float(text) for text in known])
-    wanted = columns["rf"] or columns["i"] + columns["q"]
     n_bins = len(columns[part])
 
     def chunks() -> Iterator[Samples]:
         with _csv_rows(path) as rows:
             next(rows)
-            while several := list(itertools.islice(rows, _LINES_AT_ONCE)):
+            whole = (row for number, row in rows if number not in damaged)
+            while several := list(itertools.islice(whole, _LINES_AT_ONCE)):
                 cells = [[row[at] for at in wanted] for row in several]
                 values = np.array(cells, dtype="U").astype(np.float32)
                 if kind == "rf":
@@ -524,20 +559,9 @@ def _read_csv(path: Path) -> Frames:
 
 
 @contextmanager
-def _csv_rows(path: Path) -> Iterator[Iterator[list[str]]]:
-    """Read lines of as many cells as the first has; empty ones are left out."""
-    with path.open(encoding="utf-8-sig", newline="") as stream:
-        reader = csv.reader(stream)
-
-        def rows() -> Iterator[list[str]]:
-            width = None
-            for row in reader:
-                width = len(row) if width is None else width
-                if len(row) == width:
-                    yield row
-                elif row:
-                    raise ValueError(
-                        f"line {reader.line_num} has {len(row)} cells, the first {width}"
-                    )
-
-        yield rows()
+def _csv_rows(path: Path) -> Iterator[Iterator[tuple[int, list[str]]]]:
+    """Read lines, each with its number from 1; empty ones are left out."""
+    with path.open(encoding="utf-8-sig", newline="", errors="replace") as stream:
+        # line by line: a quotation mark that damage made must not take the next ones
+        rows = enumerate((next(csv.reader([line]), []) for line in stream), start=1)
+        yield (numbered for numbered in rows if numbered[1])

@@ -105,7 +105,7 @@ def convert(
         packets = pcap.write_pcap(source, target, faults.append)
         return Conversion(messages=packets, skipped={}, faults=tuple(faults))
     write = _writer(target, suffix)
-    facts = recording_facts(source)
+    facts = recording_facts(source, faults.append)
     n_messages = 0
 
     def counted() -> TimedMessages:

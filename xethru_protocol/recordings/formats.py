@@ -12,6 +12,7 @@ from typing import Any, Literal
 from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.recordings import wire_capture
 from xethru_protocol.recordings.array_files import SUFFIXES
+from xethru_protocol.recordings.clock import steady_messages
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
     FaultHandler,
@@ -21,6 +22,7 @@ from xethru_protocol.recordings.recorded_messages import (
     RecordingFacts,
     RecordingFault,
     TimedMessages,
+    is_like,
     reading,
 )
 from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
@@ -78,7 +80,7 @@ def recording_format(path: Path | str) -> RecordingFormat:
         with path.open("rb") as stream:
             start = stream.read(8)
     for magic, found in _MAGICS.items():
-        if start.startswith(magic):
+        if is_like(start, magic):
             return found
     if path.suffix in SUFFIXES:
         raise RecordingError(
@@ -108,8 +110,9 @@ def read_recording(
 ) -> TimedMessages:
     """Yield the messages of a recording with their times [ns since 1970], None where unknown.
 
-    Times of vendor directories have a resolution of 1 ms. RecordingError if there is nothing to
-    read, or messages are lost and ``on_fault`` is None.
+    Times of vendor directories have a resolution of 1 ms. Times do not fall: where the recorder's
+    clock was set back, the frame counter tells how much later they are. RecordingError if there is
+    nothing to read, or messages are lost and ``on_fault`` is None.
 
     Parameters
     ----------
@@ -128,12 +131,13 @@ def read_recording(
         refuse_name(path, radar)
     match found:
         case "wire":
-            yield from wire_capture.read_wire(path, on_fault)
+            messages = wire_capture.read_wire(path, on_fault)
+            yield from steady_messages(messages, path.name, on_fault)
         case "mcap":
             with optional_packages():
                 from xethru_protocol.recordings.mcap import read_mcap
 
-            yield from read_mcap(path, on_fault, radar)
+            yield from steady_messages(read_mcap(path, on_fault, radar), path.name, on_fault)
         case "vendor":
             yield from read_vendor(path, on_fault)
 
@@ -182,17 +186,20 @@ def recording_content(path: Path | str) -> RecordingContent:
     return mcap_content(path)
 
 
-def recording_facts(path: Path | str) -> RecordingFacts:
-    """Return the facts of a recording; RecordingError if it cannot be read."""
+def recording_facts(path: Path | str, on_fault: FaultHandler | None = None) -> RecordingFacts:
+    """Return the facts of a recording; RecordingError if it cannot be read.
+
+    Those that are damaged are the defaults, which is reported to ``on_fault``.
+    """
     path = Path(path)
     match recording_format(path):
         case "wire":
-            return wire_capture.wire_facts(path)
+            return wire_capture.wire_facts(path, on_fault)
         case "mcap":
             with optional_packages():
                 from xethru_protocol.recordings.mcap import mcap_facts
 
-            return mcap_facts(path)
+            return mcap_facts(path, on_fault)
         case "vendor":
             return vendor_facts(path)
 
@@ -216,7 +223,7 @@ def describe_recording(
         if t_ns is not None:
             first_ns = t_ns if first_ns is None else min(first_ns, t_ns)
             last_ns = t_ns if last_ns is None else max(last_ns, t_ns)
-    facts = recording_facts(path)
+    facts = recording_facts(path, faults.append)
     with reading(path):
         files: Iterable[Path] = [path]
         if path.is_dir() or is_vendor_file(path):

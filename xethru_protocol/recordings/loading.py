@@ -396,7 +396,7 @@ class _FrameColumns:
 class _Messages:
     """Frames among the messages of one radar of a recording.
 
-    ``info`` is what an MCAP file says about the radar: see `mcap.McapContent`.
+    ``info`` is what an MCAP file says about the radar: see `RecordingContent`.
     """
 
     def __init__(
@@ -660,7 +660,8 @@ def load(
         downconversion=downconversion,
     )
     if is_array_file(path):
-        return Recording(path, {"": RadarArrays("", _of_file(path, given), str(path))}, {})
+        find = _of_file(path, given, on_fault)
+        return Recording(path, {"": RadarArrays("", find, str(path))}, {})
     content = recording_content(path)
     reported: set[RecordingFault] = set()
 
@@ -690,9 +691,11 @@ def load(
     return Recording(path, radars, texts)
 
 
-def _of_file(path: Path, given: Given) -> Callable[[], Sequence[Frames]]:
+def _of_file(
+    path: Path, given: Given, on_fault: FaultHandler | None
+) -> Callable[[], Sequence[Frames]]:
     def find() -> Sequence[Frames]:
-        frames = read_array_file(path)
+        frames = read_array_file(path, on_fault)
         ranges_m = given.ranges_m(frames.n_bins, frames.kind)
         return [frames if ranges_m is None else replace(frames, ranges_m=ranges_m)]
 

@@ -25,6 +25,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -481,6 +482,8 @@ class McapMessage:
     t_ns: int
     publish_ns: int
     data: bytes
+    at: int
+    """Where in the file it begins, or the chunk that it is in."""
 
     @property
     def topic(self) -> str:
@@ -496,23 +499,36 @@ def read_entries(
     """Yield what a file holds, to the end of its data, and where it is cut or damaged.
 
     One chunk at a time is in memory. ``stream`` and ``size`` are those of `RecordReader`;
-    ``channels`` by their numbers, if some are known already, get those that are found.
+    ``channels`` by their numbers, if some are known already, get those that are found: behind
+    damage, which may have taken them, also by the file's own index.
     """
     schemas: dict[int, str] = {}
     channels = {} if channels is None else channels
+    damaged_at: int | None = None
     for found in RecordReader(stream, size).read():
-        if not isinstance(found, LocatedRecord):
-            yield found
-            continue
-        if found.code == _DATA_END:
+        if isinstance(found, LocatedRecord) and found.code == _DATA_END:
             return
-        try:
-            entry = _entry(found, schemas, channels)
-        except DAMAGES as error:
-            yield Damage(found.at, found.at, str(error))
-            continue
+        entry = _entry_or_damage(found, schemas, channels)
+        if isinstance(entry, Damage):
+            if damaged_at is None:
+                for record in index_of(stream, size):
+                    _entry_or_damage(record, schemas, channels)
+            if damaged_at == entry.at:
+                continue  # as of many records of one chunk
+            damaged_at = entry.at
         if entry is not None:
             yield entry
+
+
+def _entry_or_damage(
+    found: Found, schemas: dict[int, str], channels: dict[int, Channel]
+) -> Entry | Cut | Damage | None:
+    if not isinstance(found, LocatedRecord):
+        return found
+    try:
+        return _entry(found, schemas, channels)
+    except DAMAGES as error:
+        return Damage(found.at, found.at, str(error))
 
 
 def _entry(
@@ -520,12 +536,15 @@ def _entry(
 ) -> Entry | None:
     if record.code == MESSAGE:
         number, sequence, t_ns, publish_ns = MESSAGE_HEAD.unpack_from(record.body)
+        if number not in channels:
+            raise ValueError(f"the channel of a message, number {number}, is not named before it")
         return McapMessage(
             channel=channels[number],
             sequence=sequence,
             t_ns=t_ns,
             publish_ns=publish_ns,
             data=record.body[MESSAGE_HEAD.size :],
+            at=record.at,
         )
     match record.content():
         case records.Schema(id=number, name=name):
@@ -670,37 +689,38 @@ class _Latched:
     data: bytes
 
 
-def end_time_of(stream: BinaryIO, size: int) -> int | None:
-    """Return the newest time [ns] of a message by the file's own index; None where it has none.
+def index_of(stream: BinaryIO, size: int) -> Iterator[LocatedRecord]:
+    """Yield the records behind a file's data, the footer last; none if their checksum is wrong.
 
-    Only the index is read, and of a wrong one no more than `_MOST_INDEX_BYTES`.
+    Of a wrong index no more than `_MOST_INDEX_BYTES` are read.
     """
     stream.seek(max(size - _TAIL_BYTES, 0))
     tail = stream.read(_TAIL_BYTES)
     code, length = _HEAD.unpack_from(tail.ljust(_HEAD.size, b"\0"))
     if (code, length) != (FOOTER, _FOOTER_BYTES) or tail[-len(MAGIC) :] != MAGIC:
-        return None
-    (at,) = struct.unpack_from("<Q", tail, _HEAD.size)
+        return
+    at, _, checksum = struct.unpack_from("<QQI", tail, _HEAD.size)
     if not max(size - _MOST_INDEX_BYTES, len(MAGIC)) <= at < size:
-        return None
-    while at + _HEAD.size <= size - _TAIL_BYTES:
-        stream.seek(at)
-        code, length = _HEAD.unpack(stream.read(_HEAD.size))
-        if code == _STATISTICS and length <= size - at:
-            with suppress(ValueError):
-                if isinstance(
-                    found := LocatedRecord(at, code, stream.read(length)).content(),
-                    records.Statistics,
-                ):
-                    return found.message_end_time
-            return None
-        at += _HEAD.size + length
+        return
+    stream.seek(at)
+    index = stream.read(size - len(MAGIC) - at)
+    if checksum not in (0, zlib.crc32(index[:-_CHECKSUM_BYTES])):
+        return
+    here = 0
+    while here + _HEAD.size <= len(index):
+        code, length = _HEAD.unpack_from(index, here)
+        begin = here + _HEAD.size
+        yield LocatedRecord(at + here, code, index[begin : begin + length])
+        here = begin + length
+
+
+def end_time_of(stream: BinaryIO, size: int) -> int | None:
+    """Return the newest time [ns] of a message by the file's own index; None where it has none."""
+    for record in index_of(stream, size):
+        with suppress(ValueError):
+            if isinstance(found := record.content(), records.Statistics):
+                return found.message_end_time
     return None
-
-
-def is_magic(head: bytes) -> bool:
-    """Whether a file begins as MCAP does, one damaged byte allowed."""
-    return len(head) == len(MAGIC) and sum(a != b for a, b in zip(head, MAGIC, strict=True)) <= 1
 
 
 def statistics_of(path: Path) -> records.Statistics:
@@ -847,13 +867,13 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
         name, part = _radar_topic(entry.topic)
         if part not in _CONTENT or radar not in {None, name}:
             continue
+        radars.add(name)
+        if len(radars) > 1:
+            raise RecordingError(
+                f"{path} holds several radars ({_names(path)}), not one; "
+                "choose one: --radar NAME, in Python radar="
+            )
         if isinstance(entry, Channel):
-            radars.add(name)
-            if len(radars) > 1:
-                raise RecordingError(
-                    f"{path} holds several radars ({_names(path)}), not one; "
-                    "choose one: --radar NAME, in Python radar="
-                )
             continue
         try:
             if part == "frame":
@@ -862,7 +882,8 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
             else:
                 message = decode_response(unpack_array(BYTE_ARRAY, entry.data).tobytes())
         except (ValueError, struct.error) as error:
-            raise RecordingError(f"{path}: a message is damaged: {reason_of(error)}") from None
+            note(_fault(path, entry.at, f"a message is damaged: {reason_of(error)}"))
+            continue
         yield message, None if "xethru-hil" in entry.channel.metadata else entry.t_ns
     if not radars and radar is not None and (names := _names(path)):
         raise RecordingError(f"{path} holds no radar {shown(radar)}; it holds {names}")
@@ -884,7 +905,7 @@ def mcap_content(path: Path) -> RecordingContent:
             if isinstance(entry, McapMessage):
                 with suppress(ValueError, struct.error):
                     lines.append((entry.t_ns, unpack_string(entry.data)))
-        elif isinstance(entry, Channel) and part in _CONTENT:
+        elif part in _CONTENT:
             radars.setdefault(name, {})
         elif isinstance(entry, McapMessage) and part == "info":
             with suppress(ValueError, RecursionError, struct.error):
@@ -898,16 +919,12 @@ def _names(path: Path) -> str:
     return ", ".join(sorted(mcap_content(path).radars))
 
 
-def mcap_facts(path: Path) -> RecordingFacts:
-    """Return what a file holds about itself, or defaults."""
+def mcap_facts(path: Path, on_fault: FaultHandler | None) -> RecordingFacts:
+    """Return what a file holds about itself, or defaults, also for what is damaged."""
     for entry in _entries_of(path, lambda fault: None):
         if isinstance(entry, Metadata) and entry.name == _FACTS:
-            try:
-                return RecordingFacts.from_json(json.loads(entry.values["facts"]))
-            except (KeyError, ValueError, TypeError, RecursionError) as error:
-                raise RecordingError(
-                    f"{path}: what it says about itself: {reason_of(error)}"
-                ) from None
+            read = partial(json.loads, entry.values.get("facts", ""))
+            return RecordingFacts.read(path, read, on_fault)
         if isinstance(entry, McapMessage):
             break
     return RecordingFacts()
@@ -919,23 +936,22 @@ def _radar_topic(topic: str) -> tuple[str, str]:
 
 
 def _entries_of(path: Path, on_fault: FaultHandler | None) -> Iterator[Entry]:
-    """Yield what a file holds before it is cut or damaged, which is reported."""
-    fault: Cut | Damage | None = None
+    """Yield what is whole in a file; what is cut or damaged is reported."""
+    is_whole = True
     with reading(path), path.open("rb") as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
-            fault = Damage(0, 0, "it does not begin as an MCAP file")
-        else:
-            size = os.fstat(stream.fileno()).st_size
-            for found in read_entries(stream, size):
-                if isinstance(found, Cut | Damage):
-                    fault = found
-                    break
-                yield found
+        size = os.fstat(stream.fileno()).st_size
+        for found in read_entries(stream, size):
+            if isinstance(found, Cut | Damage):
+                is_whole = False
+                reason = "it ends too early" if isinstance(found, Cut) else found.reason
+                report(_fault(path, found.at, f"it is cut or damaged: {reason}"), on_fault)
             else:
-                stream.seek(-len(MAGIC), os.SEEK_END)
-                if stream.read() != MAGIC:
-                    fault = Damage(size, size, "all messages are there, its index is cut off")
-    if fault is not None:
-        reason = "it ends too early" if isinstance(fault, Cut) else fault.reason
-        reason = f"it is cut or damaged: {reason}"
-        report(RecordingFault(file=path.name, offset=fault.at, reason=reason), on_fault)
+                yield found
+        stream.seek(-len(MAGIC), os.SEEK_END)
+        if is_whole and stream.read() != MAGIC:
+            reason = "it is cut or damaged: all messages are there, its index is cut off"
+            report(_fault(path, size, reason), on_fault)
+
+
+def _fault(path: Path, at: int, reason: str) -> RecordingFault:
+    return RecordingFault(file=path.name, offset=at, reason=reason)

@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from io import FileIO
+from operator import ne
 from pathlib import Path
 from typing import Any, Self, get_type_hints
 
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.table import Response
 
@@ -57,6 +58,11 @@ def writing(path: object) -> Iterator[None]:
         yield
     except OSError as error:
         raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def is_like(head: bytes, magic: bytes) -> bool:
+    """Whether a file begins with a magic number, one damaged byte allowed."""
+    return len(head) == len(magic) and sum(map(ne, head, magic)) <= 1
 
 
 class GrowingFile:
@@ -170,6 +176,18 @@ class RecordingFacts:
             "parameter_file": None if self.parameter_file is None else self.parameter_file.hex(),
             "user_header": self.user_header.hex(),
         }
+
+    @classmethod
+    def read(
+        cls, path: Path, values: Callable[[], Mapping[str, Any]], on_fault: FaultHandler | None
+    ) -> Self:
+        """Return what a file says about itself; damage is reported and gives the defaults."""
+        try:
+            return cls.from_json(values())
+        except (AttributeError, KeyError, ValueError, TypeError, RecursionError) as error:
+            reason = f"what it says about itself is damaged: {reason_of(error)}"
+            report(RecordingFault(file=path.name, offset=0, reason=reason, minor=True), on_fault)
+            return cls()
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:

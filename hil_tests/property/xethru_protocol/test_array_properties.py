@@ -33,7 +33,7 @@ def known_frames(draw: st.DrawFn) -> tuple[Frames, npt.NDArray[np.generic]]:
     values = draw(arrays.arrays(np.float32, (n_frames, width), elements=FLOATS))
     samples = values.view(np.complex64) if kind == "iq" else values
     counter = draw(st.none() | arrays.arrays(np.uint32, n_frames))
-    t_ns = draw(st.none() | arrays.arrays(np.int64, n_frames))
+    t_ns = draw(st.none() | arrays.arrays(np.int64, n_frames).map(np.sort))
     ranges_m = draw(
         st.none()
         | arrays.arrays(np.float64, n_bins, elements=st.floats(-100, 100, allow_subnormal=False))

@@ -131,13 +131,17 @@ def test_every_stored_kind_is_a_response_of_the_table() -> None:
     assert len({kind.data_type for kind in KINDS}) == len(KINDS)
 
 
+@st.composite
+def timed_messages(draw: st.DrawFn) -> list[tuple[m.Response, int | None]]:
+    """Messages of any kind with times that never decrease; some have none."""
+    drawn = draw(st.lists(messages(m.Response), max_size=6))
+    times = draw(st.lists(st.integers(0, 2**62), min_size=len(drawn), max_size=len(drawn)))
+    stamps = [t_ns if draw(st.booleans()) else None for t_ns in sorted(times)]
+    return list(zip(drawn, stamps, strict=True))
+
+
 @settings(deadline=None, max_examples=60)
-@given(
-    st.lists(
-        st.tuples(messages(m.Response), st.none() | st.integers(0, 2**62)),
-        max_size=6,
-    )
-)
+@given(timed_messages())
 def test_mcap_and_captures_give_back_what_was_written(
     timed: list[tuple[m.Response, int | None]],
 ) -> None:

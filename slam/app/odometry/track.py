@@ -142,7 +142,11 @@ def read_tum(path: Path) -> Trajectory:
         except TumError as error:
             raise TumError(f"{path}, line {number}: {error}") from None
         if len(samples) > 1 and samples[-1].t_ns <= samples[-2].t_ns:
-            raise TumError(f"{path}, line {number}: its time is not after the line before")
+            back_s = (samples[-2].t_ns - samples[-1].t_ns) / NS_PER_S
+            raise TumError(
+                f"{path}, line {number}: its time is not after the line before, but {back_s:.3f} s "
+                "earlier; sort the lines, or, where a clock was set back, cut the file there"
+            )
     if not samples:
         raise TumError(f"{path}: holds no pose")
     rows = [(sample.x_m, sample.y_m, sample.heading_rad) for sample in samples]

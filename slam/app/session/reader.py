@@ -52,11 +52,11 @@ from xethru_protocol.recordings.mcap import (
     McapMessage,
     Metadata,
     end_time_of,
-    is_magic,
     unpack_array,
     unpack_string,
 )
 from xethru_protocol.recordings.mcap import read_entries as entries_of
+from xethru_protocol.recordings.recorded_messages import is_like
 from xethru_protocol.validation import reason_of
 
 _KINDS = {
@@ -113,7 +113,7 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
             if stat.S_ISFIFO(path.stat().st_mode):  # opening one waits for who writes into it
                 raise AppError(f"{path}: is a pipe; give a file, the session.mcap of a run")
             stream = stack.enter_context(path.open("rb"))
-            if not is_magic(stream.read(len(MAGIC))):
+            if not is_like(stream.read(len(MAGIC)), MAGIC):
                 raise AppError(f"{path}: is no MCAP file{describe_kind(path)}")
             whole = os.fstat(stream.fileno()).st_size
         except IsADirectoryError:

@@ -535,11 +535,11 @@ def parse_meta(data: bytes) -> Meta:
     begin = _HEAD.size + length
     stop = min(index_end, len(data)) if index_end else len(data)
     count = max(stop - begin, 0) // _ENTRY.size
-    # The list of files of a recording whose head was never completed is not an entry.
-    kinds = data[begin + 4 : begin + count * _ENTRY.size : _ENTRY.size]
-    count = next((at for at, kind in enumerate(kinds) if kind not in (RECORD, CLOSED)), count)
-    end = begin + count * _ENTRY.size
     files = _parse_files(data, index_end) if 0 < index_end <= len(data) else None
+    if files is None:  # the list of files of a recording that was never completed is not an entry
+        kinds = data[begin + 4 : begin + count * _ENTRY.size : _ENTRY.size]
+        count = next((at for at, kind in enumerate(kinds) if kind not in (RECORD, CLOSED)), count)
+    end = begin + count * _ENTRY.size
     return Meta(
         start_ms=start_ms,
         duration_ms=duration_ms,

@@ -23,6 +23,7 @@ from typing import BinaryIO, Self
 import numpy as np
 import numpy.typing as npt
 
+from xethru_protocol.recordings.clock import counter_of, steady_messages, steady_times
 from xethru_protocol.recordings.recorded_messages import (
     MS_NS,
     FaultHandler,
@@ -31,6 +32,7 @@ from xethru_protocol.recordings.recorded_messages import (
     RecordingFault,
     Timed,
     TimedMessages,
+    is_like,
     reading,
     report,
 )
@@ -42,7 +44,6 @@ from xethru_protocol.recordings.vendor.layouts import (
     KIND_OF_TYPE,
     META_NAME,
     PARAMETER_FILE_NAME,
-    RECORD,
     VERSION,
     BinaryKind,
     DataFileKind,
@@ -225,11 +226,12 @@ class _DataFileReader:
         self.position = 0  # bytes read so far
         self.faulty = False  # its end could not be read
         self.ended = False  # nothing more can be read
-        self.times_hold = True  # the index has agreed with the file so far
+        self._agrees = True  # with the index so far
+        self._before = 0  # where the last record began
         self._on_fault = on_fault
         with reading(path):
             self._stream: BinaryIO = path.open("rb")
-            self._size = os.fstat(self._stream.fileno()).st_size
+            self.size = os.fstat(self._stream.fileno()).st_size
 
     def close(self) -> None:
         self._stream.close()
@@ -238,16 +240,17 @@ class _DataFileReader:
         """Skip a user header whose length no index gives."""
         with reading(self.path):
             start = self._stream.read(_LONGEST_USER_HEADER + 2 * _LARGEST_PLAUSIBLE_RECORD)
-        self.skip(_user_header_bytes(start, self._size, self.kind))
+        self.skip(_user_header_bytes(start, self.size, self.kind))
 
     def skip(self, size: int) -> None:
-        self.position = min(self.position + size, self._size)
+        self.position = min(self.position + size, self.size)
         self._stream.seek(self.position)
 
     def take(self, listed: int | None = None) -> tuple[Response | None, int | None] | None:
-        """Read the next record, of ``listed`` bytes by the index; None if that lists no more.
+        """Read the next record, of ``listed`` bytes by the index; None if that does not tell.
 
-        A binary record that claims more than the file holds is given up and ``listed`` skipped.
+        A binary record that claims another size than it has is given up: the next one begins
+        behind ``listed`` bytes, or where records follow each other again.
 
         Returns
         -------
@@ -267,23 +270,52 @@ class _DataFileReader:
     def _record(
         self, kind: BinaryKind, listed: int | None
     ) -> tuple[Response | None, int | None] | None:
-        left = self._size - self.position
+        begin, left = self.position, self.size - self.position
         smallest = kind.header.itemsize
         header = self._stream.read(smallest)
         size = kind.record_size(header) if len(header) == smallest else smallest
-        if size <= left:
-            self.position += size
+        following: int | None = None
+        if listed not in (None, size) and not self._is_record_at(begin + size, kind):
+            following = begin + listed if self._is_record_at(begin + listed, kind) else None
+        if size > left and following is None:
+            if listed is None or begin + listed <= self.size:
+                following = self._next_records(begin, kind)
+            if following is None:
+                self._cut(left)
+                return None
+        if following is None:
+            self._stream.seek(begin + smallest)
+            self._before, self.position = begin, begin + size
             record = header + self._stream.read(size - len(header))
             return decode_response(kind.prefix + record), None
-        if listed is None or not smallest <= listed <= left:
-            self._cut(left)
-            return None
-        self.report(f"a record is damaged: it claims {size} bytes, the index {listed}")
-        self.skip(listed)
+        self.report(f"a record is damaged: it claims {size} bytes", min(begin, following - 1))
+        self.skip(following - begin)
         return None, None
 
+    def _is_record_at(self, at: int, kind: BinaryKind) -> bool:
+        """Whether a plausible record stands at a place, or the file ends there."""
+        self._stream.seek(at)
+        header = self._stream.read(kind.header.itemsize)
+        return at == self.size or _record_end(header, 0, self.size - at, kind) is not None
+
+    def _next_records(self, damaged: int, kind: BinaryKind) -> int | None:
+        """Return where plausible records go on: behind a damaged one, or already in the one before.
+
+        For it may be the size of that one that is damaged.
+        """
+        first = self._before + 1
+        self._stream.seek(first)
+        start = self._stream.read(2 * _LARGEST_PLAUSIBLE_RECORD)
+        size = self.size - first
+        for place in range(len(start)):
+            # one record before the end is found by chance too easily among values
+            end = size if first + place > damaged else size + 1
+            if _records_follow(start, place, end, kind):
+                return first + place
+        return None
+
     def _line(self, kind: TextKind) -> tuple[Response | None, int | None] | None:
-        left = self._size - self.position
+        left = self.size - self.position
         line = self._stream.readline(left)
         if kind.is_free_text:
             line += self._continued()
@@ -292,9 +324,15 @@ class _DataFileReader:
             return None
         found: tuple[Response | None, int | None] = None, None
         if line.startswith(b"TimeStamp;"):
-            if line.rstrip() != kind.titles.rstrip():
-                columns = line.rstrip().decode("latin-1")
-                self.report(f"its columns are not the known ones: {shown(columns)}")
+            columns, known = line.rstrip(), kind.titles.rstrip()
+            if columns != known:
+                reason = f"its columns are not the known ones: {shown(columns.decode('latin-1'))}"
+                behind = columns[len(known) : len(known) + 1]  # the first line, if not its end
+                is_damaged = is_like(columns[: len(known)], known) and behind != b";"
+                self.report(reason, minor=is_damaged)
+                if is_damaged:
+                    self.position += len(line)
+                    return found
                 self.ended = self.faulty = True
                 return None
         else:
@@ -320,9 +358,10 @@ class _DataFileReader:
             self.report(f"the last record is cut: {left} bytes of it are there")
 
     def disagree(self, offset: int, reason: str) -> None:
-        """Report that the index and the file differ; the file's times are unknown from here on."""
-        self.times_hold = False
-        self.report(reason, offset, minor=True)
+        """Report the first place where the index and the file differ, which costs times."""
+        if self._agrees:
+            self._agrees = False
+            self.report(reason, offset, minor=True)
 
     def report(self, reason: str, offset: int | None = None, *, minor: bool = False) -> None:
         at = self.position if offset is None else offset
@@ -345,18 +384,23 @@ def _user_header_bytes(start: bytes, size: int, kind: DataFileKind) -> int:
 def _records_follow(start: bytes, position: int, size: int, kind: BinaryKind) -> bool:
     """Whether plausible records stand from ``position`` on: two of them, or one and the end."""
     for _ in range(2):
-        header = start[position : position + kind.header.itemsize]
-        if len(header) < kind.header.itemsize:
-            return False
-        record = kind.record_size(header)
-        if record == kind.header.itemsize or record > _LARGEST_PLAUSIBLE_RECORD:
-            return False
-        if kind.count == "length" and int.from_bytes(header[:4], "little") > _LAST_CONTENT_ID:
-            return False
-        position += record
-        if position == size:
-            return True
+        end = _record_end(start[position : position + kind.header.itemsize], position, size, kind)
+        if end is None or end == size:
+            return end is not None
+        position = end
     return True
+
+
+def _record_end(header: bytes, position: int, size: int, kind: BinaryKind) -> int | None:
+    """Return where a record ends; None if its header is cut or implausible."""
+    if len(header) < kind.header.itemsize:
+        return None
+    record = kind.record_size(header)
+    if not kind.header.itemsize < record <= min(_LARGEST_PLAUSIBLE_RECORD, size - position):
+        return None
+    if kind.count == "length" and int.from_bytes(header[:4], "little") > _LAST_CONTENT_ID:
+        return None
+    return position + record
 
 
 def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
@@ -366,9 +410,19 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     that holds only directories of one session (a recording split by directory) is read as one; a
     meta file is read with those that follow it.
     """
+    parts = _parts_of(path)
+    if all(part.meta for part in parts):
+        yield from steady_messages(_messages(path, parts, on_fault), path.name, on_fault)
+    else:  # file by file, so that times of the next begin before those of the last end
+        yield from _messages(path, parts, on_fault)
+
+
+def _messages(
+    path: Path, parts: list[_RecordingDirectory], on_fault: FaultHandler | None
+) -> TimedMessages:
     whole = path.is_dir() or path.name == META_NAME  # else one of several files is read
     meta: Meta | None = None
-    for part in _parts_of(path):
+    for part in parts:
         meta = part.meta
         if meta is None and (whole or (part.directory / META_NAME).is_file()):
             _report_meta(f"{part.problem}; no message has a time", on_fault)
@@ -381,7 +435,10 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
                 file_of = _files_by_entry(part, files, on_fault, whole=whole)
                 yield from _along_index(meta, file_of)
             for file in files:
-                yield from _rest(file)
+                rest: TimedMessages = _rest(file)
+                if meta is None:
+                    rest = steady_messages(rest, file.path.name, on_fault)
+                yield from rest
         finally:
             for file in files:
                 file.close()
@@ -397,33 +454,38 @@ def _report_meta(reason: str, on_fault: FaultHandler | None) -> None:
 def _along_index(meta: Meta, file_of: Callable[[Entry], _DataFileReader | None]) -> Iterator[Timed]:
     for entry in meta.entries():
         file = file_of(entry)
-        if file is None or entry.kind == CLOSED:
+        if file is None or entry.kind == CLOSED or not entry.size:
             continue
         if entry.data_type == file.kind.data_type ^ ALL_BITS:
             file.skip(entry.size)
             continue
+        if entry.begin <= file.size:
+            yield from _rest(file, entry.begin)
         if file.ended:
             continue
         begin = file.position
-        found = file.take(entry.size if file.times_hold else None)
+        if entry.begin != begin:
+            file.disagree(begin, f"the index has a record at byte {entry.begin}, none begins there")
+            continue
+        found = file.take(entry.size)
         if found is None:
-            if not file.faulty and file.times_hold:
+            if not file.faulty:
                 file.disagree(begin, "the index lists more records than it holds")
             continue
         size = file.position - begin
-        if size != entry.size and file.times_hold:
+        if size != entry.size:
             reason = f"the index gives this record {entry.size} bytes, it has {size}"
             file.disagree(begin, reason)
-        message, stamp_ns = found
+        message, _ = found
         if message is not None:
-            yield message, _time_ns(meta, entry.since_start_ms) if file.times_hold else stamp_ns
+            yield message, _time_ns(meta, entry.since_start_ms)
 
 
-def _rest(file: _DataFileReader) -> Iterator[Timed]:
-    """Read what the index does not list: recorded last, or all of it where there is no index."""
-    if file.position == 0:
+def _rest(file: _DataFileReader, end: int | None = None) -> Iterator[Timed]:
+    """Read what the index does not list, before a place: lost entries, those behind the last."""
+    if file.position == 0 != end:
         file.skip_user_header()
-    while (found := file.take()) is not None:
+    while (end is None or file.position < end) and (found := file.take()) is not None:
         message, stamp_ns = found
         if message is not None:
             yield message, stamp_ns
@@ -519,7 +581,8 @@ class RecordingReader:
     """Reads a recording of the vendor's format record by record; a context manager.
 
     As long as the files are there, records may be read in any order; iterating goes on where
-    `read` or a seek left off. User headers and lines of titles are skipped.
+    `read` or a seek left off. User headers and lines of titles are skipped. Times do not fall:
+    where the recorder's clock was set back, the frame counter tells how much later they are.
 
     Parameters
     ----------
@@ -567,15 +630,17 @@ class RecordingReader:
         self.session_id = first.session_id.decode("utf-8", "replace")
         self.profile_id = first.profile_id
         self._build_index([part.directory for part in parts], metas)
-        end_ms = last.start_ms + last.duration_ms
-        if not last.complete and len(self._t_ms):  # its recorder was killed
-            end_ms = int(self._t_ms[-1])
-        self.duration_ns = end_ms * MS_NS - self.start_ns
+        self.duration_ns = (last.start_ms + last.duration_ms) * MS_NS - self.start_ns
         self._wanted: npt.NDArray[np.bool_] | None = None  # by record; None for all
         self._filter: frozenset[type[Response]] = frozenset()
         self._next = 0
         self._streams: dict[Path, BinaryIO] = {}
         self._exits = ExitStack()
+        self._t_ns = steady_times(self._t_ms * MS_NS, self._counters())
+        if not last.complete and len(self):  # its recorder was killed
+            self.duration_ns = 0
+        if len(self):
+            self.duration_ns = max(self.duration_ns, int(self._t_ns[-1]) - self.start_ns)
 
     def __enter__(self) -> Self:
         return self
@@ -643,8 +708,7 @@ class RecordingReader:
                 f"{position_ms:g} ms lies outside the recording, 0 ... "
                 f"{self.duration_ns // MS_NS} ms"
             )
-        start_ms = self.start_ns // MS_NS
-        self._next = int(np.searchsorted(self._latest_ms, start_ms + position_ms))
+        self._next = int(np.searchsorted(self._t_ns, self.start_ns + round(position_ms * MS_NS)))
 
     def seek_byte(self, position: int) -> None:
         """Go to the record that holds a byte, or behind the header that does.
@@ -671,7 +735,7 @@ class RecordingReader:
         self.largest_record_bytes = 0
         for part, meta in enumerate(metas):
             all_of = np.frombuffer(meta.index, ENTRY)
-            records = all_of[all_of["kind"] == RECORD]
+            records = all_of[(all_of["kind"] != CLOSED) & (all_of["size"] > 0)]
             if (np.maximum(records["begin"], records["end"]) > _FURTHEST).any():
                 raise RecordingError(
                     f"the index of {directories[part]} is damaged: it has a record beyond "
@@ -700,11 +764,28 @@ class RecordingReader:
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
         (self._t_ms, self._data_type, self._file, self._begin, self._size, self._end,
          self._in_part) = joined  # fmt: skip
-        self._latest_ms = np.maximum.accumulate(self._t_ms)
+
+    def _counters(self) -> Iterator[tuple[str, int] | None]:
+        for at in range(len(self)):
+            try:
+                message, _ = self._read(at)
+            except RecordingError:  # which reading it will report
+                yield None
+            else:
+                yield counter_of(message)
 
     def _record(self, at: int) -> Record:
         if at >= len(self):
             raise RecordingError("the recording is at its end; look at at_end before you read")
+        message, data = self._read(at)
+        return Record(
+            message=message,
+            t_ns=int(self._t_ns[at]),
+            data=data,
+            position=int(self._end[at]) - len(data),
+        )
+
+    def _read(self, at: int) -> tuple[Response, bytes]:
         data_type, size = int(self._data_type[at]), int(self._size[at])
         path, kind = self._files[int(self._in_part[at])][data_type, int(self._file[at])]
         with reading(path):
@@ -713,12 +794,7 @@ class RecordingReader:
                 stream = self._streams[path] = self._exits.enter_context(path.open("rb"))
             stream.seek(int(self._begin[at]))
             data = stream.read(size)
-        return Record(
-            message=_message(path, kind, data, size),
-            t_ns=int(self._t_ms[at]) * MS_NS,
-            data=data,
-            position=int(self._end[at]) - size,
-        )
+        return _message(path, kind, data, size), data
 
 
 def _message(path: Path, kind: DataFileKind, data: bytes, size: int) -> Response:
