@@ -76,15 +76,16 @@ def info(arguments: Namespace) -> int:
     for name, value in about.items():
         print_line(f"{name.replace('_', ' '):<20} {'-' if value is None else value}")
     for setting, number in chip.items():
-        print_line(f"X4 {setting:<17} {_number(number)}")
+        print_line(f"X4 {setting:<17} {setting_text(number)}")
     return 0
 
 
-def _number(value: X4Value | None) -> str:
+def setting_text(value: X4Value | None) -> str:
+    """Write a setting for people; its lengths [m] and rates [Hz] to four decimals."""
     if isinstance(value, tuple):
-        return " ... ".join(map(_number, value))
+        return " ... ".join(map(setting_text, value))
     if isinstance(value, float):
-        return f"{value:.7g}"  # as far as float32 is exact
+        return np.format_float_positional(round(value, 4) + 0.0, trim="-")
     return "-" if value is None else str(value)
 
 

@@ -235,6 +235,8 @@ def _head(summary: RecordingSummary) -> Iterator[str]:
     for name, count in sorted(summary.messages.items()):
         yield f"  {count} {name}"
     told = [layout for layout in summary.frames.values() if layout.downconversion is not None]
+    if summary.frames and not told:
+        yield f"  frames of {next(iter(summary.frames.values()))}; --frames rf or baseband says it"
     for layout in told[:_FEW]:
         yield f"  frames of {layout}{_HINT if layout.inferred else ''}"
     if len(told) > _FEW:
@@ -332,6 +334,8 @@ def convert(arguments: Namespace) -> int:
         print_line(f"{target}: {counted(done.messages, noun)}")
     for name, number in sorted(done.skipped.items()):
         warn(f"xethru convert: {number} {name} left out: the format has no place for them")
+    if done.inferred is not None:
+        warn(f"xethru convert: frames are probably {done.inferred}{_HINT}")
     warn_of("convert", done.faults)
     return 1 if done.faults else 0
 

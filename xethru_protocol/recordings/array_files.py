@@ -13,7 +13,7 @@ A ``.csv`` file has a line of titles and a line for each frame: ``t_ns``, ``coun
 (since the first frame, for reading; not read back), then ``rf_<range>``, or all ``i_<range>`` and
 then all ``q_<range>``. The range is in module metres with its unit, ``i_0.4m``, or the number of
 the bin, ``i_0``, where ranges are unknown. Numbers have as many digits as it takes to read the same
-float32 back. The settings are left out.
+float32 back, those of ranges end at a micrometre. The settings are left out.
 
 Other files with these variables or columns are read, too. Only this file loads scipy, for
 ``.mat``.
@@ -95,6 +95,8 @@ class Frames:
         Shape (n_bins,) [module metres]; None if unknown.
     frame_rate_hz
         Of the settings; None if unknown.
+    inferred
+        Whether ``kind`` is a conclusion from the samples.
     """
 
     about: str
@@ -107,6 +109,7 @@ class Frames:
     ranges_m: npt.NDArray[np.float64] | None
     frame_rate_hz: float | None
     settings: Settings
+    inferred: bool = False
 
 
 _NUMBERS: Mapping[FrameKind, str] = {"rf": "real numbers", "iq": "numbers"}
@@ -460,7 +463,9 @@ _TITLE = re.compile(r"(rf|i|q)_(?:([-+.\deE]+)m|(\d+))")
 def _write_csv(fresh: Path, frames: Frames, kind: FrameKind) -> None:
     titles = [str(at) for at in range(frames.n_bins)]
     if frames.ranges_m is not None:
-        titles = [f"{range_m!r}m" for range_m in frames.ranges_m.tolist()]
+        titles = [
+            f"{np.format_float_positional(range_m, 6, trim='-')}m" for range_m in frames.ranges_m
+        ]
     parts = ("i", "q") if kind == "iq" else ("rf",)
     front = [name for name in ("t_ns", "counter") if getattr(frames, name) is not None]
     stamps = itertools.repeat(None) if frames.t_ns is None else frames.t_ns.tolist()

@@ -41,12 +41,14 @@ from xethru_protocol.wire.connection import Connection, Role
 class Conversion:
     """What a conversion did: messages written, and by name those the format has no place for.
 
-    A file of arrays has frames in place of messages.
+    A file of arrays has frames in place of messages; ``inferred`` says what they are, if that is a
+    conclusion from their samples.
     """
 
     messages: int
     skipped: dict[str, int]
     faults: tuple[RecordingFault, ...]
+    inferred: str | None = None
 
 
 def convert(
@@ -89,7 +91,12 @@ def convert(
         if on_progress is not None:
             on_progress(frames.n_frames)
         skipped = {f"lines of {name}": len(text.lines) for name, text in loaded.texts.items()}
-        return Conversion(messages=frames.n_frames, skipped=skipped, faults=tuple(faults))
+        return Conversion(
+            messages=frames.n_frames,
+            skipped=skipped,
+            faults=tuple(faults),
+            inferred=frames.about if frames.inferred else None,
+        )
     if is_array_file(source):
         raise RecordingError(
             f"{source} holds arrays; it converts to {', '.join(SUFFIXES)}. Messages of an older"

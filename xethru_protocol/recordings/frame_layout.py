@@ -6,7 +6,8 @@ for each of 188 baseband bins, or an odd number of them, are RF (9.4). Else it i
 frames themselves. The chip samples RF at 3.2 values per period of its carrier, so that neighbours
 differ about as much as they are large; white noise does so, too. Baseband bins are filtered to the
 pulse's bandwidth and neighbours are alike, in the first half of the values (I) and in the second
-(Q).
+(Q). Each pair of neighbours counts the same, so that one near bin that outshines all others does
+not decide.
 """
 
 from collections import Counter
@@ -23,9 +24,9 @@ from xethru_protocol.wire.table import Response
 _MOST_BASEBAND_BINS = 188  # Protocol reference 9.4
 _ENOUGH_FRAMES = 64
 _FEWEST_BINS = 8  # fewer do not show whether a frame is smooth
-# 0 for equal neighbours, 1 for independent ones. Emulated RF frames have 0.95 to 1.4, emulated and
-# real baseband 0.09 to 0.45.
-_SMOOTH, _ROUGH = 0.55, 0.85
+# 0 for equal neighbours, 1 for independent ones. Emulated RF frames have 0.99 to 1.2, emulated and
+# real baseband 0.2 to 0.6.
+_SMOOTH, _ROUGH = 0.72, 0.85
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,13 +143,16 @@ def _is_rf(length: int) -> bool:
 
 
 def _roughness(halves: npt.NDArray[np.float64]) -> float | None:
-    """Mean square step between neighbours in range, per twice the variance over range.
+    """Mean over neighbours in range of their squared distance, per the sum of their powers.
 
-    ``halves`` has shape (n, 2, bins). None for frames that are too short, constant or not finite.
+    ``halves`` has shape (n, 2, bins), I and Q of each frame. None for frames that are too short,
+    constant or not finite.
     """
     halves = halves[np.isfinite(halves).all(axis=(1, 2))]
     if halves.shape[2] < _FEWEST_BINS or not len(halves):
         return None
-    halves = halves - halves.mean(axis=2, keepdims=True)
-    power = 2 * float(np.square(halves[..., 1:]).sum())
-    return float(np.square(np.diff(halves, axis=2)).sum()) / power if power > 0 else None
+    halves = halves - np.median(halves, axis=2, keepdims=True)
+    power = np.square(halves).sum(axis=1)
+    power = power[:, 1:] + power[:, :-1]
+    step = np.square(np.diff(halves, axis=2)).sum(axis=1)
+    return float(np.mean(step[power > 0] / power[power > 0])) if power.any() else None

@@ -427,8 +427,10 @@ class _Messages:
     ) -> Frames:
         kind: FrameKind | None = "rf" if layout.message.startswith("RADAR_RF") else "iq"
         n_bins = layout.n_values
+        inferred = False
         if layout.message == _RAW:
             downconversion = found[n_bins].downconversion
+            inferred = found[n_bins].inferred and layout.downconversion is None
             if self._given.downconversion is None and layout.downconversion is not None:
                 downconversion = layout.downconversion
             kind = None if downconversion is None else "iq" if downconversion else "rf"
@@ -456,6 +458,7 @@ class _Messages:
             ranges_m=ranges_m,
             frame_rate_hz=rate_hz,
             settings=settings,
+            inferred=inferred,
         )
 
     def _chunks(self, layout: _ArrayLayout, kind: FrameKind | None) -> Iterator[Samples]:

@@ -31,8 +31,6 @@ KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""
 
 _PIECE_BYTES = 1 << 20
-_FOOTER_BYTES = 29  # with code and length
-_FOOTER_CHECKSUM_BYTES = 4
 
 
 @dataclass(slots=True, kw_only=True)
@@ -64,8 +62,10 @@ class Repair:
         Of a session, what is lost, by the byte at which the damage begins.
     n_elsewhere
         Of a session, messages that are missing where nothing is damaged, as of a chunk cut out.
-    n_messages, first_ns, last_ns
-        Messages in the new file, and the session time they span [ns].
+    n_messages
+        In the new file.
+    spans
+        Session time of the first and the last message by channel [ns].
     kept
         Where the old file is now; None where it was not moved.
     """
@@ -87,8 +87,7 @@ class Repair:
     data_end: int = 0
     checksum: int = 0
     n_messages: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
+    spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     kept: Path | None = None
 
     def lose(self, record: mcap.LocatedRecord, error: Exception) -> None:
@@ -109,6 +108,24 @@ class Repair:
         topics = {channel.topic for channel in self.channels.values()}
         return "/scan" in topics or SESSION_TOPIC in topics or self.metadata is not None
 
+    def duration_s(self) -> float:
+        """Return how long what was recorded lasts.
+
+        What describes a session is stamped 0, and so may be its log; a drive begins later where
+        odometry or the emulator was on before.
+        """
+        spans = self.spans
+        if self.is_session:
+            spans = {
+                number: spans[number]
+                for number, channel in self.channels.items()
+                if number in spans
+                and not mcap.is_latched(channel.metadata)
+                and channel.topic != "/log"
+            }
+        times_ns = [t_ns for span in spans.values() for t_ns in span] or [0]
+        return (max(times_ns) - min(times_ns)) / 1e9
+
     def table(self) -> dict[str, str] | None:
         """Return the table of the run: of a message, which has a checksum, or the metadata."""
         if SESSION_TOPIC in self.head:
@@ -118,7 +135,7 @@ class Repair:
         return self.metadata
 
     def __str__(self) -> str:
-        span = f"{self.n_messages} messages, {(self.last_ns - self.first_ns) / 1e9:.1f} s"
+        span = f"{self.n_messages} messages, {self.duration_s():.1f} s"
         if self.was_whole:
             return f"{self.path}: whole, nothing to repair: {span}"
         lines = [f"{self.path}: {span}"]
@@ -258,9 +275,10 @@ def _survey(path: Path, stop: StopFlag) -> Repair:
                 finder.damage(found.at)
             else:
                 try:
-                    _note(survey, finder, path, found)
+                    _note(survey, finder, found)
                 except mcap.DAMAGES as error:
                     survey.lose(found, error)
+        survey.has_index = any(mcap.index_of(*opened))
         if not survey.damages and survey.checksum:
             survey.has_right_data = _checksum(*opened, survey.data_end, stop) == survey.checksum
     topics = {
@@ -302,7 +320,7 @@ def _checksum(stream: BinaryIO, size: int, end: int, stop: StopFlag) -> int:
     return checksum
 
 
-def _note(survey: Repair, finder: GapFinder, path: Path, record: mcap.LocatedRecord) -> None:
+def _note(survey: Repair, finder: GapFinder, record: mcap.LocatedRecord) -> None:
     if record.code == mcap.MESSAGE:
         _note_message(survey, finder, record.body)
         return
@@ -320,13 +338,13 @@ def _note(survey: Repair, finder: GapFinder, path: Path, record: mcap.LocatedRec
             finder.end_data()
         case mcap.records.Statistics(channel_message_counts=counts):
             survey.message_counts = counts
-        case mcap.records.Footer() as footer:
-            survey.has_index = _is_index_right(path, record.at, footer)
 
 
 def _note_message(survey: Repair, finder: GapFinder, body: bytes) -> None:
     survey.n_messages += 1
     number, sequence, t_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
+    first_ns, last_ns = survey.spans.get(number, (t_ns, t_ns))
+    survey.spans[number] = min(first_ns, t_ns), max(last_ns, t_ns)
     channel = survey.channels.get(number)
     topic = "" if channel is None else channel.topic
     if topic == SESSION_TOPIC:
@@ -340,17 +358,6 @@ def _define(table: dict[int, Row], record: mcap.LocatedRecord, number: int, row:
     """Take a schema or channel; the last word has a chunk, for the index has no checksum each."""
     if record.is_in_chunk or number not in table:
         table[number] = row
-
-
-def _is_index_right(path: Path, at: int, footer: mcap.records.Footer) -> bool:
-    """Whether the index before the footer at a place is there and what its checksum says."""
-    start, end = footer.summary_start, at + _FOOTER_BYTES
-    with path.open("rb") as stream:
-        stream.seek(start)
-        index = stream.read(max(end - _FOOTER_CHECKSUM_BYTES - start, 0))
-        stream.seek(end)
-        ends_well = stream.read() == mcap.MAGIC
-    return ends_well and start != 0 and footer.summary_crc in (0, zlib.crc32(index))
 
 
 def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
@@ -460,5 +467,3 @@ def _read_back(readable: Path, survey: Repair) -> None:
     except ValueError as error:
         raise AppError(f"{survey.path}: cannot be made whole: {error}") from None
     survey.n_messages = statistics.message_count
-    survey.first_ns = statistics.message_start_time
-    survey.last_ns = statistics.message_end_time

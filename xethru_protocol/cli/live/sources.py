@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xethru_protocol.cli.arguments import raw_config
-from xethru_protocol.cli.output import CommandFailed, frame_rate, module_at, print_warnings, warn_of
+from xethru_protocol.cli.output import (
+    CommandFailed,
+    frame_rate,
+    module_at,
+    print_warnings,
+    warn,
+    warn_of,
+)
 from xethru_protocol.driver.frames import Samples
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -145,6 +152,11 @@ def _recorded(arguments: Namespace) -> FrameSource:
     frames = max(radar.parts, key=lambda part: part.n_frames)
     if frames.kind is None:
         raise CommandFailed(f"{path} does not say what its frames are; if baseband: --baseband")
+    if frames.frames.inferred and frames.kind == "rf":
+        warn(
+            f"xethru {arguments.command}: frames are probably {frames.frames.about}, by how smooth "
+            "they are (--baseband if not)"
+        )
     rate_hz = arguments.fps or frames.frame_rate_hz
     if rate_hz is None:
         raise CommandFailed(f"{path} does not say its frame rate; add --fps F")

@@ -12,9 +12,11 @@ import pytest
 
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule, stock
 from xethru_protocol.cli import main
+from xethru_protocol.cli.module import setting_text
 from xethru_protocol.recordings import RecordingWriter
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
+from xethru_protocol.wire.messages import X4Value
 
 XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
 
@@ -67,6 +69,21 @@ def test_stream_ends_cleanly(module: PtyModule, number: signal.Signals | None, c
         assert process.stderr.read() == b""
         assert process.wait() == code
     assert stopped(module)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ((-4.114211e-05, 9.950666427612305), "0 ... 9.9507"),  # what a module has after power-up
+        (17.048640251159668, "17.0486"),
+        (0.18, "0.18"),
+        (10.0, "10"),
+        (None, "-"),
+        (7, "7"),
+    ],
+)
+def test_settings_are_shown_to_a_tenth_of_a_millimetre(value: X4Value | None, text: str) -> None:
+    assert setting_text(value) == text
 
 
 def test_ping_and_info(module: PtyModule, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from emulator.scene.scene import empty_room, load_scene
 from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY
 from hil_tests.unit.xethru_protocol.recordings.messages import xethru
+from xethru_protocol.cli import main
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingWriter, describe_recording
@@ -59,6 +60,37 @@ def test_answers_are_certain_and_content_is_probable(
     assert not certain.inferred
     assert inferred.inferred is (certain.values % 2 == 0 and certain.values <= 376)
     assert layout_of(list(frames), True).downconversion is (certain.values % 2 == 0)
+
+
+@pytest.mark.parametrize("bin_at", [0, 1, 15, -1])
+@pytest.mark.parametrize("times", [30, 1e4])
+@pytest.mark.parametrize("downconversion", [False, True])
+def test_one_bin_that_outshines_the_others_does_not_decide(
+    downconversion: bool, times: float, bin_at: int
+) -> None:
+    """As the direct path does in the first bin of real frames."""
+    heard = recorded("lab", (0.4, 2.0), downconversion=downconversion)
+    frames: list[m.Response] = []
+    for message in heard:
+        if isinstance(message, m.DataFloat):
+            parts = message.values.reshape(2, -1).copy()
+            parts[:, bin_at] += np.float32(times) * np.abs(parts).max() * np.array((1, -0.7), "f4")
+            frames.append(m.DataFloat(info=message.info, values=parts.ravel()))
+    assert layout_of(frames).downconversion is downconversion
+
+
+def test_what_is_inferred_or_unknown_names_the_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    smooth = np.sin(np.arange(100) / 5, dtype=np.float32)
+    for name, values in (("inferred", smooth), ("unknown", np.ones(100, np.float32))):
+        with RecordingWriter(tmp_path / name) as writer:
+            writer.write(m.DataFloat(info=1, values=values), 0)
+        assert "--frames rf or baseband" in xethru(capsys, "dump", tmp_path / name)
+    assert main(["convert", str(tmp_path / "inferred"), str(tmp_path / "a.csv")]) == 0
+    assert "--frames rf or baseband" in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "unknown"), str(tmp_path / "b.csv")]) == 1
+    assert "--frames rf or baseband" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -352,7 +352,9 @@ def test_other_programs_read_the_arrays(tmp_path: Path) -> None:
     titles, *lines = (tmp_path / "a.csv").read_text().splitlines()
     columns = titles.split(",")
     assert columns[:3] == ["t_ns", "counter", "time_s"]
-    assert [float(name[2:-1]) for name in columns[3:13]] == np.asarray(source.ranges_m).tolist()
+    ranges_m = [float(name[2:-1]) for name in columns[3:13]]
+    assert ranges_m == pytest.approx(np.asarray(source.ranges_m).tolist(), abs=0.5001e-6)
+    assert max(map(len, columns)) <= len("i_0.400000m"), "no digits of a double"
     rows = np.loadtxt(lines, delimiter=",")
     n_bins = source.n_bins
     np.testing.assert_array_equal(rows[:, 3 : 3 + n_bins].astype(np.float32), source.iq.real)

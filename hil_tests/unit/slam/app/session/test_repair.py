@@ -5,6 +5,7 @@ import json
 import signal
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,18 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of, rewrite
-from hil_tests.unit.slam.app.sessions import FRAME_NS, run, write_session
+from hil_tests.unit.slam.app.sessions import (
+    FRAME_NS,
+    SlowClock,
+    run,
+    scan,
+    session_info,
+    write_session,
+)
 from slam.app.session.reader import ScanEnd, open_session
 from slam.app.session.repair import repair
-from slam.app.session_records import Gap
+from slam.app.session.writer import SessionLog
+from slam.app.session_records import Gap, LogLine
 from slam.frames import RadarFrame
 from xethru_protocol.operating_system import StopFlag, StopRequestedError, locked
 from xethru_protocol.recordings.mcap import is_latched
@@ -39,6 +48,22 @@ def test_it_says_what_is_kept_and_where_the_old_file_is(
     assert f"{cut}.unrepaired" in out
     assert Path(f"{cut}.unrepaired").stat().st_size == size
     assert run(capsys, "repair", cut)[0] == 0
+
+
+def test_a_drive_lasts_from_its_first_message_on(tmp_path: Path) -> None:
+    """Session time is that of the odometry, which was on for six minutes before."""
+    path, before_ns = tmp_path / "session.mcap", 369 * 10**9
+    log = SessionLog(path, session_info(), clock_ns=SlowClock())
+    log.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="it begins"))
+    for counter in range(30):
+        one = scan(counter)
+        frames = tuple(replace(frame, t_ns=frame.t_ns + before_ns) for frame in one.frames)
+        log.on_scan(replace(one, t_ns=one.t_ns + before_ns, frames=frames))
+    log.close()
+    for data in (path.read_bytes(), path.read_bytes()[:-2_000]):
+        path.write_bytes(data)
+        found = repair(path, None, StopFlag())
+        assert found.duration_s() == pytest.approx(29 * FRAME_NS / 1e9)
 
 
 def test_it_never_overwrites_what_it_did_not_write(
