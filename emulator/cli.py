@@ -29,7 +29,7 @@ from xethru_protocol.operating_system import (
     one_line,
 )
 from xethru_protocol.optional_packages import what_is_missing
-from xethru_protocol.validation import number, shown
+from xethru_protocol.validation import number, output, shown
 
 if TYPE_CHECKING:
     from emulator.faults.kind import KindOfFault
@@ -490,7 +490,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     _add_faults(proxy)
     proxy.add_argument(
         "--wire",
-        type=Path,
+        type=output(".xtwire", what="a wire capture"),
         metavar="FILE",
         help="new .xtwire file: all that passes the module's port",
     )
@@ -582,7 +582,10 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
         "--faults", metavar="FILE", help="fault scenario: a .toml file, or a shipped one by name"
     )
     parser.add_argument(
-        "--truth", type=Path, metavar="FILE", help="gets a JSON line for every injected fault"
+        "--truth",
+        type=output(".json", ".jsonl", ".txt", ".log", what="lines of JSON"),
+        metavar="FILE",
+        help="gets a JSON line for every injected fault",
     )
 
 

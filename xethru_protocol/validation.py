@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from xethru_protocol.operating_system import one_line
@@ -123,6 +125,38 @@ def number(
         if not is_allowed(value):
             raise ArgumentTypeError(f"{shown(text)} must be {allowed}")
         return value
+
+    return read
+
+
+_SUFFIX = re.compile(r"\.([A-Za-z]{2}\w*|h5)")
+
+
+def suffix_of(path: Path) -> str:
+    """Return what a name to be written says about the format, "" for a directory that exists.
+
+    A date or a number of a version behind a dot says nothing.
+
+    >>> [suffix_of(Path(name)) for name in ("a.csv", "rec", "rec.2026-11-25", "rec.v2")]
+    ['.csv', '', '', '']
+    """
+    return path.suffix if _SUFFIX.fullmatch(path.suffix) and not path.is_dir() else ""
+
+
+def output(*suffixes: str, what: str = "a file") -> Callable[[str], Path]:
+    """Return the type of an option that names what is written: with such a suffix, or without one.
+
+    A name with the suffix of another format would promise that format.
+    """
+
+    def read(text: str) -> Path:
+        found = suffix_of(Path(text))
+        if found and found not in suffixes:
+            allowed = " or ".join(
+                [*(f"that ends in {name}" for name in suffixes), "without suffix"]
+            )
+            raise ArgumentTypeError(f"this writes {what}, not {found[1:]}: give a name {allowed}")
+        return Path(text)
 
     return read
 

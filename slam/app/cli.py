@@ -30,7 +30,7 @@ from xethru_protocol.operating_system import (
     open_closed_streams,
 )
 from xethru_protocol.optional_packages import what_is_missing
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import output, shown
 
 _BY_A_SIGNAL = 128
 """Exit codes from here on are of signals."""
@@ -132,13 +132,18 @@ class _Subcommand(NamedTuple):
         function(stop, **options)
 
 
-def _folder(text: str) -> Path:
-    """Return a path to write to; it must be UTF-8, which Rerun's writer requires."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {shown(text)}") from None
-    return Path(text)
+def _output(*suffixes: str, what: str = "a folder") -> Callable[[str], Path]:
+    """Return the type of a path to write to; it must be UTF-8, which Rerun's writer requires."""
+    allowed = output(*suffixes, what=what)
+
+    def read(text: str) -> Path:
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {shown(text)}") from None
+        return allowed(text)
+
+    return read
 
 
 def _whole_number(text: str, *, least: int) -> int:
@@ -179,7 +184,9 @@ def _add_json(parser: argparse.ArgumentParser) -> None:
 
 def _add_out(parser: argparse.ArgumentParser, default: str) -> None:
     """Add `--out` of a command that writes several files."""
-    parser.add_argument("--out", type=_folder, default=Path(default), help="folder for the results")
+    parser.add_argument(
+        "--out", type=_output(), default=Path(default), help="folder for the results"
+    )
 
 
 def _add_preset(parser: argparse.ArgumentParser) -> None:
@@ -242,9 +249,17 @@ def _add_view(view: argparse.ArgumentParser) -> None:
     )
     where = view.add_mutually_exclusive_group()
     where.add_argument("--web", action="store_true", help="serve a page for a browser")
-    where.add_argument("--out", type=_folder, metavar="FILE.rrd", help="write a file, show nothing")
     where.add_argument(
-        "--screenshot", type=_folder, metavar="FILE.png", help="write a picture, no window needed"
+        "--out",
+        type=_output(".rrd", what="a recording of Rerun"),
+        metavar="FILE.rrd",
+        help="write a file, show nothing",
+    )
+    where.add_argument(
+        "--screenshot",
+        type=_output(".png", what="a picture"),
+        metavar="FILE.png",
+        help="write a picture, no window needed",
     )
     view.add_argument(
         "--at",
@@ -260,7 +275,10 @@ def _add_report(report: argparse.ArgumentParser) -> None:
         "session", type=Path, metavar="SESSION", help="a session.mcap, or a run's folder"
     )
     report.add_argument(
-        "--out", type=_folder, metavar="FILE.html", help="(default: report.html beside the session)"
+        "--out",
+        type=_output(".html", ".htm", what="a page"),
+        metavar="FILE.html",
+        help="(default: report.html beside the session)",
     )
 
 
@@ -320,7 +338,12 @@ def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
 
 def _add_repair(repair: argparse.ArgumentParser) -> None:
     repair.add_argument("session", type=Path, metavar="SESSION", help="an MCAP file")
-    repair.add_argument("--out", type=Path, metavar="FILE", help="write there, touch nothing else")
+    repair.add_argument(
+        "--out",
+        type=output(".mcap", what="MCAP"),
+        metavar="FILE",
+        help="write there, touch nothing else",
+    )
 
 
 def _add_convert(convert: argparse.ArgumentParser) -> None:
@@ -368,7 +391,9 @@ def _add_calibrate(calibrate: argparse.ArgumentParser) -> None:
     calibrate.add_argument(
         "--reflectors", metavar="FILE", help="known places: TOML with [[reflectors]], or a scene"
     )
-    calibrate.add_argument("--rig", type=Path, metavar="OUT", help="write a rig file")
+    calibrate.add_argument(
+        "--rig", type=output(".toml", what="TOML"), metavar="OUT", help="write a rig file"
+    )
     calibrate.add_argument("--truth", metavar="SCENE", help="print what this scene planted beside")
     _add_json(calibrate)
 
@@ -438,7 +463,12 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
     where.add_argument("--jobs", type=_count, help="processes (default: one per core)")
     where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
     sweep.add_argument(
-        "--json", dest="out", type=Path, required=True, metavar="OUT", help="result file"
+        "--json",
+        dest="out",
+        type=output(".json", what="JSON"),
+        required=True,
+        metavar="OUT",
+        help="result file",
     )
 
 

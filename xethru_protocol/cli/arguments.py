@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from xethru_protocol.cli.version import add_version
-from xethru_protocol.validation import number, shown
+from xethru_protocol.validation import number, output, shown
 from xethru_protocol.wire.codes import POWER_UP_BAUD
 
 if TYPE_CHECKING:
@@ -30,6 +30,18 @@ def utf8_text(text: str) -> str:
         text.encode()
     except UnicodeEncodeError:  # bytes that the shell passed on
         raise ArgumentTypeError("this is not text in UTF-8") from None
+    return text
+
+
+def wire_file(text: str) -> str:
+    what = "a wire capture, --out FILE.mcap writes MCAP, 'xethru convert' any other format"
+    output(".xtwire", what=what)(not_empty(text))
+    return text
+
+
+def recording_file(text: str) -> str:
+    what = "MCAP or a directory in the vendor's format, 'xethru convert' any other format"
+    output(".mcap", what=what)(not_empty(text))
     return text
 
 
@@ -423,7 +435,7 @@ def _add_record(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     _add_baudrate(one)
     one.add_argument(
         "--out",
-        type=not_empty,
+        type=recording_file,
         metavar="DIR|FILE.mcap",
         help="directory for a recording in the vendor's format (ModuleConnector), or one MCAP file "
         "for all modules and other sensors",
@@ -440,7 +452,7 @@ def _add_record(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     )
     one.add_argument(
         "--wire",
-        type=not_empty,
+        type=wire_file,
         metavar="FILE",
         help="also, or only, write all bytes of both directions here (.xtwire)",
     )

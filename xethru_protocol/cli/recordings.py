@@ -45,7 +45,7 @@ from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file
 from xethru_protocol.recordings.recorded_messages import writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import shown, suffix_of
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import LocalProtocolError
@@ -346,6 +346,9 @@ def export(arguments: Namespace) -> int:
     if arguments.out is None:
         print_line(text.rstrip())
         return 0
+    wanted = {"kaitai": ".ksy", "wireshark": ".lua"}[arguments.tool]
+    if suffix_of(Path(arguments.out)) not in ("", wanted):
+        arguments.refuse(f"{arguments.tool} gets a file *{wanted}, not {arguments.out}")
     if Path(arguments.out).exists() and not arguments.force:
         raise CommandFailed(f"{arguments.out} exists already; --force replaces it")
     try:
@@ -401,7 +404,7 @@ def _whole(target: Path, *, replace: bool) -> Iterator[Path]:
     fresh = target
     try:
         with writing(target):
-            if not target.suffix:
+            if not suffix_of(target):
                 target.parent.mkdir(parents=True, exist_ok=True)
         with writing(target), built_aside(target) as fresh:
             if target.is_dir():

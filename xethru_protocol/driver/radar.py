@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from xethru_protocol.driver import profiles, raw_mode, reconnect
 from xethru_protocol.driver.board import Diagnostics, Pins
@@ -233,6 +233,14 @@ class RadarState(Part[KindT]):
     @geometry.setter
     def geometry(self, geometry: FrameGeometry | None) -> None:
         self._link.frames.geometry = geometry
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What is known of raw frames, by the names in the info of an MCAP file; empty if nothing.
+
+        Lengths are module metres.
+        """
+        return raw_mode.description(self._link)
 
     @property
     def statistics(self) -> LinkStatistics:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -104,6 +105,27 @@ def _offset_m(link: Link, config: RawConfig) -> Steps[float | None]:
     if not isinstance(offset_m, float) or not math.isfinite(offset_m):
         raise RemoteProtocolError(f"{link.name} reads back FRAMEAREAOFFSET as {offset_m}")
     return offset_m
+
+
+def description(link: Link) -> dict[str, Any]:
+    """Return what is known of the frames, as `RadarState.description`."""
+    geometry = link.frames.geometry
+    if geometry is None:
+        return {}
+    settings: dict[str, Any] = {}
+    if isinstance(link.plan, RawPlan):
+        settings = {setting.name: value for setting, value in link.plan.config.settings()}
+    return {
+        "range_start_m": geometry.range_start_m,
+        "bin_length_m": geometry.bin_length_m,
+        "n_bins": geometry.n_bins,
+        "rate_hz": link.frames.rate_hz or None,
+        "settings": settings
+        | {
+            X4Setting.FRAMEAREA.name: geometry.area_m,
+            X4Setting.FRAMEBINCOUNT.name: geometry.n_bins,
+        },
+    }
 
 
 def read_geometry(link: Link, downconversion: bool) -> Steps[FrameGeometry]:

@@ -11,9 +11,10 @@ other sensors are in MCAP only.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from xethru_protocol.recordings import pcap, wire_capture
 from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file, write_array_file
@@ -26,6 +27,7 @@ from xethru_protocol.recordings.formats import (
     recording_format,
     refuse_name,
 )
+from xethru_protocol.recordings.frame_layout import FrameGeometries
 from xethru_protocol.recordings.loading import load
 from xethru_protocol.recordings.recorded_messages import (
     RecordingError,
@@ -34,7 +36,9 @@ from xethru_protocol.recordings.recorded_messages import (
     TimedMessages,
 )
 from xethru_protocol.recordings.vendor.writer import RecordingWriter
+from xethru_protocol.validation import suffix_of
 from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.messages import DataFloat
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +85,7 @@ def convert(
     """
     source, target = Path(source), Path(target)
     faults: list[RecordingFault] = []
-    suffix = "" if target.is_dir() else target.suffix
+    suffix = suffix_of(target)
     if suffix and target.exists():
         raise RecordingError(f"{target} exists already")
     if suffix in SUFFIXES:
@@ -112,7 +116,11 @@ def convert(
         packets = pcap.write_pcap(source, target, faults.append)
         return Conversion(messages=packets, skipped={}, faults=tuple(faults))
     write = _writer(target, suffix)
-    facts = recording_facts(source, faults.append)
+    facts, content = recording_facts(source, faults.append), recording_content(source)
+    described = content.radars.get(radar or next(iter(content.radars), ""), {})
+    about = {
+        name: value for name, value in described.items() if name != "name" and value is not None
+    }
     n_messages = 0
 
     def counted() -> TimedMessages:
@@ -123,16 +131,16 @@ def convert(
             if on_progress is not None and n_messages % 1000 == 0:
                 on_progress(n_messages)
 
-    skipped = write(target, counted(), facts) or {}
+    skipped = write(target, counted(), facts, about) or {}
     n_messages -= sum(skipped.values())
     if on_progress is not None:
         on_progress(n_messages)
-    for name, lines in recording_content(source).texts.items():
+    for name, lines in content.texts.items():
         skipped[f"lines of {name}"] = len(lines)
     return Conversion(messages=n_messages, skipped=skipped, faults=tuple(faults))
 
 
-_Writer = Callable[[Path, TimedMessages, RecordingFacts], dict[str, int] | None]
+_Writer = Callable[[Path, TimedMessages, RecordingFacts, Mapping[str, Any]], dict[str, int] | None]
 
 
 def _writer(target: Path, suffix: str) -> _Writer:
@@ -153,9 +161,13 @@ def _writer(target: Path, suffix: str) -> _Writer:
     )
 
 
-def _write_vendor(target: Path, messages: TimedMessages, facts: RecordingFacts) -> dict[str, int]:
+def _write_vendor(
+    target: Path, messages: TimedMessages, facts: RecordingFacts, about: Mapping[str, Any]
+) -> dict[str, int]:
     skipped: Counter[str] = Counter()
     last_ns = 0
+    geometries = FrameGeometries()  # by answers, for which there is no place
+    answered: dict[str, Any] = {}
     with RecordingWriter(
         target,
         session_id=facts.session_id,
@@ -165,14 +177,22 @@ def _write_vendor(target: Path, messages: TimedMessages, facts: RecordingFacts) 
     ) as writer:
         for message, t_ns in messages:
             last_ns = last_ns if t_ns is None else t_ns
+            geometries.take(message)
+            if not answered and isinstance(message, DataFloat) and geometries.of(message):
+                answered = geometries.about(message)
             if not writer.write(message, last_ns):
                 skipped[message_name(message)] += 1
+        if answered or about:
+            writer.describe(answered | {**about})
         writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
     return dict(skipped)
 
 
-def _write_wire(target: Path, messages: TimedMessages, facts: RecordingFacts) -> None:
+def _write_wire(
+    target: Path, messages: TimedMessages, facts: RecordingFacts, about: Mapping[str, Any]
+) -> None:
     module = Connection(Role.MODULE)
-    with wire_capture.WireCapture(target, {"facts": facts.as_json()}) as capture:
+    note = {"facts": facts.as_json(), "radar": dict(about)}
+    with wire_capture.WireCapture(target, note) as capture:
         for message, t_ns in messages:
             capture.write("rx", module.send(message), t_ns)

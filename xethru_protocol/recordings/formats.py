@@ -26,7 +26,12 @@ from xethru_protocol.recordings.recorded_messages import (
     reading,
 )
 from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
-from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
+from xethru_protocol.recordings.vendor.reader import (
+    is_vendor_file,
+    read_vendor,
+    vendor_about,
+    vendor_facts,
+)
 from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
 from xethru_protocol.wire.x4 import RF_BIN_M
 
@@ -149,13 +154,12 @@ def refuse_name(path: Path, radar: str | None) -> None:
 
 def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
     """Return the radars of a recording; only a session (MCAP) has several, and names them."""
-    if recording_format(path) != "mcap":
-        return (RadarFacts(),)
     return tuple(starmap(_radar_facts, recording_content(path).radars.items()))
 
 
-def _radar_facts(name: str, info: Mapping[str, Any]) -> RadarFacts:
-    """Read the description of a radar in MCAP; facts without content if it is invalid."""
+def _radar_facts(key: str, info: Mapping[str, Any]) -> RadarFacts:
+    """Read the description of a radar; facts without content if it is invalid."""
+    name = key or None
     try:
         start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
         # the read-back of baseband ends at the last bin, that of RF one behind it
@@ -172,14 +176,16 @@ def _radar_facts(name: str, info: Mapping[str, Any]) -> RadarFacts:
 
 
 def recording_content(path: Path | str) -> RecordingContent:
-    """Return radars and texts; only MCAP has names, descriptions and texts.
+    """Return radars and texts; only MCAP has names and texts.
 
     RecordingError if there is nothing to read.
     """
     path = Path(path)
-    if recording_format(path) != "mcap":
-        recording_facts(path)  # raises
-        return RecordingContent(radars={"": {}})
+    match recording_format(path):
+        case "vendor":
+            return RecordingContent(radars={"": vendor_about(path)})
+        case "wire":
+            return RecordingContent(radars={"": wire_capture.wire_about(path)})
     with optional_packages():
         from xethru_protocol.recordings.mcap import mcap_content
 

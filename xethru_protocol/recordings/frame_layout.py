@@ -12,6 +12,7 @@ not decide.
 
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -121,6 +122,16 @@ class FrameGeometries:
                 self.answers[X4Setting.FRAMEAREA.name] = start_m, end_m
             case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(n_bins,)):
                 self.answers[X4Setting.FRAMEBINCOUNT.name] = n_bins
+
+    def about(self, frame: DataFloat) -> dict[str, Any]:
+        """Return what is known of a frame, by the names in the info of an MCAP file."""
+        geometry = self.of(frame)
+        return {
+            "range_start_m": None if geometry is None else geometry.range_start_m,
+            "bin_length_m": None if geometry is None else geometry.bin_length_m,
+            "n_bins": None if geometry is None else geometry.n_bins,
+            "settings": dict(self.answers),
+        }
 
     def of(self, frame: DataFloat) -> FrameGeometry | None:
         """Return where the bins of a frame lie; None if the answers are missing or of others."""

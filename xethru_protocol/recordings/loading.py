@@ -504,8 +504,10 @@ class _Messages:
             start_m, bin_m = geometry.range_start_m, geometry.bin_length_m
             layout = _ArrayLayout(_RAW, n_values, start_m, bin_m, geometry.downconversion)
         elif (n_bins := self._info.get("n_bins")) in (n_values, n_values / 2):
-            described = self._info.get("range_start_m"), self._info.get("bin_length_m")
-            layout = _ArrayLayout(_RAW, n_values, *described, n_bins != n_values)
+            lengths_m = [
+                _length_m(self._info.get(key)) for key in ("range_start_m", "bin_length_m")
+            ]
+            layout = _ArrayLayout(_RAW, n_values, lengths_m[0], lengths_m[1], n_bins != n_values)
         return _FrameRow(layout, message.info, message.values, t_ns)
 
     def _take_setting(self, message: ReplyByte | ReplyInt | ReplyFloat) -> None:
@@ -513,6 +515,11 @@ class _Messages:
             values = tuple(message.values)
             name = X4Setting(message.content_id).name
             self._settings[name] = values[0] if len(values) == 1 else values
+
+
+def _length_m(value: object) -> float | None:
+    """Return a length of a description; None for anything else."""
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
 _RAW = "DATA FLOAT"

@@ -835,12 +835,20 @@ class RadarTopics:
         )
 
 
-def write_mcap(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> None:
-    """Write messages to a file, which is there when it is whole; RecordingError if that fails."""
+def write_mcap(
+    path: Path,
+    messages: Iterable[Timed],
+    facts: RecordingFacts,
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write messages to a file, which is there when it is whole; RecordingError if that fails.
+
+    ``about`` is what is known of the module beside them, as for `RadarTopics`.
+    """
     with writing(path), written_whole(path) as fresh, fresh.open("wb") as stream:
         writer = McapWriter(stream)
         writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
-        recording = RadarTopics(writer)
+        recording = RadarTopics(writer, about=about)
         for message, t_ns in messages:
             recording.write(message, t_ns)
         writer.finish()

@@ -146,6 +146,8 @@ class Recorder:
             if self._writer is not None and self.failure is None and self._is_wanted(type(message)):
                 try:
                     self.messages += self._writer.write(message, arrival_ns + self._since_1970_ns)
+                    if self.messages == 1 and (about := getattr(self._radar, "description", {})):
+                        self._writer.describe(about)
                 except RecordingError as error:
                     self._fail(error)
 

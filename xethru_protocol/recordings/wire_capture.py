@@ -198,6 +198,15 @@ def wire_facts(path: Path, on_fault: FaultHandler | None) -> RecordingFacts:
     return RecordingFacts.read(path, lambda: read_note(path).get("facts", {}), on_fault)
 
 
+def wire_about(path: Path) -> Mapping[str, Any]:
+    """Return what the note says of the module, by the names in an MCAP file's info."""
+    try:
+        about = read_note(path).get("radar", {})
+    except RecordingError:  # damaged; the messages are there
+        return {}
+    return about if isinstance(about, dict) else {}
+
+
 def read_wire(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     """Messages from the module in a wire capture, each with the time its last byte came.
 

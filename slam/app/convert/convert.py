@@ -16,7 +16,7 @@ from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
 from xethru_protocol.recordings import RecordingError, WireCapture
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import shown, suffix_of
 
 
 def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
@@ -51,6 +51,7 @@ def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: St
 
 
 _SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
+_OF_SESSION = (_MAT_SUFFIX, _WIRE_SUFFIX, ".bag")
 _PRESET = "robust"
 _MAT_PRESET = "paper"  # such ranges are of its front end: they scatter by a bin, 7 mm
 
@@ -73,6 +74,13 @@ def run_convert(
     """
     if out.exists():
         raise AppError(f"{out}: exists; choose another name")
+    is_session = source.suffix == _SESSION_SUFFIX
+    if is_session and suffix_of(out) not in ("", _SESSION_SUFFIX, *_OF_SESSION):
+        raise UsageError(
+            f"{out}: a session is not converted to {out.suffix}; name an OUT that ends in "
+            f"{', '.join(_OF_SESSION)}, or a new folder for a bag of ROS 2; `xethru convert` makes "
+            "tables and arrays of its frames"
+        )
     warnings: list[str] = []
     if source.suffix == _SESSION_SUFFIX and out.suffix != _SESSION_SUFFIX:
         with _whole(out) as fresh:
@@ -128,7 +136,7 @@ def _whole(out: Path) -> Iterator[Path]:
     fresh = out
     try:
         with naming(out):
-            if not out.suffix:
+            if not suffix_of(out):
                 out.parent.mkdir(parents=True, exist_ok=True)
             with built_aside(out) as fresh:
                 yield fresh

@@ -37,11 +37,6 @@ def record(arguments: Namespace) -> int:
         arguments.refuse("--out DIR is missing, or --wire FILE, or both")
     if arguments.out == arguments.wire:
         arguments.refuse("--out and --wire must not be the same")
-    if arguments.wire is not None and Path(arguments.wire).suffix in {".mcap", ".npz", ".pcap"}:
-        arguments.refuse(
-            "--wire FILE is a wire capture, .xtwire; --out FILE.mcap writes MCAP, and "
-            "'xethru convert' any other format"
-        )
     mode = Listen()
     profile = profile_of(arguments)
     if arguments.profile == "raw":
@@ -101,6 +96,7 @@ def _record_from(
     try:
         silence_s = mode.start(radar)
         print_warnings(radar)
+        recorder.describe(mode.about(radar))
         while not (stop.requested or recorder.is_enough):
             if duration_s is not None and recorder.elapsed_s >= duration_s:
                 if not recorder.messages:

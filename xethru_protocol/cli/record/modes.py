@@ -20,7 +20,6 @@ from xethru_protocol.wire.codes import (
     MatrixControl,
     OutputFeature,
     ProfileId,
-    X4Setting,
 )
 from xethru_protocol.wire.errors import (
     DeviceError,
@@ -81,20 +80,7 @@ class RawFrames(Listen):
         return max(2.0, 3.0 / self._rate_hz)
 
     def about(self, radar: X4M300) -> dict[str, Any]:
-        geometry = radar.geometry
-        assert geometry is not None, "configured before"
-        settings = {setting.name: value for setting, value in self._config.settings()}
-        return {
-            "range_start_m": geometry.range_start_m,
-            "bin_length_m": geometry.bin_length_m,
-            "n_bins": geometry.n_bins,
-            "rate_hz": self._rate_hz,
-            "settings": settings
-            | {
-                X4Setting.FRAMEAREA.name: geometry.area_m,
-                X4Setting.FRAMEBINCOUNT.name: geometry.n_bins,
-            },
-        }
+        return radar.description | {"rate_hz": self._rate_hz}
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
         """Receive until a frame came or the time is over; other messages are not kept."""

@@ -2,6 +2,7 @@
 
 import time
 from argparse import Namespace
+from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -108,6 +109,14 @@ class RecordingFiles:
         early, self._early = self._early or [], None
         for received in early:
             self.take_bytes(*received)
+
+    def describe(self, about: Mapping[str, Any]) -> None:
+        """Store what is known of the module, by the names in an MCAP file's info."""
+        if self._writer is not None and about:
+            try:
+                self._writer.describe(about)
+            except RecordingError as error:
+                self.fail(error)
 
     def listen_to(self, radar: X4M300) -> None:
         """Take the module's messages from now on; the time of the recording begins."""

@@ -426,6 +426,9 @@ def kind_of_file(name: str) -> DataFileKind | None:
 
 META_NAME = "xethru_recording_meta.dat"
 PARAMETER_FILE_NAME = "xethru_parameter_file.par"
+ABOUT_NAME = "xethru_radar.json"
+"""Our own file beside the vendor's, whose reader opens what the meta file lists: ``session_id``
+and, in ``radar``, what is known of the module, by the names in the info of an MCAP file."""
 VERSION = 13
 
 ALL_BITS = 0xFFFFFFFF

@@ -12,13 +12,14 @@ positions leave out the time between them; here a position is the time since the
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +38,7 @@ from xethru_protocol.recordings.recorded_messages import (
     report,
 )
 from xethru_protocol.recordings.vendor.layouts import (
+    ABOUT_NAME,
     ALL_BITS,
     CLOSED,
     ENTRY,
@@ -542,6 +544,25 @@ def vendor_facts(path: Path) -> RecordingFacts:
         stopped_ns=_time_ns(ended, max(stops)) if ended and stops else None,
         closed_ns=_time_ns(ended, ended.duration_ms) if ended else None,
     )
+
+
+def vendor_about(path: Path) -> Mapping[str, Any]:
+    """Return what a recorder of ours stored of the module beside a recording; empty if nothing.
+
+    Of a recording that is split into directories it lies in the one that holds them.
+    """
+    part = _parts_of(path)[0]
+    session = None if part.meta is None else part.meta.session_id.decode("utf-8", "replace")
+    for directory in (part.directory, part.directory.parent):
+        try:
+            table = json.loads((directory / ABOUT_NAME).read_bytes())
+        except (OSError, ValueError, RecursionError):
+            continue
+        if isinstance(table, dict) and isinstance(about := table.get("radar"), dict):
+            is_alone = session is None and directory == part.directory
+            if is_alone or table.get("session_id") == session:
+                return about
+    return {}
 
 
 def _time_ns(meta: Meta, since_start_ms: int) -> int:

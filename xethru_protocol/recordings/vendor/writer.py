@@ -6,16 +6,24 @@ up to the last record and the index up to the last entry. Only the totals in the
 file and its list of files are missing then; the reader does without them.
 """
 
+import json
 import re
 import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Self, TypedDict
+from typing import Any, Self, TypedDict
 
-from xethru_protocol.recordings.recorded_messages import MS_NS, GrowingFile, RecordingError, writing
+from xethru_protocol.recordings.recorded_messages import (
+    MODULE_METRES,
+    MS_NS,
+    GrowingFile,
+    RecordingError,
+    writing,
+)
 from xethru_protocol.recordings.vendor.layouts import (
+    ABOUT_NAME,
     ALL_BITS,
     CLOSED,
     KIND_OF_MESSAGE,
@@ -343,6 +351,17 @@ class RecordingWriter:
         self._part_at(time_ms).write(message, kind, time_ms)
         self._stored_ms[kind.data_type] = time_ms
         return True
+
+    def describe(self, about: Mapping[str, Any]) -> None:
+        """Store what is known of the module beside the recording, for `load`.
+
+        ``about`` is by the names in the info of an MCAP file; lengths are module metres.
+        RecordingError if the file cannot be written.
+        """
+        radar = {"length_unit": MODULE_METRES, **about}
+        path = self.directory / ABOUT_NAME
+        with writing(path):
+            path.write_text(json.dumps({"session_id": self.session_id, "radar": radar}), "utf-8")
 
     def close(self, *, stopped_ns: int | None = None, closed_ns: int | None = None) -> None:
         """Write the totals and close all files; calling it again does nothing.

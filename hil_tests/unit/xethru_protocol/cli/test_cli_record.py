@@ -346,7 +346,7 @@ def test_files_are_split_named_and_headed(module: PtyModule, tmp_path: Path) -> 
     assert main(["record", "--port", module.path, "--out", str(out), *arguments]) == 0
     files = sorted(out.glob("lab_2*.dat"))
     assert len(files) == 3
-    assert len(list(out.iterdir())) == 4
+    assert len(list(out.iterdir())) == 5
     assert all(file.read_bytes().startswith("hütte".encode()) for file in files)
     assert counters(out) == [0, 1, 2, 3, 4]
     facts = recording_facts(out)
@@ -356,7 +356,7 @@ def test_files_are_split_named_and_headed(module: PtyModule, tmp_path: Path) -> 
     assert main(["record", "--port", module.path, "--out", str(out), "--count", "1"]) == 1
     arguments = ["--count", "1", "--force"]
     assert main(["record", "--port", module.path, "--out", str(out), *arguments]) == 0
-    assert len(list(out.iterdir())) == 2
+    assert len(list(out.iterdir())) == 3
 
 
 def test_directories_are_made_and_replaced(
@@ -370,12 +370,12 @@ def test_directories_are_made_and_replaced(
     assert capsys.readouterr().out.startswith(f"{out}: 3 messages")
     parts = sorted(path.name for path in out.iterdir())
     pattern = r"xethru_recording_\d{8}_\d{6}_one_"
-    assert [re.sub(pattern, "", name) for name in parts] == ["0", "1", "2"]
+    assert [re.sub(pattern, "", name) for name in parts] == ["0", "1", "2", "xethru_radar.json"]
     assert counters(out) == counters(tmp_path) == [0, 1, 2]
     command[4] = str(out)
     assert main(command) == 1
     assert main([*command, "--force"]) == 0
-    assert sorted(path.suffix for path in out.iterdir()) == [".dat", ".dat"]
+    assert sorted(path.suffix for path in out.iterdir()) == [".dat", ".dat", ".json"]
 
 
 def test_an_interval_leaves_frames_out(module: PtyModule, tmp_path: Path) -> None:

@@ -73,9 +73,12 @@ def test_it_never_overwrites_what_it_did_not_write(
     kept = Path(f"{cut}.unrepaired")
     kept.write_text("precious")
     assert run(capsys, "repair", cut)[:2] == (1, "")
-    assert run(capsys, "repair", cut, "--out", kept)[0] == 1
-    assert (cut.read_bytes(), kept.read_text()) == (before, "precious")
-    assert sorted(tmp_path.iterdir()) == [cut, kept]
+    there = tmp_path / "there.mcap"
+    there.write_text("precious")
+    assert run(capsys, "repair", cut, "--out", there)[0] == 1
+    texts = kept.read_text(), there.read_text()
+    assert (cut.read_bytes(), *texts) == (before, "precious", "precious")
+    assert sorted(tmp_path.iterdir()) == [cut, kept, there]
 
 
 def test_a_folder_in_which_a_run_is_recording_is_left_alone(
