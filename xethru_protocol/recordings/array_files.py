@@ -15,7 +15,9 @@ then all ``q_<range>``. The range is in module metres with its unit, ``i_0.4m``,
 the bin, ``i_0``, where ranges are unknown. Numbers have as many digits as it takes to read the same
 float32 back, those of ranges end at a micrometre. The settings are left out.
 
-Other files with these variables or columns are read, too. Only this file loads scipy, for
+Other files with these variables or columns are read, too, and by their content, whatever their
+names: ``.npy`` of shape (n, bins), of complex numbers or of values as sent, and lines of complex
+numbers as numpy, Python and MATLAB write them, a frame in each. Only this file loads scipy, for
 ``.mat``.
 """
 
@@ -48,6 +50,7 @@ from numpy.lib.format import (
 from xethru_protocol.operating_system import written_whole
 from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.recordings.clock import steady_times
+from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
     NO_TIME_NS,
     FaultHandler,
@@ -58,7 +61,9 @@ from xethru_protocol.recordings.recorded_messages import (
     writing,
 )
 from xethru_protocol.recordings.vendor.layouts import kind_of_file
+from xethru_protocol.recordings.vendor.reader import is_vendor_file
 from xethru_protocol.validation import reason_of, shown
+from xethru_protocol.wire.messages import DataFloat
 
 Samples = npt.NDArray[Any]
 """In the dtype of their kind."""
@@ -69,6 +74,9 @@ DTYPES: Mapping[FrameKind, np.dtype[Any]] = {
     "iq": np.dtype(np.complex64),
 }
 SUFFIXES = (".csv", ".mat", ".npz")
+_TEXT = ".txt"  # of complex numbers
+_MAGICS = {b"\x93NUMPY": ".npy", b"PK\x03\x04": ".npz", b"MATLAB 5.0 MAT": ".mat"}
+_LONGEST_START = 1 << 16  # bytes; a line of numbers is shorter
 _AT_ONCE = 256  # frames of a file that are read together
 _LINES_AT_ONCE = 8  # a number as text is ten times as large
 
@@ -120,11 +128,29 @@ _DAMAGED = (
 
 
 def is_array_file(path: Path) -> bool:
-    """Whether a file holds arrays and no messages, by its suffix."""
-    return path.suffix in SUFFIXES and path.is_file() and kind_of_file(path.name) is None
+    """Whether a file holds arrays and no messages."""
+    return bool(_format_of(path))
 
 
-def read_array_file(path: Path, on_fault: FaultHandler | None = None) -> Frames:
+def _format_of(path: Path) -> str:
+    """Return the suffix of a format of arrays, by content or else by name; "" for other files."""
+    if not path.is_file() or kind_of_file(path.name) is not None:
+        return ""
+    with reading(path), path.open("rb") as stream:
+        start = stream.read(_LONGEST_START)
+    lines = (line.strip().decode("latin-1") for line in start.splitlines())
+    line = next((line for line in lines if line and not line.startswith("#")), "")
+    for magic, suffix in _MAGICS.items():
+        if start.startswith(magic):
+            return suffix
+    if is_vendor_file(path):
+        return ""
+    return _TEXT if _complex_row(line) else path.suffix if path.suffix in SUFFIXES else ""
+
+
+def read_array_file(
+    path: Path, on_fault: FaultHandler | None = None, *, downconversion: bool | None = None
+) -> Frames:
     """Return what a file of arrays holds; its samples are read by ``chunks``, of ``.mat`` at once.
 
     Times do not fall: where the recorder's clock was set back, the counter tells how much later
@@ -139,10 +165,17 @@ def read_array_file(path: Path, on_fault: FaultHandler | None = None) -> Frames:
         note(f"frame {number}: {text}", minor=True)
 
     with _naming(path):
-        if path.suffix == ".csv":
-            frames = _read_csv(path, note)
-        else:
-            frames = {".mat": _read_mat, ".npz": _read_npz}[path.suffix](path)
+        match _format_of(path):
+            case ".csv":
+                frames = _read_csv(path, note)
+            case ".mat":
+                frames = _read_mat(path)
+            case ".npz":
+                frames = _read_npz(path)
+            case ".npy":
+                frames = _read_npy(path, downconversion)
+            case _:
+                frames = _read_text(path, note)
     if frames.t_ns is None:
         return frames
     counters: Iterable[tuple[str, int] | None] = itertools.repeat(None)
@@ -225,7 +258,7 @@ def _frames(
             yield from chunks()
 
     return Frames(
-        about=f"{shape[1]} {what} ({path.suffix})",
+        about=f"{shape[1]} {what} ({path.suffix or path.name})",
         kind=kind,
         chunks=checked,
         n_frames=shape[0],
@@ -345,6 +378,35 @@ def _npz_chunks(path: Path, kind: FrameKind) -> Iterator[Samples]:
                     yield rows.astype(DTYPES[kind])
                 return
         yield archive[kind].astype(DTYPES[kind])
+
+
+def _read_npy(path: Path, downconversion: bool | None) -> Frames:
+    values = np.load(path, mmap_mode="r", allow_pickle=False)
+    if values.ndim != 2 or values.dtype.kind not in "fciu":
+        raise ValueError(f"it holds {values.dtype} of shape {values.shape}, not frames x bins")
+    kind: FrameKind | None = "iq"
+    inferred = False
+    n_bins = values.shape[1]
+    if values.dtype.kind != "c":
+        layouts = FrameLayouts(downconversion)
+        for row in values[:_AT_ONCE]:
+            layouts.take(DataFloat(info=0, values=row.astype(np.float32)))
+        layout = layouts.layouts().get(n_bins, FrameLayout(values=n_bins, downconversion=False))
+        kind = None if layout.downconversion is None else "iq" if layout.downconversion else "rf"
+        inferred = layout.inferred
+        n_bins = layout.bins or n_bins
+
+    def chunks() -> Iterator[Samples]:
+        for begin in range(0, len(values), _AT_ONCE):
+            rows = values[begin : begin + _AT_ONCE]
+            if kind == "iq" and values.dtype.kind != "c":
+                halves = np.split(rows.astype(np.float32), 2, axis=1)
+                rows = np.stack(halves, axis=-1).view(np.complex64)[..., 0]
+            yield rows.astype(DTYPES[kind or "rf"])
+
+    shape = len(values), n_bins
+    frames = _frames(path, kind or "rf", shape, np.dtype("f4"), chunks=chunks, beside={})
+    return replace(frames, kind=kind, inferred=inferred)
 
 
 # --- .mat ---------------------------------------------------------------------------------------
@@ -561,6 +623,49 @@ def _read_csv(path: Path, note: Callable[[str], None]) -> Frames:
                 yield iq
 
     return _frames(path, kind, (n_frames, n_bins), DTYPES[kind], chunks=chunks, beside=beside)
+
+
+# --- lines of complex numbers -------------------------------------------------------------------
+
+_BETWEEN = re.compile(r"[,;\s]+")
+_IMAGINARY = re.compile(r"[\d.][ij]$")
+
+
+def _complex_row(line: str) -> list[complex] | None:
+    """Return the numbers of a line, one of which has an imaginary part; None for another line.
+
+    >>> _complex_row("(1+-2j), 3i"), _complex_row("1, 2"), _complex_row("# a+bj")
+    ([(1-2j), 3j], None, None)
+    """
+    cells = [cell.strip("()[]") for cell in _BETWEEN.split(line.strip())]
+    if not any(_IMAGINARY.search(cell) for cell in cells):
+        return None
+    try:
+        return [complex(re.sub("i$", "j", cell.replace("+-", "-"))) for cell in cells if cell]
+    except ValueError:
+        return None
+
+
+def _read_text(path: Path, note: Callable[[str], None]) -> Frames:
+    def rows(report_line: Callable[[str], None]) -> Iterator[list[complex]]:
+        n_bins = 0
+        with path.open(encoding="latin-1") as stream:
+            for number, line in enumerate(stream, start=1):
+                row = _complex_row(line)
+                n_bins = n_bins or len(row or ())
+                if row is not None and len(row) == n_bins:
+                    yield row
+                elif line.strip() and not line.lstrip().startswith("#"):
+                    report_line(f"line {number} is not {n_bins} complex numbers")
+
+    lengths = [len(row) for row in rows(note)]
+
+    def chunks() -> Iterator[Samples]:
+        for row in rows(lambda reason: None):
+            yield np.array([row], np.complex64)
+
+    shape = len(lengths), max(lengths, default=0)
+    return _frames(path, "iq", shape, DTYPES["iq"], chunks=chunks, beside={})
 
 
 @contextmanager

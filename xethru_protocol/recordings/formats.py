@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.recordings import wire_capture
-from xethru_protocol.recordings.array_files import SUFFIXES
+from xethru_protocol.recordings.array_files import is_array_file
 from xethru_protocol.recordings.clock import steady_messages
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
@@ -87,14 +87,16 @@ def recording_format(path: Path | str) -> RecordingFormat:
     for magic, found in _MAGICS.items():
         if is_like(start, magic):
             return found
-    if path.suffix in SUFFIXES:
+    if is_array_file(path):
         raise RecordingError(
             f"{path} is read for arrays only, by xethru_protocol.load and 'xethru convert';"
             f" messages are kept in .mcap"
         )
     raise RecordingError(
         f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
-        " a wire capture (.xtwire) or MCAP"
+        " a wire capture (.xtwire), MCAP, or arrays. Of a data file its name, as"
+        " xethru_datafloat_*.dat, decides, else its first records; of arrays .csv, .mat, .npz or"
+        " .npy, else a first line of complex numbers"
     )
 
 
@@ -232,7 +234,7 @@ def describe_recording(
     facts = recording_facts(path, faults.append)
     with reading(path):
         files: Iterable[Path] = [path]
-        if path.is_dir() or is_vendor_file(path):
+        if path.is_dir() or path.name.startswith("xethru_"):
             files = (path if path.is_dir() else path.parent).rglob("xethru_*")
         size_bytes = sum(file.stat().st_size for file in files if file.is_file())
     return RecordingSummary(

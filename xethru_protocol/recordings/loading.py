@@ -705,7 +705,7 @@ def _of_file(
     path: Path, given: Given, on_fault: FaultHandler | None
 ) -> Callable[[], Sequence[Frames]]:
     def find() -> Sequence[Frames]:
-        frames = read_array_file(path, on_fault)
+        frames = read_array_file(path, on_fault, downconversion=given.downconversion)
         ranges_m = given.ranges_m(frames.n_bins, frames.kind)
         return [frames if ranges_m is None else replace(frames, ranges_m=ranges_m)]
 

@@ -419,12 +419,14 @@ def closing_order(kind: DataFileKind) -> int:
 
 def kind_of_file(name: str) -> DataFileKind | None:
     for kind in _LONGEST_FIRST:
-        if name.startswith(kind.file_prefix) and name.endswith(kind.suffix):
+        if name.startswith(kind.file_prefix) and name.endswith((kind.suffix, WRITING_SUFFIX)):
             return kind
     return None
 
 
 META_NAME = "xethru_recording_meta.dat"
+WRITING_SUFFIX = ".writing"
+"""Of files that the vendor's recorder has not completed, in place of their own."""
 PARAMETER_FILE_NAME = "xethru_parameter_file.par"
 ABOUT_NAME = "xethru_radar.json"
 """Our own file beside the vendor's, whose reader opens what the meta file lists: ``session_id``

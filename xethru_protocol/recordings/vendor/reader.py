@@ -47,6 +47,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     META_NAME,
     PARAMETER_FILE_NAME,
     VERSION,
+    WRITING_SUFFIX,
     BinaryKind,
     DataFileKind,
     Entry,
@@ -58,12 +59,14 @@ from xethru_protocol.recordings.vendor.layouts import (
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.errors import LocalProtocolError
+from xethru_protocol.wire.messages import BasebandAp, BasebandIq
 from xethru_protocol.wire.table import Response
 
 _LONGEST_USER_HEADER = 4096  # bytes; searched where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16
 _LAST_CONTENT_ID = 14  # Protocol reference 6.1
 _FURTHEST = 1 << 48  # byte of a recording; sums of such numbers stay within 64 bits
+_MOST_LOOKED_AT = 100  # files of a directory
 _DIRECTORY_PREFIX = "xethru_recording_"
 _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT")
 
@@ -125,6 +128,8 @@ def _part(directory: Path, files: dict[Path, DataFileKind] | None = None) -> _Re
                 meta = parse_meta(path.read_bytes())
     except RecordingError as error:
         problem = f"it is of no use: {error}"
+    if meta is None and (directory / META_NAME).with_suffix(WRITING_SUFFIX).exists():
+        problem = f"it is missing, and files *{WRITING_SUFFIX} tell that the recorder was killed"
     found = _data_files(directory, meta) if files is None else files
     return _RecordingDirectory(directory=directory, files=found, meta=meta, problem=problem)
 
@@ -152,7 +157,44 @@ def _kind_of_entry(entry: Entry) -> DataFileKind | None:
 
 
 def is_vendor_file(path: Path) -> bool:
-    return path.name == META_NAME or kind_of_file(path.name) is not None
+    return path.name == META_NAME or kind_of_data_file(path) is not None
+
+
+def kind_of_data_file(path: Path) -> DataFileKind | None:
+    """Return what a data file holds by its name, else by its content; None if it holds nothing.
+
+    RecordingError if its records may be of several kinds: only its name tells.
+    """
+    kind = kind_of_file(path.name)
+    if kind is not None or path.name == META_NAME or not path.is_file():
+        return kind
+    with path.open("rb") as stream:
+        start = stream.read(2 * _LARGEST_PLAUSIBLE_RECORD)
+    size = path.stat().st_size
+    found = [
+        kind
+        for kind in KIND_OF_TYPE.values()
+        if (
+            start.startswith(kind.titles)
+            if isinstance(kind, TextKind)
+            else _records_follow(start, 0, size, kind)
+        )
+    ]
+    if not found:
+        return None
+    if KIND_OF_MESSAGE[BasebandIq] in found:  # amplitude and phase have the same layout
+        kind = KIND_OF_MESSAGE[BasebandIq]
+        assert isinstance(kind, BinaryKind)
+        first = decode_response(kind.prefix + start[: kind.record_size(start)])
+        assert isinstance(first, BasebandIq)
+        is_polar = (first.i >= 0).all() and (np.abs(first.q) <= np.float32(np.pi)).all()
+        return KIND_OF_MESSAGE[BasebandAp] if is_polar else kind
+    if len(found) > 1:
+        names = " or ".join(kind.file_prefix for kind in found)
+        raise RecordingError(
+            f"{path} is of several kinds by its records; begin its name with {names}"
+        )
+    return found[0]
 
 
 def _parts_of(path: Path) -> list[_RecordingDirectory]:
@@ -160,7 +202,7 @@ def _parts_of(path: Path) -> list[_RecordingDirectory]:
     with reading(path):
         if not path.exists():
             raise RecordingError(f"there is no recording {path}")
-        kind = kind_of_file(path.name)
+        kind = kind_of_data_file(path)
         if path.is_dir():
             parts = [_part(path)]
             if not parts[0].files:
@@ -171,6 +213,9 @@ def _parts_of(path: Path) -> list[_RecordingDirectory]:
             parts = _chain(path.parent)
     if not any(part.files for part in parts):
         wanted = "xethru_baseband_iq_*.dat, xethru_datafloat_*.dat or the like"
+        others = sorted(path.iterdir())[:_MOST_LOOKED_AT] if path.is_dir() else []
+        if renamed := next(filter(kind_of_data_file, others), None):
+            wanted += f"; {renamed} is one by its content: files under other names are read singly"
         raise RecordingError(f"{path} holds no recording this can read; it needs a file {wanted}")
     return parts
 

@@ -370,7 +370,7 @@ def test_directories_are_made_and_replaced(
     assert capsys.readouterr().out.startswith(f"{out}: 3 messages")
     parts = sorted(path.name for path in out.iterdir())
     pattern = r"xethru_recording_\d{8}_\d{6}_one_"
-    assert [re.sub(pattern, "", name) for name in parts] == ["0", "1", "2", "xethru_radar.json"]
+    assert [re.sub(pattern, "", name) for name in parts] == ["xethru_radar.json", "0", "1", "2"]
     assert counters(out) == counters(tmp_path) == [0, 1, 2]
     command[4] = str(out)
     assert main(command) == 1
