@@ -16,6 +16,7 @@ from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
 from xethru_protocol.recordings import RecordingError, WireCapture
+from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.validation import shown, suffix_of
 
 
@@ -74,7 +75,7 @@ def run_convert(
     """
     if out.exists():
         raise AppError(f"{out}: exists; choose another name")
-    is_session = source.suffix == _SESSION_SUFFIX
+    is_session = source.suffix == _SESSION_SUFFIX or _begins(source, MAGIC)
     if is_session and suffix_of(out) not in ("", _SESSION_SUFFIX, *_OF_SESSION):
         raise UsageError(
             f"{out}: a session is not converted to {out.suffix}; name an OUT that ends in "
@@ -82,20 +83,20 @@ def run_convert(
             "tables and arrays of its frames"
         )
     warnings: list[str] = []
-    if source.suffix == _SESSION_SUFFIX and out.suffix != _SESSION_SUFFIX:
+    if is_session and out.suffix != _SESSION_SUFFIX:
         with _whole(out) as fresh:
             result = _from_session(open_session(source, stop), fresh, preset, radar, stop)
     elif out.suffix != _SESSION_SUFFIX:
         raise UsageError(
             f"{out}: of a bag or MATLAB file a session is made; give a name that ends in .mcap"
         )
-    elif source.suffix == _SESSION_SUFFIX and _is_session(source, stop):
+    elif is_session and _is_session(source, stop):
         raise UsageError(
             f"{source}: is a session already; name an OUT that ends in .mat, .xtwire or .bag, or "
             "a new folder for a bag of ROS 2"
         )
     else:
-        is_mat = source.suffix == _MAT_SUFFIX
+        is_mat = source.suffix == _MAT_SUFFIX or _begins(source, b"MATLAB 5.0")
         name = preset or (_MAT_PRESET if is_mat else _PRESET)
         _config(name)  # reports a wrong name before anything is read
         given_rig = None if rig is None else load_rig(rig).rig
@@ -117,6 +118,15 @@ def run_convert(
     for line in warnings:
         note(f"{source}: {line}")
     print_text(result.replace(str(fresh), str(out)))
+
+
+def _begins(source: Path, magic: bytes) -> bool:
+    """Whether a file begins so, whatever its name."""
+    with naming(source):
+        if not source.is_file():
+            return False
+        with source.open("rb") as stream:
+            return stream.read(len(magic)) == magic
 
 
 def _is_session(path: Path, stop: StopFlag) -> bool:

@@ -1,5 +1,6 @@
 """A suffix of a name to be written is honoured or refused, by every command that writes."""
 
+import shutil
 from collections.abc import Callable
 from datetime import UTC
 from pathlib import Path
@@ -76,7 +77,10 @@ def test_a_date_or_a_version_is_not_a_suffix(target: str, here: Path) -> None:
     ("target", "code"), [("x.csv", 2), ("x.npz", 2), ("x.mcpa", 2), ("bag.2026-11-25", 0)]
 )
 def test_a_session_is_converted_to_what_the_suffix_says(target: str, code: int, here: Path) -> None:
-    write_session(here / "session.mcap", 3)
-    assert SLAM(["convert", "session.mcap", target]) == code
+    for name in ("session.mcap", "session.bak"):  # by its content
+        write_session(here / name, 3)
+        assert SLAM(["convert", name, target]) == code
+        if code == 0 and name == "session.mcap":
+            shutil.rmtree(here / target)
     assert (here / target / "metadata.yaml").is_file() == (code == 0)
     assert (here / target).exists() == (code == 0)

@@ -87,7 +87,9 @@ def test_every_kind_of_file_is_known_by_its_records_or_needs_its_name(
         found = list(read_recording(renamed, lambda fault: None))
     except RecordingError as error:
         assert prefix in str(error)  # noqa: PT017 - one of several kinds with the same layout
-        assert prefix.endswith(("pulsedoppler_float", "noisemap_float", "_byte", "radar_rf"))
+        assert prefix.endswith(
+            ("pulsedoppler_float", "noisemap_float", "_byte", "_rf", "_normalized")
+        )
     else:
         whole = list(read_recording(file, lambda fault: None))
         assert [message for message, _ in found] == [message for message, _ in whole]
