@@ -43,8 +43,12 @@ class RadarFrame:
                 f"a radar frame is one row of float32 samples, not shape {self.samples.shape} "
                 f"of {self.samples.dtype}; raw RF mode (no downconversion) gives that"
             )
-        if not self.bin_length_m > 0:
-            raise ValueError(f"bin_length_m is {self.bin_length_m}, must be positive")
+        if self.radar < 0:
+            raise ValueError(f"radar is {self.radar}, must be the index of a mount, 0 or more")
+        if not 0 < self.bin_length_m < math.inf:
+            raise ValueError(f"bin_length_m is {self.bin_length_m}, must be positive and finite")
+        if not math.isfinite(self.range_start_m):
+            raise ValueError(f"range_start_m is {self.range_start_m}, must be finite")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +68,17 @@ class Detection:
     # pulse alone; NaN where the front end fits none
     misfit: float = math.nan
     saturated: bool = False  # whether samples of the echo lay at a limit of the module's sampler
+
+    def __post_init__(self) -> None:
+        if self.radar < 0:
+            raise ValueError(f"radar is {self.radar}, must be the index of a mount, 0 or more")
+        if not math.isfinite(self.range_m):
+            raise ValueError(f"range_m is {self.range_m}, must be finite")
+        if self.sigma_m <= 0 or self.misfit < 0:
+            raise ValueError(
+                f"sigma_m is {self.sigma_m} and misfit {self.misfit}; the first must be positive, "
+                "the second 0 or more, and both NaN where they are not known"
+            )
 
 
 class Detector(Protocol):

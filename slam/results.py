@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from slam.config import SlamConfig
 from slam.frames import Detection, RadarFrame
+from slam.geometry import Rig
 
 Array = NDArray[np.float64]
 
@@ -212,6 +213,71 @@ class SmoothedRun:
     landmark_covariances_m2: Array  # shape (m, 2, 2)
 
 
+class StepInputError(ValueError):
+    """A pipeline was given something that it cannot be stepped with; it stays as it was."""
+
+
+class InputCheck:
+    """Checks what a pipeline is stepped with, before it changes anything; raises StepInputError."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._n_radars = len(rig.mounts)
+        self._last_ns: int | None = None  # time of the last step
+
+    def begin(self, pose_at: PoseAt, t_ns: int) -> Array:
+        """Return the odometry pose (3,) of a step, which may not be before the last one."""
+        if self._last_ns is not None and not t_ns >= self._last_ns:
+            raise StepInputError(f"t_ns is {t_ns}, before that of the last step, {self._last_ns}")
+        pose = self.pose(pose_at, t_ns)
+        self._last_ns = t_ns
+        return pose
+
+    def pose(self, pose_at: PoseAt, t_ns: int) -> Array:
+        """Return the odometry pose at a time, shape (3,), three finite numbers."""
+        pose = np.array(pose_at(t_ns), dtype=np.float64)
+        if pose.shape != (POSE_SIZE,) or not all(map(math.isfinite, pose)):
+            raise StepInputError(
+                f"odometry at {t_ns} ns is {pose.tolist()}; a pose is three finite numbers, "
+                "x [m], y [m] and heading [rad]"
+            )
+        return pose
+
+    def frames(self, frames: Sequence[RadarFrame]) -> dict[int, int]:
+        """Return the times of frames by radar; each must be of another radar of the rig."""
+        stamps_ns = self._stamps_ns(frames)
+        if len(stamps_ns) < len(frames):
+            radars = [frame.radar for frame in frames]
+            raise StepInputError(f"frames of radars {radars}; a step takes one of each")
+        return stamps_ns
+
+    def detections(
+        self, detections: Sequence[Detection], of_frames_ns: Mapping[int, int] | None = None
+    ) -> tuple[Detection, ...]:
+        """Return detections, which must be those of one frame of each radar of the rig.
+
+        ``of_frames_ns`` are the times of these frames by radar; None: of any.
+        """
+        stamps_ns = self._stamps_ns(detections) if of_frames_ns is None else of_frames_ns
+        for each in detections:
+            if stamps_ns.get(each.radar) != each.t_ns:
+                raise StepInputError(
+                    f"a detection of radar {each.radar} at {each.t_ns} ns, which is not of the "
+                    f"radar's frame in this step; times of frames by radar: {stamps_ns}"
+                )
+        return tuple(detections)
+
+    def _stamps_ns(self, seen: Sequence[RadarFrame | Detection]) -> dict[int, int]:
+        stamps_ns: dict[int, int] = {}
+        for each in seen:
+            if each.radar >= self._n_radars:
+                raise StepInputError(
+                    f"radar {each.radar} of a rig of {self._n_radars}; radars are numbered from 0 "
+                    "in the order of its mounts"
+                )
+            stamps_ns.setdefault(each.radar, each.t_ns)
+        return stamps_ns
+
+
 class Slam(Protocol):
     """The paper's pipeline or the robust one; the map frame is the body frame at the first pose."""
 
@@ -225,6 +291,8 @@ class Slam(Protocol):
         There is at most one frame per radar, each with the time it was taken at; a radar whose
         frame was lost is absent. ``pose_at`` is asked for the pose at ``t_ns``, the time of the
         state, and, unless all radars are taken to have sampled then, at the times of the frames.
+        Times of steps do not fall. Raises StepInputError, a ValueError, before anything has changed
+        if the input is not so, or a pose is not finite.
         """
         ...
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from slam.paper.association import update_map
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.ekf import motion_noise, predict, start
 from slam.paper.trilateration import NO_MOTIONS, Trilaterator
-from slam.results import Belief, PoseAt, SmoothedRun, StepResult
+from slam.results import Belief, InputCheck, PoseAt, SmoothedRun, StepResult
 
 Array = NDArray[np.float64]
 
@@ -32,6 +31,7 @@ class UwbRadarSlam:
         sensor = config.observation
         self._Q = np.diag([sensor.sigma_range_m**2, sensor.sigma_bearing_rad**2])
         self._detector = detector or make_detector(config, rig)
+        self._check = InputCheck(rig)
         limits = config.detection
         self._trilaterator = Trilaterator(
             config.trilateration, rig, (limits.min_range_m, limits.max_range_m)
@@ -44,13 +44,19 @@ class UwbRadarSlam:
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        detect = partial(detect_all, self._detector, frames, self.rig)
+        stamps_ns = self._check.frames(frames)
+
+        def detect() -> tuple[Detection, ...]:
+            found = detect_all(self._detector, frames, self.rig)
+            return self._check.detections(found, stamps_ns)
+
         return self._take(detect, pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        return self._take(lambda: tuple(detections), pose_at, t_ns)
+        checked = self._check.detections(detections)
+        return self._take(lambda: checked, pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
         if self.config.window.end_of_run is EndOfRun.DROP:
@@ -69,17 +75,17 @@ class UwbRadarSlam:
         self, detect: Callable[[], tuple[Detection, ...]], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Collect a state where the robot has moved; estimate the oldest once w are there."""
-        pose = np.array(pose_at(t_ns), dtype=np.float64)
+        pose = self._check.begin(pose_at, t_ns)
         if self._collected_pose is None:  # Odom[0] <- origin
             self._collected_pose = self._estimated_pose = pose
             return ()
         window = self.config.window
         if not has_moved(self._collected_pose, pose, window.min_distance_m, window.min_turn_rad):
             return ()
-        self._collected_pose = pose
         detections = detect()
         motions = self._motions(detections, pose, pose_at, t_ns)
         fixes = self._trilaterator.locate(detections, t_ns, motions)
+        self._collected_pose = pose
         self._window.append(
             CollectedState(t_ns=t_ns, odometry_pose=pose, detections=detections, fixes=fixes)
         )
@@ -118,4 +124,6 @@ class UwbRadarSlam:
         if self.config.trilateration.sample_time is SampleTime.NOMINAL:
             return NO_MOTIONS
         stamps_ns = {detection.t_ns for detection in detections} - {t_ns}
-        return {stamp_ns: between(pose, pose_at(stamp_ns)) for stamp_ns in stamps_ns}
+        return {
+            stamp_ns: between(pose, self._check.pose(pose_at, stamp_ns)) for stamp_ns in stamps_ns
+        }

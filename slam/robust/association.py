@@ -68,17 +68,24 @@ class RangeScan:
     bearing_sigmas_rad: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("bearings_rad", "bearing_sigmas_rad"):
+        """Raise ValueError if a number is not finite, or missing for one of the ranges."""
+        n = len(self.ranges_m)
+        for name in ("sigmas_m", "bearings_rad", "bearing_sigmas_rad", "labels"):
             values = getattr(self, name)
-            if values is not None and len(values) != len(self.ranges_m):
+            if values is not None and len(values) != n:
                 raise ValueError(
-                    f"{len(values)} {name} of {len(self.ranges_m)} ranges; there must be one for "
-                    "each range"
+                    f"{len(values)} {name} of {n} ranges; there must be one for each range"
                 )
-        if self.labels is not None and len(self.labels) != len(self.ranges_m):
+        sigmas = (*(self.sigmas_m or ()), *(self.bearing_sigmas_rad or ()))
+        numbers = (*self.ranges_m, *(self.moved or ()), *self.blurred_m, *(self.bearings_rad or ()))
+        if (
+            self.radar < 0
+            or min(sigmas, default=0.0) < 0.0
+            or not math.isfinite(sum(numbers + sigmas))
+        ):
             raise ValueError(
-                f"{len(self.labels)} labels of {len(self.ranges_m)} ranges; there must be one, or "
-                "None, for each range"
+                f"{self}: radar must be the index of a mount, every number finite, and none of the "
+                "standard deviations negative"
             )
 
     @property

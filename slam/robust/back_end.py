@@ -231,6 +231,8 @@ class RobustBackEnd:
 
         ``covariance`` (3, 3) is its noise, where that is known better than from the wheels' model.
         """
+        if not np.isfinite(increment).all():
+            raise ValueError(f"increment is {increment}; dx, dy [m] and turn [rad] must be finite")
         wheels = self.parameters.wheels
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
         self._log.add_motion(increment, motion, is_loose=covariance is not None)
@@ -270,6 +272,12 @@ class RobustBackEnd:
         Without ``solve`` merges and the solution over all poses wait for a later time. With
         ``decide`` what is unclear is taken for the likeliest; without it, questions stay open.
         """
+        radars = {scan.radar for scan in scans}
+        if len(radars) < len(scans) or max(radars, default=0) >= len(self.rig.mounts):
+            raise ValueError(
+                f"scans of radars {[scan.radar for scan in scans]}; there is at most one of each "
+                f"of the {len(self.rig.mounts)} in the rig"
+            )
         looks = [scan for scan in scans if scan.looks]
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)

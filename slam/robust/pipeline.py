@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.geometry import Rig, between, has_moved
 from slam.growing_arrays import PackedRows
-from slam.results import Belief, PoseAt, SmoothedRun, StepResult
+from slam.results import Belief, InputCheck, PoseAt, SmoothedRun, StepResult
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
@@ -47,6 +46,7 @@ class RobustSlam:
         self.rig = rig
         self._branches = Branches(rig, back_end_parameters(config, wheels, rules))
         self._detector = detector or make_detector(config, rig)
+        self._check = InputCheck(rig)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
         # Since when the wheels have stood at a pose, and how long they did since the last state
@@ -62,17 +62,22 @@ class RobustSlam:
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Return the state if the robot has moved; without any frame there is odometry alone."""
-        stamps_ns = {frame.radar: frame.t_ns for frame in frames}
-        detect = partial(detect_all, self._detector, frames, self.rig)
+        stamps_ns = self._check.frames(frames)
+
+        def detect() -> tuple[Detection, ...]:
+            found = detect_all(self._detector, frames, self.rig)
+            return self._check.detections(found, stamps_ns)
+
         return self._take(detect, stamps_ns, pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Do what ``step`` does; a radar without a detection looked at ``t_ns`` and saw nothing."""
+        checked = self._check.detections(detections)
         stamps_ns = dict.fromkeys(range(len(self.rig.mounts)), t_ns)
         stamps_ns |= {detection.radar: detection.t_ns for detection in detections}
-        return self._take(lambda: tuple(detections), stamps_ns, pose_at, t_ns)
+        return self._take(lambda: checked, stamps_ns, pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
         return ()
@@ -92,7 +97,7 @@ class RobustSlam:
         pose_at: PoseAt,
         t_ns: int,
     ) -> tuple[StepResult, ...]:
-        pose = np.array(pose_at(t_ns), dtype=np.float64)
+        pose = self._check.begin(pose_at, t_ns)
         if has_moved(self._still, pose, _STILL_M, _STILL_RAD):
             self._still, self._still_ns = pose, t_ns
         self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
@@ -107,7 +112,7 @@ class RobustSlam:
         detections = detect()
         sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         moved = {
-            radar: None if stamp_ns == t_ns else between(pose, pose_at(stamp_ns))
+            radar: None if stamp_ns == t_ns else between(pose, self._check.pose(pose_at, stamp_ns))
             for radar, stamp_ns in stamps_ns.items()
         }
         branches = self._branches

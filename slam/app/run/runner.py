@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from slam.app.errors import AppError
 from slam.app.session_records import (
     LogLine,
     RadarInfo,
@@ -33,7 +34,7 @@ from slam.geometry import Rig
 from slam.growing_arrays import PackedRows, RowsByTime
 from slam.numba_functions import compile_kernels
 from slam.paper.pipeline import UwbRadarSlam
-from slam.results import Slam, SmoothedRun, StepResult
+from slam.results import Slam, SmoothedRun, StepInputError, StepResult
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.frames import Frame
@@ -358,6 +359,8 @@ def run_slam(
     ------
     OdometryError
         Odometry does not cover the time of a scan.
+    AppError
+        SLAM cannot be stepped with a scan, such as one that is before the last one.
     """
     recorder = RunRecorder(true_landmarks_m)
     observers = [recorder, *observers]
@@ -398,6 +401,8 @@ def run_slam(
                     results = slam.step(frames, odometry.pose_at, scan.t_ns)
             except StepGivenUpError:
                 given_up, scan = True, replace(scan, used=False)
+            except StepInputError as error:
+                raise AppError(f"scan {scan.counter}: {error}") from None
             finally:
                 for observer in observers:
                     observer.on_scan(scan)

@@ -18,11 +18,14 @@ from hil_tests.unit.slam.app.sessions import (
     session_info,
     snapshot,
 )
+from slam.app.errors import AppError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.run.output import RunProgress
-from slam.app.run.runner import LinkStates, run_slam, unknown_truth
+from slam.app.run.runner import LinkStates, make_slam, run_slam, unknown_truth
 from slam.app.session_records import LogLine
+from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.frames import RadarFrame
+from slam.geometry import paper_rig
 from slam.results import Belief, PoseAt, StepResult
 
 COUNTERS = (5, 6, 8, 11, 12)
@@ -105,6 +108,16 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     assert record.n_frames == 2 * 3
     np.testing.assert_array_equal(record.world_from_map, np.zeros(3))
     assert np.isnan(record.states.truth).all()
+
+
+@pytest.mark.parametrize("back_end", BackEnd)
+def test_scans_whose_times_fall_end_the_run_and_reach_the_observers(back_end: BackEnd) -> None:
+    ends = [TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0) for t_ns in (0, 20 * FRAME_NS)]
+    slam = make_slam(SlamConfig(back_end=back_end), paper_rig(), WheelNoise())
+    listener = Listener()
+    with pytest.raises(AppError):
+        run_slam(map(scan, (5, 4)), OdometryTrack(ends), slam, unknown_truth, [listener])
+    assert [scan.counter for scan in listener.scans] == [5, 4]
 
 
 def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
