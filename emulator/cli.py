@@ -29,7 +29,7 @@ from xethru_protocol.operating_system import (
     one_line,
 )
 from xethru_protocol.optional_packages import what_is_missing
-from xethru_protocol.validation import number, output, shown
+from xethru_protocol.validation import Parser, number, output, shown
 
 if TYPE_CHECKING:
     from emulator.faults.kind import KindOfFault
@@ -361,7 +361,7 @@ def _warn(text: str) -> None:
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="xethru-emulator",
         description="Emulated X4M300 radars on pseudo-terminals. To begin: `xethru-emulator "
         "serve --bare` prints the path of a port; `xethru info --port PATH` asks what is there.",

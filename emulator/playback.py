@@ -42,7 +42,7 @@ from xethru_protocol.recordings import (
     recording_radars,
 )
 from xethru_protocol.recordings.recorded_messages import TimedMessages
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import choices, shown
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import BootloaderReply, ResponseCode, SensorMode, X4Setting
 from xethru_protocol.wire.messages import (
@@ -193,9 +193,7 @@ def kinds(names: Iterable[str]) -> frozenset[str]:
     """
     wanted = frozenset(map(_slug, names))
     for name in sorted(wanted - _KINDS):
-        raise ValueError(
-            f"{shown(name)} is no kind of message; known are {', '.join(sorted(_KINDS))}"
-        )
+        raise ValueError(f"{shown(name)} is no kind of message; {choices(name, sorted(_KINDS))}")
     return wanted
 
 

@@ -40,7 +40,7 @@ from xethru_protocol.operating_system import STDOUT, StopFlag, json_text
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.transport import open_line
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import choices, shown
 from xethru_protocol.wire.errors import PortUnavailable
 
 NS_PER_MS = 1_000_000
@@ -110,7 +110,7 @@ class FaultSession:
                 if name not in self.devices:
                     raise FaultPlanError(
                         f"fault[{index}].radar: no radar is called {shown(name)}; "
-                        f"there are {', '.join(self.devices)}"
+                        f"{choices(name, self.devices)}"
                     )
 
     def control(

@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from xethru_protocol.validation import problem_text, shown
+from xethru_protocol.validation import choices, problem_text, shown
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -455,7 +455,7 @@ def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
     """
     known = sorted(file.stem for file in _SHIPPED_PRESETS.glob("*.toml"))
     if name not in known:
-        raise ConfigError(f"unknown preset {name}; known: {', '.join(known)}")
+        raise ConfigError(f"unknown preset {name}; {choices(name, known)}")
     file = _SHIPPED_PRESETS / f"{name}.toml"
     source = f"preset {name}.toml"
     try:
@@ -480,8 +480,8 @@ def config_from_tables(
     if "environment" not in tables:
         return _validated(base, source)
     if environment != BASE_ENVIRONMENT and environment not in overrides:
-        allowed = ", ".join([BASE_ENVIRONMENT, *sorted(overrides)])
-        raise ConfigError(f"{source}: no environment {environment}; known: {allowed}")
+        known = choices(environment, [BASE_ENVIRONMENT, *sorted(overrides)])
+        raise ConfigError(f"{source}: no environment {environment}; {known}")
     configs = {BASE_ENVIRONMENT: _validated(base, source)}
     for name, values in overrides.items():
         key = f"environment.{name}"

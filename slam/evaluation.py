@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from slam.geometry import (
     has_moved,
     transform,
     wrap_angle,
+    wrap_angles,
 )
 from slam.results import Association, StepResult
 
@@ -84,6 +86,34 @@ def ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
     """
     _check_rows(estimate_xy, reference_xy)
     return rmse_m(transform(align_se2(estimate_xy, reference_xy), estimate_xy), reference_xy)
+
+
+def ate_rotation_rmse_rad(estimate: Array, reference: Array) -> float:
+    """Return the RMS error of heading after the alignment of ``ate_rmse_m``; shapes (n, 3)."""
+    turn_rad = align_se2(estimate[:, :2], reference[:, :2])[2]
+    errors_rad = wrap_angles(estimate[:, 2] + turn_rad - reference[:, 2])
+    return math.sqrt(float(np.mean(errors_rad**2)))
+
+
+def relative_pose_errors(estimate: Array, reference: Array, delta_m: float) -> Array:
+    """Return the error of each motion over ``delta_m`` of the reference's way, shape (k, 3).
+
+    Poses (n, 3) belong together by time. A motion begins where the one before ends, as in evo
+    (``evo_rpe --delta_unit m --pairs_from_reference``). Of the motions Q of the reference and P of
+    the estimate the error is Q^-1 P (Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM
+    Systems", IROS 2012): dx, dy [m] and turn [rad].
+    """
+    ends, way_m = [0], 0.0
+    for row, step_m in enumerate(np.hypot(*np.diff(reference[:, :2], axis=0).T).tolist(), start=1):
+        way_m += step_m
+        if way_m >= delta_m:
+            ends.append(row)
+            way_m = 0.0
+    errors = [
+        between(between(reference[i], reference[j]), between(estimate[i], estimate[j]))
+        for i, j in pairwise(ends)
+    ]
+    return np.array(errors).reshape(-1, 3)
 
 
 def icp_ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import math
+import os.path
 import re
-from argparse import ArgumentTypeError
-from collections.abc import Callable, Mapping, Sequence
+from argparse import ArgumentParser, ArgumentTypeError
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from xethru_protocol.operating_system import one_line
 
@@ -94,6 +96,42 @@ def shown(value: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
+_FEW = 4
+"""So many names may be listed in any case."""
+
+
+def choices(name: str, names: Iterable[str]) -> str:
+    """Return which name may be meant by an unknown one; all names where they are few, or none is.
+
+    >>> choices("labb", ["lab", "store"]), choices("x", ["lab", "store"])
+    ('did you mean lab? known are lab, store', 'known are lab, store')
+    """
+    known = list(names)
+    close = [f"did you mean {each}?" for each in get_close_matches(name.lower(), known, n=1)]
+    if not close or len(known) <= _FEW:
+        close.append(f"known are {', '.join(known) or 'none'}")
+    return " ".join(close)
+
+
+_INVALID_CHOICE = re.compile(r"(.*invalid choice: '(.*)') \(choose from '?(.*?)'?\)", re.DOTALL)
+_BETWEEN_CHOICES = re.compile("'?, '?")
+
+
+class Parser(ArgumentParser):
+    """A parser of a command line that asks which choice was meant by a misspelt one."""
+
+    def error(self, message: str) -> NoReturn:
+        if found := _INVALID_CHOICE.fullmatch(message):
+            message = f"{found[1]}; {choices(found[2], _BETWEEN_CHOICES.split(found[3]))}"
+        super().error(message)
+
+
+def recording_at(text: str) -> str:
+    """Return the path of a recording: of a run's folder that of its session.mcap."""
+    session = os.path.join(text, "session.mcap")
+    return session if os.path.isfile(session) else text
+
+
 def reason_of(error: Exception) -> str:
     """Return why reading something failed, without Python's own words for what it met.
 
@@ -166,7 +204,7 @@ def _text(problem: Problem, keys: Sequence[str], table: Any) -> str:  # noqa: AN
     kind, value, limits = problem["type"], problem.get("input"), problem.get("ctx", {})
     match kind:
         case "extra_forbidden":
-            text = f"unknown key; allowed are {', '.join(keys) or 'none'}"
+            text = f"unknown key; {choices(str(problem['loc'][-1]), keys)}"
         case "tuple_type" if isinstance(value, dict) and table is not None:
             name = problem["loc"][-1]
             text = f"must be a list of tables; begin each with [[{name}]], not [{name}]"

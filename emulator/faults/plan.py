@@ -43,7 +43,7 @@ from pydantic import (
 from emulator.faults.kind import KindOfFault, Parameters, Target
 from emulator.faults.kinds import KINDS
 from emulator.scene.toml_files import Table, finite, load_table
-from xethru_protocol.validation import problem_text, shown
+from xethru_protocol.validation import choices, problem_text, shown
 from xethru_protocol.wire.messages import Command
 from xethru_protocol.wire.table import ROWS
 
@@ -139,17 +139,15 @@ class FaultSpec(Table):
     @classmethod
     def _known_kind(cls, kind: str) -> str:
         if kind not in KINDS:
-            raise ValueError(
-                f"no kind of fault is called {shown(kind)}; known are {', '.join(KINDS)}"
-            )
+            raise ValueError(f"no kind of fault is called {shown(kind)}; {choices(kind, KINDS)}")
         return kind
 
     @field_validator("command")
     @classmethod
     def _known_command(cls, command: str | int | None) -> str | int | None:
         if isinstance(command, str) and command not in _COMMANDS:
-            known = ", ".join(sorted(_COMMANDS))
-            raise ValueError(f"no command is called {shown(command)}; known are {known}")
+            known = choices(command, sorted(_COMMANDS))
+            raise ValueError(f"no command is called {shown(command)}; {known}")
         if isinstance(command, int) and not 0 <= command <= 0xFF:
             raise ValueError(f"an opcode is 0 ... 255, not {command}")
         return command

@@ -24,6 +24,7 @@ from pydantic import (
 )
 
 from emulator.chip.chip import Refusal
+from xethru_protocol.validation import choices
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
     ErrorCode,
@@ -261,7 +262,7 @@ def option_of(text: str) -> tuple[str, object]:
     name, equals, value = text.partition("=")
     kind = _OPTION_TYPES.get(name)
     if kind is None:
-        raise ValueError(f"no option is called {name}; there are {', '.join(_OPTION_TYPES)}")
+        raise ValueError(f"no option is called {name}; {choices(name, _OPTION_TYPES)}")
     try:
         if not equals:
             raise ValueError

@@ -31,7 +31,7 @@ from emulator.scene.motion import (
 from emulator.scene.people import PersonSpec
 from emulator.scene.rooms import FAMILIES, MOST_ROOMS, room_of, room_tables
 from emulator.scene.toml_files import Number, SerialNumber, Table, is_name, load_table
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import choices, shown
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
 """Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
@@ -543,9 +543,10 @@ def load_scene(path_or_name: str | Path) -> Scene:
     if room is not None:
         return Scene.model_validate(room_tables(*room))
     if is_name(path_or_name) and ":" in path_or_name:
+        family = path_or_name.partition(":")[0]
         raise UnknownSceneError(
-            f"{path_or_name}: no such room; the families are {', '.join(FAMILIES)}, and each has "
-            f"the rooms 0 to {MOST_ROOMS - 1}: pillars:3"
+            f"{path_or_name}: no such room; a family has the rooms 0 to {MOST_ROOMS - 1}, such as "
+            f"pillars:3; {choices(family, FAMILIES)}"
         )
     return load_table(
         Scene,

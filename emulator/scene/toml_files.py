@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from xethru_protocol.operating_system import read_bounded
-from xethru_protocol.validation import problem_text, shown
+from xethru_protocol.validation import choices, problem_text, shown
 
 # Beside this package, in the repository and in the wheel alike. Not importlib.resources on the
 # name "fixtures": a folder of that name in the user's own project would come first.
@@ -90,8 +90,8 @@ def load_table(
     if is_name(path_or_name):
         if text not in shipped_names(folder):
             raise unknown(
-                f"{text}: no such {what}; known are {', '.join(shipped_names(folder))}, "
-                "or give the path of a .toml file"
+                f"{text}: no such {what}, nor the path of a .toml file; "
+                f"{choices(text, shipped_names(folder))}"
             )
         source = _FIXTURES / folder / f"{text}.toml"
     try:

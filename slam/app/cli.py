@@ -30,7 +30,7 @@ from xethru_protocol.operating_system import (
     open_closed_streams,
 )
 from xethru_protocol.optional_packages import what_is_missing
-from xethru_protocol.validation import output, shown
+from xethru_protocol.validation import Parser, number, output, recording_at, shown
 
 _BY_A_SIGNAL = 128
 """Exit codes from here on are of signals."""
@@ -144,6 +144,11 @@ def _output(*suffixes: str, what: str = "a folder") -> Callable[[str], Path]:
         return allowed(text)
 
     return read
+
+
+def _session(text: str) -> Path:
+    """Return the path of a session, also of that in a run's folder."""
+    return Path(recording_at(text))
 
 
 def _whole_number(text: str, *, least: int) -> int:
@@ -272,7 +277,7 @@ def _add_view(view: argparse.ArgumentParser) -> None:
 
 def _add_report(report: argparse.ArgumentParser) -> None:
     report.add_argument(
-        "session", type=Path, metavar="SESSION", help="a session.mcap, or a run's folder"
+        "session", type=_session, metavar="SESSION", help="a session.mcap, or a run's folder"
     )
     report.add_argument(
         "--out",
@@ -326,18 +331,42 @@ def _add_run(run: argparse.ArgumentParser) -> None:
 
 
 def _add_replay(replay: argparse.ArgumentParser) -> None:
-    replay.add_argument("session", type=Path, metavar="SESSION", help="a session.mcap")
+    replay.add_argument(
+        "session", type=_session, metavar="SESSION", help="a session.mcap, or a run's folder"
+    )
     _add_out(replay, "out/replay")
 
 
 def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
-    evaluate.add_argument("estimate", type=Path, metavar="EST", help="TUM file to judge")
-    evaluate.add_argument("reference", type=Path, metavar="REF", help="TUM file to judge by")
+    evaluate.add_argument(
+        "estimates",
+        type=Path,
+        nargs="+",
+        metavar="EST",
+        help="TUM file to judge, or a session or a run's folder, whose estimate is judged",
+    )
+    evaluate.add_argument(
+        "reference",
+        type=Path,
+        metavar="REF",
+        help="TUM file to judge by, or a session or a run's folder, whose truth it is",
+    )
+    evaluate.add_argument(
+        "--delta",
+        dest="delta_m",
+        type=number(float, lambda value: 0.0 < value < math.inf, "metres, more than 0"),
+        default=1.0,
+        metavar="M",
+        help="way that a relative error is over, metres (default: 1)",
+    )
+    evaluate.add_argument("--out", type=Path, metavar="FILE.png", help="draw paths and errors")
     _add_json(evaluate)
 
 
 def _add_repair(repair: argparse.ArgumentParser) -> None:
-    repair.add_argument("session", type=Path, metavar="SESSION", help="an MCAP file")
+    repair.add_argument(
+        "session", type=_session, metavar="SESSION", help="an MCAP file, or a run's folder"
+    )
     repair.add_argument(
         "--out",
         type=output(".mcap", what="MCAP"),
@@ -348,7 +377,10 @@ def _add_repair(repair: argparse.ArgumentParser) -> None:
 
 def _add_convert(convert: argparse.ArgumentParser) -> None:
     convert.add_argument(
-        "source", type=Path, metavar="IN", help="session.mcap, *.mat, *.bag or folder"
+        "source",
+        type=_session,
+        metavar="IN",
+        help="session.mcap or a run's folder, *.mat, *.bag, or a folder with a rosbag2",
     )
     convert.add_argument("out", type=Path, metavar="OUT", help="must not exist")
     convert.add_argument(
@@ -387,7 +419,9 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
 
 
 def _add_calibrate(calibrate: argparse.ArgumentParser) -> None:
-    calibrate.add_argument("session", type=Path, metavar="SESSION", help="a session.mcap")
+    calibrate.add_argument(
+        "session", type=_session, metavar="SESSION", help="a session.mcap, or a run's folder"
+    )
     calibrate.add_argument(
         "--reflectors", metavar="FILE", help="known places: TOML with [[reflectors]], or a scene"
     )
@@ -563,11 +597,12 @@ _COMMANDS = (
     ),
     _Subcommand(
         "evaluate",
-        "slam.app.run.result_files:run_evaluate",
-        "compare two trajectories",
+        "slam.app.commands.evaluate:run_evaluate",
+        "compare trajectories with a reference",
         _add_evaluate,
-        "Absolute trajectory error of EST against REF, two TUM files: associated by "
-        "time, aligned by rotation and translation, root mean square of the distance.",
+        "Errors of each EST against REF, as evo has them: poses are associated by time. Absolute "
+        "error (ATE): aligned by rotation and translation, root mean square of the distances and "
+        "of the headings. Relative error (RPE): of the motions over --delta metres of REF's way.",
     ),
     _Subcommand(
         "repair",
@@ -631,7 +666,7 @@ _COMMANDS = (
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="uwb-slam", description="UWB-radar SLAM on X4M300 radars, emulated or real."
     )
     parser.set_defaults(extra="slam")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from xethru_protocol.cli.version import add_version
-from xethru_protocol.validation import number, output, shown
+from xethru_protocol.validation import Parser, number, output, recording_at, shown
 from xethru_protocol.wire.codes import POWER_UP_BAUD
 
 if TYPE_CHECKING:
@@ -23,6 +23,10 @@ def not_empty(text: str) -> str:
     if not text:
         raise ArgumentTypeError("must not be empty")
     return text
+
+
+def recording(text: str) -> str:
+    return recording_at(not_empty(text))
 
 
 def utf8_text(text: str) -> str:
@@ -271,7 +275,7 @@ def _add_radar(one: argparse.ArgumentParser) -> None:
 def _add_live_source(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "recording",
-        type=not_empty,
+        type=recording,
         nargs="?",
         metavar="RECORDING",
         help="any recording with radar frames, else a module at --port; --frame-area, --fps and "
@@ -502,7 +506,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     ``run`` of the result names the function that carries the command out, as ``file:function``;
     ``refuse(text)`` ends the program for wrong usage.
     """
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = Parser(
         prog="xethru", description="Talk to XeThru X4M300 radar modules, real or emulated."
     )
     add_version(parser)
@@ -556,7 +560,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "message, as decode does, with its time t_ns. Exit 1 if a part could not be read.",
     )
     one.add_argument(
-        "file", type=not_empty, metavar="FILE", help="file or directory of a recording"
+        "file", type=recording, metavar="FILE", help="file or directory of a recording"
     )
     one.add_argument("--samples", action="store_true", help="print arrays whole")
     _add_frames(one)
@@ -574,7 +578,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     one.add_argument(
         "source",
-        type=not_empty,
+        type=recording,
         metavar="SOURCE",
         help="any recording that 'xethru dump' reads",
     )

@@ -92,6 +92,8 @@ def recording_format(path: Path | str) -> RecordingFormat:
             f"{path} is read for arrays only, by xethru_protocol.load and 'xethru convert';"
             f" messages are kept in .mcap"
         )
+    if start.startswith(b"RRF"):
+        raise RecordingError(f"{path} is a view in Rerun's format; 'uwb-slam view' opens it")
     raise RecordingError(
         f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
         " a wire capture (.xtwire), MCAP, or arrays. Of a data file its name, as"

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from slam.evaluation import (
     associate_times,
     ate_rmse_m,
+    ate_rotation_rmse_rad,
     icp_align_se2,
     icp_ate_rmse_m,
     landmark_metrics,
     nees_pose,
+    relative_pose_errors,
     rmse_m,
 )
 from slam.geometry import between, transform
@@ -49,6 +51,61 @@ def lissajous() -> tuple[Array, Array]:
 def test_ate_equals_evo() -> None:
     # evo 1.38.1: evo_ape tum ref.tum est.tum -a, both written with repr floats.
     assert ate_rmse_m(*lissajous()) == pytest.approx(0.04804433714655651, abs=1e-9)
+
+
+def turning() -> tuple[Array, Array]:
+    estimate, reference = lissajous()
+    k = np.arange(60)
+    heading = 0.3 * k
+    off = heading + 0.8 + 0.02 * np.sin(1.7 * k) + 0.001 * k
+    return np.column_stack([estimate, off]), np.column_stack([reference, heading])
+
+
+def test_rotation_error_equals_evo() -> None:
+    # evo 1.38.1: APE of rotation_angle_deg after align()
+    degrees = math.degrees(ate_rotation_rmse_rad(*turning()))
+    assert degrees == pytest.approx(2.062841932741795, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("delta_m", "pairs", "metres", "degrees"),
+    [
+        (0.5, 21, 0.0763782330291394, 1.1863170967963947),
+        (1.0, 11, 0.06926231615918403, 1.1560003834323442),
+        (2.0, 5, 0.09752193756625584, 1.0458290458083477),
+    ],
+)
+def test_relative_errors_equal_evo(
+    delta_m: float, pairs: int, metres: float, degrees: float
+) -> None:
+    # evo 1.38.1: RPE(delta, Unit.meters, all_pairs=False, pairs_from_reference=True)
+    errors = relative_pose_errors(*turning(), delta_m)
+    assert len(errors) == pairs
+    assert math.sqrt(np.mean(np.sum(errors[:, :2] ** 2, axis=1))) == pytest.approx(metres, abs=1e-9)
+    assert math.degrees(math.sqrt(np.mean(errors[:, 2] ** 2))) == pytest.approx(degrees, abs=1e-9)
+
+
+@given(poses, st.floats(0.001, 0.1), st.floats(-0.2, 0.2))
+def test_relative_errors_of_wheels_that_err_by_shares_are_closed_forms(
+    moved: Array, scale: float, curvature: float
+) -> None:
+    """On a straight way, a scale error s and a drift c give arcs of (1 + s) d that turn by c d.
+
+    Where the estimate lies costs nothing.
+    """
+    way_m = 0.25 * np.arange(41)
+    reference = np.column_stack([way_m, np.zeros(41), np.zeros(41)])
+    arc_m, turn = (1.0 + scale) * way_m, curvature * way_m
+    x = arc_m * np.sinc(turn / np.pi)
+    y = arc_m * np.sin(turn / 2) * np.sinc(turn / math.tau)
+    estimate = np.column_stack([transform(moved, np.column_stack([x, y])), turn + moved[2]])
+    errors = relative_pose_errors(estimate, reference, 1.0)
+    half = curvature / 2.0
+    chord_m = (1.0 + scale) * np.sinc(half / np.pi)
+    expected = [chord_m * math.cos(half) - 1.0, chord_m * math.sin(half), curvature]
+    assert errors == pytest.approx(np.tile(expected, (10, 1)), abs=1e-9)
+    assert relative_pose_errors(reference, reference, 1.0) == pytest.approx(np.zeros((10, 3)))
+    assert relative_pose_errors(estimate, reference, 10.5).shape == (0, 3)
 
 
 @given(seeds, poses)

@@ -14,8 +14,8 @@ from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 
 from hil_tests.system.short_scene import write_short_scene
+from slam.app.commands.evaluate import evaluate
 from slam.app.odometry.track import read_tum
-from slam.app.run.result_files import evaluate
 from slam.app.run.runner import execute
 from slam.app.run.summary import summarise
 from slam.app.session import cdr as ros

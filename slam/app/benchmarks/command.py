@@ -23,7 +23,6 @@ from slam.app.benchmarks.path_errors import (
     score_run,
     write_run,
 )
-from slam.app.errors import naming
 from slam.app.run.output import print_progress, print_table, print_text, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
@@ -34,6 +33,7 @@ from slam.app.run.pictures import (
     picture,
 )
 from slam.app.run.pictures import ODOMETRY as ODOMETRY_COLOUR
+from slam.app.run.result_files import made_folder
 from xethru_protocol.operating_system import StopFlag
 
 _PANELS = 4
@@ -56,13 +56,12 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
     """
     module = import_module(f"slam.app.benchmarks.{name.replace('-', '_')}")
     data_set: DataSet = module.read_data_set(data)
-    with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
     runs = []
-    for run in data_set.runs:
-        stop.check()
-        runs.append(scored := score_run(data_set, run, stop, print_progress))
-        write_run(out / name / run.name, scored)
+    with made_folder(out):  # what cannot be written ends the command before any run
+        for run in data_set.runs:
+            stop.check()
+            runs.append(scored := score_run(data_set, run, stop, print_progress))
+            write_run(out / name / run.name, scored)
     width_in, height_in = _size_in(len(runs))
     path, title = out / f"{name}.png", f"{data_set.title} (real data)"
     with picture(path, width_in=width_in, height_in=height_in, title=title) as figure:

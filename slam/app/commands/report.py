@@ -32,7 +32,7 @@ from slam.app.run.pictures import (
     label,
     svg_of,
 )
-from slam.app.run.replay import play, refuse_overwriting, session_file
+from slam.app.run.replay import play, refuse_overwriting
 from slam.app.run.result_files import REPORT
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
 from slam.app.run.summary import (
@@ -315,7 +315,7 @@ def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
 
 def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
     """Write the report of a session; beside the session if `out` is None."""
-    recorded = open_session(session_file(session), stop)
+    recorded = open_session(session, stop)
     page = out or recorded.path.with_name(REPORT)
     refuse_overwriting(recorded.path, page)
     text = _report_text(recorded, stop)

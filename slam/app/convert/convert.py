@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from slam.app.convert.matlab import convert_mat, write_detections
@@ -12,6 +12,7 @@ from slam.app.errors import AppError, UsageError, naming
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_text
 from slam.app.run.replay import recorded_config
+from slam.app.run.result_files import made_folder
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
@@ -145,9 +146,9 @@ def _whole(out: Path) -> Iterator[Path]:
     """
     fresh = out
     try:
-        with naming(out):
+        with ExitStack() as held, naming(out):
             if not suffix_of(out):
-                out.parent.mkdir(parents=True, exist_ok=True)
+                held.enter_context(made_folder(out.parent))
             with built_aside(out) as fresh:
                 yield fresh
                 for path in filter(Path.is_file, (fresh, *fresh.rglob("*"))):

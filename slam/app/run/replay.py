@@ -52,17 +52,10 @@ def session_file(given: Path, *, allow_view: bool = False) -> Path:
 
     `allow_view` prefers the .rrd of a folder, which is drawn already, if it was closed.
     """
-    if not given.is_dir():
-        if not given.exists():
-            raise AppError(f"{given}: no such file")
-        return given
     session, view = given / SESSION, given / VIEW
     if allow_view and view.is_file() and (is_finished(view) or not session.is_file()):
         return view
-    if session.is_file():
-        return session
-    names = f"{VIEW} nor {SESSION}" if allow_view else SESSION
-    raise AppError(f"{given}: holds no {names}; name a session.mcap")
+    return session if session.is_file() else given
 
 
 def refuse_overwriting(recorded: Path, out: Path | None) -> None:

@@ -1,11 +1,10 @@
-"""The results of a run: summary, files and printed table; and `uwb-slam evaluate`."""
+"""The results of a run: summary, files and printed table."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -13,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError, naming
-from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
-from slam.app.run.output import ResultRow, print_result, print_text
+from slam.app.odometry.track import NS_PER_S, Trajectory, write_tum
+from slam.app.run.output import ResultRow, print_result
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, summarise
 from slam.app.session_records import SessionInfo
-from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
+from slam.evaluation import LandmarkScore
 from slam.results import SmoothedRun
 from xethru_protocol.operating_system import (
     PathInUseError,
@@ -111,10 +110,27 @@ def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
     return json.dumps(unknown | known, indent=2, allow_nan=False)
 
 
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Make a folder; at the end it is removed, as those above it, if this made it and it is empty.
+
+    AppError if it cannot be made.
+    """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    with naming(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # from here on they are not empty
+            for each in made:
+                each.rmdir()
+
+
 def hold_folder(out: Path, held: ExitStack) -> None:
     """Make a folder and lock it; the results of an earlier run stay until there are others."""
+    held.enter_context(made_folder(out))
     with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
         try:
             held.enter_context(locked(out))
         except PathInUseError:
@@ -137,53 +153,3 @@ def saying_what_is_left(kept: str) -> Iterator[None]:
         yield
     except StopRequestedError as stopped:
         raise StopRequestedError(stopped.received, kept) from None
-
-
-_TOLERANCE_NS = NS_PER_S // 100
-"""Stamps further apart than 10 ms are not associated, as in evo."""
-
-
-def evaluate(estimate: Path, reference: Path) -> dict[str, float | int | str | None]:
-    """Return the ATE of one TUM file against another, with the numbers of poses.
-
-    The ATE is None where positions are so large that it overflows. Two files with fewer than two
-    stamps in common raise AppError.
-    """
-    est, ref = read_tum(estimate), read_tum(reference)
-    est_rows, ref_rows = associate_times(est.stamps_ns, ref.stamps_ns, _TOLERANCE_NS)
-    if len(est_rows) < 2:
-        raise AppError(
-            f"{estimate} and {reference} share {len(est_rows)} stamps within 10 ms; "
-            "both must be in the same time base"
-        )
-    return {
-        "ate_rmse_m": _finite_ate_m(est.poses[est_rows, :2], ref.poses[ref_rows, :2]),
-        "pairs": len(est_rows),
-        "estimate_poses": len(est.stamps_ns),
-        "reference_poses": len(ref.stamps_ns),
-        "alignment": "SE(2), no scale",
-    }
-
-
-def _finite_ate_m(
-    estimate_xy: NDArray[np.float64], reference_xy: NDArray[np.float64]
-) -> float | None:
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            ate_m = ate_rmse_m(estimate_xy, reference_xy)
-    except np.linalg.LinAlgError:  # the alignment met what had overflowed
-        return None
-    return ate_m if math.isfinite(ate_m) else None
-
-
-def run_evaluate(stop: StopFlag, *, estimate: Path, reference: Path, as_json: bool) -> None:
-    result = evaluate(estimate, reference)
-    if as_json:
-        print_text(json.dumps(result, allow_nan=False))
-        return
-    ate_m = result["ate_rmse_m"]
-    size = "beyond floating point" if ate_m is None else f"{1e3 * float(ate_m):.1f} mm"
-    print_text(
-        f"ATE {size} (RMS, {result['alignment']}, "
-        f"{result['pairs']} of {result['estimate_poses']} poses)"
-    )

@@ -13,7 +13,7 @@ import re
 import stat
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple, TypeAlias
@@ -41,6 +41,7 @@ from slam.geometry import Rig
 from slam.results import SmoothedRun
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.operating_system import StopFlag
+from xethru_protocol.recordings.formats import recording_format
 from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,
     DOUBLE_ARRAY,
@@ -56,7 +57,7 @@ from xethru_protocol.recordings.mcap import (
     unpack_string,
 )
 from xethru_protocol.recordings.mcap import read_entries as entries_of
-from xethru_protocol.recordings.recorded_messages import is_like
+from xethru_protocol.recordings.recorded_messages import RecordingError, is_like
 from xethru_protocol.validation import reason_of
 
 _KINDS = {
@@ -66,13 +67,15 @@ _KINDS = {
     b"#ROSBAG": "a bag of ROS 1 of an old version; `rosbag migrate` it first",
     b"SQLite format 3\0": "an SQLite file, like those in a rosbag2 folder; give that folder to "
     "`uwb-slam convert`",
-    b"\x89XTWIRE": "a wire capture of one port; `xethru dump` reads it",
     b"MATLAB 5.0 MAT-file": "a MATLAB file; `uwb-slam convert` reads detections from it",
     b"\x89HDF": "an HDF5 file",
-    b"PK\x03\x04": "a zip archive; unpack it first",
+    b"PK\x03\x04": "a zip archive, or arrays of numpy; `xethru view` shows arrays",
     b"\x1f\x8b": "a gzip file; unpack it first",
     b"\x28\xb5\x2f\xfd": "a zstd file; unpack it first",
 }
+
+
+_OF_A_MODULE = "a recording of one module; `xethru view` shows it, `xethru dump` prints it"
 
 
 def describe_kind(path: Path) -> str:
@@ -86,11 +89,17 @@ def describe_kind(path: Path) -> str:
     ', it is a bag of ROS 1; `uwb-slam convert` makes a session of it'
     """
     if path.is_dir():
-        return " with a rosbag2 in it" if (path / "metadata.yaml").exists() else ""
+        if (path / "metadata.yaml").exists():
+            return " with a rosbag2 in it; `uwb-slam convert` makes a session of it"
+        is_recording = any(path.glob("xethru_*"))
+        return f" with {_OF_A_MODULE}" if is_recording else " without a session.mcap in it"
     with path.open("rb") as stream:
         head = stream.read(32)
     if not head:
         return ", it is empty; whatever was to write it ended before it did"
+    with suppress(RecordingError, OSError):
+        if recording_format(path) in {"vendor", "wire"}:
+            return f", it is {_OF_A_MODULE}"
     for magic, kind in _KINDS.items():
         if head.startswith(magic):
             return f", it is {kind}"
@@ -118,7 +127,8 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
             whole = os.fstat(stream.fileno()).st_size
         except IsADirectoryError:
             raise AppError(
-                f"{path}: is a directory{describe_kind(path)}; give the session.mcap in it"
+                f"{path}: is a directory{describe_kind(path)}; give the session.mcap of a run, or "
+                "the run's folder"
             ) from None
         except OSError as error:
             raise _unreadable(path, error) from None
@@ -483,7 +493,7 @@ def open_session(path: Path, stop: StopFlag | None = None) -> RecordedSession:
         raise AppError(
             f'{path}: an MCAP file, but no session of `uwb-slam`: its metadata "{METADATA_NAME}" '
             "is missing; of a bag in the layout of the paper's data set `uwb-slam convert` makes a "
-            "session"
+            "session, a recording of one module `xethru view` shows"
         )
     check_format(path, head.table)
     names = head.names()

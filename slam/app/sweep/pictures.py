@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from pydantic import BaseModel, Field, ValidationError
 
-from slam.app.errors import AppError, naming
+from slam.app.errors import AppError
 from slam.app.run.output import print_table, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
@@ -27,6 +27,7 @@ from slam.app.run.pictures import (
     label,
     picture,
 )
+from slam.app.run.result_files import made_folder
 from slam.app.sweep import CLEAN
 from slam.app.sweep.run import SweepRun
 from slam.app.sweep.statistics import Group, in_band, nis_in_band, summarise_groups
@@ -82,11 +83,10 @@ def run_experiment(stop: StopFlag, *, name: str, sweep: Path, out: Path) -> None
 
     Raises AppError if the folder or a file cannot be written, or `experiment_of` does.
     """
-    with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
-    shown = experiment_of(name, sweep, out)
-    stop.check()
-    write_json(out / f"{name}.json", {"simulated": True, "groups": shown.numbers})
+    with made_folder(out):
+        shown = experiment_of(name, sweep, out)
+        stop.check()
+        write_json(out / f"{name}.json", {"simulated": True, "groups": shown.numbers})
     width_in, height_in = shown.size_in
     path = out / f"{name}.png"
     with picture(path, width_in=width_in, height_in=height_in, title=shown.title) as figure:

@@ -24,6 +24,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.run.output import note, print_progress, print_table, print_text
+from slam.app.run.result_files import made_folder
 from slam.app.sweep import CLEAN
 from slam.app.sweep.bound import PURPOSE, load_gtsam
 from slam.app.sweep.run import Case, RunKey, SweepRun, make_case, program_version, run_case
@@ -215,8 +216,8 @@ def run_sweep(
     if path.exists() and not path.is_file():  # opening a pipe waits for who writes into it
         raise AppError(f"{path}: is no regular file; choose another --json, or move it away")
     with ExitStack() as held:
+        held.enter_context(made_folder(path.parent))
         with naming(path):  # what cannot be written ends the command before any run, too
-            path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
             try:
                 held.enter_context(locked(path))

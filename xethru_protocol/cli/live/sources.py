@@ -145,7 +145,10 @@ def _recorded(arguments: Namespace) -> FrameSource:
     )
     if arguments.radar is None and len(recording.radars) > 1:
         names = ", ".join(map(shown, recording.radars))
-        raise CommandFailed(f"{path} holds several radars: {names}; choose one: --radar NAME")
+        raise CommandFailed(
+            f"{path} holds several radars: {names}; choose one with --radar NAME, or see all of a "
+            "session with 'uwb-slam view'"
+        )
     radar = recording.radar if arguments.radar is None else recording.named(arguments.radar)
     if not radar.parts:
         raise CommandFailed(f"{path} holds no radar frames")

@@ -13,7 +13,7 @@ from xethru_protocol.cli.output import (
 )
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.validation import shown
+from xethru_protocol.validation import choices, shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
     FileType,
@@ -224,7 +224,7 @@ def profile_of(arguments: Namespace) -> ProfileMode | None:
                 arguments.refuse(f"output {part} belongs to --profile {others[0]}, not {name}")
             if part not in known:
                 arguments.refuse(
-                    f"profile {name} has no output {shown(part)}; known: {', '.join(known)}"
+                    f"profile {name} has no output {shown(part)}; {choices(part, known)}"
                 )
         for rivals in _RIVALS:
             both = [part for part in names if part in rivals]

@@ -126,7 +126,7 @@ def test_a_signal_after_a_commands_last_check_counts_too(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     interrupted = lambda *_, **__: os.kill(os.getpid(), which)  # noqa: E731 - used once, below
-    monkeypatch.setattr("slam.app.run.result_files.run_evaluate", interrupted)
+    monkeypatch.setattr("slam.app.commands.evaluate.run_evaluate", interrupted)
     assert main(["evaluate", "one.tum", "two.tum"]) == code
     assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"
 

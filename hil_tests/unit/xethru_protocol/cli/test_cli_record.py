@@ -307,7 +307,10 @@ def test_a_module_without_the_profile_or_output_is_named(tmp_path: Path, capsys:
     [
         (["--profile", "presence", "--output", "sleep"], "belongs to --profile respiration"),
         (["--profile", "respiration", "--output", "single"], "belongs to --profile presence"),
-        (["--profile", "presence", "--output", "iq,radio"], 'has no output "radio"; known: iq, ap'),
+        (
+            ["--profile", "presence", "--output", "iq,radio"],
+            'has no output "radio"; known are iq, ap',
+        ),
         (["--output", "iq"], "--output needs --profile presence or respiration"),
         (["--zone", "1", "2"], "--zone needs --profile"),
         (["--profile", "none", "--sensitivity", "3"], "--sensitivity needs --profile"),

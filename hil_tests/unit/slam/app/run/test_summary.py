@@ -9,17 +9,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 
-from hil_tests.unit.slam.app.sessions import record_of_steps, session_info
+from hil_tests.unit.slam.app.sessions import (
+    FRAME_NS,
+    feed,
+    odometry,
+    record_of_steps,
+    session_info,
+    snapshot,
+)
 from slam.app.cli import main
+from slam.app.commands.evaluate import evaluate
 from slam.app.odometry.track import Trajectory, write_tum
 from slam.app.run.output import summary_rows, table_text
-from slam.app.run.result_files import evaluate
 from slam.app.run.runner import RunRecord
 from slam.app.run.summary import NEES_AT, Summary, summarise
 from slam.app.session.description import settings_text
+from slam.app.session.writer import SessionLog
 from slam.config import BackEnd, DetectionConfig, RobustConfig, SlamConfig, TrilaterationConfig
-from slam.evaluation import LandmarkScore
+from slam.evaluation import LandmarkScore, ate_rmse_m
 from slam.geometry import Mount, Rig
 from slam.results import Association, Belief, Observation, SmoothedRun, StepResult
 
@@ -292,7 +302,81 @@ def test_a_rigid_motion_costs_nothing_and_noise_counts(
     assert (result["pairs"], result["reference_poses"]) == (N_POSES - 3, N_POSES)
 
     assert main(["evaluate", *map(str, files)]) == 0
-    assert capsys.readouterr().out == "ATE 10.0 mm (RMS, SE(2), no scale, 197 of 197 poses)\n"
+    printed, _ = capsys.readouterr().out.splitlines()
+    assert printed == "ATE 10.0 mm (RMS, SE(2), no scale, 197 of 197 poses)"
+
+
+def test_the_errors_of_wheels_that_err_by_a_share(tmp_path: Path) -> None:
+    """On a circle of 1 m, a radius 2 % too large and 1 degree of heading."""
+    reference = square_path()
+    wide = reference * [1.02, 1.02, 1.0] + [0.0, 0.0, math.radians(1.0)]
+    write_tum(tmp_path / "ref.tum", Trajectory(stamps_ns=STAMPS, poses=reference))
+    write_tum(tmp_path / "est.tum", Trajectory(stamps_ns=STAMPS, poses=wide))
+    result = evaluate(tmp_path / "est.tum", tmp_path / "ref.tum")
+    assert result["ate_rmse_m"] == pytest.approx(0.02, rel=1e-9)
+    assert result["ate_rotation_rmse_deg"] == pytest.approx(1.0, rel=1e-9)
+    # 32 chords of the polygon of 200 are the first that are a metre or more together
+    chord_m, turned = 2.0 * math.sin(32 * math.pi / N_POSES), math.radians(1.0)
+    off_m = chord_m * math.sqrt(1.02**2 + 1.0 - 2.0 * 1.02 * math.cos(turned))
+    assert result["rpe_rmse_m"] == pytest.approx(off_m, rel=1e-9)
+    assert result["rpe_rotation_rmse_deg"] == pytest.approx(0.0, abs=1e-9)
+    assert result["rpe_pairs"] == (N_POSES - 1) // 32
+    assert evaluate(tmp_path / "est.tum", tmp_path / "ref.tum", delta_m=9.0)["rpe_rmse_m"] is None
+
+
+def test_several_estimates_beside_one_reference_and_a_picture(
+    files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate, reference = map(str, files)
+    picture = tmp_path / "errors.png"
+    command = ["evaluate", estimate, reference, reference, "--out", str(picture)]
+    assert main([*command, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["reference"] == reference
+    assert [row["estimate"] for row in result["estimates"]] == [estimate, reference]
+    errors_m = [row["ate_rmse_m"] for row in result["estimates"]]
+    assert errors_m == [pytest.approx(0.01, rel=0.01), pytest.approx(0.0, abs=1e-12)]
+    with Image.open(picture) as drawn:
+        assert drawn.format == "PNG"
+        assert len(drawn.getcolors() or ()) > 10
+    assert main(command) == 0
+    assert estimate in capsys.readouterr().out
+    assert main([*command[:-1], str(tmp_path / "errors.html")]) == 2
+    assert not (tmp_path / "errors.html").exists()
+
+
+def test_a_session_and_a_runs_folder_are_judged_like_their_trajectories(tmp_path: Path) -> None:
+    """The estimate of a session against its truth, which may also be a file of TUM lines."""
+    session = tmp_path / "session.mcap"
+    states = [snapshot(counter) for counter in range(12)]
+    stamps = np.array([state.t_ns for state in states])
+
+    def truth_at(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.array([snapshot(t_ns // FRAME_NS).truth for t_ns in stamps_ns.tolist()])
+
+    log = SessionLog(session, session_info(), odometry(14), truth_at=truth_at)
+    feed(log, len(states))
+    log.close()
+    truth, estimate = (
+        np.array([getattr(state, name) for state in states]) for name in ("truth", "estimate")
+    )
+    expected = ate_rmse_m(estimate[:, :2], truth[:, :2])
+    write_tum(tmp_path / "ref.tum", Trajectory(stamps_ns=stamps, poses=truth))
+    folder = tmp_path / "replayed"
+    folder.mkdir()
+    for name, rows in (("estimate", estimate), ("truth", truth)):
+        write_tum(folder / f"{name}.tum", Trajectory(stamps_ns=stamps, poses=rows))
+    for est, ref in (
+        (session, tmp_path / "ref.tum"),
+        (tmp_path, tmp_path / "ref.tum"),
+        (session, session),
+        (tmp_path / "ref.tum", tmp_path),
+        (folder, folder),
+    ):
+        result = evaluate(est, ref)
+        wanted = 0.0 if est == tmp_path / "ref.tum" else expected
+        assert result["ate_rmse_m"] == pytest.approx(wanted, abs=1e-12)
+        assert result["pairs"] == len(states)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
