@@ -469,6 +469,9 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
         "--laps", type=_count, help="drive the first laps of each scene only, so many"
     )
     sweep.add_argument(
+        "--fps", type=_count, default=5, help="frames/s of each radar (default: %(default)s)"
+    )
+    sweep.add_argument(
         "--set",
         dest="settings",
         type=_setting,

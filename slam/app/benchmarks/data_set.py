@@ -52,11 +52,12 @@ class Positions:
     def at(self, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
         """Return the places at some stamps, (k, 2), interpolated, and where they are known, (k,).
 
-        A place is known between two positions that are at most a second apart.
+        A place is known at a position, and between two that are at most a second apart.
         """
         after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, len(self.t_ns) - 1)
         first, second = self.t_ns[after - 1], self.t_ns[after]
-        known = (t_ns >= first) & (t_ns <= second) & (second - first <= _MOST_GAP_NS)
+        is_near = (t_ns == first) | (t_ns == second) | (second - first <= _MOST_GAP_NS)
+        known = (t_ns >= first) & (t_ns <= second) & is_near
         # Differences of nanoseconds are whole numbers: no stamp passes through a float.
         share = (t_ns - first) / np.maximum(second - first, 1)
         xy = self.xy_m[after - 1] + share[:, None] * (self.xy_m[after] - self.xy_m[after - 1])

@@ -74,9 +74,12 @@ def score_run(
     paths = {ODOMETRY: run.dead_reckoning()}
     n_positions = len(associated(run, paths[ODOMETRY])[0])
     if n_positions < _FEWEST:
+        begin_ns, end_ns = run.t_ns[[0, -1]]
+        n_meant = np.count_nonzero((run.truth.t_ns >= begin_ns) & (run.truth.t_ns <= end_ns))
         raise AppError(
-            f"{run.name}: {n_positions} positions of its truth lie in the time of its odometry; "
-            "both must be of the same drive"
+            f"{run.name}: {n_meant} positions of its truth lie in the time of its odometry, and "
+            f"{n_positions} of them at a step or between two that are at most a second apart; "
+            f"{_FEWEST} are needed, and both must be of the same drive"
         )
     solutions = {}
     for name, with_labels in ((WITH_IDS, True), (WITHOUT_IDS, False)):

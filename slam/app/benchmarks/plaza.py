@@ -103,7 +103,13 @@ def read_run(path: Path) -> Run:
         ends = poses if row.kind == "EDGE_SE2" else landmarks
         for name, known in ((first, poses), (second, ends)):
             if name not in known:
-                raise row.error(f"no line defines {shown(name)}")
+                other = "pose" if name in poses else "landmark"
+                is_there = name in poses or name in landmarks
+                raise row.error(
+                    f"{name} is a {other}, which no {row.kind} is used of"
+                    if is_there
+                    else f"no line defines {shown(name)}"
+                )
         covariance = matrix_of(row.values[_MEASURED[row.kind] :])
         if np.linalg.eigvalsh(covariance).min() <= 0.0:
             raise row.error("its covariance is not positive")

@@ -19,7 +19,7 @@ import numpy as np
 
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.arrival import ClockLine
-from slam.app.odometry.live import LineSource, LiveOdometry, parse_source
+from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_source
 from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.frame_sources import RigSource, sampler_limits
@@ -116,6 +116,7 @@ def run_rig(
             None if ports is None else tuple(ports),
             lambda radar, record: inbox.offer(("link", radar, record)),
             note,
+            odometry_socket=line_source.place if line_source.kind is SourceKind.UNIX else "",
         )
         rig_source = held.enter_context(RigSource(links))
         if wire:

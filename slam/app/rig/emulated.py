@@ -288,9 +288,9 @@ def open_loopback(scene: Scene, seed: int) -> RigSource:
     return RigSource(links)
 
 
-def end_tick(duration_ns: int) -> int:
+def end_tick(duration_ns: int, fps: float = FRAME_RATE_HZ) -> int:
     """Return the first tick after the end of the scene."""
-    period_ns = NS_PER_S / real_frame_rate(FRAME_RATE_HZ)
+    period_ns = NS_PER_S / real_frame_rate(fps)
     return int(duration_ns / period_ns) + 1
 
 

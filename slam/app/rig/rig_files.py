@@ -260,6 +260,8 @@ def open_rig(
     ports: Sequence[str] | None,
     observer: RecordObserver,
     note: Callable[[str], None],
+    *,
+    odometry_socket: str = "",
 ) -> tuple[RadarLink, ...]:
     """Open the modules of a rig; the links are in its order.
 
@@ -272,6 +274,9 @@ def open_rig(
         Gets everything that happens on their links, later on from other threads.
     note
         Gets a line about where each radar was found, and one about the ports that are skipped.
+    odometry_socket
+        That of an emulator, "" for none: if the ports beside it are those of the rig, other
+        programs' ports are not opened.
 
     Raises
     ------
@@ -289,10 +294,16 @@ def open_rig(
                 "there are no modules and no running emulators on this machine; "
                 "plug the modules in, or name their ports with --ports"
             )
-        modules = []
+        near = [
+            port for port in candidates if odometry_socket and _are_beside(port, odometry_socket)
+        ]
+        wanted = {radar.serial for radar in rig.radars}
+        modules: list[_OpenModule] = []
         passed_over = []
         unopened = []
-        for port in dict.fromkeys(candidates):
+        for port in dict.fromkeys((*named, *near, *candidates)):
+            if near and port not in (*named, *near) and wanted <= {one.serial for one in modules}:
+                break
             try:
                 module = _OpenModule(port, observer, unless_it_works)
             except AppError as error:
@@ -304,7 +315,7 @@ def open_rig(
                     passed_over.append(f"{port} (no module answers)")
                 continue
             modules.append(module)
-            if port not in named and module.serial not in {radar.serial for radar in rig.radars}:
+            if port not in named and module.serial not in wanted:
                 passed_over.append(f"{port} (module {module.serial})")
         if passed_over:
             note(f"passed over, not of this rig: {', '.join(passed_over)}")
@@ -317,6 +328,11 @@ def open_rig(
                 module.driver.close()
         unless_it_works.pop_all()
     return links
+
+
+def _are_beside(port: str, other: str) -> bool:
+    first, second = (os.path.realpath(os.path.dirname(path) or ".") for path in (port, other))
+    return first == second
 
 
 def are_emulated(links: Sequence[RadarLink]) -> bool:
@@ -346,7 +362,8 @@ def _match(
         if twin is not module and module.serial in wanted:
             raise AppError(
                 f"two modules have the serial number {module.serial}, at {twin.port} and "
-                f"{module.port}; are these two names of one port, or a module's copy?"
+                f"{module.port}: two names of one port, or two emulators of one scene? name the "
+                "ports to open with --ports"
             )
     foreign = [module for module in modules if module.serial not in wanted]
     missing = [radar for radar in rig.radars if radar.serial not in by_serial]

@@ -233,6 +233,7 @@ class Case:
     seed: int = 0
     bound: bool = False
     room: tuple[str, int] | None = None  # family and number of a random room
+    fps: int = FRAME_RATE_HZ  # frames/s that the radars are asked for
 
     @property
     def key(self) -> RunKey:
@@ -325,6 +326,7 @@ def loopback_source(
     *,
     noise_seed: int | None = None,
     stress: Stress = STRESSES[CLEAN],
+    fps: int = FRAME_RATE_HZ,
     stop: StopFlag = NO_STOP,
 ) -> RunSource:
     """Return the emulated robot in this process: same driver, device and odometry text as the demo.
@@ -334,8 +336,8 @@ def loopback_source(
     trajectory = scene.trajectory()
     duration_ns = trajectory.duration_ns
     radars = open_loopback(scene, seed if noise_seed is None else noise_seed)
-    radars.start(RAW_CONFIG, FRAME_RATE_HZ)
-    scans = radars.scans(end_tick(duration_ns), stop)
+    radars.start(RAW_CONFIG, fps)
+    scans = radars.scans(end_tick(duration_ns, fps), stop)
     return RunSource(
         info=SessionInfo(
             scene=scene.name,
@@ -378,7 +380,9 @@ def source_of(case: Case, stop: StopFlag = NO_STOP) -> RunSource:
         )
     slam = make_slam(case.config, rig_of(case.scene), wheels_of(case.scene), front_end)
     scene = stressed_scene(case.scene, stress, case.seed)
-    return loopback_source(scene, case.preset, slam, case.seed, stress=stress, stop=stop)
+    return loopback_source(
+        scene, case.preset, slam, case.seed, stress=stress, fps=case.fps, stop=stop
+    )
 
 
 def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP) -> SweepRun:

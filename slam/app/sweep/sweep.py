@@ -15,7 +15,7 @@ import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from joblib import cpu_count
 from pydantic import TypeAdapter, ValidationError
 
 from slam.app.errors import AppError, UsageError, naming
+from slam.app.rig.emulated import FRAME_RATE_HZ
 from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.run.result_files import made_folder
 from slam.app.sweep import CLEAN
@@ -178,6 +179,7 @@ def run_sweep(
     stresses: Sequence[str] = (),
     bound: bool = False,
     laps: int | None = None,
+    fps: int = FRAME_RATE_HZ,
     jobs: int | None = None,
     dask: str | None = None,
 ) -> None:
@@ -204,6 +206,7 @@ def run_sweep(
         bound=bound,
         laps=laps,
     )
+    cases = [replace(case, fps=fps) for case in cases]
     if bound:
         load_gtsam(PURPOSE)
     if out.is_dir():
@@ -310,6 +313,7 @@ def _command(
         "settings": " ".join(f"{key}={','.join(values)}" for key, values in settings),
         "stresses": " ".join(dict.fromkeys(case.stress for case in cases)),
         "bound": str(bound),
+        "frame rate": str(cases[0].fps),
     }
     for case in cases[:: seeds[0]]:
         command[f"scene file {case.scene.name}"] = _digest(case.scene.model_dump_json())

@@ -11,10 +11,12 @@ from PIL import Image
 from hil_tests.unit.slam.app.benchmarks import worlds
 from slam.app.benchmarks import BENCHMARKS, plaza
 from slam.app.benchmarks.back_end import grouped
-from slam.app.benchmarks.data_set import LandmarkMeasurement, Run
-from slam.app.benchmarks.path_errors import associated
+from slam.app.benchmarks.data_set import LandmarkMeasurement, Positions, Run
+from slam.app.benchmarks.path_errors import associated, score_run
 from slam.app.cli import main
+from slam.app.errors import AppError
 from slam.app.odometry.track import Trajectory, read_tum
+from xethru_protocol.operating_system import StopFlag
 
 
 def write(name: str, folder: Path) -> Path:
@@ -131,6 +133,30 @@ def test_detections_nearer_than_a_landmark_is_wide_are_one() -> None:
         assert one.bearing_sigma_rad == pytest.approx(math.sqrt(0.03**2 + 0.04**2))
     (single,) = grouped([seen(3.0, 0.0)], 0.8)
     assert single.range_m == pytest.approx(3.0)
+
+
+def test_a_drive_is_compared_at_its_own_poses_however_far_apart(tmp_path: Path) -> None:
+    worlds.write_pyfg_file(tmp_path / "small.pyfg", duration_s=20.0)
+    (run,) = plaza.read_data_set(tmp_path).runs
+    step = round(2.0 / worlds.PERIOD_S)  # poses are two seconds apart
+    truth = Positions(t_ns=run.truth.t_ns[::step], xy_m=run.truth.xy_m[::step])
+    sparse = Run(name="sparse", steps=run.steps[::step], truth=truth)
+    xy, there = associated(sparse, np.column_stack([truth.xy_m, np.zeros(len(truth.t_ns))]))
+    assert len(xy) == len(truth.t_ns) >= 10
+    np.testing.assert_allclose(xy, there, atol=1e-12)
+
+
+def test_a_truth_between_steps_far_apart_is_not_of_another_drive(tmp_path: Path) -> None:
+    worlds.write_pyfg_file(tmp_path / "small.pyfg", duration_s=20.0)
+    data = plaza.read_data_set(tmp_path)
+    (run,) = data.runs
+    step = round(2.0 / worlds.PERIOD_S)
+    between_ns = run.truth.t_ns[step // 2 :: step]
+    truth = Positions(t_ns=between_ns, xy_m=np.zeros((len(between_ns), 2)))
+    sparse = Run(name="sparse", steps=run.steps[::step], truth=truth)
+    inside = np.count_nonzero(between_ns <= sparse.t_ns[-1])
+    with pytest.raises(AppError, match=f"sparse: {inside} positions .* and 0 of them at a step"):
+        score_run(data, sparse, StopFlag(), lambda text: None)
 
 
 def test_how_densely_a_path_is_sampled_does_not_count(tmp_path: Path) -> None:

@@ -346,10 +346,30 @@ def test_step_times_have_no_gap_and_keep_what_was_given() -> None:
     assert np.diff(times).max() <= 0.25 + 1e-12
 
 
+@pytest.mark.parametrize(
+    ("edge", "end"),
+    [
+        ("EDGE_RANGE 1 A0 A1 1 1", "A1"),
+        ("EDGE_SE2_XY 1 A0 A1 1 1 1 0 1", "A1"),
+        ("EDGE_RANGE 1 L0 L0 1 1", "L0"),
+        ("EDGE_SE2 1 A0 L0 1 0 0 1 0 0 1 0 1", "L0"),
+    ],
+)
+def test_a_measurement_between_two_of_a_kind_is_not_called_undefined(
+    tmp_path: Path, edge: str, end: str
+) -> None:
+    """As a range between two robots is."""
+    lines = ["VERTEX_SE2 0 A0 0 0 0", *ONE_EDGE, "VERTEX_XY L0 1 1"]
+    (tmp_path / "a.pyfg").write_text("\n".join([*lines, edge]), encoding="ascii")
+    with pytest.raises(AppError, match=rf"line {len(lines) + 1}: {end} is a ") as caught:
+        plaza.read_data_set(tmp_path)
+    assert "defines" not in str(caught.value)
+
+
 def test_a_path_is_interpolated_between_positions_a_second_apart_at_most() -> None:
     t_ns = np.array([0, 10**9, 5 * 10**9], dtype=np.int64)
     path = Positions(t_ns=t_ns, xy_m=np.array([[0.0, 0.0], [1.0, 2.0], [5.0, 5.0]]))
-    asked = np.array([-1, 0, 250_000_000, 10**9, 2 * 10**9, 6 * 10**9], dtype=np.int64)
-    xy, known = path.at(asked)
-    assert known.tolist() == [False, True, True, True, False, False]
-    np.testing.assert_allclose(xy[1:4], [[0.0, 0.0], [0.25, 0.5], [1.0, 2.0]])
+    asked = [-1, 0, 250_000_000, 10**9, 2 * 10**9, 5 * 10**9, 6 * 10**9]
+    xy, known = path.at(np.array(asked, dtype=np.int64))
+    assert known.tolist() == [False, True, True, True, False, True, False]
+    np.testing.assert_allclose(xy[known], [[0.0, 0.0], [0.25, 0.5], [1.0, 2.0], [5.0, 5.0]])

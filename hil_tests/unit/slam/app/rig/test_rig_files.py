@@ -169,8 +169,17 @@ class Bench:
         line = self.lines[port] = LoopbackTransport(device, name=port)
         return X4M300(line, clock=line.clock_ns, observer=observer)
 
-    def find(self, *ports: str, rig: RigFile | None = None) -> tuple[RadarLink, ...]:
-        return open_rig(rig or robot(), RIG, ports or None, self.hear, self.notes.append)
+    def find(
+        self, *ports: str, rig: RigFile | None = None, odometry_socket: str = ""
+    ) -> tuple[RadarLink, ...]:
+        return open_rig(
+            rig or robot(),
+            RIG,
+            ports or None,
+            self.hear,
+            self.notes.append,
+            odometry_socket=odometry_socket,
+        )
 
     def hear(self, name: str, record: ProtocolRecord) -> None:
         self.heard.append((name, record.summary))
@@ -252,6 +261,47 @@ def test_a_foreign_module_is_refused_where_it_was_named_and_passed_over_elsewher
     assert not bench.is_open("c")
     (skipped,) = [note for note in bench.notes if note.startswith("passed over")]
     assert skipped == f"passed over, not of this rig: c (module {OTHER})"
+    for link in links:
+        link.driver.close()
+
+
+SOMEBODYS = {"theirs/left": LEFT, "theirs/right": RIGHT}
+OURS = {"ours/left": LEFT, "ours/right": RIGHT}
+
+
+def test_ports_beside_the_odometry_are_taken_and_those_of_others_not_opened(bench: Bench) -> None:
+    bench.serials = SOMEBODYS | OURS
+    links = bench.find(odometry_socket="ours/odometry.sock")
+    assert [link.port for link in links] == list(OURS)
+    assert set(bench.lines) == set(OURS)
+    for link in links:
+        link.driver.close()
+
+
+@pytest.mark.parametrize(
+    ("socket", "serials"),
+    [
+        ("", SOMEBODYS | OURS),
+        ("elsewhere/odometry.sock", SOMEBODYS | OURS),
+        ("ours/odometry.sock", SOMEBODYS | {"ours/left": LEFT}),  # a port there is missing
+    ],
+)
+def test_two_emulators_of_one_scene_are_told_apart_by_their_ports(
+    socket: str, serials: dict[str, str], bench: Bench
+) -> None:
+    bench.serials = serials
+    with pytest.raises(AppError, match=LEFT) as refused:
+        bench.find(odometry_socket=socket)
+    assert "--ports" in str(refused.value)
+    assert not any(bench.is_open(port) for port in bench.lines)
+    for link in bench.find(*SOMEBODYS, odometry_socket=socket):
+        link.driver.close()
+
+
+def test_what_the_ports_beside_the_odometry_lack_is_looked_for_elsewhere(bench: Bench) -> None:
+    bench.serials = {"theirs/right": RIGHT, "ours/left": LEFT, "theirs/other": OTHER}
+    links = bench.find(odometry_socket="ours/odometry.sock")
+    assert [link.port for link in links] == ["ours/left", "theirs/right"]
     for link in links:
         link.driver.close()
 

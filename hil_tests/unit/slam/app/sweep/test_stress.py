@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -16,9 +17,16 @@ from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
 from slam.app.session_records import Scan
 from slam.app.sweep import CLEAN, FAMILIES, STRESSES, Stress
-from slam.app.sweep.run import DisturbedDetector, stressed_scans, stressed_scene
+from slam.app.sweep.run import (
+    DisturbedDetector,
+    make_case,
+    source_of,
+    stressed_scans,
+    stressed_scene,
+)
 from slam.config import RobustConfig, SlamConfig
 from slam.frames import Detection, RadarFrame
+from xethru_protocol.wire.x4 import real_frame_rate
 
 PERIOD_NS = 200_000_000
 N_TICKS, N_RADARS = 1000, 4
@@ -82,6 +90,15 @@ def test_silence_is_one_piece_of_a_tenth_for_all_radars() -> None:
         begins.append(silent[0] / N_TICKS)
     assert 0.15 <= min(begins) < 0.35
     assert 0.55 < max(begins) <= 0.75
+
+
+@pytest.mark.parametrize("fps", [2, 10])
+def test_a_run_has_the_frame_rate_that_is_asked_for(fps: int) -> None:
+    source = source_of(replace(make_case("lab", "paper", 0), fps=fps))
+    first, second = islice(source.scans, 2)
+    source.close()
+    assert second.t_ns - first.t_ns == pytest.approx(1e9 / real_frame_rate(fps), abs=1.0)
+    assert source.info.radars[0].rate_hz == pytest.approx(real_frame_rate(fps))
 
 
 def test_a_dead_radar_is_never_heard() -> None:
