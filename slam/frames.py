@@ -16,6 +16,10 @@ from slam.geometry import Rig
 _LIMIT_TOLERANCE = 1e-6
 
 
+class StepInputError(ValueError):
+    """A pipeline was given something that it cannot be stepped with; it stays as it was."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarFrame:
     """One raw RF frame of one radar, with everything a front end needs to turn bins into metres."""
@@ -43,12 +47,14 @@ class RadarFrame:
                 f"a radar frame is one row of float32 samples, not shape {self.samples.shape} "
                 f"of {self.samples.dtype}; raw RF mode (no downconversion) gives that"
             )
-        if self.radar < 0:
-            raise ValueError(f"radar is {self.radar}, must be the index of a mount, 0 or more")
-        if not 0 < self.bin_length_m < math.inf:
-            raise ValueError(f"bin_length_m is {self.bin_length_m}, must be positive and finite")
-        if not math.isfinite(self.range_start_m):
-            raise ValueError(f"range_start_m is {self.range_start_m}, must be finite")
+        if self.radar < 0 or not (
+            math.isfinite(self.range_start_m) and 0 < self.bin_length_m < math.inf
+        ):
+            raise ValueError(
+                f"radar {self.radar}, range_start_m {self.range_start_m}, bin_length_m "
+                f"{self.bin_length_m}: the first must be the index of a mount, the others finite, "
+                "the last positive"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,14 +76,12 @@ class Detection:
     saturated: bool = False  # whether samples of the echo lay at a limit of the module's sampler
 
     def __post_init__(self) -> None:
-        if self.radar < 0:
-            raise ValueError(f"radar is {self.radar}, must be the index of a mount, 0 or more")
-        if not math.isfinite(self.range_m):
-            raise ValueError(f"range_m is {self.range_m}, must be finite")
-        if self.sigma_m <= 0 or self.misfit < 0:
+        is_possible = self.radar >= 0 and math.isfinite(self.range_m)
+        if not is_possible or self.sigma_m <= 0 or self.misfit < 0:
             raise ValueError(
-                f"sigma_m is {self.sigma_m} and misfit {self.misfit}; the first must be positive, "
-                "the second 0 or more, and both NaN where they are not known"
+                f"radar {self.radar}, range_m {self.range_m}, sigma_m {self.sigma_m}, misfit "
+                f"{self.misfit}: the first must be the index of a mount, the second finite, the "
+                "others positive, or NaN where they are not known"
             )
 
 
@@ -101,6 +105,13 @@ class Detector(Protocol):
 def detect_all(detector: Detector, frames: Sequence[RadarFrame], rig: Rig) -> tuple[Detection, ...]:
     offsets_m = [rig.mounts[frame.radar].range_offset_m for frame in frames]
     found = detector.detect_many(frames, offsets_m)
+    for frame, detections in zip(frames, found, strict=True):
+        for each in detections:
+            if (each.radar, each.t_ns) != (frame.radar, frame.t_ns):
+                raise StepInputError(
+                    f"the front end found a range of radar {each.radar} at {each.t_ns} ns in the "
+                    f"frame of radar {frame.radar} at {frame.t_ns} ns"
+                )
     return tuple(detection for of_frame in found for detection in of_frame)
 
 

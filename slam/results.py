@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import SlamConfig
-from slam.frames import Detection, RadarFrame
+from slam.frames import Detection, RadarFrame, StepInputError
 from slam.geometry import Rig
 
 Array = NDArray[np.float64]
@@ -213,10 +213,6 @@ class SmoothedRun:
     landmark_covariances_m2: Array  # shape (m, 2, 2)
 
 
-class StepInputError(ValueError):
-    """A pipeline was given something that it cannot be stepped with; it stays as it was."""
-
-
 class InputCheck:
     """Checks what a pipeline is stepped with, before it changes anything; raises StepInputError."""
 
@@ -242,39 +238,18 @@ class InputCheck:
             )
         return pose
 
-    def frames(self, frames: Sequence[RadarFrame]) -> dict[int, int]:
-        """Return the times of frames by radar; each must be of another radar of the rig."""
-        stamps_ns = self._stamps_ns(frames)
-        if len(stamps_ns) < len(frames):
-            radars = [frame.radar for frame in frames]
-            raise StepInputError(f"frames of radars {radars}; a step takes one of each")
-        return stamps_ns
-
-    def detections(
-        self, detections: Sequence[Detection], of_frames_ns: Mapping[int, int] | None = None
-    ) -> tuple[Detection, ...]:
-        """Return detections, which must be those of one frame of each radar of the rig.
-
-        ``of_frames_ns`` are the times of these frames by radar; None: of any.
-        """
-        stamps_ns = self._stamps_ns(detections) if of_frames_ns is None else of_frames_ns
-        for each in detections:
-            if stamps_ns.get(each.radar) != each.t_ns:
-                raise StepInputError(
-                    f"a detection of radar {each.radar} at {each.t_ns} ns, which is not of the "
-                    f"radar's frame in this step; times of frames by radar: {stamps_ns}"
-                )
-        return tuple(detections)
-
-    def _stamps_ns(self, seen: Sequence[RadarFrame | Detection]) -> dict[int, int]:
+    def stamps_ns(self, seen: Sequence[RadarFrame] | Sequence[Detection]) -> dict[int, int]:
+        """Return the times of frames, or of detections, by radar; there is one frame of each."""
         stamps_ns: dict[int, int] = {}
         for each in seen:
-            if each.radar >= self._n_radars:
+            is_second = isinstance(each, RadarFrame) and each.radar in stamps_ns
+            is_other = stamps_ns.setdefault(each.radar, each.t_ns) != each.t_ns
+            if each.radar >= self._n_radars or is_second or is_other:
                 raise StepInputError(
-                    f"radar {each.radar} of a rig of {self._n_radars}; radars are numbered from 0 "
-                    "in the order of its mounts"
+                    f"{type(each).__name__} of radar {each.radar} at {each.t_ns} ns: a step takes "
+                    f"one frame of each of {self._n_radars} radars, numbered from 0 in the order "
+                    f"of the rig's mounts, or the detections of one; times by radar: {stamps_ns}"
                 )
-            stamps_ns.setdefault(each.radar, each.t_ns)
         return stamps_ns
 
 

@@ -163,15 +163,8 @@ _seed, _count = partial(_whole_number, least=0), partial(_whole_number, least=1)
 """Of a random generator; how many of something."""
 
 
-def _seconds(text: str) -> float:
-    """Return a time in seconds, finite, 0 or more."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value >= 0.0):
-        raise argparse.ArgumentTypeError(f"must be seconds, 0 or more, not {shown(text)}")
-    return value
+_seconds = number(float, lambda value: 0.0 <= value < math.inf, "seconds, 0 or more")
+_metres = number(float, lambda value: 0.0 < value < math.inf, "metres, more than 0")
 
 
 def _setting(text: str) -> tuple[str, tuple[str, ...]]:
@@ -180,6 +173,13 @@ def _setting(text: str) -> tuple[str, tuple[str, ...]]:
     if not key or not all(named):
         raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {shown(text)}")
     return key.strip(), named
+
+
+def _add_session(parser: argparse.ArgumentParser) -> None:
+    """Add the session that a command reads."""
+    parser.add_argument(
+        "session", type=_session, metavar="SESSION", help="a session.mcap, or a run's folder"
+    )
 
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
@@ -276,9 +276,7 @@ def _add_view(view: argparse.ArgumentParser) -> None:
 
 
 def _add_report(report: argparse.ArgumentParser) -> None:
-    report.add_argument(
-        "session", type=_session, metavar="SESSION", help="a session.mcap, or a run's folder"
-    )
+    _add_session(report)
     report.add_argument(
         "--out",
         type=_output(".html", ".htm", what="a page"),
@@ -331,9 +329,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
 
 
 def _add_replay(replay: argparse.ArgumentParser) -> None:
-    replay.add_argument(
-        "session", type=_session, metavar="SESSION", help="a session.mcap, or a run's folder"
-    )
+    _add_session(replay)
     _add_out(replay, "out/replay")
 
 
@@ -354,7 +350,7 @@ def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     evaluate.add_argument(
         "--delta",
         dest="delta_m",
-        type=number(float, lambda value: 0.0 < value < math.inf, "metres, more than 0"),
+        type=_metres,
         default=1.0,
         metavar="M",
         help="way that a relative error is over, metres (default: 1)",
@@ -419,9 +415,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
 
 
 def _add_calibrate(calibrate: argparse.ArgumentParser) -> None:
-    calibrate.add_argument(
-        "session", type=_session, metavar="SESSION", help="a session.mcap, or a run's folder"
-    )
+    _add_session(calibrate)
     calibrate.add_argument(
         "--reflectors", metavar="FILE", help="known places: TOML with [[reflectors]], or a scene"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,19 +45,15 @@ class UwbRadarSlam:
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        stamps_ns = self._check.frames(frames)
-
-        def detect() -> tuple[Detection, ...]:
-            found = detect_all(self._detector, frames, self.rig)
-            return self._check.detections(found, stamps_ns)
-
+        self._check.stamps_ns(frames)
+        detect = partial(detect_all, self._detector, frames, self.rig)
         return self._take(detect, pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        checked = self._check.detections(detections)
-        return self._take(lambda: checked, pose_at, t_ns)
+        self._check.stamps_ns(detections)
+        return self._take(lambda: tuple(detections), pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
         if self.config.window.end_of_run is EndOfRun.DROP:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,22 +63,17 @@ class RobustSlam:
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Return the state if the robot has moved; without any frame there is odometry alone."""
-        stamps_ns = self._check.frames(frames)
-
-        def detect() -> tuple[Detection, ...]:
-            found = detect_all(self._detector, frames, self.rig)
-            return self._check.detections(found, stamps_ns)
-
+        stamps_ns = self._check.stamps_ns(frames)
+        detect = partial(detect_all, self._detector, frames, self.rig)
         return self._take(detect, stamps_ns, pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Do what ``step`` does; a radar without a detection looked at ``t_ns`` and saw nothing."""
-        checked = self._check.detections(detections)
         stamps_ns = dict.fromkeys(range(len(self.rig.mounts)), t_ns)
-        stamps_ns |= {detection.radar: detection.t_ns for detection in detections}
-        return self._take(lambda: checked, stamps_ns, pose_at, t_ns)
+        stamps_ns |= self._check.stamps_ns(detections)
+        return self._take(lambda: tuple(detections), stamps_ns, pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
         return ()

@@ -11,7 +11,7 @@ from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.convert.authors_bag import AuthorsBag
 from slam.app.cli import main
 from slam.app.commands.evaluate import evaluate
-from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.track import OdometryTrack, read_tum
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
 from xethru_protocol.operating_system import StopFlag
 
@@ -61,7 +61,7 @@ def test_whoever_downloads_it_can_run_it(
     assert main(["convert", str(session), str(detections), "--preset", "paper"]) == 0
     assert main(["convert", str(detections), str(again)]) == 0
     assert main(["replay", str(again), "--out", str(tmp_path / "fixes")]) == 0
-    judged = evaluate(tmp_path / "fixes" / "estimate.tum", out / "truth.tum")
+    judged = evaluate(read_tum(tmp_path / "fixes" / "estimate.tum"), read_tum(out / "truth.tum"))
     ate_m, pairs = judged["ate_rmse_m"], judged["pairs"]
     assert isinstance(ate_m, float)
     assert isinstance(pairs, int)

@@ -97,7 +97,7 @@ def test_summary_agrees_with_the_trajectory_files(demo: Finished) -> None:
         ("smoothed", "smoothed_ate_rmse_m"),
         ("odometry", "odometry_ate_rmse_m"),
     ):
-        result = evaluate(demo.out / f"{name}.tum", truth)
+        result = evaluate(read_tum(demo.out / f"{name}.tum"), read_tum(truth))
         assert result["ate_rmse_m"] == pytest.approx(summary[field], rel=1e-9)
         assert result["pairs"] == result["reference_poses"]
 

@@ -19,10 +19,10 @@ from slam.config import (
     WheelNoise,
     WindowConfig,
 )
-from slam.frames import Detection, RadarFrame
+from slam.frames import Detection, RadarFrame, StepInputError
 from slam.geometry import Mount, Rig
 from slam.paper.pipeline import UwbRadarSlam
-from slam.results import PoseAt, Slam, StepInputError
+from slam.results import PoseAt, Slam
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters

@@ -29,12 +29,12 @@ from slam.app.session_records import (
 )
 from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import TrueAssociationNis, true_range_nis
-from slam.frames import Detector, RadarFrame
+from slam.frames import Detector, RadarFrame, StepInputError
 from slam.geometry import Rig
 from slam.growing_arrays import PackedRows, RowsByTime
 from slam.numba_functions import compile_kernels
 from slam.paper.pipeline import UwbRadarSlam
-from slam.results import Slam, SmoothedRun, StepInputError, StepResult
+from slam.results import Slam, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.frames import Frame
