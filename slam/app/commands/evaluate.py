@@ -9,14 +9,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum
 from slam.app.run.output import print_table, print_text
-from slam.app.run.pictures import TRUTH, label, picture
 from slam.app.session.reader import RecordedScan, open_session
 from slam.app.session_records import Snapshot
 from slam.evaluation import associate_times, ate_rmse_m, ate_rotation_rmse_rad, relative_pose_errors
@@ -135,8 +132,7 @@ def run_evaluate(
         except AppError as error:
             raise AppError(f"{name}: {error}") from None
     if out is not None:
-        with picture(out, width_in=10.0, height_in=5.0) as figure:
-            _draw(figure, paths, truth)
+        _draw(out, paths, truth)
     if as_json:
         rows = [{"estimate": name, **errors} for name, errors in results.items()]
         several = {"reference": str(reference), "estimates": rows}
@@ -158,18 +154,23 @@ def run_evaluate(
     print_table(title, header, table)
 
 
-def _draw(figure: Figure, paths: Mapping[str, Trajectory], reference: Trajectory) -> None:
+def _draw(out: Path, paths: Mapping[str, Trajectory], reference: Trajectory) -> None:
     """Draw the aligned paths on the reference, and how far each is from it over time."""
-    map_axes, error_axes = figure.subplots(1, 2)
-    map_axes.set_aspect("equal", adjustable="datalim")
-    map_axes.plot(*reference.poses[:, :2].T, color=TRUTH, linewidth=3.0, label="reference")
-    for number, (name, path) in enumerate(paths.items()):
-        stamps_ns, poses, truth = associated(path, reference)
-        aligned = transform(align_se2(poses[:, :2], truth[:, :2]), poses[:, :2])
-        colour = colormaps["tab10"](number % 10)
-        map_axes.plot(*aligned.T, color=colour, linewidth=1.0, label=name)
-        error_mm = 1e3 * np.linalg.norm(aligned - truth[:, :2], axis=1)
-        error_axes.plot((stamps_ns - reference.stamps_ns[0]) / NS_PER_S, error_mm, color=colour)
-    label(map_axes, "paths, aligned to the reference", "x [m]", "y [m]")
-    label(error_axes, "distance from the reference", "time [s]", "error [mm]")
-    figure.legend(loc="outside lower left", frameon=False, fontsize=9)
+    from matplotlib import colormaps  # half a second, loaded only if needed
+
+    from slam.app.run.pictures import TRUTH, label, picture
+
+    with picture(out, width_in=10.0, height_in=5.0) as figure:
+        map_axes, error_axes = figure.subplots(1, 2)
+        map_axes.set_aspect("equal", adjustable="datalim")
+        map_axes.plot(*reference.poses[:, :2].T, color=TRUTH, linewidth=3.0, label="reference")
+        for number, (name, path) in enumerate(paths.items()):
+            stamps_ns, poses, truth = associated(path, reference)
+            aligned = transform(align_se2(poses[:, :2], truth[:, :2]), poses[:, :2])
+            colour = colormaps["tab10"](number % 10)
+            map_axes.plot(*aligned.T, color=colour, linewidth=1.0, label=name)
+            error_mm = 1e3 * np.linalg.norm(aligned - truth[:, :2], axis=1)
+            error_axes.plot((stamps_ns - reference.stamps_ns[0]) / NS_PER_S, error_mm, color=colour)
+        label(map_axes, "paths, aligned to the reference", "x [m]", "y [m]")
+        label(error_axes, "distance from the reference", "time [s]", "error [mm]")
+        figure.legend(loc="outside lower left", frameon=False, fontsize=9)
