@@ -546,7 +546,7 @@ def load_scene(path_or_name: str | Path) -> Scene:
         family = path_or_name.partition(":")[0]
         raise UnknownSceneError(
             f"{path_or_name}: no such room; a family has the rooms 0 to {MOST_ROOMS - 1}, such as "
-            f"pillars:3; {choices(family, FAMILIES)}"
+            f"pillars:3" + ("" if family in FAMILIES else f"; {choices(family, FAMILIES)}")
         )
     return load_table(
         Scene,

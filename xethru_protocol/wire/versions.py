@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from xethru_protocol.validation import choices, shown
+from xethru_protocol.validation import shown
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
     InfoItem,
@@ -358,8 +358,8 @@ def firmware_named(name: str) -> FirmwareVersions:
     """
     if name not in FIRMWARE_NAMES:
         raise ValueError(
-            f"firmware {shown(name)} is not known (without a version: the newest); "
-            f"{choices(name, FIRMWARE_NAMES)}"
+            f"firmware {shown(name)} is not known; it is one of {', '.join(FIRMWARE_NAMES)} "
+            "(without a version: the newest)"
         )
     line, _, version = name.partition("-")
     if line == _BASE.lower():
