@@ -23,6 +23,7 @@ from xethru_protocol.operating_system import (
     STDERR,
     STDOUT,
     StopFlag,
+    StopRequestedError,
     each_line,
     flush_streams,
     json_text,
@@ -353,6 +354,8 @@ def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
         start[arguments.command](arguments, stop, _warn)
     except CannotServeError as error:
         return _failed(str(error), exit_code=error.exit_code)
+    except StopRequestedError:  # while a file of its input was waited for
+        pass
     return 0
 
 

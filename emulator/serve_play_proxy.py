@@ -36,7 +36,7 @@ from emulator.ports.tcp import is_loopback
 from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
 from emulator.x4m300 import PortDevice, radar_device
-from xethru_protocol.operating_system import STDOUT, StopFlag, json_text
+from xethru_protocol.operating_system import STDOUT, StopFlag, json_text, waiting
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.transport import open_line
@@ -90,7 +90,9 @@ class FaultSession:
         if truth is not None:
             try:
                 # by lines: a fault is in the file as soon as it is injected
-                self._truth = cleanup.enter_context(truth.open("w", buffering=1, encoding="utf-8"))
+                with waiting():
+                    log = truth.open("w", buffering=1, encoding="utf-8")
+                self._truth = cleanup.enter_context(log)
             except OSError as error:
                 raise LinkError(f"{truth}: cannot write the truth log: {error.strerror}") from error
 

@@ -14,12 +14,13 @@ import select
 import shutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal, Self, TextIO, TypeVar
+from typing import Any, ClassVar, Literal, Self, TextIO, TypeVar
 
 T = TypeVar("T")
 
@@ -29,7 +30,7 @@ _PR_SET_PDEATHSIG = 1  # Linux, prctl(2)
 
 def read_bounded(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     """Return all of a file, which may be a pipe; OSError if it has more bytes than that."""
-    with path.open("rb") as file:
+    with waiting(), path.open("rb") as file:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
         raise OSError(errno.EFBIG, f"longer than {most_bytes >> 20} MiB")
@@ -84,7 +85,8 @@ def written_whole(path: Path) -> Iterator[Path]:
     Raises OSError if the file cannot be written, or another process is just doing so.
     """
     if path.exists() and (not path.is_file() or _is_output(path)):
-        yield path
+        with waiting():  # a pipe waits for its reader
+            yield path
         return
     target = Path(os.path.realpath(path))  # a link stays one
     fresh = target.with_name(f".unfinished.{target.name}")
@@ -177,7 +179,14 @@ class StopFlag:
         later, the system's handler, which ends the process where it stands (a second SIGHUP is
         ignored: a closing terminal sends two);
         ``"previous"``, the handler of before; ``"same"``, the same as the first.
+
+    Attributes
+    ----------
+    entered
+        The flag that was entered last and gets the signals; None outside of all.
     """
+
+    entered: ClassVar[StopFlag | None] = None
 
     def __init__(self, second: Literal["default", "previous", "same"] = "default") -> None:
         self.received: signal.Signals | None = None  # the last that arrived
@@ -186,11 +195,13 @@ class StopFlag:
         self._second = second
         self._previous: dict[signal.Signals, Any] = {}
         self._at_once = False
+        self._outer: StopFlag | None = None
         self._leave: Callable[[signal.Signals], None] | None = None
         self._end: Callable[[], None] | None = None
 
     def __enter__(self) -> Self:
         """Install the handlers. Main thread only, as Python demands."""
+        self._outer, StopFlag.entered = StopFlag.entered, self
         for which in _SIGNALS:
             if which is not signal.SIGHUP or signal.getsignal(which) is not signal.SIG_IGN:
                 self._previous[which] = signal.signal(which, self._on_signal)
@@ -199,6 +210,7 @@ class StopFlag:
     def __exit__(self, *exception: object) -> None:
         for which, handler in self._previous.items():
             signal.signal(which, handler)
+        StopFlag.entered = self._outer
 
     def check(self) -> None:
         """Raise StopRequestedError if a signal arrived since this flag was entered."""
@@ -206,13 +218,17 @@ class StopFlag:
             raise StopRequestedError(self.received)
 
     @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """Let a signal raise where it arrives: for waiting, where nothing is half-done."""
+    def at_once(self, *, earlier: bool = True) -> Iterator[None]:
+        """Let a signal raise where it arrives: for waiting, where nothing is half-done.
+
+        So does one that came ``earlier``, if asked for.
+        """
         before = self._at_once
         try:
             # in this order: a signal is seen by the check, or raises where it arrives
             self._at_once = True
-            self.check()
+            if earlier:
+                self.check()
             yield
         finally:
             self._at_once = before
@@ -287,6 +303,18 @@ class StopFlag:
             os.kill(os.getpid(), which)
 
 
+@contextmanager
+def waiting(*, earlier: bool = True) -> Iterator[None]:
+    """Let a signal raise where it arrives: around what waits for another process, as a pipe does.
+
+    A system call that a signal interrupts is repeated, unless the handler raises. ``earlier`` is
+    that of `StopFlag.at_once`.
+    """
+    flag = StopFlag.entered if threading.current_thread() is threading.main_thread() else None
+    with nullcontext() if flag is None else flag.at_once(earlier=earlier):
+        yield
+
+
 def open_closed_streams(*, replace: bool = True) -> None:
     """Put the null device where the shell closed a standard stream (`>&-`).
 
@@ -309,11 +337,11 @@ _MOST_LATE = 100_000
 
 
 class Outlet:
-    """Standard output or standard error for as long as it takes text; its methods never raise.
+    """Standard output or standard error for as long as it takes text; no OSError is raised.
 
     A terminal goes away with its connection, the reader of a pipe ends, a disk gets full: nothing
     more is written then, and `failure` is the reason. A stream may also block, as a terminal does
-    after Ctrl-S or a pipe that nobody reads. Only `write` waits for it.
+    after Ctrl-S or a pipe that nobody reads. Only `write` waits for it; a signal ends that.
     """
 
     def __init__(self, name: Literal["stdout", "stderr"], descriptor: int) -> None:
@@ -341,7 +369,8 @@ class Outlet:
     def write(self, text: str) -> None:
         """Write a text behind those that wait, however long the stream blocks."""
         text, self._late = self._late + text, ""
-        self._put(text)
+        with waiting(earlier=False):  # results are printed after a signal, too
+            self._put(text)
 
     def write_soon(self, text: str) -> None:
         """Write a text if the stream does not block, else keep it until it takes text again."""

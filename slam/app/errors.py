@@ -31,6 +31,12 @@ def naming(path: Path) -> Iterator[None]:
         raise AppError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
+def refuse_pipe(path: Path) -> None:
+    """Raise AppError if a path is a pipe: a recording is read more than once, or from its end."""
+    if path.is_fifo():
+        raise AppError(f"{path}: is a pipe; give a file")
+
+
 class RadarSilentError(AppError):
     """A radar that was streaming sends no more frames."""
 

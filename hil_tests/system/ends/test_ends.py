@@ -16,7 +16,7 @@ from hil_tests.system.ends.programs import (
     started,
     wait_for_end,
 )
-from hil_tests.system.ends.trials import run_trials
+from hil_tests.system.ends.trials import NAMES, run_trials
 
 pytestmark = [
     pytest.mark.slow,
@@ -133,5 +133,5 @@ def test_a_killed_conversion_leaves_nothing_half() -> None:
 @pytest.mark.timeout(2000)
 @pytest.mark.parametrize("ending", [Ending.KILL, TERM, HANG_UP, Ending.FULL_DISK])
 def test_programs_can_be_ended_at_any_time(ending: Ending) -> None:
-    findings = run_trials(7, 6, endings=[ending])
+    findings = run_trials(len(NAMES), 6, endings=[ending])
     assert findings.problems == []

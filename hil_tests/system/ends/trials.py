@@ -34,7 +34,10 @@ from hil_tests.system.ends.programs import (
     wait_for_end,
 )
 
-NAMES = ("demo", "run", "record", "sweep", "replay", "report", "convert")
+NAMES = (
+    *("demo", "run", "record", "sweep", "replay", "report", "convert"),
+    *("view", "calibrate", "repair"),
+)
 ENDINGS = (Ending.KILL, Ending.TERM, Ending.HANG_UP, Ending.FULL_DISK)
 
 
@@ -102,7 +105,7 @@ def trial(
     place.mkdir()
     (folder := place / "out").mkdir()
     after_s = chance.uniform(0.0, whole.took_s)
-    size_bytes = chance.randrange(4096, whole.size_bytes)
+    size_bytes = chance.randrange(min(4096, whole.size_bytes // 2), whole.size_bytes)
     with ExitStack() as stack:
         if ending is Ending.FULL_DISK:
             stack.enter_context(small_disk(folder, size_bytes))

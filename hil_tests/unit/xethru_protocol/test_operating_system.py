@@ -11,7 +11,7 @@ import sys
 import termios
 import threading
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -319,6 +319,31 @@ def test_links_stay_links_and_what_is_no_file_is_written_to_itself(tmp_path: Pat
     finally:
         os.close(reader)
     assert pipe.is_fifo()
+
+
+def write_to_a_pipe(pipe: Path) -> None:
+    with written_whole(pipe) as fresh:
+        fresh.write_text("nobody reads it")
+
+
+def print_to_a_pipe(pipe: Path) -> None:
+    keep = os.open(pipe, os.O_RDWR)  # so that no end is missing, and nobody reads
+    with os.fdopen(keep, "w") as stream, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", stream)
+        Outlet("stdout", 1).write("x" * (1 << 20))
+
+
+@pytest.mark.parametrize("wait", [read_bounded, write_to_a_pipe, print_to_a_pipe])
+def test_a_signal_ends_the_wait_for_a_pipe(wait: Callable[[Path], object], tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "pipe")
+    soon = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM))
+    with StopFlag() as stop:
+        soon.start()
+        with pytest.raises(StopRequestedError) as stopped:
+            wait(pipe)
+    assert stopped.value.exit_code == 143
+    assert stop.received is signal.SIGTERM
+    assert StopFlag.entered is None
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from slam.app.errors import AppError, UsageError, naming
+from slam.app.errors import AppError, UsageError, naming, refuse_pipe
 from slam.app.run.output import print_text
 from slam.app.run.replay import (
     is_finished,
@@ -142,6 +142,9 @@ def run_view(
     path = session_file(session, allow_view=out is None)
     for written in (out, screenshot):
         refuse_overwriting(path, written)
+    for opened in (path, out):  # by Rerun, which seeks
+        if opened is not None:
+            refuse_pipe(opened)
     where = SERVE_WEB if web else SPAWN
     if path.suffix == ".rrd":
         if out is not None:

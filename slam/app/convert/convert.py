@@ -8,7 +8,7 @@ from pathlib import Path
 
 from slam.app.convert.matlab import convert_mat, write_detections
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
-from slam.app.errors import AppError, UsageError, naming
+from slam.app.errors import AppError, UsageError, naming, refuse_pipe
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_text
 from slam.app.run.replay import recorded_config
@@ -76,6 +76,7 @@ def run_convert(
     """
     if out.exists():
         raise AppError(f"{out}: exists; choose another name")
+    refuse_pipe(source)
     is_session = source.suffix == _SESSION_SUFFIX or _begins(source, MAGIC)
     if is_session and suffix_of(out) not in ("", _SESSION_SUFFIX, *_OF_SESSION):
         raise UsageError(

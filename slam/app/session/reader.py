@@ -10,7 +10,6 @@ import json
 import math
 import os
 import re
-import stat
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -21,7 +20,7 @@ from typing import BinaryIO, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, OdometryError
+from slam.app.errors import AppError, OdometryError, refuse_pipe
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.rig.frame_sources import recorded_frame, sampler_limits
 from slam.app.session import cdr
@@ -119,8 +118,7 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
     """
     with ExitStack() as stack:
         try:
-            if stat.S_ISFIFO(path.stat().st_mode):  # opening one waits for who writes into it
-                raise AppError(f"{path}: is a pipe; give a file, the session.mcap of a run")
+            refuse_pipe(path)
             stream = stack.enter_context(path.open("rb"))
             if not is_like(stream.read(len(MAGIC)), MAGIC):
                 raise AppError(f"{path}: is no MCAP file{describe_kind(path)}")
