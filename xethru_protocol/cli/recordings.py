@@ -18,6 +18,7 @@ from xethru_protocol.cli.output import (
     counted,
     print_json,
     print_line,
+    print_text,
     profile_name,
     warn,
     warn_of,
@@ -344,7 +345,7 @@ def export(arguments: Namespace) -> int:
     """Write the message table for another tool."""
     text = {"kaitai": structure, "wireshark": dissector}[arguments.tool]()
     if arguments.out is None:
-        print_line(text.rstrip())
+        print_text(text)
         return 0
     wanted = {"kaitai": ".ksy", "wireshark": ".lua"}[arguments.tool]
     if suffix_of(Path(arguments.out)) not in ("", wanted):

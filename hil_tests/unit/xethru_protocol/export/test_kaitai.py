@@ -81,3 +81,12 @@ def test_every_vector_is_parsed_with_its_fields(tmp_path: Path) -> None:
             if not same(found, value):
                 wrong.append(f"{vector.name}.{key}: {found} != {value}")
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("tool", ["kaitai", "wireshark"])
+def test_what_is_printed_is_the_file(
+    tool: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert xethru(["export", tool, "--out", str(tmp_path / "file")]) == 0
+    assert xethru(["export", tool]) == 0
+    assert capsys.readouterr().out == (tmp_path / "file").read_text()
