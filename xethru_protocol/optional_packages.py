@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+from shlex import quote
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
 DISTRIBUTION = "xethru-hil"
+_ORIGIN = "direct_url.json"
 
 PACKAGES = {
     "mcap": ("lz4", "mcap", "zstandard"),
@@ -14,6 +24,9 @@ PACKAGES = {
 }
 """Names as imported, by the extra of pyproject.toml that lists their distributions."""
 
+_CALLED = {"live": "Rerun"}
+"""What users call the packages of an extra, where a package's name would not tell them."""
+
 INCLUDED = {
     "slam": ("emulator", "mcap"),
     "view": ("emulator", "live", "mcap", "slam"),
@@ -23,8 +36,45 @@ INCLUDED = {
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to an installation."""
-    return f"pip install '{DISTRIBUTION}[{extra}]'"
+    """Return the command that adds an extra to this installation.
+
+    It names what the installation was made of, as pip recorded it (PEP 610): a clone, a wheel or a
+    repository. A program that runs from its source tree names that tree.
+    """
+    origin = _origin()
+    url = str(origin.get("url", ""))
+    path = Path(unquote(urlsplit(url).path))
+    option = ""
+    if vcs := origin.get("vcs_info"):
+        what = f"{DISTRIBUTION}[{extra}] @ {vcs['vcs']}+{url}"
+    elif url.startswith("file:") and path.exists():
+        option = "-e " if origin.get("dir_info", {}).get("editable") else ""
+        what = f"{'.' if path == Path.cwd() else path}[{extra}]"
+    else:
+        what = f"{DISTRIBUTION}[{extra}]"
+    return f"{_pip()} install {option}{quote(what)}"
+
+
+def _origin() -> dict[str, Any]:
+    source = Path(__file__).parents[1]
+    if (source / "pyproject.toml").is_file():
+        return {"url": source.as_uri(), "dir_info": {"editable": True}}
+    from importlib.metadata import PackageNotFoundError, distribution  # 20 ms
+
+    try:
+        found: dict[str, Any] = json.loads(distribution(DISTRIBUTION).read_text(_ORIGIN) or "{}")
+    except (PackageNotFoundError, ValueError):
+        return {}
+    return found
+
+
+def _pip() -> str:
+    """Return what calls the pip of this interpreter, which need not be the first on the path."""
+    pip, python = shutil.which("pip"), Path(sys.executable)
+    if pip is not None and Path(pip).parent == python.parent:
+        return "pip"
+    is_near = python.is_relative_to(Path.cwd())
+    return f"{quote(os.path.relpath(python) if is_near else str(python))} -m pip"
 
 
 def what_is_missing(error: ModuleNotFoundError, *, extra: str | None = None) -> str | None:
@@ -44,5 +94,5 @@ def what_is_missing(error: ModuleNotFoundError, *, extra: str | None = None) -> 
                 one for one in (own, *INCLUDED) if {own, found} <= {one, *INCLUDED.get(one, ())}
             )
             named = next(wholes, found)
-            return f"{package} is not installed: {install_command(named)}"
+            return f"{_CALLED.get(found, package)} is not installed: {install_command(named)}"
     return None

@@ -82,10 +82,10 @@ PROMISES: dict[str, tuple[Promise, ...]] = {
     "base": (
         *_DRIVER,
         Promise("xethru-emulator --help", "serve"),
-        Promise("xethru-emulator serve --bare", "pip install 'xethru-hil[emulator]'", 2),
+        Promise("xethru-emulator serve --bare", "[emulator]", 2),
         Promise("uwb-slam --help", "demo"),
-        Promise("uwb-slam demo", "pip install 'xethru-hil[slam]'", 2),
-        Promise("xethru convert rec rec.mcap", "pip install 'xethru-hil[mcap]'", 1),
+        Promise("uwb-slam demo", "[slam]", 2),
+        Promise("xethru convert rec rec.mcap", "[mcap]", 1),
         Promise("pip install 'xethru-hil[mcap]'"),
         Promise("xethru convert rec rec.mcap"),
     ),
@@ -97,7 +97,7 @@ PROMISES: dict[str, tuple[Promise, ...]] = {
     "hil": _HIL,
     "slam": (
         *_SLAM,
-        Promise("uwb-slam view demo --out view.rrd", "pip install 'xethru-hil[view]'", 2),
+        Promise("uwb-slam view demo --out view.rrd", "[view]", 2),
     ),
     "view": _VIEW,
     "all": (*_DRIVER, *_EMULATOR, *_VIEW, *_HIL),

@@ -1,6 +1,7 @@
 """Extras: the table of their packages, and what programs print without them."""
 
 import importlib.metadata
+import json
 import re
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.paths import REPOSITORY
-from xethru_protocol.optional_packages import INCLUDED, PACKAGES, what_is_missing
+from xethru_protocol.optional_packages import INCLUDED, PACKAGES, install_command, what_is_missing
 
 _PROJECT = REPOSITORY / "pyproject.toml"
 _NOT_INSTALLED = """\
@@ -61,23 +62,78 @@ def test_the_table_of_included_extras_agrees_with_the_requirements(extra: str) -
 
 
 @pytest.mark.parametrize(
-    ("module", "own", "line"),
+    ("module", "own", "named"),
     [
-        ("scipy.signal", "emulator", "scipy is not installed: pip install 'xethru-hil[emulator]'"),
-        ("scipy", "slam", "scipy is not installed: pip install 'xethru-hil[slam]'"),
-        ("mcap.writer", "slam", "mcap is not installed: pip install 'xethru-hil[slam]'"),
-        ("mcap.writer", None, "mcap is not installed: pip install 'xethru-hil[mcap]'"),
-        ("rerun", "slam", "rerun is not installed: pip install 'xethru-hil[view]'"),
-        ("rerun", "live", "rerun is not installed: pip install 'xethru-hil[live]'"),
-        ("rerun", None, "rerun is not installed: pip install 'xethru-hil[live]'"),
-        ("PIL", "view", "PIL is not installed: pip install 'xethru-hil[view]'"),
-        ("PIL", "slam", "PIL is not installed: pip install 'xethru-hil[slam]'"),
+        ("scipy.signal", "emulator", ("scipy", "emulator")),
+        ("scipy", "slam", ("scipy", "slam")),
+        ("mcap.writer", "slam", ("mcap", "slam")),
+        ("mcap.writer", None, ("mcap", "mcap")),
+        ("rerun", "slam", ("Rerun", "view")),
+        ("rerun", "live", ("Rerun", "live")),
+        ("rerun", None, ("Rerun", "live")),
+        ("PIL", "view", ("PIL", "view")),
+        ("PIL", "slam", ("PIL", "slam")),
         ("xethru_protocol.nothing", "slam", None),
         (None, None, None),
     ],
 )
-def test_names_the_extra(module: str | None, own: str | None, line: str | None) -> None:
+def test_names_the_extra(
+    module: str | None, own: str | None, named: tuple[str, str] | None
+) -> None:
+    line = None if named is None else f"{named[0]} is not installed: {install_command(named[1])}"
     assert what_is_missing(ModuleNotFoundError(name=module), extra=own) == line
+
+
+GIT = {"vcs": "git", "commit_id": "f00d"}
+
+
+@pytest.mark.parametrize(
+    ("origin", "command"),
+    [
+        ({"url": "file://{clone}", "dir_info": {"editable": True}}, "-e '{clone}[slam]'"),
+        ({"url": "file://{clone}", "dir_info": {}}, "'{clone}[slam]'"),
+        ({"url": "file://{wheel}", "archive_info": {}}, "'{wheel}[slam]'"),
+        (
+            {"url": "https://example.org/x.git", "vcs_info": GIT},
+            "'xethru-hil[slam] @ git+https://example.org/x.git'",
+        ),
+        ({"url": "file:///removed/since"}, "'xethru-hil[slam]'"),
+        ({}, "'xethru-hil[slam]'"),
+    ],
+)
+def test_the_command_names_what_was_installed(
+    origin: dict[str, object], command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (clone := tmp_path / "a clone").mkdir()
+    (wheel := tmp_path / "w.whl").touch()
+    (information := tmp_path / "xethru_hil-1.dist-info").mkdir()
+    (information / "METADATA").write_text("Name: xethru-hil\nVersion: 1\n")
+    places = {"{clone}": str(clone), "{wheel}": str(wheel)}
+    url, expected = str(origin.get("url", "")), command
+    for word, place in places.items():
+        url, expected = url.replace(word, Path(place).as_uri()[7:]), expected.replace(word, place)
+    if origin:
+        (information / "direct_url.json").write_text(json.dumps(origin | {"url": url}))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(
+        "xethru_protocol.optional_packages.__file__", str(tmp_path / "site-packages" / "p" / "extras.py")
+    )
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
+    assert install_command("slam") == f"pip install {expected}"
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert install_command("slam") == f"{sys.executable} -m pip install {expected}"
+
+
+def test_in_a_clone_the_command_is_that_of_its_pages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pyproject.toml").touch()
+    monkeypatch.setattr(
+        "xethru_protocol.optional_packages.__file__", str(tmp_path / "xethru_protocol" / "extras.py")
+    )
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
+    monkeypatch.chdir(tmp_path)
+    assert install_command("view") == "pip install -e '.[view]'"
 
 
 @pytest.mark.parametrize(
@@ -88,37 +144,37 @@ def test_names_the_extra(module: str | None, own: str | None, line: str | None) 
             ["dump", "FILE"],
             1,
             "xethru dump: MCAP needs packages that are optional; "
-            r"\w+ is not installed: pip install 'xethru-hil\[mcap\]'",
+            r"\w+ is not installed: .*pip install .*\[mcap\]'",
         ),
         (
             "emulator.cli",
             ["serve", "--bare"],
             2,
-            r"xethru-emulator: \w+ is not installed: pip install 'xethru-hil\[emulator\]'",
+            r"xethru-emulator: \w+ is not installed: .*pip install .*\[emulator\]'",
         ),
         (
             "emulator.cli",
             ["faults"],
             2,
-            r"xethru-emulator: \w+ is not installed: pip install 'xethru-hil\[emulator\]'",
+            r"xethru-emulator: \w+ is not installed: .*pip install .*\[emulator\]'",
         ),
         (
             "slam.app.cli",
             ["demo"],
             2,
-            r"uwb-slam: \w+ is not installed: pip install 'xethru-hil\[slam\]'",
+            r"uwb-slam: \w+ is not installed: .*pip install .*\[slam\]'",
         ),
         (
             "slam.app.cli",
             ["replay", "FILE"],
             2,
-            r"uwb-slam: \w+ is not installed: pip install 'xethru-hil\[slam\]'",
+            r"uwb-slam: \w+ is not installed: .*pip install .*\[slam\]'",
         ),
         (
             "slam.app.cli",
             ["view", "FILE"],
             2,
-            r"uwb-slam: \w+ is not installed: pip install 'xethru-hil\[view\]'",
+            r"uwb-slam: \w+ is not installed: .*pip install .*\[view\]'",
         ),
     ],
 )

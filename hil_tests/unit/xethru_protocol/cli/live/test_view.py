@@ -34,6 +34,7 @@ from xethru_protocol.cli import main
 from xethru_protocol.cli.arguments import parse
 from xethru_protocol.cli.live.analysis import Clutter, LiveAnalysis
 from xethru_protocol.cli.live.sources import open_source
+from xethru_protocol.optional_packages import install_command
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 
@@ -356,8 +357,7 @@ def test_a_missing_viewer_is_named(
     monkeypatch.setitem(sys.modules, "rerun_cli", None)
     assert main(["view", str(at_rest)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    install = "pip install 'xethru-hil[live]'"
-    assert line == f"xethru view: the Rerun viewer is not installed: {install}"
+    assert line == f"xethru view: the Rerun viewer is not installed: {install_command('live')}"
 
 
 def test_without_a_display_other_ways_are_named(
