@@ -4,16 +4,21 @@ import base64
 import html
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.text import Text
 from PIL import Image
 
 from hil_tests.browser import contents_of, find_browser, photograph
 from hil_tests.system.recorded_session import record_session
 from slam.app.cli import main
+from slam.app.run import pictures
 from slam.app.run.pictures import SMOOTHED
 from slam.app.view.rerun_recording import count_rows
 from slam.evaluation import ate_rmse_m
@@ -62,7 +67,7 @@ def test_the_page_loads_nothing_from_elsewhere(reported: Reported) -> None:
     addresses = Addresses()
     addresses.feed(reported.text)
     assert addresses.tags.isdisjoint({"script", "link", "iframe", "object", "embed", "base"})
-    assert len(addresses.found) == 8  # map, errors, consistency, links; each wide and narrow
+    assert len(addresses.found) == 10  # map, errors, consistency, echoes, links; wide and narrow
     for address in addresses.found:
         kind, _, data = address.partition(",")
         assert kind == "data:image/svg+xml;base64"
@@ -71,7 +76,7 @@ def test_the_page_loads_nothing_from_elsewhere(reported: Reported) -> None:
         # what it refers to lies in itself: the names of XML dialects are no addresses to ask
         references = re.findall(r'(?:xlink:)?href="([^"]*)"|url\(([^)]*)\)', svg)
         assert references
-        assert all((href or url).startswith("#") for href, url in references)
+        assert all((href or url).startswith(("#", "data:")) for href, url in references)
     assert "@import" not in reported.text
     assert "url(" not in reported.text
 
@@ -87,14 +92,28 @@ def test_the_numbers_are_those_of_a_replay(reported: Reported, tmp_path: Path) -
 
 
 def test_a_lost_frame_and_a_fault_are_told_and_escaped(reported: Reported) -> None:
-    row = re.findall(r"<tr><td>rear_left</td>(.*?)</tr>", reported.text)[0]
-    cells = re.findall(r"<td>(.*?)</td>", row)
+    row = re.findall(r"<tr><td[^>]*>rear_left</td>(.*?)</tr>", reported.text)[0]
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", row)
     assert cells[3].startswith("1 (")  # lost
     assert cells[4:6] == ["1", "1"]  # most in a row, faults
     assert "Warnings: 1<" in reported.text
     assert "CRC of 5731 bytes &lt;does not fit&gt;" in reported.text
-    others = re.findall(r"<tr><td>front_left</td>(.*?)</tr>", reported.text)[0]
-    assert re.findall(r"<td>(.*?)</td>", others)[3:6] == ["0 (0.00 %)", "0", "0"]
+    others = re.findall(r"<tr><td[^>]*>front_left</td>(.*?)</tr>", reported.text)[0]
+    assert re.findall(r"<td[^>]*>(.*?)</td>", others)[3:6] == ["0 (0.00 %)", "0", "0"]
+
+
+def test_the_first_sentences_say_what_was_done_and_how_good_it_was(
+    reported: Reported, tmp_path: Path
+) -> None:
+    done, verdict = re.findall(r'<p class="verdict">(.*?)</p>', reported.text)
+    assert main(["replay", str(reported.session), "--out", str(tmp_path)]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert f"{reported.n_landmarks} landmarks in {summary['frames']} frames of 4 radars" in done
+    assert "1 frames were lost, and there were 1 faults" in done
+    ate_m, odometry_m = summary["ate_rmse_m"], summary["odometry_ate_rmse_m"]
+    assert ("better" in verdict) is (ate_m < odometry_m)
+    assert f"{1e3 * ate_m:.1f} mm" in verdict
+    assert f"{1e3 * odometry_m:.1f} mm" in verdict
 
 
 def test_settings_are_shown_as_json_has_them(reported: Reported) -> None:
@@ -131,7 +150,9 @@ for (const width of [1100, 400]) {{
   frame.onload = () => {{
     const root = frame.contentDocument.documentElement;
     const images = [...frame.contentDocument.images].map(image => image.naturalWidth);
-    widths.push([width, root.scrollWidth, ...images]);
+    const cells = [...frame.contentDocument.querySelectorAll("td")];
+    const right = Math.max(...cells.map(cell => cell.getBoundingClientRect().right));
+    widths.push([width, Math.max(root.scrollWidth, right), ...images]);
     if (widths.length == 2) document.title = JSON.stringify(widths.sort((a, b) => b[0] - a[0]));
   }};
   frame.srcdoc = page;
@@ -153,7 +174,7 @@ def test_nothing_is_wider_than_a_screen_or_a_telephone(reported: Reported, tmp_p
     # an inch has 96 px: text of 10 points then has 11 px or more on the telephone
     assert all(width > 900 for width in wide[2:])
     assert all(400 < width < 440 for width in narrow[2:])
-    assert len(wide) == len(narrow) == 6
+    assert len(wide) == len(narrow) == 7
 
 
 def test_the_smoothed_path_has_its_number_and_is_on_the_map(tmp_path: Path) -> None:
@@ -164,9 +185,41 @@ def test_the_smoothed_path_has_its_number_and_is_on_the_map(tmp_path: Path) -> N
     ate_m = ate_rmse_m(record.whole_smoothed.poses[:, :2], record.states.truth[:, :2])
     shown = re.findall(r'<td>smoothed ATE</td><td class="value">([0-9.]+) mm</td>', page)
     assert shown == [f"{1e3 * ate_m:.1f}"]
-    pictures = [base64.b64decode(data).decode() for data in re.findall(r'base64,([^"]*)"', page)]
-    coloured = [SMOOTHED in picture for picture in pictures]
-    assert coloured == [True] * 6 + [False] * 2  # map, errors, consistency; each narrow and wide
+    drawn = [base64.b64decode(data).decode() for data in re.findall(r'base64,([^"]*)"', page)]
+    coloured = [SMOOTHED in picture for picture in drawn]
+    assert coloured == [True] * 6 + [False] * 4  # map, errors, consistency; each narrow and wide
+
+
+def test_no_text_is_cut_and_no_legend_lies_over_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record_session(tmp_path / "session.mcap", "robust")
+    n_drawn = 0
+
+    def svg_of(draw: Callable[..., None], *arguments: object, **size: float) -> str:
+        def checked(figure: Figure, *given: object) -> None:
+            nonlocal n_drawn
+            n_drawn += 1
+            draw(figure, *given)
+            figure.draw_without_rendering()
+            edge = figure.bbox.padded(1.0)
+            axes_of = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
+            ticks = {text for axis in axes_of for text in axis.get_ticklabels()}  # also unseen ones
+            for text in figure.findobj(lambda found: isinstance(found, Text)):
+                assert isinstance(text, Text)
+                if text not in ticks and text.get_visible() and text.get_text():
+                    box = text.get_window_extent()
+                    assert edge.x0 <= box.x0 <= box.x1 <= edge.x1, text.get_text()
+            data = [axes.bbox for axes in figure.axes if axes.axison]
+            for legend in figure.findobj(Legend):
+                box = legend.get_window_extent()
+                assert not any(box.overlaps(panel) for panel in data)
+
+        return pictures.svg_of(checked, *arguments, **size)
+
+    monkeypatch.setattr("slam.app.commands.report.svg_of", svg_of)
+    assert main(["report", str(tmp_path)]) == 0
+    assert n_drawn == 10
 
 
 def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
@@ -176,13 +229,13 @@ def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
     assert "measured data" in page
     assert "simulated" not in page
     assert "The truth of this drive is unknown" in page
+    assert "Whether SLAM was better than the wheels is unknown" in page
     assert "begun 2026-09-21 14:13:20 UTC" in page
     assert "odometry clock: monotonic" in page
     assert "ATE" not in page
     assert "nearest truth" not in page
     assert "Errors over time" not in page
-    pictures = [base64.b64decode(data).decode() for data in re.findall(r'base64,([^"]*)"', page)]
-    assert len(pictures) == 8
+    assert len(re.findall(r'base64,([^"]*)"', page)) == 10
     assert main(["view", str(tmp_path / "session.mcap"), "--out", str(tmp_path / "v.rrd")]) == 0
     rows = count_rows(tmp_path / "v.rrd")
     assert rows["/map/estimate/path"] > 0

@@ -116,7 +116,8 @@ def test_the_command_names_what_was_installed(
         (information / "direct_url.json").write_text(json.dumps(origin | {"url": url}))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(
-        "xethru_protocol.optional_packages.__file__", str(tmp_path / "site-packages" / "p" / "extras.py")
+        "xethru_protocol.optional_packages.__file__",
+        str(tmp_path / "site-packages" / "p" / "extras.py"),
     )
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
     assert install_command("slam") == f"pip install {expected}"
@@ -129,7 +130,8 @@ def test_in_a_clone_the_command_is_that_of_its_pages(
 ) -> None:
     (tmp_path / "pyproject.toml").touch()
     monkeypatch.setattr(
-        "xethru_protocol.optional_packages.__file__", str(tmp_path / "xethru_protocol" / "extras.py")
+        "xethru_protocol.optional_packages.__file__",
+        str(tmp_path / "xethru_protocol" / "extras.py"),
     )
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
     monkeypatch.chdir(tmp_path)

@@ -7,7 +7,7 @@ import html
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S
-from slam.app.run.output import print_text, run_rows, summary_rows
+from slam.app.rig.echo_arcs import bscan_picture, n_shown_bins
+from slam.app.run.output import mm_text, print_text, run_rows, summary_rows
 from slam.app.run.pictures import (
     ESTIMATE,
     LANDMARK,
@@ -48,6 +49,7 @@ from slam.app.run.summary import (
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.evaluation import LANDMARK_MATCH_M
+from slam.frames import RadarFrame
 from slam.geometry import transform
 from slam.growing_arrays import PackedRows
 from xethru_protocol.operating_system import StopFlag, each_line, one_line, written_whole
@@ -57,6 +59,76 @@ _KEPT_WARNINGS = 200
 
 _Smoothed = tuple[NDArray[np.float64], NDArray[np.float64]]
 """See `smoothed_errors`."""
+
+
+_ECHO_ROWS = 800
+"""Most frames of a radar in the report: of a longer drive every second, every fourth and so on."""
+_GREYS = 32
+"""Of a B-scan: noise in all 256 would make the page twice as large."""
+
+
+class _Echoes:
+    """Collects near samples of frames, so many that a picture shows them.
+
+    They are by radar: times since the first scan [ns], and samples.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._step = 1
+        self._n_scans = 0
+        self._rows: dict[int, list[RadarFrame]] = {}
+
+    def on_scan(self, scan: Scan) -> None:
+        if self._n_scans % self._step == 0:
+            for frame in scan.frames:
+                n_bins = n_shown_bins(len(frame.samples), frame.range_start_m, frame.bin_length_m)
+                kept = replace(frame, samples=frame.samples[:n_bins].copy())
+                self._rows.setdefault(frame.radar, []).append(kept)
+            if max(map(len, self._rows.values()), default=0) >= _ECHO_ROWS:
+                self._step *= 2
+                self._rows = {radar: rows[::2] for radar, rows in self._rows.items()}
+        self._n_scans += 1
+
+    def write(self, page: _Page, record: RunRecord) -> None:
+        page.heading("Echoes")
+        if not self._rows:
+            page.note("The session holds no frames.")
+            return
+        page.note(
+            "What the radars received, their constant part removed; bright is strong, from -62 to "
+            "-30 dB of full scale. A target that the robot passes is a curved line."
+        )
+        page.picture(
+            "B-scan of each radar: echoes over time and range",
+            self._draw,
+            record,
+            height_in=0.6 + 1.5 * len(self._rows),
+            narrow_height_in=0.6 + 1.5 * len(self._rows),
+        )
+
+    def _draw(self, figure: Figure, record: RunRecord) -> None:
+        panels = figure.subplots(len(self._rows), 1, sharex=True, squeeze=False).ravel()
+        for axes, (radar, rows) in zip(panels, sorted(self._rows.items()), strict=True):
+            newest = rows[-1]
+            alike = [row for row in rows if row.samples.shape == newest.samples.shape]
+            picture = bscan_picture(
+                np.stack([row.samples for row in alike]), newest.range_start_m, newest.bin_length_m
+            )
+            ends_s = _seconds(record, [alike[0].t_ns, alike[-1].t_ns])
+            first_m, step_m = newest.range_start_m, newest.bin_length_m
+            axes.imshow(
+                picture.T // (256 // _GREYS),
+                aspect="auto",
+                origin="lower",
+                cmap="viridis",
+                vmin=0,
+                vmax=_GREYS - 1,
+                extent=(*ends_s, first_m + step_m, first_m + step_m * picture.shape[1]),
+            )
+            label(axes, self._names[radar], "", "range [m]")
+            axes.grid(visible=False)
+        panels[-1].set_xlabel(_TIME)
 
 
 class _ReportData(SessionObserver):
@@ -72,6 +144,7 @@ class _ReportData(SessionObserver):
 
     def __init__(self, info: SessionInfo) -> None:
         self.links = LinkStates(info.radars)
+        self.echoes = _Echoes([radar.name for radar in info.radars])
         self.changes: list[LinkChange] = []
         self.warnings: list[LogLine] = []
         self.n_warnings = 0
@@ -81,6 +154,7 @@ class _ReportData(SessionObserver):
 
     def on_scan(self, scan: Scan) -> None:
         self._end_ns = scan.t_ns
+        self.echoes.on_scan(scan)
         self.changes += self.links.on_scan(scan)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
@@ -114,6 +188,7 @@ body { font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #20242a; back
 h1 { font-size: 1.6rem; margin: 0 0 .2rem; }
 h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid #dfe3e8; }
 p.note { color: #6a707a; margin: .3rem 0 .8rem; }
+p.verdict { font-size: 1.1rem; margin: .6rem 0 .3rem; }
 p.origin { display: inline-block; padding: .1rem .6rem; border-radius: .6rem; margin: .3rem 0;
            background: #fff3d6; color: #6b4b00; font-weight: 600; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
@@ -130,6 +205,14 @@ summary { cursor: pointer; }
   body { margin: 1rem auto; padding: 0 .9rem; }
   th, td { padding-right: .6rem; }
   h1, p { overflow-wrap: anywhere; }
+  div.wide table, div.wide tbody { display: block; }
+  div.wide tr { display: grid; grid-template-columns: repeat(var(--columns), 1fr);
+                padding: .25rem 0; border-bottom: 1px solid #dfe3e8; }
+  div.wide tr:first-child { display: none; }
+  div.wide td { padding: 0 .4rem .1rem 0; white-space: normal; overflow-wrap: anywhere; }
+  div.wide td:last-child { grid-column-end: -1; }
+  div.wide td::before { content: attr(data-name); display: block; font-size: .75rem;
+                        line-height: 1.2; color: #6a707a; }
 }
 """
 
@@ -179,9 +262,18 @@ class _Page:
 
     def table(self, names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         head = "".join(f"<th>{escape(name)}</th>" for name in names)
-        lines = [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
+        columns = [escape(name, quote=True) for name in names]
+        lines = [
+            "".join(
+                f'<td data-name="{name}">{escape(cell)}</td>'
+                for name, cell in zip(columns, row, strict=True)
+            )
+            for row in rows
+        ]
         self._parts.append(
-            f'<div class="wide"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
+            f'<div class="wide" style="--columns: {len(names) if len(names) < 6 else 3}">'
+            f"<table><tr>{head}</tr>"
+            f"{''.join(f'<tr>{line}</tr>' for line in lines)}</table></div>"
         )
 
     def details(self, summary: str, text: str) -> None:
@@ -234,11 +326,18 @@ def _draw_errors(
             axes.plot(t_s, 1e3 * smoothed[0], color=SMOOTHED, label="smoothed at the end")
         label(axes, "Position error, from the start pose, not aligned", "", "error [mm]")
         axes.set_ylim(bottom=0.0)
-        axes.legend(frameon=False, loc="upper left")
+        _legend_below(figure, axes)
     panels[-1].step(t_s, numbers.n_landmarks, color=LANDMARK, where="post")
     label(panels[-1], "Landmarks on the map", _TIME, "number [1]")
     panels[-1].set_ylim(bottom=0.0)
     panels[-1].yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _legend_below(figure: Figure, axes: Axes) -> None:
+    """Put the legend of a panel below the figure: inside it would lie over the data."""
+    lines, names = axes.get_legend_handles_labels()
+    n_columns = 2 if figure.get_figwidth() <= NARROW_IN else len(names)
+    figure.legend(lines, names, loc="outside lower left", ncols=n_columns, frameon=False)
 
 
 def _draw_consistency(
@@ -261,7 +360,7 @@ def _draw_consistency(
             lines.append((smoothed[1], SMOOTHED, "smoothed at the end"))
         for values, colour, name in lines:
             panels[1].plot(t_s, values, color=colour, linewidth=1.0, label=name)
-        panels[1].legend(frameon=False, loc="upper left", ncols=2)
+        _legend_below(figure, panels[1])
         label(panels[1], "NEES of the pose in the start frame / 3, 95 % band", "", "NEES / 3 [1]")
         _scale(panels[1], numbers.nees_per_dof)
     panels[-1].set_xlabel(_TIME)
@@ -341,6 +440,8 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     seed = "" if info.seed is None else f", seed {info.seed}"
     page = _Page(f"{info.scene}, preset {info.preset}{seed}")
     page.note("simulated data" if info.simulated else "measured data", kind="origin")
+    page.note(_what_was_done(info, record, data), kind="verdict")
+    page.note(_verdict(summary, record, data), kind="verdict")
     page.note(_what_it_is(session, record))
     if record.last.step is None:
         page.note(
@@ -390,6 +491,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         narrow_height_in=4.4,
     )
     _write_landmarks(page, info, record.last)
+    data.echoes.write(page, record)
     _write_links(page, info, data, record)
     _write_parameters(page, info)
     return page.text()
@@ -515,6 +617,35 @@ def _write_parameters(page: _Page, info: SessionInfo) -> None:
     }
     for name, values in settings.items():
         page.details(name, "\n".join(_lines_of(values)))
+
+
+def _what_was_done(info: SessionInfo, record: RunRecord, data: _ReportData) -> str:
+    assert record.last is not None
+    way = np.diff(record.states.estimate[:, :2], axis=0)
+    lost = sum(count.lost for count in data.links.counts.values())
+    faults = sum(count.faults for count in data.links.counts.values())
+    return (
+        f"A robot drove {np.linalg.norm(way, axis=1).sum():.1f} m in "
+        f"{record.duration_ns / NS_PER_S:.0f} s; SLAM found {len(record.last.landmark_ids)} "
+        f"landmarks in {record.n_frames} frames of {len(info.radars)} radars. "
+        f"{lost} frames were lost, and there were {faults} faults on the links."
+    )
+
+
+def _verdict(summary: Summary | None, record: RunRecord, data: _ReportData) -> str:
+    """Return whether SLAM was better than the wheels alone, as far as it can be known."""
+    assert record.last is not None
+    if summary is None:
+        believed_mm = 1e3 * math.sqrt(float(np.trace(record.last.pose_covariance[:2, :2])))
+        return (
+            "Whether SLAM was better than the wheels is unknown, since no truth was recorded; it "
+            f"believes its last position to {believed_mm:.1f} mm."
+        )
+    better = "better" if summary.ate_rmse_m < summary.odometry_ate_rmse_m else "worse"
+    return (
+        f"SLAM was {better} than the wheels alone: its RMS error was "
+        f"{mm_text(summary.ate_rmse_m)}, theirs {mm_text(summary.odometry_ate_rmse_m)}."
+    )
 
 
 def _what_it_is(session: RecordedSession, record: RunRecord) -> str:

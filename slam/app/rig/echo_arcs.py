@@ -46,3 +46,31 @@ def envelope_db(echoes: NDArray[np.float32], bin_length_m: float) -> NDArray[np.
     power = echoes[:, 1:-1] ** 2 + quadrature**2
     level_db: NDArray[np.float32] = np.float32(10.0) * np.log10(np.maximum(power, _LEAST_POWER))
     return level_db
+
+
+# What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
+# sample, so an envelope of -62 dB) to a near rod.
+_SHOWN_RANGE_M = 3.0
+_FLOOR_DB, _TOP_DB = -62.0, -30.0
+
+
+def bscan_picture(
+    frames: NDArray[np.float32], range_start_m: float, bin_length_m: float
+) -> NDArray[np.uint8]:
+    """Draw echoes as grey levels: constant part removed, envelope, decibels.
+
+    `frames` is raw RF, shape (n_frames, n_bins), slow time downwards, with true metres of the first
+    bin and between two bins. The result has shape (n_frames, n_shown - 2), up to 3 m of range; 0 is
+    -62 dB of full scale or less, 255 is -30 dB or more.
+    """
+    n_shown = n_shown_bins(frames.shape[1], range_start_m, bin_length_m)
+    echoes = frames[:, :n_shown] - frames[:, :n_shown].mean(axis=0)
+    level_db = envelope_db(echoes, bin_length_m)
+    scaled = (level_db - _FLOOR_DB) / (_TOP_DB - _FLOOR_DB)
+    picture: NDArray[np.uint8] = (np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return picture
+
+
+def n_shown_bins(n_bins: int, range_start_m: float, bin_length_m: float) -> int:
+    """Return how many bins of a frame pictures show: up to 3 m of range."""
+    return min(n_bins, max(int((_SHOWN_RANGE_M - range_start_m) / bin_length_m), 3))

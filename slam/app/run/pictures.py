@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import matplotlib
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from slam.app.errors import naming
+from slam.app.odometry.track import NS_PER_S
 from slam.app.run.runner import LinkState, RunRecord
 from slam.app.run.summary import Summary
 from slam.app.session_records import SessionInfo, Snapshot
@@ -113,7 +115,7 @@ def label(
     x_label: str,
     y_label: str,
     *,
-    fontsize: int = 10,
+    fontsize: float = 10,
     pad: float | None = None,
 ) -> None:
     """Give a panel its title, its axes' names with units, and a pale grid."""
@@ -239,12 +241,16 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     estimate = transform(place, states.estimate[:, :2])
     odom_place = place if summary is not None else _world_from_odom(record)
     odometry = transform(odom_place, states.odometry[:, :2])
-    axes = figure.add_subplot()
+    has_truth = summary is not None
+    is_narrow = figure.get_figwidth() <= NARROW_IN
+    grid = None if is_narrow else figure.add_gridspec(2, 2, width_ratios=_WIDTHS)
+    axes = figure.add_subplot() if grid is None else figure.add_subplot(grid[:, 0])
     axes.set_aspect("equal", adjustable="datalim")
     for number, line in enumerate(info.outlines_m):
         name = "wall or box" if number == 0 else None
         axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
-    axes.plot(*odometry.T, color=ODOMETRY, linewidth=1.1, alpha=0.9, label="wheel odometry")
+    wide = 1.1 if has_truth else 4.0  # nothing else lies below the estimate
+    axes.plot(*odometry.T, color=ODOMETRY, linewidth=wide, alpha=0.9, label="wheel odometry")
     if summary is not None:
         axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=4.0, alpha=0.6, label="true path")
     axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.7, label="radar SLAM")
@@ -268,6 +274,70 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     outlined = [transform(place, last.landmarks_m), estimate, info.true_landmarks_m]
     _draw_landmarks(axes, last, extent_m(*outlined, *info.outlines_m))
     axes.margins(0.06)
+    title, remark = _title_and_remark(info, summary, estimate)
+    if is_narrow:
+        title, remark = (
+            "\n".join(line for part in text.split("\n") for line in wrap(part, n_letters))
+            for text, n_letters in ((title, _TITLE_LETTERS), (remark, _REMARK_LETTERS))
+        )
+    n_lines = remark.count("\n") + 1
+    label(axes, title, "x [m]", "y [m]", fontsize=10 if is_narrow else 11, pad=12 + 12 * n_lines)
+    note(axes, remark, (0.0, 1.0), (0.0, 8.0), PALE_INK, xycoords="axes fraction")
+    if grid is None:
+        figure.legend(
+            loc="outside lower left", ncols=2, frameon=False, handlelength=1.4, columnspacing=1.0
+        )
+        return
+    beside = figure.add_subplot(grid[0, 1])
+    beside.axis("off")
+    lines = axes.get_legend_handles_labels()
+    beside.legend(*lines, loc="upper left", borderaxespad=0.0, frameon=False, handlelength=1.6)
+    _draw_distances(figure.add_subplot(grid[1, 1]), record, estimate, odometry, has_truth)
+
+
+_TITLE_LETTERS, _REMARK_LETTERS = 44, 58
+"""Of a line of a narrow picture."""
+_WIDTHS = (2.6, 1.0)
+"""Of the map, and of the legend with the panel of distances below it."""
+
+
+def _draw_distances(
+    axes: Axes,
+    record: RunRecord,
+    estimate: NDArray[np.float64],
+    odometry: NDArray[np.float64],
+    has_truth: bool,
+) -> None:
+    """Draw how far the paths are from the truth, or else from the estimate, over time.
+
+    On the map they lie on each other. Paths have shape (n, 2), world frame.
+    """
+    states, smoothed = record.states, record.whole_smoothed
+    minutes = (states.t_ns - record.start_ns) / (60 * NS_PER_S)
+    paths = [(ODOMETRY, odometry)]
+    if has_truth:
+        paths.append((ESTIMATE, estimate))
+    if smoothed is not None:
+        paths.append((SMOOTHED, transform(record.world_from_map, smoothed.poses[:, :2])))
+    reference = states.truth[:, :2] if has_truth else estimate
+    tops = []
+    for colour, path in paths:
+        distances_mm = 1e3 * np.linalg.norm(path - reference, axis=1)
+        known_mm = distances_mm[np.isfinite(distances_mm)]
+        tops.append(float(np.percentile(known_mm, 99)) if len(known_mm) else 0.0)
+        axes.plot(minutes, distances_mm, color=colour, linewidth=0.9)
+    what = "error" if has_truth else "from radar SLAM"
+    label(axes, f"{what} [mm]", "time [min]", "", fontsize=8.5)
+    axes.tick_params(labelsize=8)
+    axes.xaxis.label.set_fontsize(8.5)
+    axes.set_xlim(0.0, max(float(minutes[-1]), 1e-3))
+    # beside the truth the wheels leave the panel, where the others would be lines at its bottom
+    axes.set_ylim(0.0, max(1.3 * max(tops[1:] if has_truth else tops), 1.0))
+
+
+def _title_and_remark(
+    info: SessionInfo, summary: Summary | None, estimate: NDArray[np.float64]
+) -> tuple[str, str]:
     simulated = " (simulated)" if info.simulated else ""
     if summary is None:
         length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
@@ -292,20 +362,7 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
             remark = (
                 f"smoothed at the end: ATE {ate_mm:.1f} mm, {share:.2f} of odometry's\n{remark}"
             )
-    is_narrow = figure.get_figwidth() <= NARROW_IN
-    if is_narrow:  # a line each for what was driven, and what came of it
-        title = title.replace(": ", ":\n", 1)
-        remark = remark.replace("; ", ";\n")
-    n_lines = remark.count("\n") + 1
-    label(axes, title, "x [m]", "y [m]", fontsize=10 if is_narrow else 11, pad=12 + 12 * n_lines)
-    note(axes, remark, (0.0, 1.0), (0.0, 8.0), PALE_INK, xycoords="axes fraction")
-    if is_narrow:
-        figure.legend(
-            loc="outside lower left", ncols=2, frameon=False, handlelength=1.4, columnspacing=1.0
-        )
-        return
-    # beside the axes, below a title that may be longer than they are wide
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handlelength=1.6)
+    return title, remark
 
 
 def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:

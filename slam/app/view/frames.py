@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from slam.app.odometry.track import NS_PER_S
-from slam.app.rig.echo_arcs import envelope_db
+from slam.app.rig.echo_arcs import bscan_picture, n_shown_bins
 from slam.app.session_records import RadarInfo, Scan, Snapshot
 from slam.app.view.rerun_recording import (
     FAULT_RGB,
@@ -25,30 +25,6 @@ from slam.app.view.rerun_recording import (
     rr,
 )
 from slam.frames import RadarFrame
-
-# What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
-# sample, so an envelope of -62 dB) to a near rod.
-_SHOWN_RANGE_M = 3.0
-_FLOOR_DB, _TOP_DB = -62.0, -30.0
-
-
-def bscan_picture(
-    frames: NDArray[np.float32], range_start_m: float, bin_length_m: float
-) -> NDArray[np.uint8]:
-    """Draw echoes as grey levels: constant part removed, envelope, decibels.
-
-    `frames` is raw RF, shape (n_frames, n_bins), slow time downwards, with true metres of the first
-    bin and between two bins. The result has shape (n_frames, n_shown - 2), up to 3 m of range; 0 is
-    -62 dB of full scale or less, 255 is -30 dB or more.
-    """
-    n_wanted = int((_SHOWN_RANGE_M - range_start_m) / bin_length_m)
-    n_shown = min(frames.shape[1], max(n_wanted, 3))
-    echoes = frames[:, :n_shown] - frames[:, :n_shown].mean(axis=0)
-    level_db = envelope_db(echoes, bin_length_m)
-    scaled = (level_db - _FLOOR_DB) / (_TOP_DB - _FLOOR_DB)
-    picture: NDArray[np.uint8] = (np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return picture
-
 
 BLOCK_FRAMES = 128
 """Rows of one B-scan picture; as many frames are sent at once to a file."""
@@ -115,9 +91,11 @@ class FrameLayer:
     def _send_frames(self, block: _FrameBlock) -> None:
         if not block.frames:
             return
-        samples = np.stack([frame.samples for frame in block.frames])
-        n_frames, n_bins = samples.shape
         newest = block.frames[-1]
+        # as far as the B-scan: over a whole frame the view's axis has no number but 0
+        n_bins = n_shown_bins(len(newest.samples), newest.range_start_m, newest.bin_length_m)
+        samples = np.stack([frame.samples[:n_bins] for frame in block.frames])
+        n_frames = len(samples)
         if block.axis != (axis := (newest.range_start_m, newest.bin_length_m, n_bins)):
             block.axis = axis
             labels_m = (axis[0] + axis[1] * np.arange(n_bins)).astype(np.float32)
@@ -129,7 +107,7 @@ class FrameLayer:
         # blocks come early, because someone watches, the picture is of the newest frames.
         shown = samples
         if n_frames < BLOCK_FRAMES:
-            shown = np.stack([frame.samples for frame in block.shown])
+            shown = np.stack([frame.samples[:n_bins] for frame in block.shown])
         picture = bscan_picture(shown, newest.range_start_m, newest.bin_length_m)
         # The envelope lacks the first bin and the last.
         ends_m = newest.range_start_m + newest.bin_length_m * np.array([1, picture.shape[1]])

@@ -142,6 +142,9 @@ class Ground:
         """Two corners of it without the border, shape (2, 2)."""
         return np.array([self.low_m + self.margin_m, self.high_m - self.margin_m])
 
+    def is_same(self, other: Ground) -> bool:
+        return bool(np.all(self.low_m == other.low_m) and np.all(self.high_m == other.high_m))
+
     def holds(self, points_m: Array) -> bool:
         """Return whether points, shape (n, 2), lie on it, at most half in its border."""
         border = self.margin_m / 2
@@ -159,10 +162,13 @@ class Ground:
         lines, places, texts = [], [], []
         for axis, name in enumerate("xy"):
             first, last = np.ceil(self.low_m[axis] / step_m), np.floor(self.high_m[axis] / step_m)
+            in_corner_m = self.low_m[axis] + 0.99 * self.margin_m  # where numbers of both axes meet
             for tick in np.arange(first, last + 1) * step_m + 0.0:  # no -0
                 ends = np.array([self.low_m, self.high_m])
                 ends[:, axis] = tick
                 lines.append(ends)
+                if tick < in_corner_m:
+                    continue
                 # a number lies in the border, outside of what is drawn
                 place = self.low_m + 0.5 * self.margin_m
                 place[axis] = tick
@@ -172,7 +178,10 @@ class Ground:
 
 
 class MapLayer:
-    """Sends poses and echoes in blocks, the map once per second."""
+    """Sends poses and echoes in blocks, the map once per second.
+
+    `ground` is a new one when the map or a fan has grown beyond it.
+    """
 
     def __init__(self, recording: RerunRecording, info: SessionInfo) -> None:
         self._recording = recording
@@ -187,8 +196,8 @@ class MapLayer:
         self._next_map_ns = self._next_path_ns = 0
         self._last: tuple[Snapshot, RowTimes] | None = None
         world_m = known_world_m(info)
-        self._grows = not len(world_m)  # the layout shows all of a known world and no more
-        self._ground = Ground.around(np.zeros((1, 2)) if self._grows else world_m)
+        self.ground = Ground.around(world_m if len(world_m) else np.zeros((1, 2)))
+        self._wedges_m = np.concatenate([wedge(self._field, radar) for radar in info.radars])
         self._send_statics(info)
 
     def on_snapshot(self, snapshot: Snapshot, host_ns: int | None, odom: Array) -> None:
@@ -291,7 +300,7 @@ class MapLayer:
 
     def _send_ground(self) -> None:
         """Send the grid, and the robot, which is as large as the map needs it to be seen."""
-        lines, places, texts = self._ground.grid()
+        lines, places, texts = self.ground.grid()
         grid = rr.LineStrips2D(
             [screen(line) for line in lines], colors=GRID_RGB, radii=_LINE_POINTS, draw_order=1.0
         )
@@ -306,7 +315,7 @@ class MapLayer:
 
     def _send_robot(self, entity: str, colour: Rgb, rim: Rgb, order: float) -> None:
         """Send a disk with an arrow forwards, in the body's frame."""
-        radius_m = max(_ROBOT_PART * self._ground.size_m, _ROBOT_M)
+        radius_m = max(_ROBOT_PART * self.ground.size_m, _ROBOT_M)
         centre = np.zeros((1, 2), dtype=np.float32)
         for name, size_m, rgb, depth in (
             ("rim", radius_m, rim, 0.0),
@@ -326,7 +335,7 @@ class MapLayer:
     def _enlargement(self, snapshot: Snapshot) -> int:
         pose = snapshot.pose_covariance[None, :2, :2]
         every = np.concatenate([snapshot.landmark_covariances_m2, pose])
-        return enlargement(every, self._ground.size_m)
+        return enlargement(every, self.ground.size_m)
 
     def _send_poses(self, entity: str, stamps: RowTimes, poses: Array) -> None:
         """Send poses (n, 3) of the world as the transform of an entity drawn in the body frame."""
@@ -390,10 +399,14 @@ class MapLayer:
             snapshot.world_from_map[2], snapshot.landmark_covariances_m2
         )
         here = transform(snapshot.world_from_map, snapshot.estimate[:2])[None]
-        seen = np.concatenate([points, here])
+        pose = compose(snapshot.world_from_map, snapshot.estimate)
+        wedges_m, half_m = transform(pose, self._wedges_m), 0.5 * self.ground.margin_m
+        # fans reach to the edge of the border
+        fans_m = np.array([wedges_m.min(axis=0) + half_m, wedges_m.max(axis=0) - half_m])
+        seen = np.concatenate([points, here, fans_m])
         seen = seen[np.isfinite(seen).all(axis=1)]
-        if self._grows and not self._ground.holds(seen):
-            self._ground = Ground.around(np.concatenate([seen, self._ground.inner_corners_m]))
+        if not self.ground.holds(seen):
+            self.ground = Ground.around(np.concatenate([seen, self.ground.inner_corners_m]))
             self._send_ground()
         enlarged = self._enlargement(snapshot)
         outlines = [
@@ -416,7 +429,7 @@ class MapLayer:
         walls = [screen(ends) for ends in spans if np.isfinite(ends).all()]
         answered = rr.LineStrips2D(walls, colors=LANDMARK_RGB, radii=0.02, draw_order=34.0)
         self._recording.row("map/landmarks/walls", stamps, answered)
-        ground = self._ground
+        ground = self.ground
         top = np.array([[(ground.low_m[0] + ground.high_m[0]) / 2, ground.high_m[1]]])
         legend = rr.Points2D(
             screen(top),

@@ -72,7 +72,7 @@ only. {data}
   direction, so it is an arc: **green** if it moved the estimate, **dim** if not. {points}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, constant part removed. A
   landmark that the robot passes is a curved line.
-* **Frame**: the newest raw frame; red bars are detections.
+* **Frame**: the newest raw frame, up to 3 m; red bars are detections.
 {numbers}
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
   every command and answer under *Log*.
@@ -118,12 +118,15 @@ def about(info: SessionInfo) -> str:
     )
 
 
-def blueprint(info: SessionInfo) -> rrb.Blueprint:
-    """Return the layout; the cursor follows the newest data, so a file opens with its whole map."""
+def blueprint(info: SessionInfo, ground: Ground | None) -> rrb.Blueprint:
+    """Return the layout; the cursor follows the newest data, so a file opens with its whole map.
+
+    The map shows the ground; None: what is drawn.
+    """
     names = [radar.name for radar in info.radars]
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(_map_view(info), _numbers(info), row_shares=[5, 2]),
+            rrb.Vertical(_map_view(ground), _numbers(info), row_shares=[5, 2]),
             _echoes(names),
             rrb.Vertical(
                 rrb.Tabs(
@@ -153,11 +156,9 @@ def blueprint(info: SessionInfo) -> rrb.Blueprint:
     )
 
 
-def _map_view(info: SessionInfo) -> rrb.Spatial2DView:
-    known = known_world_m(info)
+def _map_view(ground: Ground | None) -> rrb.Spatial2DView:
     bounds = None
-    if len(known):
-        ground = Ground.around(known)
+    if ground is not None:
         low, high = np.sort(screen(np.array([ground.low_m, ground.high_m])), axis=0)
         bounds = rrb.VisualBounds2D(
             x_range=[float(low[0]), float(high[0])], y_range=[float(low[1]), float(high[1])]
@@ -441,10 +442,14 @@ class RerunView(SessionObserver):
         self._smoothed: SmoothedRun | None = None
         self._odom: NDArray[np.float64] | None = None
         self._host_ns: int | None = None
+        self._info = info
+        known_m = known_world_m(info)
+        self._shown = Ground.around(known_m) if len(known_m) else None
+        self._is_live = flush_s is not None
         seed, of_seed = ("", "") if info.seed is None else (f"-{info.seed}", f", seed {info.seed}")
         self._recording = RerunRecording(
             target,
-            blueprint(info),
+            blueprint(info, self._shown),
             recording_id=f"{info.scene}-{info.preset}{seed}",
             name=f"{info.scene}, preset {info.preset}{of_seed}",
             start_ns=info.started_unix_ns or 0,
@@ -500,6 +505,7 @@ class RerunView(SessionObserver):
         self._map.send_last()
         self._send_smoothed_numbers()
         self._link.finish()
+        self._show_ground()
         self._recording.finish()
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
@@ -518,6 +524,12 @@ class RerunView(SessionObserver):
         self._send_states()
         self._link.send()
 
+    def _show_ground(self) -> None:
+        """Lay out all anew if the map has grown."""
+        if self._shown is None or not self._shown.is_same(self._map.ground):
+            self._shown = self._map.ground
+            self._recording.arrange(blueprint(self._info, self._shown))
+
     def _send_smoothed_numbers(self) -> None:
         """Send the curves of the whole run: those of a part of it would be there twice."""
         smoothed, stamps = self._smoothed, self._stamps
@@ -533,5 +545,7 @@ class RerunView(SessionObserver):
         stamps = self._stamps.at(range(n_states - len(rows), n_states))
         if rows and self._odom is not None:
             self._map.send(rows, stamps)
+            if self._is_live and is_world_known(self._info):  # an unknown one grows all the time
+                self._show_ground()
             send_numbers(self._recording, rows, stamps, self._odom)
             self._frames.send_detections(rows, stamps)

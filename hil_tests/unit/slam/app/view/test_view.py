@@ -11,8 +11,8 @@ from rerun.chunk import RrdReader
 
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info, smoothed_run, snapshot
 from slam.app.errors import AppError
+from slam.app.rig.echo_arcs import bscan_picture, wedge
 from slam.app.session_records import LogLine, Scan, SessionInfo, Snapshot
-from slam.app.view.frames import bscan_picture
 from slam.app.view.rerun_recording import count_rows
 from slam.app.view.session_view import RerunView
 from slam.frames import Detection
@@ -78,9 +78,11 @@ def test_every_frame_is_a_bar_chart_with_its_counter_and_samples(finished: Path)
     assert sorted(charts) == list(range(N_SCANS))  # type: ignore[type-var]  # no None here
     for counter in (0, 127, 128, N_SCANS - 1):
         (tensor,) = charts[counter]
-        assert tensor["shape"] == [1431]
+        frame = scan(counter).frames[1]
+        n_shown = int((3.0 - frame.range_start_m) / frame.bin_length_m)  # up to 3 m
+        assert tensor["shape"] == [n_shown]
         np.testing.assert_array_equal(
-            np.array(tensor["buffer"], dtype=np.float32), scan(counter).frames[1].samples
+            np.array(tensor["buffer"], dtype=np.float32), frame.samples[:n_shown]
         )
 
 
@@ -202,9 +204,9 @@ def test_the_guide_speaks_of_truth_only_where_there_is_one(tmp_path: Path, is_kn
 
 def blueprint_values(path: Path, component: str) -> list[Any]:
     reader = RrdReader(path)
-    (blueprint,) = reader.blueprints()
     return [
         value
+        for blueprint in reader.blueprints()
         for chunk in reader.stream(store=blueprint)
         for batch in [chunk.to_record_batch()]
         if component in batch.schema.names
@@ -223,14 +225,30 @@ def test_a_blueprint_is_embedded(finished: Path) -> None:
 
 def test_the_map_has_a_grid_with_metres_inside_of_what_is_visible(tmp_path: Path) -> None:
     path = drawn(tmp_path, snapshot(0))
-    (texts,) = [t for _, t in rows(path, "/map/grid/numbers", "Points2D:labels") if t]
-    (places,) = [p for _, p in rows(path, "/map/grid/numbers", "Points2D:positions") if p]
-    (bounds,) = blueprint_values(path, "VisualBounds2D:range")
+    *_, texts = [t for _, t in rows(path, "/map/grid/numbers", "Points2D:labels") if t]
+    *_, places = [p for _, p in rows(path, "/map/grid/numbers", "Points2D:positions") if p]
+    # of the layout at the beginning, and of that which holds all
+    ranges = blueprint_values(path, "VisualBounds2D:range")
+    bounds = max(ranges, key=lambda found: np.ptp(found["x_range"]) + np.ptp(found["y_range"]))
     (left, right), (top, bottom) = bounds["x_range"], bounds["y_range"]
-    # the true landmarks are at (1.0, 0.5) and (-0.5, 2.0); up is negative on the screen
-    np.testing.assert_allclose([left, right, top, bottom], [-1.1, 1.6, -2.6, 0.1], atol=1e-6)
+    # around landmarks and robot are 0.6 m, around what the radars see from its place 0.3 m; up is
+    # negative on the screen
+    info, state = session_info(), snapshot(0)
+    pose = compose(state.world_from_map, state.estimate)
+    outlines = [wedge(info.field_of_view, radar) for radar in info.radars]
+    fans = transform(pose, np.concatenate(outlines))
+    found = transform(state.world_from_map, state.landmarks_m)
+    known = np.concatenate([info.true_landmarks_m, found, pose[None, :2]])
+    low = np.minimum(known.min(axis=0) - 0.6, fans.min(axis=0) - 0.3)
+    high = np.maximum(known.max(axis=0) + 0.6, fans.max(axis=0) + 0.3)
+    np.testing.assert_allclose(
+        [left, right, top, bottom], [low[0], high[0], -high[1], -low[1]], atol=1e-6
+    )
     at = dict(zip(texts, places, strict=True))
-    assert {"x -0.5 m", "x 0 m", "x 1.5 m", "y 0 m", "y 0.5 m", "y 2.5 m"} <= set(at)
+    assert {"x 0 m", "x 1 m", "y 1 m"} <= set(at)
+    of_x, of_y = ([place for text, place in at.items() if text[0] == axis] for axis in "xy")
+    apart_m = np.abs(np.array(of_x)[:, None] - np.array(of_y))
+    assert apart_m.min() > 0.29
     for text, (x, y) in at.items():
         axis, value, unit = text.split()
         assert unit == "m"
