@@ -8,7 +8,7 @@ PYTEST := $(BIN)/python -m pytest
 .PHONY: demo test test-quick test-rare test-all test-explore test-install check bench sweep stress scenes failures harm pictures docs clean
 .DELETE_ON_ERROR:
 
-demo: $(VENV)/installed-demo
+demo: $(VENV)/installed-view
 	$(BIN)/uwb-slam demo --out out/demo
 
 # One process more than cores: many tests wait for a pty.
@@ -75,14 +75,14 @@ STRESSES := outliers dropped skew walk silent all dead carried $(MODEL_ERRORS)
 # What each hardship costs preset robust, on two laps and five seeds: 200 runs. `make stress
 # STRESSES="wander_10 slip"` runs some rows only. Stopped, it goes on where it was; picture and table
 # in out/experiments.
-stress: $(VENV)/installed-demo
+stress: $(VENV)/installed-slam
 	$(BIN)/uwb-slam sweep --scene lab classroom --laps 2 --seeds 5 --json out/stress.json \
 		--stress $(STRESSES)
 	$(BIN)/uwb-slam experiment stress --sweep out/stress.json
 
 # Preset robust in every scene that has wheels and something to map, five seeds each, and in ten
 # rooms of every random family: 130 runs, in two sweeps that go on likewise.
-scenes: $(VENV)/installed-demo
+scenes: $(VENV)/installed-slam
 	$(BIN)/uwb-slam sweep --seeds 5 --json out/scenes.json --scene $(SCENES)
 	$(BIN)/uwb-slam experiment scenes --sweep out/scenes.json
 	$(BIN)/uwb-slam sweep --seeds 1 --json out/rooms.json --scene $(FAMILIES:=:0-9)
@@ -90,7 +90,7 @@ scenes: $(VENV)/installed-demo
 
 # Every scene and three rooms of every family under every hardship, a run each: 660 runs, whose last
 # line counts those that are worse than their wheels, lost, or carried and not found.
-failures: $(VENV)/installed-demo
+failures: $(VENV)/installed-slam
 	$(BIN)/uwb-slam sweep --laps 2 --seeds 1 --json out/failures.json \
 		--scene $(SCENES) $(FAMILIES:=:0-2) --stress $(STRESSES)
 
@@ -99,7 +99,7 @@ failures: $(VENV)/installed-demo
 # runs. Rooms below 40 are for development. The last lines count.
 FIRST_SEED := 0
 upto = $(shell expr $(FIRST_SEED) + $(1))
-harm: $(VENV)/installed-demo
+harm: $(VENV)/installed-slam
 	$(BIN)/uwb-slam sweep --seeds 1 --json out/harm-$(FIRST_SEED).json \
 		--scene $(DECEIVING:=:$(FIRST_SEED)-$(call upto,9)) $(FAMILIES:=:$(FIRST_SEED)-$(call upto,2)) \
 		--stress slip_large noise_stated_low carried
@@ -126,7 +126,8 @@ $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "no Python >= 3.11 found; set PYTHON=/path/to/python3" >&2; exit 1; }
 	"$(PYTHON)" -m venv $(VENV)
 
-$(VENV)/installed-demo: EXTRA = [slam]
+$(VENV)/installed-view: EXTRA = [view]
+$(VENV)/installed-slam: EXTRA = [slam]
 $(VENV)/installed-test: EXTRA = [test]
 $(VENV)/installed-bench: EXTRA = [bench]
 $(VENV)/installed-dev: EXTRA = [dev]

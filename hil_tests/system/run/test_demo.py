@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 
 from hil_tests.system.short_scene import write_short_scene
+from slam.app.commands.demo import name_the_next
 from slam.app.commands.evaluate import evaluate
 from slam.app.odometry.track import read_tum
 from slam.app.run.runner import execute
@@ -61,8 +62,12 @@ def test_stdout_is_one_table_of_simulated_numbers_and_stderr_is_progress(demo: F
         "speed",
     ]
     assert "0 lost" in lines[-2]
-    progress = demo.process.stderr.splitlines()
+    *progress, report, viewer = demo.process.stderr.splitlines()
     assert progress
+    assert (report, viewer) == (
+        f"report: uwb-slam report {demo.out}",
+        f"viewer: uwb-slam view {demo.out}",
+    )
     assert all(line.startswith("scene time") for line in progress)
 
 
@@ -159,3 +164,20 @@ def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -
     for numbers in (summary, again):
         del numbers["realtime_factor"]
     assert summary == again
+
+
+def test_the_last_lines_are_commands_that_work_where_the_demo_ran(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (folder := tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (program := folder / "uwb-slam").touch(mode=0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [".venv/bin/uwb-slam", "demo"])
+    monkeypatch.setenv("PATH", "/nowhere")
+    name_the_next(Path("my out"), has_view=False)
+    monkeypatch.setenv("PATH", str(program.parent))
+    name_the_next(Path("out"), has_view=False)
+    assert capfd.readouterr().err.splitlines() == [
+        "report: .venv/bin/uwb-slam report 'my out'",
+        "report: uwb-slam report out",
+    ]

@@ -16,6 +16,7 @@ from hil_tests.paths import REPOSITORY
 from xethru_protocol.optional_packages import INCLUDED, PACKAGES, install_command, what_is_missing
 
 _PROJECT = REPOSITORY / "pyproject.toml"
+_OWN_FILE = "xethru_protocol.optional_packages.__file__"
 _NOT_INSTALLED = """\
 import runpy, sys
 for package in {packages}:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import Literal
 
 from slam.app.errors import AppError, EmulatorError, RadarSilentError
@@ -25,7 +28,7 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.rig.frame_sources import RigSource
-from slam.app.run.output import RunProgress, note
+from slam.app.run.output import RunProgress, note, print_progress
 from slam.app.run.result_files import (
     REPORT,
     RESULTS,
@@ -46,6 +49,7 @@ from slam.numba_functions import compile_kernels
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.optional_packages import install_command, what_is_missing
 
+_PROGRAM = "uwb-slam"
 _OUTPUTS = (SESSION, VIEW, REPORT, *RESULTS)
 
 
@@ -142,8 +146,20 @@ def run_demo(
             raise EmulatorError(f"{scans.failure}{kept}")
         if record.last is None:
             raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
+        name_the_next(out, has_view=make_view is not None)
         if live is not None:
             live.keep_serving()
+
+
+def name_the_next(out: Path, *, has_view: bool) -> None:
+    """Print the commands that show the drive, as they work where this one did."""
+    called = Path(sys.argv[0])
+    found = shutil.which(_PROGRAM)
+    is_near = called.name == _PROGRAM and (found is None or not called.samefile(found))
+    program, folder = quote(str(called) if is_near else _PROGRAM), quote(str(out))
+    print_progress(f"report: {program} report {folder}")
+    if has_view:
+        print_progress(f"viewer: {program} view {folder}")
 
 
 def _rerun_view() -> Callable[[Path, SessionInfo], SessionObserver] | None:
