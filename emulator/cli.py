@@ -11,6 +11,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import socket
 import sys
 from collections.abc import Callable, Sequence
@@ -39,7 +40,8 @@ TIMEOUT_S = 10.0
 _INTERRUPTED = 130
 """Exit code after SIGINT, as of a shell."""
 MOST_BARE = 64
-SERIAL_DIGITS = 12
+LAST_SERIAL = 10**12 - MOST_BARE
+"""From which so many modules count on within 12 digits."""
 LAST_PORT = 65535
 _LINKS = {"usb": (0, 1000), "uart": (600, 10_000_000)}
 """Links and the numbers they take: latency in ms, baud rate."""
@@ -623,8 +625,8 @@ def _option(text: str) -> tuple[str, object]:
 
 
 def _serial(text: str) -> int:
-    if len(text) != SERIAL_DIGITS or not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{shown(text)} must be {SERIAL_DIGITS} digits")
+    if not re.fullmatch(r"[0-9]{12}", text) or int(text) > LAST_SERIAL:
+        raise argparse.ArgumentTypeError(f"{shown(text)} must be 12 digits, {LAST_SERIAL} at most")
     return int(text)
 
 

@@ -49,7 +49,6 @@ CONTROL_NAME = "control.sock"
 PROXY_NAME = "proxy"
 FIRST_BARE, BARE_SERIALS = 100_000_000_000, 100
 """Bare modules have serial numbers from it to twice as much; a process has so many of them."""
-MOST_SERIALS = 10**12
 Warn = Callable[[str], None]
 """Gets a warning in one line."""
 
@@ -232,11 +231,6 @@ def _serials(options: Namespace, of_scene: Sequence[str]) -> list[str]:
         first = FIRST_BARE + BARE_SERIALS * secrets.randbelow(FIRST_BARE // BARE_SERIALS)
         kept = [] if options.state_dir is None else options.state_dir.glob(f"1{'[0-9]' * 11}.json")
         first = min((int(path.stem) // BARE_SERIALS * BARE_SERIALS for path in kept), default=first)
-    if first + len(of_scene) > MOST_SERIALS:
-        raise CannotServeError(
-            f"--serial {first}: {len(of_scene)} modules count beyond 12 digits; give a lower one",
-            exit_code=2,
-        )
     return [f"{first + index:012d}" for index in range(len(of_scene))]
 
 

@@ -274,9 +274,7 @@ class Device:
         self.module = module
         self._stream = stream
         self._outbox = outbox
-        self._connection = Connection(Role.MODULE)
-        self._received = self._fresh_parser()
-        self._damaged = False  # by a wrong checksum, since the last command
+        self._start_line()
         self._reset_ns: int | None = None
         self._ready_ns: int | None = None
         # until when the command task sleeps, and the reply it sends then; commands wait behind it
@@ -336,9 +334,11 @@ class Device:
             self._waiting_bytes += len(data)
         self._carry_out_commands(now_ns)
 
-    def _fresh_parser(self) -> Connection | VendorConnection:
-        strict = self.module.options.parser == "strict"
-        return Connection(Role.MODULE) if strict else VendorConnection()
+    def _start_line(self) -> None:
+        self._connection = Connection(Role.MODULE)
+        vendor = self.module.options.parser == "vendor"
+        self._received = VendorConnection() if vendor else self._connection
+        self._damaged = False  # by a wrong checksum, since the last command
 
     def _carry_out_commands(self, now_ns: int) -> None:
         left = COMMANDS_AT_ONCE
@@ -423,9 +423,7 @@ class Device:
         self._backlog = False
         self._waiting_bytes = 0
         self._outbox.clear()
-        self._connection = Connection(Role.MODULE)
-        self._received = self._fresh_parser()
-        self._damaged = False
+        self._start_line()
         self.module.power_up(into_bootloader=restart is not None and restart.into_bootloader)
         self._stream.restarted(self._ready_ns)
 
