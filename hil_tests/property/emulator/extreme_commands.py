@@ -1,7 +1,8 @@
 """Commands with extreme fields, over every row of the message table: no bytes end a module.
 
 In process and in virtual time, with the echo source of an empty room and saved flash, as
-``xethru-emulator serve --bare --state-dir`` runs a module. Fields are bytes made from the kinds of
+``xethru-emulator serve --bare --state-dir`` runs a module; a third of them with faults armed, as
+`ctl` does, a third playing a recording, as `play` does. Fields are bytes made from the kinds of
 the row, so values that no host of ours would encode are among them; some commands are cut or have
 bytes behind them. Everything follows from the seed.
 
@@ -27,24 +28,33 @@ from typing import TypeVar
 from emulator.chip import Pace
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice
-from emulator.faults.plan import FaultPlan
+from emulator.faults.kinds import KINDS
+from emulator.faults.plan import FaultPlan, fault_spec
 from emulator.module.memory import SavedState
 from emulator.module.modes import ModuleState
 from emulator.module.settings import MODELS, DeviceOptions
+from emulator.playback import played_radars
 from emulator.scene.scene import empty_room
 from emulator.x4m300 import radar_device
+from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import IDENTITY
 from xethru_protocol.wire import fields as kinds
 from xethru_protocol.wire.codes import FORMAT_KEY, BootloaderKey
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.framing import NeedData, encode_no_escape, encode_normal
+from xethru_protocol.wire.framing import (
+    NO_ESCAPE_HEADER_BYTES,
+    START,
+    NeedData,
+    encode_no_escape,
+    encode_normal,
+)
 from xethru_protocol.wire.messages import Ping, Pong
 from xethru_protocol.wire.table import ROWS, Command
 
 Result = TypeVar("Result")
 LONGEST_CALL_S = 5.0
 SECOND = 1_000_000_000
-COMMANDS_PER_MODULE = 500
+COMMANDS_PER_MODULE = 250
 PACKETS = 6
 """Most that the host reads after a command."""
 LARGEST_FRAME = 9 + 16384
@@ -208,10 +218,13 @@ class Findings:
 class Trial:
     """One module and a host that sends it extreme commands."""
 
-    def __init__(self, seed: int, pace: Pace, firmware: str, findings: Findings) -> None:
+    def __init__(
+        self, seed: int, pace: Pace, firmware: str, findings: Findings, *, what: str
+    ) -> None:
         self._rng = random.Random(seed)
-        self._name = f"seed {seed}, {pace}, {firmware}"
+        self._name = f"seed {seed}, {pace}, {firmware}, {what}"
         self._pace = pace
+        self._what = what
         changes: dict[str, object] = {
             "firmware": firmware,
             "parser": self._rng.choice(("strict", "vendor")),
@@ -228,15 +241,22 @@ class Trial:
         self._start()
 
     def _start(self) -> None:
-        scene = empty_room(1)
-        self._module = radar_device(
-            IDENTITY,
-            echo_source(scene, 0, 0),
-            self._pace,
-            options=self._options,
-            memory=self._flash,
-        )
-        self._device = FaultyDevice(self._module, "radar", FaultPlan())
+        if self._what == "played":
+            (played,) = played_radars(FIXTURES / "recordings" / "single", on_fault=print, loop=True)
+            self._module = played.device
+        else:
+            self._module = radar_device(
+                IDENTITY,
+                echo_source(empty_room(1), 0, 0),
+                self._pace,
+                options=self._options,
+                memory=self._flash,
+            )
+        plan = FaultPlan(seed=self._rng.getrandbits(62))
+        self._device = FaultyDevice(self._module, "radar", plan)
+        self._module.port_opened(self._now_ns)
+        for kind in self._rng.choices(list(KINDS), k=2 if self._what == "faults" else 0):
+            self._device.add(fault_spec(kind, count=0, probability=self._rng.choice((0.1, 1.0))))
 
     def run(self, commands: int) -> None:
         """Send commands until one ends the module or makes it hang."""
@@ -272,9 +292,12 @@ class Trial:
                 self._now_ns = max(wake_ns, self._now_ns)
                 self._timed(lambda: self._device.advance(self._now_ns))
             return None
-        assert 0 < len(packet) <= LARGEST_FRAME
+        assert packet
+        assert len(packet) <= LARGEST_FRAME or self._what == "faults"
         self._findings.packets += 1
-        self._findings.answers[packet[9 if packet[0] == 0x7C else 1]] += 1
+        if self._what != "faults":
+            first = packet[1 if packet[0] == START else NO_ESCAPE_HEADER_BYTES]
+            self._findings.answers[first] += 1
         return packet
 
     def _come_back(self) -> None:
@@ -295,6 +318,8 @@ class Trial:
 
     def _ping(self) -> None:
         """Ask for a sign of life, behind bytes that end whatever was begun."""
+        self._device.clear()
+        self._device.plug(self._now_ns)
         self._now_ns += 10 * SECOND
         self._timed(lambda: self._device.advance(self._now_ns))
         while not self._module.listens or self._module.module.state is ModuleState.BOOTLOADER:
@@ -331,7 +356,8 @@ def run(count: int, seed: int, report: Callable[[str], None] = lambda text: None
         pace = list(Pace)[number % 2]
         firmware = ("sensor", "xep")[number // 2 % 2]
         most = min(COMMANDS_PER_MODULE, count - findings.commands)
-        trial = Trial(seed * 1_000_000 + number, pace, firmware, findings)
+        what = ("plain", "faults", "played")[number // 4 % 3]
+        trial = Trial(seed * 1_000_000 + number, pace, firmware, findings, what=what)
         trial.run(most)
         number += 1
         if number % 20 == 0:

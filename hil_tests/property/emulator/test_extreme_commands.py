@@ -8,7 +8,7 @@ from hil_tests.property.emulator.extreme_commands import COMMANDS_PER_MODULE, ru
 @pytest.mark.parametrize(
     "count",
     [
-        4 * COMMANDS_PER_MODULE,  # both paces and both firmwares
+        12 * COMMANDS_PER_MODULE,  # both paces, both firmwares, with faults, a recording
         pytest.param(100_000, marks=[pytest.mark.rare, pytest.mark.timeout(0)]),
     ],
 )
