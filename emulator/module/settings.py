@@ -153,8 +153,9 @@ class DeviceOptions(BaseModel):
     after_damage: Literal["answer", "error"] = "answer"
     """What the first command after a wrong checksum gets: what it asks for, or ERROR 1 without
     being carried out. The firmware's source has no such error. Public logs of a real X4M03 show it:
-    of 55 sessions that began with X4 INIT and a checksum error in what the line still held, 42
-    report ERROR 1 to INIT."""
+    of 55 sessions that found such an error in what the line still held, and asked for no mode, 42
+    report ERROR 1 to X4 INIT, their first command; whether the module saw damage they do not
+    tell."""
     waiting_frames: int = Field(0, ge=0)
     """How many radar frames wait for a host that does not read, at pace realtime; 0: with the base
     firmware as many as its message pool has blocks of that size, 2 (1.1), else as many as the queue
