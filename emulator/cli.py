@@ -220,7 +220,7 @@ def request_of(words: Sequence[str]) -> dict[str, Any]:  # noqa: PLR0911 - one r
             return {"verb": "loop", "value": loop == "on"}
         case ["filter", *names]:
             return {"verb": "filter", "kinds": names or None}
-    raise ValueError(f"{' '.join(words)!r} is no request; see xethru-emulator ctl --help")
+    raise ValueError(f"{' '.join(words)!r} is not a request; see xethru-emulator ctl --help")
 
 
 def _fault(kind: str, keys: Sequence[str]) -> dict[str, Any]:

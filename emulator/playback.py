@@ -193,7 +193,7 @@ def kinds(names: Iterable[str]) -> frozenset[str]:
     """
     wanted = frozenset(map(_slug, names))
     for name in sorted(wanted - _KINDS):
-        raise ValueError(f"{shown(name)} is no kind of message; {choices(name, sorted(_KINDS))}")
+        raise ValueError(f"{shown(name)} is not a kind of message; {choices(name, sorted(_KINDS))}")
     return wanted
 
 

@@ -339,7 +339,7 @@ class Rfc2217Transport(SocketTransport):
         try:
             self._command(_SET_BAUDRATE, baudrate.to_bytes(4, "big"))
         except OverflowError:
-            raise Disconnected(f"{self.name}: {baudrate} is no baud rate") from None
+            raise Disconnected(f"{self.name}: {baudrate} is not a baud rate") from None
         if not self._wait(lambda: _SET_BAUDRATE in self._answers):
             raise Disconnected(f"{self.name} does not answer to a change of the baud rate")
         found = int.from_bytes(self._answers[_SET_BAUDRATE], "big")
@@ -417,7 +417,7 @@ class Rfc2217Transport(SocketTransport):
             if found is None:
                 self._held, start = data[at:], len(data)
                 if len(self._held) > _LONGEST_COMMAND:
-                    raise Disconnected(f"{self.name} sends what is no telnet; is it another port?")
+                    raise Disconnected(f"{self.name} does not send telnet; is it another port?")
                 break
             start = found.end()
             escaped, verb, option, about = found.groups()
@@ -475,7 +475,7 @@ def _address(url: str) -> tuple[str, int]:
     scheme, _, rest = url.partition("://")
     if scheme.lower() not in _SCHEMES:
         raise PortUnavailable(
-            f"{url}: {scheme}:// is no kind of port; there are tcp://HOST:PORT, "
+            f"{url}: {scheme}:// is not a kind of port; there are tcp://HOST:PORT, "
             "rfc2217://HOST:PORT, and serial ports such as /dev/ttyACM0"
         )
     found = re.fullmatch(r"(\[[^\]]+\]|[^:/?#\[\]]+):([0-9]{1,5})/?", rest, re.ASCII)

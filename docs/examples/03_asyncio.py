@@ -2,7 +2,7 @@
 
 `AsyncX4M300` has the methods of `X4M300` as coroutines. Each module has a task that reads its
 frames, and one that pings it meanwhile: any task may send commands while another one reads. There
-are no threads; the event loop watches the ports.
+is no thread; the event loop watches the ports.
 
 Without arguments the example reads both modules of an emulated corridor; with modules of your own:
 `python 03_asyncio.py /dev/ttyACM0 /dev/ttyACM1`. It prints

@@ -184,7 +184,7 @@ class Context:
     packets_since
         Packets it has seen since it fired; 0 for the one with which it fired.
     first_counter
-        Counter of the frame with which it fired last; None if it was no frame.
+        Counter of the frame with which it fired last; None if that was not a frame.
     command
         The command itself, or the one that a reply answers; None if unknown.
     previous_frame

@@ -327,7 +327,7 @@ def received_bytes(data: bytes, sent_baud: int, read_baud: int) -> bytes:
 
     Eight data bits, least significant first, no parity; an idle line is high. The receiver waits
     for a falling edge, looks in the middle of its own bit time whether the line is still low, else
-    it was no start bit; then it takes eight bits, each in its middle, and the stop bit, which it
+    it was not a start bit; then it takes eight bits, each in its middle, and the stop bit, which it
     does not judge, as a terminal in raw mode does not. Then it waits for the line to be high and to
     fall again.
 

@@ -242,7 +242,7 @@ class PtyLink:
 
     def _publish(self) -> None:
         if os.path.lexists(self.path) and not self.path.is_symlink():
-            raise LinkError(f"{self.path}: exists and is no link; remove it or use --link-dir")
+            raise LinkError(f"{self.path}: exists and is not a link; remove it or use --link-dir")
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
             fresh.unlink(missing_ok=True)

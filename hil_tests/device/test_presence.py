@@ -72,9 +72,9 @@ def test_outputs_read_back_and_exclude_each_other(radar: X4M300) -> None:
 
 def test_zones_outside_the_limits_are_not_sent(radar: X4M300) -> None:
     radar.profile.load()
-    with pytest.raises(LocalProtocolError, match="does not lie within"):
+    with pytest.raises(LocalProtocolError):
         radar.profile.set_zone(0.1, 5.0)
-    with pytest.raises(LocalProtocolError, match="smaller than"):
+    with pytest.raises(LocalProtocolError):
         radar.profile.set_zone(1.0, 1.1)
 
 

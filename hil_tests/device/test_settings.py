@@ -177,5 +177,5 @@ def test_registers_of_the_chip(radar: X4M300) -> None:
 
 
 def test_areas_without_bins_are_not_even_sent(radar: X4M300) -> None:
-    with pytest.raises(LocalProtocolError, match="has no bins"):
+    with pytest.raises(LocalProtocolError):
         radar.configure_raw(RawConfig(frame_area_m=(-5.0, -4.9)))

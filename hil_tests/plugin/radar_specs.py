@@ -185,7 +185,7 @@ def _query(text: str, query: str, allowed: Sequence[str] | None) -> dict[str, st
         key, equals, value = part.partition("=")
         if not key or not equals or not value or (allowed is not None and key not in allowed):
             raise SpecError(
-                f"--radar {text}: {part!r} is no option here; allowed are "
+                f"--radar {text}: {part!r} is not an option here; allowed are "
                 + ", ".join(f"{name}=..." for name in allowed or ("NAME",))
             )
         options[key] = value

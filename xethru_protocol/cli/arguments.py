@@ -76,8 +76,8 @@ def split_limit(text: str) -> tuple[str, float]:
     found = _LIMIT.fullmatch(text)
     if found is None or (found[3] and int(found[3]) > 23) or (found[1] and not float(found[1])):
         raise ArgumentTypeError(
-            f"{shown(text)} is no limit: write 500records, 10MB (B, kB, MB, GB), 600s (s, min, h) "
-            "or daily@14 (an hour, 0 ... 23)"
+            f"{shown(text)} is not a limit: write 500records, 10MB (B, kB, MB, GB), "
+            "600s (s, min, h) or daily@14 (an hour, 0 ... 23)"
         )
     number, unit, hour = found.groups()
     if hour:
@@ -301,7 +301,7 @@ def _add_live_source(one: argparse.ArgumentParser) -> None:
     )
 
 
-_NO_MEDICAL_DEVICE = "Breathing is an estimate for experiments: this is no medical device."
+_NO_MEDICAL_DEVICE = "Breathing is an estimate for experiments: this is not a medical device."
 
 
 def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:

@@ -170,7 +170,7 @@ def _missing(probe: PortProbe) -> str | None:
     network=False,
 )
 def _no_port(probe: PortProbe) -> str | None:
-    return None if probe.is_serial_port else "it is no serial port"
+    return None if probe.is_serial_port else "it is not a serial port"
 
 
 @Check(

@@ -372,7 +372,7 @@ def files_to_replace(targets: Iterable[Path], *, replace: bool) -> list[Path]:
     old = [path for target in targets for path in _recording_files(target)]
     for path in old:
         if not path.is_file():  # --force must not remove a device
-            raise RecordingError(f"{path} is no file; name a new one")
+            raise RecordingError(f"{path} is not a file; name a new one")
     if old and not replace:
         raise RecordingError(f"there is a recording already: {old[0]}; --force replaces it")
     return old

@@ -219,7 +219,7 @@ def _record(text: bytes, number: int) -> tuple[int, int, bytes]:
             raise ValueError
         record = bytes.fromhex(text[1:].decode("ascii"))
     except ValueError:
-        raise FirmwareError(f"line {number} is no line of an Intel hex file") from None
+        raise FirmwareError(f"line {number} is not a line of an Intel hex file") from None
     if len(record) < 5 or len(record) != record[0] + 5:
         raise FirmwareError(f"line {number} has another length than it says")
     if sum(record) & 0xFF:

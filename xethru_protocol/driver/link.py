@@ -641,7 +641,8 @@ class Link:
     def set_baud_rate(self, baudrate: int, *, force: bool = False) -> Steps[None]:
         if baudrate not in BAUD_RATES and not force:
             raise LocalProtocolError(
-                f"{baudrate} baud is no rate of a module; it has {', '.join(map(str, BAUD_RATES))}"
+                f"{baudrate} baud is not a rate of a module; it has "
+                f"{', '.join(map(str, BAUD_RATES))}"
             )
         old = self.baudrate
         yield from self.request(m.SetBaudRate(baudrate=baudrate))

@@ -408,7 +408,7 @@ class Conversation:
             )
         if self._damaged_since:
             return ResponseTimeout(
-                f"{missing}, but bytes that are no XeThru packets; "
+                f"{missing}, but bytes that are not XeThru packets; "
                 "is it another device, or another baud rate?"
             )
         return ResponseTimeout(f"{missing}; {likely}")

@@ -95,7 +95,7 @@ def recording_format(path: Path | str) -> RecordingFormat:
     if start.startswith(b"RRF"):
         raise RecordingError(f"{path} is a view in Rerun's format; 'uwb-slam view' opens it")
     raise RecordingError(
-        f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
+        f"{path} is not a recording that can be read: a directory or data file of ModuleConnector,"
         " a wire capture (.xtwire), MCAP, or arrays. Of a data file its name, as"
         " xethru_datafloat_*.dat, decides, else its first records; of arrays .csv, .mat, .npz or"
         " .npy, else a first line of complex numbers"

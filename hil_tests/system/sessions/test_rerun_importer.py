@@ -196,7 +196,7 @@ def test_what_is_for_other_importers_is_left_to_them(
     ("content", "reason"),
     [
         (b"", "cut"),
-        (b"no capture at all, whatever its name", "is no wire capture"),
+        (b"no capture at all, whatever its name", "is not a wire capture"),
         (b"\x89XTWIRE\n" + struct.pack("<II", 9, 0), "version 9"),
     ],
 )

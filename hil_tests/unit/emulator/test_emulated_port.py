@@ -35,9 +35,9 @@ def test_a_running_emulator_is_controlled_by_its_port(tmp_path: Path) -> None:
         assert control(port, "fault add stall seconds=2")["ids"] == {"radar_1": 1}
         (fault,) = control(port, "state")["radars"]["radar_1"]["faults"]
         assert (fault["kind"], fault["parameters"]) == ("stall", {"seconds": 2.0})
-        with pytest.raises(ValueError, match='no kind of fault is called "rain"'):
+        with pytest.raises(ValueError, match="rain"):
             control(port, "fault add rain")
-        with pytest.raises(ValueError, match="'explode' is no request"):
+        with pytest.raises(ValueError, match="explode"):
             control(port, "explode")
     with pytest.raises(
         FileNotFoundError, match=f"no emulator answers: No such file.*{tmp_path}/port"

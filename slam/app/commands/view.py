@@ -44,7 +44,7 @@ def _require_readable(path: Path) -> None:
     except OSError as error:
         raise AppError(f"{path}: cannot be read: {error.strerror or error}") from None
     if len(head) < 8 or not head.startswith(_MAGIC):
-        raise AppError(f"{path}: is no Rerun recording")
+        raise AppError(f"{path}: is not a Rerun recording")
     written = (head[4], head[5])
     major, minor, *_ = version("rerun-sdk").split(".")
     ours = (int(major), int(minor))
@@ -108,7 +108,7 @@ def _settled(process: SlamViewerProcess, rrd: Path, at_s: float | None, stop: St
         _wait(stop, give_up)
     lines = {line.name: line for line in client.get_state().recordings[0].timelines}
     if DEVICE_TIME not in lines:
-        raise AppError(f"{rrd}: has no timeline {DEVICE_TIME}, so it is no view of a session")
+        raise AppError(f"{rrd}: has no timeline {DEVICE_TIME}, so it is not a view of a session")
     end_s = (lines[DEVICE_TIME].end or 0) / 1e9
     client.set_time(
         DEVICE_TIME, duration=end_s if at_s is None else min(at_s, end_s), play_state="paused"

@@ -57,7 +57,7 @@ class LiveOdometry:
     Attributes
     ----------
     n_refused
-        Lines that were no pose, or not later than the one before.
+        Lines that did not hold a pose, or not later than the one before.
     ended
         Whether no more lines will come.
     trouble
@@ -310,7 +310,7 @@ def _path_source(text: str) -> LineSource:
     )
     kind = next((kind for is_one, kind in kinds if is_one(mode)), None)
     if kind is None:
-        raise UsageError(f"odometry {text}: is no source of text; give one of {HELP}")
+        raise UsageError(f"odometry {text}: is not a source of text; give one of {HELP}")
     return LineSource(kind=kind, place=text, number=BAUD if kind is SourceKind.SERIAL else 0)
 
 
@@ -342,7 +342,7 @@ def read_lines(source: LineSource, is_stopped: Callable[[], bool]) -> Iterator[t
                         "TUM text is expected"
                     )
     except UnicodeError:  # as the codec of host names has it
-        raise OdometryError(f"odometry from {source.name}: is no name of a host") from None
+        raise OdometryError(f"odometry from {source.name}: is not the name of a host") from None
     except (OSError, XeThruError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OdometryError(f"odometry from {source.name}: {reason}") from None

@@ -121,7 +121,7 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
             refuse_pipe(path)
             stream = stack.enter_context(path.open("rb"))
             if not is_like(stream.read(len(MAGIC)), MAGIC):
-                raise AppError(f"{path}: is no MCAP file{describe_kind(path)}")
+                raise AppError(f"{path}: is not an MCAP file{describe_kind(path)}")
             whole = os.fstat(stream.fileno()).st_size
         except IsADirectoryError:
             raise AppError(

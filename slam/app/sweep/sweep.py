@@ -213,11 +213,11 @@ def run_sweep(
         raise AppError(f"{out}: is a folder, must be a file")
     if out.exists() and not out.is_file():
         # it would be replaced: as root, even a device for everybody
-        raise AppError(f"{out}: is no regular file, must be one")
+        raise AppError(f"{out}: must be a regular file")
     command = _command(cases, presets, (n_seeds, first_seed), settings, bound=bound)
     path = out.with_name(f"{out.name}.part")
     if path.exists() and not path.is_file():  # opening a pipe waits for who writes into it
-        raise AppError(f"{path}: is no regular file; choose another --json, or move it away")
+        raise AppError(f"{path}: is not a regular file; choose another --json, or move it away")
     with ExitStack() as held:
         held.enter_context(made_folder(path.parent))
         with naming(path):  # what cannot be written ends the command before any run, too

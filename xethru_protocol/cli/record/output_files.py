@@ -89,7 +89,7 @@ class RecordingFiles:
         """Raise RecordingError if something is in the way and must stay."""
         directory, wire = self._directory, self._wire_path
         if directory is not None and directory.exists() and not directory.is_dir():
-            raise RecordingError(f"{directory} is no directory; name a new one")
+            raise RecordingError(f"{directory} is not a directory; name a new one")
         if wire is not None and wire.is_dir():
             raise RecordingError(f"{wire} is a directory; name a file in it")
         files_to_replace(self.paths, replace=self._arguments.force)

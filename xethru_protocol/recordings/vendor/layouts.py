@@ -536,7 +536,7 @@ def parse_meta(data: bytes) -> Meta:
     if version != VERSION:
         raise RecordingError(f"its format version is {version}, known is {VERSION}")
     if not EARLIEST_MS <= start_ms <= LATEST_MS:
-        raise RecordingError(f"its start is no time: {start_ms} ms since 1970")
+        raise RecordingError(f"its start is not a time: {start_ms} ms since 1970")
     begin = _HEAD.size + length
     stop = min(index_end, len(data)) if index_end else len(data)
     count = max(stop - begin, 0) // _ENTRY.size

@@ -213,7 +213,7 @@ def test_a_stale_socket_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
     OdometryFeed(stale, LINES, Pace.ASAP).close()
     precious = tmp_path / "notes"
     precious.write_text("keep me")
-    with pytest.raises(LinkError, match="notes: cannot offer the odometry socket"):
+    with pytest.raises(LinkError):
         OdometryFeed(precious, LINES, Pace.ASAP)
     assert precious.read_text() == "keep me"
 

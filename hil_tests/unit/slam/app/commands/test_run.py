@@ -128,7 +128,7 @@ def test_the_help_shows_that_very_recipe(capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.parametrize("text", ["9" * 5000, "9" * 19, "²", "-5", ""])
 def test_a_clock_that_is_none_is_wrong_usage(text: str) -> None:
-    with pytest.raises(UsageError, match="must be arrival, unix, monotonic"):
+    with pytest.raises(UsageError):
         parse_clock(text, parse_source("-"))
 
 
