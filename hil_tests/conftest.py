@@ -67,7 +67,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def _compile_once() -> None:
     """Compile the kernels, those of each file in a process: the first time it takes seconds."""
-    program = "import slam.{}.kernels, slam.numba_functions; slam.numba_functions.compile_kernels()"
+    program = (
+        "import slam.{}.kernels, slam.numba_compilation; slam.numba_compilation.compile_kernels()"
+    )
     compilers = [
         subprocess.Popen([sys.executable, "-c", program.format(folder)], cwd=HERE.parent)
         for folder in ("front_end", "robust")
@@ -104,8 +106,8 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if "slam.numba_functions" in sys.modules:  # not within the time limit of the first test
-        sys.modules["slam.numba_functions"].compile_kernels()
+    if "slam.numba_compilation" in sys.modules:  # not within the time limit of the first test
+        sys.modules["slam.numba_compilation"].compile_kernels()
     if not config.pluginmanager.hasplugin("timeout") or config.getoption("timeout") is not None:
         return
     usual_s = float(config.getini("timeout") or 0)

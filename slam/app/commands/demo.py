@@ -45,7 +45,7 @@ from slam.app.session.writer import SessionLog
 from slam.app.session_records import Scan, SessionInfo, SessionObserver
 from slam.app.view.viewer import LiveView
 from slam.config import BackEnd
-from slam.numba_functions import compile_kernels
+from slam.numba_compilation import compile_kernels
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.optional_packages import install_command, what_is_missing
 

@@ -32,7 +32,7 @@ from slam.evaluation import TrueAssociationNis, true_range_nis
 from slam.frames import Detector, RadarFrame, StepInputError
 from slam.geometry import Rig
 from slam.growing_arrays import PackedRows, RowsByTime
-from slam.numba_functions import compile_kernels
+from slam.numba_compilation import compile_kernels
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters
