@@ -33,23 +33,23 @@ class ScriptedTransport:
         self.set_baudrate: Callable[[int], object] = lambda baudrate: None
         self.pending: list[bytes] = []
         self.timed: list[tuple[int, bytes]] = []
-        self._answer = answer
+        self.answer = answer
         self._module = Connection(Role.MODULE)
 
     def clock(self) -> int:
         return self.now_ns
 
     def say(self, *said: m.Message | bytes) -> None:
-        self.pending += [self._bytes(item) for item in said]
+        self.pending += [self.bytes_of(item) for item in said]
 
     def say_later(self, delay_s: float, *said: m.Message | bytes) -> None:
         due_ns = self.now_ns + round(delay_s * 1e9)
-        self.timed = sorted([*self.timed, *((due_ns, self._bytes(item)) for item in said)])
+        self.timed = sorted([*self.timed, *((due_ns, self.bytes_of(item)) for item in said)])
 
     def vanish_later(self, delay_s: float) -> None:
         self.vanishes_ns = self.now_ns + round(delay_s * 1e9)
 
-    def _bytes(self, item: m.Message | bytes) -> bytes:
+    def bytes_of(self, item: m.Message | bytes) -> bytes:
         return item if isinstance(item, bytes) else self._module.send(item)
 
     def read(self, timeout_s: float) -> bytes:
@@ -76,7 +76,7 @@ class ScriptedTransport:
         while (event := self._module.next_event()) is not NEED_DATA:
             assert isinstance(event, m.Message)
             self.received.append(event)
-            self.say(*self._answer(event))
+            self.say(*self.answer(event))
 
     def close(self) -> None:
         self.closed = True

@@ -340,7 +340,7 @@ def test_right_answer_behind_a_wrong_one_is_taken(driver_on: DriverOn) -> None:
 
 def test_silence_of_a_module_that_sends_frames_is_none_of_its_power(raw: Scripted) -> None:
     radar, line = raw
-    line._answer = lambda command: []
+    line.answer = lambda command: []
     for k in range(60):
         line.say_later(0.05 * k, frame(k))
     with pytest.raises(ResponseTimeout, match="it sends frames meanwhile"):
@@ -380,7 +380,7 @@ def test_module_that_stays_silent_is_pinged_before_each_command(driver_on: Drive
             radar.stop()
     stop = m.X4DriverSet(setting=X4Setting.FPS, value=0.0)
     assert line.received == [stop, m.Ping()]
-    line._answer = lambda command: [m.Error(code=1), READY]
+    line.answer = lambda command: [m.Error(code=1), READY]
     assert radar.ping() is PongCode.XTS_SPRP_READY
     assert line.received[2:] == [m.Ping()]
 
@@ -500,7 +500,7 @@ def test_closing_a_dead_module_tells_and_does_not_raise(driver_on: DriverOn) -> 
     radar, line = driver_on()
     with radar:
         radar.configure_raw()
-        line._answer = lambda command: []
+        line.answer = lambda command: []
     assert line.closed
     assert radar.warnings[0].startswith("the module was not stopped: no answer")
 

@@ -166,7 +166,7 @@ def test_short_chunk_is_the_modules_fault_and_the_file_is_closed(emulated: Emula
         answer = module(command)
         return [m.ReplyByte(values=b"?")] if isinstance(command, m.GetFileData) else answer
 
-    line._answer = short
+    line.answer = short
     with pytest.raises(RemoteProtocolError, match="sent 1 bytes from 0 on, not 256"):
         radar.files.read(USER, 1)
     assert module.open == set()

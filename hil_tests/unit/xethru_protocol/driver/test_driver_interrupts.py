@@ -23,11 +23,11 @@ def test_interrupt_while_bytes_are_sorted_leaves_a_driver_that_works(raw: Script
         raise Interrupted
 
     radar.listener = interrupt
-    line.say(b"".join(line._bytes(frame(k)) for k in (1, 2)) + line._bytes(frame(3))[:100])
+    line.say(b"".join(line.bytes_of(frame(k)) for k in (1, 2)) + line.bytes_of(frame(3))[:100])
     with pytest.raises(Interrupted):
         radar.read_frame()
     radar.listener = None
-    line.say(line._bytes(frame(3))[100:], frame(4))
+    line.say(line.bytes_of(frame(3))[100:], frame(4))
     assert radar.read_frame().counter == 4
     assert radar.ping() is PongCode.XTS_SPRP_READY
     assert radar.statistics.faults  # the rest of frame 3
@@ -35,10 +35,10 @@ def test_interrupt_while_bytes_are_sorted_leaves_a_driver_that_works(raw: Script
 
 def test_a_frame_cut_by_the_end_of_the_driver_is_not_counted_as_lost(raw: Scripted) -> None:
     radar, line = raw
-    line.say(line._bytes(frame(1)) + line._bytes(frame(2))[:100])
+    line.say(line.bytes_of(frame(1)) + line.bytes_of(frame(2))[:100])
     with radar:
         assert radar.read_frame().counter == 1
-        line.say(line._bytes(frame(2))[100:], frame(3))
+        line.say(line.bytes_of(frame(2))[100:], frame(3))
     assert radar.frames_lost == 0
 
 

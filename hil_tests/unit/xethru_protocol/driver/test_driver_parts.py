@@ -284,14 +284,14 @@ def test_frames_go_on_after_a_setting_that_the_module_refuses(
     raw: Scripted, answer: m.Message, error: type[XeThruError]
 ) -> None:
     radar, line = raw
-    plain = line._answer
+    plain = line.answer
 
     def refusing(command: m.Message) -> Sequence[m.Message | bytes]:
         if isinstance(command, m.X4DriverSet) and command.setting is X4Setting.DACMIN:
             return [answer]
         return plain(command)
 
-    line._answer = refusing
+    line.answer = refusing
     radar.start(17)
     with pytest.raises(error):
         radar.x4.dac_min = 950

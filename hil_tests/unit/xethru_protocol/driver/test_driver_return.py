@@ -238,7 +238,7 @@ def test_packet_cut_by_an_outage_is_counted_as_junk(plugged: DriverOn, machine: 
     machine.plug(HOME, PlainModule(), from_s=2.0)
     radar, line = plugged(reconnect_s=10.0)
     radar.configure_raw()
-    line.say(line._bytes(frame(7))[:100])
+    line.say(line.bytes_of(frame(7))[:100])
     radar._call_once(Link.take_stale_input)
     unplug(line)
     radar.ping()

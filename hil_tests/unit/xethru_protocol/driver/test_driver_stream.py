@@ -331,7 +331,7 @@ def test_module_that_answers_at_neither_rate_is_expected_at_the_new_one(
     module = UartModule()
     radar, line, changes = uart(driver_on, module)
     radar.info()
-    line._answer = lambda command: [m.Ack()] if isinstance(command, m.SetBaudRate) else []
+    line.answer = lambda command: [m.Ack()] if isinstance(command, m.SetBaudRate) else []
     with pytest.raises(ResponseTimeout, match="neither at 38400 nor at 115200 baud; this side st"):
         radar.set_baud_rate(38400)
     assert [rate for rate, _ in changes] == [38400, 115200, 38400]

@@ -123,7 +123,7 @@ def test_answer_behind_a_late_pong_is_not_taken_for_the_next_commands(driver_on:
         line.say_later(0.2, m.Error(code=21))  # in order: behind the others
         return []
 
-    line._answer = slow
+    line.answer = slow
     with pytest.raises(DeviceError) as caught:
         radar.request(SECOND)
     assert caught.value.code == 21  # not the ACK of FIRST
@@ -136,7 +136,7 @@ def test_ping_tells_the_state_of_now_not_of_a_late_pong(driver_on: DriverOn) -> 
     for _ in range(3):
         with pytest.raises(ResponseTimeout):
             radar.ping()
-    line._answer = lambda command: [NOT_READY, NOT_READY, NOT_READY, READY]
+    line.answer = lambda command: [NOT_READY, NOT_READY, NOT_READY, READY]
     began_ns = line.now_ns
     assert radar.ping() is PongCode.XTS_SPRP_READY
     assert line.now_ns - began_ns < 100_000_000  # all that were owed came: nothing to wait for
@@ -148,7 +148,7 @@ def test_pongs_a_module_never_sent_cost_a_quarter_second_once(driver_on: DriverO
     for _ in range(3):
         with pytest.raises(ResponseTimeout):
             radar.ping()
-    line._answer = lambda command: [READY]  # it was off meanwhile and owes nothing
+    line.answer = lambda command: [READY]  # it was off meanwhile and owes nothing
     began_ns = line.now_ns
     assert radar.ping() is PongCode.XTS_SPRP_READY
     assert line.now_ns - began_ns == pytest.approx(250_000_000, abs=1_000_000)
@@ -162,7 +162,7 @@ def test_waiting_for_owed_pongs_never_outlasts_the_timeout(driver_on: DriverOn) 
     for _ in range(2):
         with pytest.raises(ResponseTimeout):
             radar.ping()
-    line._answer = lambda command: [READY]
+    line.answer = lambda command: [READY]
     began_ns = line.now_ns
     assert radar.ping(0.1) is PongCode.XTS_SPRP_READY
     assert line.now_ns - began_ns == pytest.approx(100_000_000, abs=1_000_000)
