@@ -128,7 +128,6 @@ def test_lines_are_tum_and_reproduce_every_float() -> None:
     poses = drift(scene.trajectory().poses(times), scene.odometry, seed=4)
     lines = scene_odometry(scene, 4)
     assert lines != scene_odometry(scene, 5)
-    assert len(lines) == 3457
     assert lines[0] == "0.000000000 0.0 0.0 0 0 0 0.0 1.0"
     for t_ns, (x, y, heading), line in zip(times, poses, lines, strict=True):
         stamp, *numbers = line.split(" ")
