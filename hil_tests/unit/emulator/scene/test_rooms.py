@@ -6,22 +6,32 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from emulator.scene.rooms import FAMILIES
+from emulator.scene.rooms import FAMILIES, room_tables
 from emulator.scene.scene import Scene, UnknownSceneError, load_scene
 from slam.app.sweep import FAMILIES as NAMED
 
 ROOMS = [(family, number) for family in FAMILIES for number in range(10)]
 
-# third corner of the course and last target of room 9, from another program with the same laws
+# Third corner of the course, last target, and the sums of all numbers in the tables and of their
+# squares, of room 9, from another program with the same laws
 PUBLISHED = {
-    "pillars": ((3.8805, 1.5176), (4.1734, -0.9614)),
-    "office": ((3.2158, 3.0066), (0.8432, -0.5907)),
-    "dense": ((2.2042, 2.2042), (-0.6944, 0.9818)),
-    "loop": ((10.9331, 5.7985), (0.6814, 4.9011)),
-    "sparse": ((3.0895, 2.9883), (-0.6095, -0.0249)),
-    "people": ((2.5321, 2.6141), (1.8622, 1.0772)),
-    "rig": ((1.8969, 2.3444), (1.6473, -0.9668)),
+    "pillars": ((3.8805, 1.5176), (4.1734, -0.9614), (104.1125, 33458.8511)),
+    "office": ((3.2158, 3.0066), (0.8432, -0.5907), (96.9628, 33557.9073)),
+    "dense": ((2.2042, 2.2042), (-0.6944, 0.9818), (111.237, 33428.5668)),
+    "loop": ((10.9331, 5.7985), (0.6814, 4.9011), (271.345, 35020.1562)),
+    "sparse": ((3.0895, 2.9883), (-0.6095, -0.0249), (61.8707, 33314.6562)),
+    "people": ((2.5321, 2.6141), (1.8622, 1.0772), (102.3184, 33413.2142)),
+    "rig": ((1.8969, 2.3444), (1.6473, -0.9668), (-190.2691, 54132.9675)),
 }
+TABLES = ("path", "odometry", "radars", "targets", "walls", "objects", "people")
+
+
+def numbers_in(table: object) -> list[float]:
+    if isinstance(table, dict):
+        return numbers_in(list(table.values()))
+    if isinstance(table, (list, tuple)):
+        return [number for value in table for number in numbers_in(value)]
+    return [float(table)] if isinstance(table, (int, float)) else []
 
 
 def off_course_m(scene: Scene, x: float, y: float) -> float:
@@ -155,10 +165,13 @@ def test_sensors_and_rig_are_those_of_the_lab() -> None:
 
 
 def test_rooms_are_those_that_results_were_published_for() -> None:
-    for family, (corner, place) in PUBLISHED.items():
+    for family, (corner, place, sums) in PUBLISHED.items():
         scene = load_scene(f"{family}:9")
         last = scene.targets[-1]
         assert (scene.path.waypoints_m[2], (last.x_m, last.y_m)) == (corner, place)
+        numbers = numbers_in([room_tables(family, 9)[name] for name in TABLES])
+        found = math.fsum(numbers), math.fsum(number * number for number in numbers)
+        assert found == pytest.approx(sums, rel=0, abs=1e-4), family
     assert tuple(FAMILIES) == NAMED
 
 
