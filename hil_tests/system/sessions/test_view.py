@@ -169,7 +169,7 @@ def test_a_run_goes_on_when_its_viewer_is_killed(
     assert said.count("the viewer was closed; the run goes on without it") == 1
 
 
-def test_an_address_without_a_listener_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_address_without_a_listener_is_named() -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))  # bound and not listening: nobody else gets it meanwhile
         url = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"
@@ -178,7 +178,6 @@ def test_an_address_without_a_listener_is_named(capsys: pytest.CaptureFixture[st
     with pytest.raises(SystemExit) as usage:
         main(["demo", "--rerun", "http://127.0.0.1:9876"])
     assert usage.value.code == 2
-    assert "must be spawn, connect, serve-web, or an address like" in capsys.readouterr().err
 
 
 @contextmanager
@@ -240,13 +239,12 @@ def test_a_demo_is_watched_while_it_runs(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_demo_that_cannot_be_watched_leaves_an_earlier_run_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "session.mcap").write_text("of an earlier run")
     assert main(["demo", "--out", str(tmp_path), "--rerun", "spawn"]) == 1
-    assert "--rerun serve-web" in capsys.readouterr().err
     assert (tmp_path / "session.mcap").read_text() == "of an earlier run"
 
 

@@ -103,14 +103,11 @@ def test_scenes_has_a_row_per_clean_group(
 
 
 @pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
-def test_a_result_never_replaces_its_sweep(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_result_never_replaces_its_sweep(name: str, tmp_path: Path) -> None:
     path = tmp_path / f"{name}.json"
     Path(written(tmp_path, runs())).rename(path)
     before = path.read_bytes()
     assert main(["experiment", name, "--sweep", str(path), "--out", str(tmp_path)]) == 1
-    assert "choose another --out" in capsys.readouterr().err
     assert path.read_bytes() == before
 
 
