@@ -25,9 +25,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hil_tests.plugin.findings import Findings, Measurement
-from hil_tests.plugin.radar_targets import Way, WireBytes, WireTap
+from hil_tests.plugin.radar_targets import WireBytes, WireTap
 from hil_tests.plugin.session_radars import RadarUnderTest
 from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
+from xethru_protocol.recordings.wire_capture import Way
 from xethru_protocol.wire.codec import describe, encode
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from hil_tests.paths import FIXTURES
 from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import RadarArgument, RadarKind
 from xethru_protocol.driver.radar import X4M300, known_ports
+from xethru_protocol.recordings.wire_capture import Way
 from xethru_protocol.transport import Transport, capacity_bytes_per_s, find_ports, open_line
 from xethru_protocol.wire.codes import POWER_UP_BAUD
 from xethru_protocol.wire.errors import XeThruError
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from emulator.scene.scene import Scene
 
 MOST_BYTES = 32 << 20  # of one test, some five minutes of frames; then the oldest go
-
-Way = Literal["rx", "tx"]
 
 
 @dataclass(frozen=True, slots=True)

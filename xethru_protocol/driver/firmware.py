@@ -5,12 +5,12 @@ its port may vanish and come back. Page 0 announces the sum of the image's bytes
 flash; from then on only a whole image ends the bootloader. Protocol reference 4.12.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 from xethru_protocol.driver import reconnect
+from xethru_protocol.driver.files import OnProgress
 from xethru_protocol.driver.link import (
     SLOW_TIMEOUT_S,
     TIMEOUT_S,
@@ -56,8 +56,6 @@ _LOOK_AGAIN_S = 0.1
 _ATTEMPTS = 3  # to write one page over a line that damages packets
 _LARGEST_FILE = 1 << 24
 _PADDING = b"\xff"
-
-OnProgress = Callable[[int, int], None]
 
 
 class FirmwareError(XeThruError):
