@@ -55,6 +55,14 @@ def test_every_enum_stands_in_the_reference() -> None:
     assert len(listed) == len(enums)
 
 
+def test_rates_of_a_uart_are_the_references() -> None:
+    """Protocol reference 10."""
+    assert (
+        *(9_600, 19_200, 38_400, 115_200, 230_400, 460_800, 500_000, 576_000, 921_600),
+        *(10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6),
+    ) == codes.BAUD_RATES
+
+
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table["enum"])
 def test_enums_have_the_references_ids_and_names(table: dict[str, Any]) -> None:
     found = {

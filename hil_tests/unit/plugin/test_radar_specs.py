@@ -36,6 +36,7 @@ def one(text: str) -> RadarArgument:
 def test_what_a_spec_names(text: str, kind: RadarKind, target: str, name: str) -> None:
     spec = one(text)
     assert (spec.kind, spec.target, spec.name) == (kind, target, name)
+    assert spec.emulated == (kind is RadarKind.EMULATED)
 
 
 def test_a_name_without_a_slash_is_a_port_if_it_is_there(
@@ -54,6 +55,7 @@ def test_recordings_must_exist(tmp_path: Path) -> None:
         one(f"replay:{recording}")
     recording.touch()
     assert one(f"replay:{recording}").name == "replay-drive"
+    assert one(f"replay:{recording}").emulated
 
 
 def test_options() -> None:

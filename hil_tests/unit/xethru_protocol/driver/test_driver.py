@@ -430,6 +430,13 @@ def test_module_that_is_not_ready_is_waited_for(driver_on: DriverOn) -> None:
     assert 0.3e9 <= line.now_ns < 0.5e9
 
 
+def test_module_that_never_gets_ready_is_waited_for_ten_seconds(driver_on: DriverOn) -> None:
+    radar, line = driver_on(lambda command: [m.Pong(value=PongCode.XTS_SPRP_NOTREADY)])
+    with pytest.raises(ResponseTimeout):
+        radar.configure_raw()
+    assert 10e9 <= line.now_ns < 10.2e9
+
+
 def test_module_that_stops_is_a_timeout_and_says_if_it_restarted(raw: Scripted) -> None:
     radar, line = raw
     with pytest.raises(ResponseTimeout, match="no frame from the port within 1 s"):

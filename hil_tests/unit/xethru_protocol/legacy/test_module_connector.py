@@ -105,6 +105,26 @@ def test_register_fields_lie_in_their_registers() -> None:
         assert 0 <= field.address <= 127, name
 
 
+class Registers:
+    """PIF registers that an X4 of the extras reads and writes."""
+
+    def __init__(self, **of_address: int) -> None:
+        self.pif = {int(name[1:]): value for name, value in of_address.items()}
+        self.x4driver_get_pif_register = self.pif.__getitem__
+        self.x4driver_set_pif_register = self.pif.__setitem__
+
+
+@pytest.mark.parametrize("before", [0x00, 0x9F, 0xFF, 0x8A])
+@pytest.mark.parametrize("power", range(4))
+def test_a_register_field_is_written_and_its_neighbours_stay(before: int, power: int) -> None:
+    """Field tx_power is bits 6 and 5 of register 117."""
+    registers = Registers(_117=before)
+    x4 = legacy.registers.X4(registers)
+    assert x4.tx_power == before >> 5 & 3
+    x4.tx_power = power
+    assert registers.pif == {117: before & 0x9F | power << 5}
+
+
 # --- at a port ----------------------------------------------------------------------------------
 
 
