@@ -1,4 +1,4 @@
-"""Forward geometry of one radar, and what is no range."""
+"""Forward geometry of one radar, and what is not a range."""
 
 import math
 

@@ -90,7 +90,7 @@ def test_a_damaged_byte_in_the_head_loses_nothing(
 
 
 def test_a_head_with_damage_needs_no_repair(whole: bytes, tmp_path: Path) -> None:
-    """The second copy follows the first at once, so what lies before it is no loss."""
+    """The second copy follows the first at once, so what lies before it is not lost."""
     chance = random.Random(9)
     path = tmp_path / "damaged.mcap"
     first, second, *_ = chunks_of(whole)

@@ -133,7 +133,7 @@ def test_what_is_framed_is_read_back(payload: bytes) -> None:
 
 
 def test_a_packet_that_holds_a_start_waits_for_what_follows() -> None:
-    """Its first byte is no known message, so it may be a false start in front of a frame."""
+    """Its first byte begins no known message, so it may be a false start in front of a frame."""
     packet = bytes.fromhex("7D 7C7C7C7C 7F7D 7E")
     expected = [(0, b"\x7c" * 4)]
     assert packets_in(read_all(packet)) == []

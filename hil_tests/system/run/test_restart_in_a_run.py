@@ -28,7 +28,7 @@ def test_frames_after_a_restart_are_those_of_their_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Protocol reference 6.1: the counter begins anew; content is that of scene time."""
-    # A restart takes a second, on a loaded machine several: that is no silence here.
+    # A restart takes a second, on a loaded machine several: that does not count as silence here.
     monkeypatch.setattr(frame_sources, "SILENCE_S", 10.0)
     scene_file = str(write_short_scene(tmp_path))
     scene, _ = scene_and_config(scene_file, "paper")

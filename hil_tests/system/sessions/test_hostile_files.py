@@ -112,7 +112,7 @@ def test_a_signal_ends_the_reading_of_a_degenerate_file(
 
 
 def test_a_chunk_of_zeros_is_not_unpacked(degenerate: Path, tmp_path: Path) -> None:
-    """Else two hundred of them would take a minute: what they hold is no record."""
+    """Else two hundred of them would take a minute: what they hold are not records."""
     zeros = chunk(bytes(N_BYTES))
     path = tmp_path / "zeros.mcap"
     path.write_bytes(degenerate.read_bytes()[:31] + zeros * N_CHUNKS)

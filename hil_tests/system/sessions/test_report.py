@@ -73,7 +73,7 @@ def test_the_page_loads_nothing_from_elsewhere(reported: Reported) -> None:
         assert kind == "data:image/svg+xml;base64"
         svg = base64.b64decode(data).decode()
         assert svg.startswith("<?xml")
-        # what it refers to lies in itself: the names of XML dialects are no addresses to ask
+        # what it refers to lies in itself: the names of XML dialects are not addresses to ask
         references = re.findall(r'(?:xlink:)?href="([^"]*)"|url\(([^)]*)\)', svg)
         assert references
         assert all((href or url).startswith(("#", "data:")) for href, url in references)

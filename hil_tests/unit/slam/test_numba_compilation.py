@@ -16,7 +16,7 @@ def _power(values: NDArray[np.float64], exponent: int) -> float:
 
 @kernel("f8(f8[::1])")
 def squares_and_cubes(values: NDArray[np.float64]) -> float:
-    """Call another one, with numbers that are no variables."""
+    """Call another one, with numbers that are constants."""
     return _power(values, 2) + _power(values, 3)
 
 
@@ -27,4 +27,4 @@ def test_a_kernel_calls_another_and_is_compiled_once() -> None:
     assert squares_and_cubes(2 * values) == 4 * 14.0 + 8 * 36.0
     assert _power.compiled() is _power.compiled()  # type: ignore[attr-defined]  # of the decorator
     assert len(_power.compiled().signatures) == 1  # type: ignore[attr-defined]  # the same
-    assert squares_and_cubes.__doc__ == "Call another one, with numbers that are no variables."
+    assert squares_and_cubes.__doc__ == "Call another one, with numbers that are constants."

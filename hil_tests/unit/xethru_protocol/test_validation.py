@@ -130,7 +130,7 @@ def test_nonsense_of_set_is_one_plain_line() -> None:
         ("a\n\x1b[2J", '"a\\n\\u001b[2J"'),
         ("x" * 200, '"' + "x" * 56 + "..."),
         (10**5000, "a number that long"),
-        ("\udcff\x9b", '"\\udcff\\x9b"'),  # bytes of a shell that are no text
+        ("\udcff\x9b", '"\\udcff\\x9b"'),  # bytes of a shell that are not text
         (None, "nothing"),
         ({"a": 1}, "a table"),
         (math.nan, "nan"),

@@ -144,7 +144,7 @@ def test_a_value_out_of_bounds_is_refused_with_its_limit(
 
 
 def test_one_bad_value_is_one_problem(tmp_path: Path) -> None:
-    """That the only radar is refused is no second problem of the list of radars."""
+    """That the only radar is refused is not reported as a second problem of the list of radars."""
     with pytest.raises(SceneError, match=r'not "1"$'):
         load_scene(write(tmp_path, GOOD.replace("000000000001", "1")))
 

@@ -20,7 +20,7 @@ def noise(rng: np.random.Generator) -> NDArray[np.complex128]:
 def test_false_alarms_in_white_noise() -> None:
     """Near the nominal rate, within three standard deviations of a binomial count.
 
-    The nominal rate is no bound: noise that is estimated adds false alarms.
+    The nominal rate is not a bound: noise that is estimated adds false alarms.
     """
     rng = np.random.default_rng(4)
     alarms = sum(

@@ -99,7 +99,7 @@ def test_what_is_inferred_or_unknown_names_the_option(
         (1431, False),
         (1432, False),
         (378, False),
-        (181, False),  # an odd number is no number of pairs
+        (181, False),  # an odd number of values cannot be pairs
         (376, None),
         (14, None),  # too short to say
         (0, None),

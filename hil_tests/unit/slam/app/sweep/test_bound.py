@@ -316,4 +316,4 @@ def test_ranges_of_one_radar_place_a_landmark_once_they_tell_it() -> None:
     assert found is not None
     np.testing.assert_allclose(found, landmark, atol=1e-6)
     at_rest = [SeenFrom(step=0, known=item.known, antenna=MOUNT) for item in seen[:1] * 20]
-    assert first_position(rig, at_rest, poses) is None  # a circle is no point
+    assert first_position(rig, at_rest, poses) is None  # the range gives a circle, not a point

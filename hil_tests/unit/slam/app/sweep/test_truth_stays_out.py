@@ -28,7 +28,7 @@ N_SCANS = 200
 
 
 def planted(scene: Scene) -> Scene:
-    """Return a world with other values of every key that is no input of SLAM."""
+    """Return a world with other values of every key that SLAM does not get."""
     radars = tuple(
         radar.model_copy(
             update={
