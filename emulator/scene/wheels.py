@@ -116,8 +116,6 @@ def drift(
 def _slips(n_steps: int, model: OdometrySpec, *, seed: int) -> NDArray[np.float64]:
     """Return what wheels report too much at each step, shape (n_steps, 2): [m forward, rad]."""
     slips = np.zeros((n_steps, 2))
-    if model.slips_per_s == 0.0:
-        return slips
     chances = uniforms(n_steps, seed=seed, stream=_SLIPS_STREAM)
     steps = np.flatnonzero(chances < model.slips_per_s / model.rate_hz)
     for kind, sigma in enumerate((model.slip_sigma_m, math.radians(model.slip_sigma_deg))):

@@ -292,6 +292,9 @@ def test_only_known_usb_ids_are_modules(monkeypatch: pytest.MonkeyPatch) -> None
         ("/dev/ttyACM1", 0x03EB, 0x2404),
         ("/dev/ttyACM0", 0x03EB, 0x6124),
         ("/dev/ttyACM2", 0x2341, 0x0043),
+        ("/dev/ttyUSB0", 0x0403, 0x6001),
+        ("/dev/ttyUSB1", 0x0403, 0x6014),
+        ("/dev/ttyUSB2", 0x0403, 0x6015),
         ("/dev/ttyS0", None, None),
     ]:
         listed.append(ListPortInfo(path))
@@ -301,6 +304,8 @@ def test_only_known_usb_ids_are_modules(monkeypatch: pytest.MonkeyPatch) -> None
     assert [(found.path, found.description) for found in find_ports()] == [
         ("/dev/ttyACM0", "XeThru module"),
         ("/dev/ttyACM1", "XeThru module in its bootloader"),
+        ("/dev/ttyUSB0", "FTDI adapter (X2 module?)"),
+        ("/dev/ttyUSB1", "FTDI adapter (X2 module?)"),
     ]
 
 
