@@ -53,6 +53,17 @@ def test_the_chest_moves_as_a_sine() -> None:
     assert breath == pytest.approx([0, 0.005, 0, -0.005, 0, 0.005], abs=1e-12)
 
 
+def test_a_realistic_breath_has_two_equal_halves_and_a_pause() -> None:
+    """Half a cosine out in 0.4 of a breath, half a cosine back in as much, then rest."""
+    breath = chest_displacement_m(
+        person(breaths_per_min=6.0, breath_amplitude_m=0.005, breath_pattern="realistic"),
+        times(0, 1, 2, 4, 5, 6, 8, 9, 10),
+    )
+    slope = 0.005 * math.cos(math.pi / 4)
+    expected = [-0.005, -slope, 0, 0.005, slope, 0, -0.005, -0.005, -0.005]
+    assert breath == pytest.approx(expected, abs=1e-12)
+
+
 def test_the_echo_of_a_person() -> None:
     """Radar equation for a point: root of the cross section, R**-2; the chest shortens the way."""
     stands = person(
