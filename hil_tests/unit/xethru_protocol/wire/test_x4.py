@@ -111,6 +111,16 @@ def test_receive_delay_is_one_byte(start: float, steps: int) -> None:
     assert x4.frame_area(start, start + 5).rx_wait == steps + 1
 
 
+@pytest.mark.parametrize(("downconversion", "longest_m"), [(False, 9.8765432), (True, 9.6707819)])
+def test_an_area_that_is_too_long_is_remembered_as_the_longest(
+    downconversion: bool, longest_m: float
+) -> None:
+    """Protocol reference 9.4, step 2."""
+    start_m = float(np.float32(0.4))
+    area = x4.quantised_area(start_m, 20.0, 0.18, downconversion)
+    assert area.requested_end_m == float(np.float32(start_m + float(np.float32(longest_m))))
+
+
 def test_limit_that_is_a_bin_but_for_rounding_is_that_bin() -> None:
     """9.4 steps 7 and 8: float32(3.325) lies 7e-6 of a bin behind a bin.
 
