@@ -203,7 +203,7 @@ def test_frames_that_come_together_are_judged_one_by_one(
     for counter in range(6):
         values = on_lattice(counter, counts).values.copy()
         values[: damaged.get(counter, 0)] = 0.08
-        frames.append(line._bytes(m.DataFloat(info=counter, values=values)))
+        frames.append(line.bytes_of(m.DataFloat(info=counter, values=values)))
     line.say(b"".join(frames))
     assert radar.frames_waiting() == 6
     assert radar.statistics.off_lattice_samples == sum(damaged.values())
