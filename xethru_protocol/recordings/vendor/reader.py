@@ -156,6 +156,11 @@ def _kind_of_entry(entry: Entry) -> DataFileKind | None:
     return KIND_OF_TYPE.get(entry.data_type) or KIND_OF_TYPE.get(entry.data_type ^ ALL_BITS)
 
 
+# What follows the magic numbers of others may look like any records.
+_LONG_MAGICS = (b"\x89XTWIRE\n", b"\x89MCAP0\r\n", b"\x93NUMPY", b"MATLAB 5.0")
+_SHORT_MAGICS = (b"PK\x03\x04", b"RRF")  # of .npz and of Rerun
+
+
 def is_vendor_file(path: Path) -> bool:
     return path.name == META_NAME or kind_of_data_file(path) is not None
 
@@ -170,6 +175,9 @@ def kind_of_data_file(path: Path) -> DataFileKind | None:
         return kind
     with path.open("rb") as stream:
         start = stream.read(2 * _LARGEST_PLAUSIBLE_RECORD)
+    is_other = any(is_like(start[: len(magic)], magic) for magic in _LONG_MAGICS)
+    if is_other or start.startswith(_SHORT_MAGICS):
+        return None
     size = path.stat().st_size
     found = [
         kind
