@@ -124,7 +124,8 @@ def test_the_rrd_holds_every_frame_and_a_blueprint(demo: Finished) -> None:
     rows = count_rows(demo.out / "session.rrd")
     assert sum(rows[f"/radar/{name}/frame"] for name in RADARS) == summary["frames"]
     assert rows["/link/log/front_left"] > 10
-    assert len(RrdReader(demo.out / "session.rrd").blueprints()) == 1
+    # that of the beginning, and that which shows the whole map
+    assert len(RrdReader(demo.out / "session.rrd").blueprints()) == 2
 
 
 def test_the_map_is_a_picture_with_all_its_colours(demo: Finished) -> None:
