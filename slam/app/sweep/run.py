@@ -184,9 +184,9 @@ class DisturbedDetector:
         )
         added = math.sqrt(self.stress.range_noise**2 - 1.0)
         stated_m = [
-            robust.range_sigma_m
-            if math.isnan(detection.sigma_m)
-            else math.hypot(robust.range_floor_m, detection.sigma_m)
+            math.hypot(robust.range_floor_m, detection.sigma_m)
+            if math.isfinite(detection.sigma_m)
+            else robust.range_sigma_m
             for detection in detections
         ]
         return tuple(
