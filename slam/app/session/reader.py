@@ -342,11 +342,10 @@ class RecordedSession:
         for radar, part, entry in self._messages():
             if part == "detections":
                 with _naming(self.path, entry):
-                    ranges_m = unpack_array(DOUBLE_ARRAY, entry.data).tolist()
-                held += [
-                    Detection(radar=radar, t_ns=entry.t_ns, range_m=range_m, amplitude=math.nan)
-                    for range_m in ranges_m
-                ]
+                    held += [
+                        Detection(radar=radar, t_ns=entry.t_ns, range_m=range_m, amplitude=math.nan)
+                        for range_m in unpack_array(DOUBLE_ARRAY, entry.data).tolist()
+                    ]
             elif entry.topic == "/scan":
                 of_scan[entry.t_ns] = tuple(one for one in held if one.t_ns == entry.t_ns)
                 held = []

@@ -273,6 +273,15 @@ def test_damage_names_the_file(session_file: Path, tmp_path: Path) -> None:
     assert str(path) in str(caught.value)
 
 
+def test_a_recorded_range_that_cannot_be_names_file_and_message(tmp_path: Path) -> None:
+    path = tmp_path / "session.mcap"
+    log = SessionLog(path, session_info())
+    log.on_detections(0, 0, np.array([0.8, np.nan]))
+    log.close()
+    with pytest.raises(AppError, match=rf"{path}: a message of /radar/.*/detections"):
+        open_session(path).detections()
+
+
 def test_the_end_comes_from_the_index_without_a_pass_over_the_file(
     session_file: Path, tmp_path: Path
 ) -> None:
