@@ -355,7 +355,12 @@ def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
         metavar="M",
         help="way that a relative error is over, metres (default: 1)",
     )
-    evaluate.add_argument("--out", type=Path, metavar="FILE.png", help="draw paths and errors")
+    evaluate.add_argument(
+        "--out",
+        type=output(".png", what="a picture"),
+        metavar="FILE.png",
+        help="draw paths and errors",
+    )
     _add_json(evaluate)
 
 

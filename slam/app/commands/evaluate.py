@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, UsageError
+from slam.app.errors import AppError
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum
 from slam.app.run.output import print_table, print_text
-from slam.app.session.reader import RecordedScan, open_session
+from slam.app.session.reader import RecordedScan, begins_with, open_session
 from slam.app.session_records import Snapshot
 from slam.evaluation import associate_times, ate_rmse_m, ate_rotation_rmse_rad, relative_pose_errors
 from slam.geometry import align_se2, transform
@@ -47,11 +47,7 @@ def trajectory_at(
     source = Path(recording_at(str(path)))
     if source.is_dir() and (source / f"{wanted}.tum").is_file():  # as replay leaves it
         source /= f"{wanted}.tum"
-    is_session = source.is_dir()
-    if source.is_file():  # a pipe would be waited for
-        with source.open("rb") as stream:
-            is_session = stream.read(len(MAGIC)) == MAGIC
-    if not is_session:
+    if not (source.is_dir() or begins_with(source, MAGIC)):
         return read_tum(source)
     rows: dict[int, Array] = {}
     for record in open_session(source, stop).played():
@@ -121,8 +117,6 @@ def run_evaluate(
     as_json: bool,
 ) -> None:
     """Print the errors of each estimate against the reference, and draw them if asked for."""
-    if out is not None and out.suffix != ".png":
-        raise UsageError(f"--out {out}: a picture is written; give a name that ends in .png")
     truth = trajectory_at(reference, stop, "truth")
     paths = {str(path): trajectory_at(path, stop) for path in estimates}
     results: dict[str, Errors] = {}

@@ -441,7 +441,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     page = _Page(f"{info.scene}, preset {info.preset}{seed}")
     page.note("simulated data" if info.simulated else "measured data", kind="origin")
     page.note(_what_was_done(info, record, data), kind="verdict")
-    page.note(_verdict(summary, record, data), kind="verdict")
+    page.note(_verdict(summary, record), kind="verdict")
     page.note(_what_it_is(session, record))
     if record.last.step is None:
         page.note(
@@ -632,7 +632,7 @@ def _what_was_done(info: SessionInfo, record: RunRecord, data: _ReportData) -> s
     )
 
 
-def _verdict(summary: Summary | None, record: RunRecord, data: _ReportData) -> str:
+def _verdict(summary: Summary | None, record: RunRecord) -> str:
     """Return whether SLAM was better than the wheels alone, as far as it can be known."""
     assert record.last is not None
     if summary is None:

@@ -13,7 +13,7 @@ from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_text
 from slam.app.run.replay import recorded_config
 from slam.app.run.result_files import made_folder
-from slam.app.session.reader import RecordedSession, open_session
+from slam.app.session.reader import RecordedSession, begins_with, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
 from xethru_protocol.recordings import RecordingError, WireCapture
@@ -77,7 +77,7 @@ def run_convert(
     if out.exists():
         raise AppError(f"{out}: exists; choose another name")
     refuse_pipe(source)
-    is_session = source.suffix == _SESSION_SUFFIX or _begins(source, MAGIC)
+    is_session = source.suffix == _SESSION_SUFFIX or begins_with(source, MAGIC)
     if is_session and suffix_of(out) not in ("", _SESSION_SUFFIX, *_OF_SESSION):
         raise UsageError(
             f"{out}: a session is not converted to {out.suffix}; name an OUT that ends in "
@@ -98,7 +98,7 @@ def run_convert(
             "a new folder for a bag of ROS 2"
         )
     else:
-        is_mat = source.suffix == _MAT_SUFFIX or _begins(source, b"MATLAB 5.0")
+        is_mat = source.suffix == _MAT_SUFFIX or begins_with(source, b"MATLAB 5.0")
         name = preset or (_MAT_PRESET if is_mat else _PRESET)
         _config(name)  # reports a wrong name before anything is read
         given_rig = None if rig is None else load_rig(rig).rig
@@ -120,15 +120,6 @@ def run_convert(
     for line in warnings:
         note(f"{source}: {line}")
     print_text(result.replace(str(fresh), str(out)))
-
-
-def _begins(source: Path, magic: bytes) -> bool:
-    """Whether a file begins so, whatever its name."""
-    with naming(source):
-        if not source.is_file():
-            return False
-        with source.open("rb") as stream:
-            return stream.read(len(magic)) == magic
 
 
 def _is_session(path: Path, stop: StopFlag) -> bool:

@@ -32,7 +32,7 @@ from slam.app.run.runner import (
     make_slam,
 )
 from slam.app.session.constants import different_constants, recorded_rules
-from slam.app.session.reader import RecordedScan, RecordedSession, open_session
+from slam.app.session.reader import RecordedScan, RecordedSession, begins_with, open_session
 from slam.app.session.state_rows import smoothed_row, state_row
 from slam.app.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
@@ -64,9 +64,7 @@ def refuse_overwriting(recorded: Path, out: Path | None) -> None:
         return
     if out.samefile(recorded):
         raise UsageError(f"{out}: is the session itself; write to another file")
-    with out.open("rb") as stream:
-        is_recording = stream.read(len(MAGIC)) == MAGIC
-    if is_recording:
+    if begins_with(out, MAGIC):
         raise UsageError(f"{out}: is a recording, which cannot be repeated; write to another file")
 
 

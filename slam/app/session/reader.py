@@ -181,6 +181,17 @@ def _found_in(
             raise _unreadable(path, error) from None
 
 
+def begins_with(path: Path, magic: bytes) -> bool:
+    """Return whether a regular file begins so, whatever its name; AppError if it is unreadable."""
+    try:
+        if not path.is_file():  # a pipe would be waited for
+            return False
+        with path.open("rb") as stream:
+            return stream.read(len(magic)) == magic
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
 def _unreadable(path: Path, error: OSError) -> AppError:
     return AppError(f"{path}: cannot read: {error.strerror or error}")
 

@@ -1,5 +1,6 @@
 """A recorded session comes back as it was; damaged and foreign files are one line."""
 
+import errno
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from slam.app.errors import AppError
 from slam.app.odometry.track import TumSample
 from slam.app.run.replay import play_states
 from slam.app.session.description import settings_text
-from slam.app.session.reader import open_session
+from slam.app.session.reader import begins_with, open_session
 from slam.app.session.state_rows import smoothed_of, smoothed_row, snapshot_of, state_row
 from slam.app.session.writer import SessionLog
 from slam.app.session_records import LogLine, Scan, Snapshot
@@ -31,6 +32,7 @@ from slam.config import SlamConfig, load_preset
 from slam.frames import RadarFrame
 from slam.results import SmoothedRun
 from xethru_protocol.operating_system import StopFlag
+from xethru_protocol.recordings.mcap import MAGIC
 
 N_SCANS = 60
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
@@ -271,6 +273,19 @@ def test_damage_names_the_file(session_file: Path, tmp_path: Path) -> None:
     with pytest.raises(AppError) as caught:
         list(open_session(path).records())
     assert str(path) in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_not_called_unwritable(
+    session_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert begins_with(session_file, MAGIC)
+
+    def refuse(path: Path, mode: str) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(AppError, match="cannot read: Permission denied"):
+        begins_with(session_file, MAGIC)
 
 
 def test_a_recorded_range_that_cannot_be_names_file_and_message(tmp_path: Path) -> None:
