@@ -142,9 +142,6 @@ class Ground:
         """Two corners of it without the border, shape (2, 2)."""
         return np.array([self.low_m + self.margin_m, self.high_m - self.margin_m])
 
-    def is_same(self, other: Ground) -> bool:
-        return bool(np.all(self.low_m == other.low_m) and np.all(self.high_m == other.high_m))
-
     def holds(self, points_m: Array) -> bool:
         """Return whether points, shape (n, 2), lie on it, at most half in its border."""
         border = self.margin_m / 2
@@ -180,10 +177,11 @@ class Ground:
 class MapLayer:
     """Sends poses and echoes in blocks, the map once per second.
 
-    `ground` is a new one when the map or a fan has grown beyond it.
+    `ground` is a new one when the map or a fan has grown beyond it; it begins as the one that is
+    given, if any.
     """
 
-    def __init__(self, recording: RerunRecording, info: SessionInfo) -> None:
+    def __init__(self, recording: RerunRecording, info: SessionInfo, ground: Ground | None) -> None:
         self._recording = recording
         self._radars = info.radars
         self._field = info.field_of_view
@@ -195,8 +193,7 @@ class MapLayer:
         self._first_ns: int | None = None
         self._next_map_ns = self._next_path_ns = 0
         self._last: tuple[Snapshot, RowTimes] | None = None
-        world_m = known_world_m(info)
-        self.ground = Ground.around(world_m if len(world_m) else np.zeros((1, 2)))
+        self.ground = ground or Ground.around(np.zeros((1, 2)))
         self._wedges_m = np.concatenate([wedge(self._field, radar) for radar in info.radars])
         self._send_statics(info)
 

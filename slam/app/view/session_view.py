@@ -460,7 +460,7 @@ class RerunView(SessionObserver):
         settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
         self._recording.static("radars", rr.TextDocument(settings))
         self._frames = FrameLayer(self._recording, info.radars)
-        self._map = MapLayer(self._recording, info)
+        self._map = MapLayer(self._recording, info, self._shown)
         style_numbers(self._recording)
         self._link = LinkLayer(self._recording, info.radars)
 
@@ -526,7 +526,7 @@ class RerunView(SessionObserver):
 
     def _show_ground(self) -> None:
         """Lay out all anew if the map has grown."""
-        if self._shown is None or not self._shown.is_same(self._map.ground):
+        if self._shown is not self._map.ground:
             self._shown = self._map.ground
             self._recording.arrange(blueprint(self._info, self._shown))
 
