@@ -105,12 +105,12 @@ class RobustSlam:
         window = self.config.window
         if not has_moved(self._pose, pose, window.min_distance_m, window.min_turn_rad):
             return ()
-        detections = detect()
-        sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         moved = {
             radar: None if stamp_ns == t_ns else between(pose, self._check.pose(pose_at, stamp_ns))
             for radar, stamp_ns in stamps_ns.items()
         }
+        detections = detect()
+        sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         branches = self._branches
         elapsed_s = (t_ns - self._t_ns) / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, self._stood_ns / _NS_PER_S)

@@ -147,6 +147,31 @@ def test_a_front_end_that_names_another_radar_moves_nothing(back_end: BackEnd) -
     assert result.belief.pose == pytest.approx([STEP_M, 0.0, 0.0], abs=1e-3)
 
 
+class CountingFrames(FoundElsewhere):
+    """A front end that finds nothing, and counts its frames."""
+
+    n_frames = 0
+
+    def detect_many(
+        self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
+    ) -> list[tuple[Detection, ...]]:
+        self.n_frames += len(frames)
+        return [() for _ in frames]
+
+
+def test_a_frame_whose_pose_is_not_finite_does_not_reach_the_front_end() -> None:
+    """It has a state of its own: a step that is repeated would give it the frame twice."""
+    detector = CountingFrames()
+    slam = RobustSlam(SlamConfig(back_end=BackEnd.ROBUST), TWO, WheelNoise(), detector)
+    slam.step([], straight, 0)
+    frames = [frame_of(0, TICK_NS + 1)]
+    with pytest.raises(StepInputError):
+        slam.step(frames, bad_at(TICK_NS + 1), TICK_NS)
+    assert detector.n_frames == 0
+    assert len(slam.step(frames, straight, TICK_NS)) == 1
+    assert detector.n_frames == 1
+
+
 @pytest.mark.parametrize("back_end", BackEnd)
 def test_a_step_of_the_same_time_is_accepted(back_end: BackEnd) -> None:
     slam = make(back_end)
