@@ -57,7 +57,8 @@ def trajectory_at(
             rows[record.scan.t_ns] = record.truth
     known = {t_ns: pose for t_ns, pose in sorted(rows.items()) if np.isfinite(pose).all()}
     if not known:
-        raise AppError(f"{path}: holds no {wanted}; `uwb-slam replay` writes what it finds")
+        remedy = "`uwb-slam replay` makes one" if wanted == "estimate" else "give a TUM file of it"
+        raise AppError(f"{path}: holds no {wanted}; {remedy}")
     return Trajectory(
         stamps_ns=np.array(list(known), dtype=np.int64), poses=np.array(list(known.values()))
     )

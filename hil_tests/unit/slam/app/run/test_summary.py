@@ -17,11 +17,14 @@ from hil_tests.unit.slam.app.sessions import (
     feed,
     odometry,
     record_of_steps,
+    scan,
     session_info,
     snapshot,
+    write_scans,
 )
 from slam.app.cli import main
 from slam.app.commands.evaluate import Errors, evaluate, trajectory_at
+from slam.app.errors import AppError
 from slam.app.odometry.track import Trajectory, write_tum
 from slam.app.run.output import summary_rows, table_text
 from slam.app.run.runner import RunRecord
@@ -385,6 +388,15 @@ def test_a_session_and_a_runs_folder_are_judged_like_their_trajectories(tmp_path
         wanted = 0.0 if est == tmp_path / "ref.tum" else expected
         assert result["ate_rmse_m"] == pytest.approx(wanted, abs=1e-12)
         assert result["pairs"] == len(states)
+
+
+def test_a_session_without_poses_names_a_remedy_that_works(tmp_path: Path) -> None:
+    """Replay makes estimates, but no truth."""
+    session = write_scans(tmp_path / "session.mcap", [scan(0)])
+    with pytest.raises(AppError, match="holds no estimate; `uwb-slam replay` makes one"):
+        trajectory_at(session, StopFlag())
+    with pytest.raises(AppError, match="holds no truth; give a TUM file of it"):
+        trajectory_at(session, StopFlag(), "truth")
 
 
 @pytest.mark.parametrize("sign", [1, -1])
