@@ -68,10 +68,7 @@ _GREYS = 32
 
 
 class _Echoes:
-    """Collects near samples of frames, so many that a picture shows them.
-
-    They are by radar: times since the first scan [ns], and samples.
-    """
+    """Collects frames by radar, their near samples only, so many that a picture shows them."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
