@@ -124,6 +124,8 @@ class Doubt:
         """Add a doubt with other evidence: what confirms both confirms either."""
         self.add(newer)
         self.nats = {id_: nats for id_, nats in newer.nats.items() if id_ < self.next_id}
+        # The newer one's is also of landmarks that the older one did not know.
+        self.information = _nothing()
         self.alike = None
 
 

@@ -126,7 +126,7 @@ def test_doubts_that_are_joined_need_what_both_need() -> None:
     older.information, newer.information = 2.0 * np.eye(3), np.eye(3)
     older.join(newer)
     assert (older.next_id, older.nats) == (3, {1: 2.0})
-    np.testing.assert_array_equal(older.information, np.eye(3))
+    np.testing.assert_array_equal(older.information, np.zeros((3, 3)))
     np.testing.assert_allclose(older.variances, 2.0 * np.array(RULE.hidden_variances))
 
 
