@@ -108,7 +108,17 @@ class Measure:
     ) -> None:
         """Record a number; ``limit`` holds the smallest and the largest allowed value."""
         low, high = limit
-        measurement = Measurement(name=name, value=float(value), unit=unit, low=low, high=high)
+        if low is not None and high is not None and low > high:
+            pytest.fail(
+                f"measure {name}: limit {low, high}: the smallest comes first", pytrace=False
+            )
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = None
+        if number is None:  # not above, where pytest would show both errors
+            pytest.fail(f"measure {name}: {value!r} is not a number", pytrace=False)
+        measurement = Measurement(name=name, value=number, unit=unit, low=low, high=high)
         self.taken.append(measurement)
         self._properties.append((f"measurement {name}", measurement.text))
         if not measurement.within:

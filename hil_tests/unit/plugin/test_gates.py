@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -120,6 +121,14 @@ def test_a_measure_that_is_no_number_fails(limit: tuple[float | None, float | No
     with pytest.raises(pytest.fail.Exception, match="noise is nan dB"):
         Measure(properties)("noise", math.nan, unit="dB", limit=limit)
     assert [name for name, _ in properties] == ["measurement noise"], "reported all the same"
+
+
+@pytest.mark.parametrize(("value", "limit"), [("a", (None, None)), (1.0, (2.0, 1.0))])
+def test_a_measure_that_makes_no_sense_fails_the_test(value: Any, limit: Any) -> None:
+    properties: list[tuple[str, object]] = []
+    with pytest.raises(pytest.fail.Exception):
+        Measure(properties)("noise", value, limit=limit)
+    assert not properties
 
 
 @pytest.mark.parametrize(

@@ -142,6 +142,11 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
     """
     try:
         facts = json.loads(text)
+        if isinstance(facts, dict) and facts.get("x_m") is None:
+            raise AppError(
+                f"{path}: is a recording of modules and not a session: it does not say where the "
+                "radars are mounted; `xethru view` shows it"
+            )
         unit = facts["length_unit"]
         radar = checked(_RADAR, facts)
     except (ValueError, TypeError, KeyError) as error:

@@ -23,7 +23,7 @@ from hil_tests.unit.slam.app.sessions import (
 from slam.app.errors import AppError
 from slam.app.odometry.track import TumSample
 from slam.app.run.replay import play_states
-from slam.app.session.description import settings_text
+from slam.app.session.description import read_radar_text, settings_text
 from slam.app.session.reader import begins_with, open_session
 from slam.app.session.state_rows import smoothed_of, smoothed_row, snapshot_of, state_row
 from slam.app.session.writer import SessionLog
@@ -330,3 +330,9 @@ def test_a_session_that_grows_reads_the_same_again(tmp_path: Path) -> None:
     path.write_bytes(whole)
     assert sum(1 for _ in session.scans()) == n_scans
     assert sum(1 for _ in open_session(path).scans()) == 60
+
+
+def test_a_recording_of_modules_is_not_a_session(tmp_path: Path) -> None:
+    """What `xethru record` writes has the same topics, and does not know where a radar is."""
+    with pytest.raises(AppError, match="xethru view"):
+        read_radar_text(tmp_path / "rec.mcap", "/radar/radar_1/info", '{"x_m": null}')
