@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import cast
 
 import pytest
 
@@ -124,10 +124,12 @@ def test_a_measure_that_is_no_number_fails(limit: tuple[float | None, float | No
 
 
 @pytest.mark.parametrize(("value", "limit"), [("a", (None, None)), (1.0, (2.0, 1.0))])
-def test_a_measure_that_makes_no_sense_fails_the_test(value: Any, limit: Any) -> None:
+def test_a_measure_that_makes_no_sense_fails_the_test(
+    value: object, limit: tuple[float | None, float | None]
+) -> None:
     properties: list[tuple[str, object]] = []
     with pytest.raises(pytest.fail.Exception):
-        Measure(properties)("noise", value, limit=limit)
+        Measure(properties)("noise", cast("float", value), limit=limit)
     assert not properties
 
 
