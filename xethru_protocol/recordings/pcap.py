@@ -53,8 +53,8 @@ class _Side:
         while not isinstance(packet := self._reader.next_packet(), NeedData):
             if isinstance(packet, Packet):
                 yield from self._cut(packet.offset - self._begin)
-                counter = counter_of(decode_response(packet.payload))
-                counter = counter if self._way == "rx" else None
+                is_answer = self._way == "rx"
+                counter = counter_of(decode_response(packet.payload)) if is_answer else None
                 yield from self._cut(len(self._bytes) - self._reader.buffered, counter)
 
     def _cut(self, size: int, counter: tuple[str, int] | None = None) -> Iterator[_Record]:

@@ -281,8 +281,9 @@ class _DataFileReader:
         self.position = 0  # bytes read so far
         self.faulty = False  # its end could not be read
         self.ended = False  # nothing more can be read
+        self._last_bytes = 0  # size of the last whole record
         self._agrees = True  # with the index so far
-        self._before = 0  # where the last record began
+        self._before = 0  # where the last record began, or the last damaged one if that is behind
         self._on_fault = on_fault
         with reading(path):
             self._stream: BinaryIO = path.open("rb")
@@ -330,17 +331,20 @@ class _DataFileReader:
         header = self._stream.read(smallest)
         size = kind.record_size(header) if len(header) == smallest else smallest
         following: int | None = None
+        before, self._before = self._before, max(self._before, begin)
         if listed not in (None, size) and not self._is_record_at(begin + size, kind):
             following = begin + listed if self._is_record_at(begin + listed, kind) else None
         if size > left and following is None:
-            if listed is None or begin + listed <= self.size:
-                following = self._next_records(begin, kind)
+            # one as large as the last, or without a whole header, is not damaged but cut
+            is_cut = size == self._last_bytes or left < smallest
+            if not is_cut and (listed is None or begin + listed <= self.size):
+                following = self._next_records(before + 1, begin, kind)
             if following is None:
                 self._cut(left)
                 return None
         if following is None:
             self._stream.seek(begin + smallest)
-            self._before, self.position = begin, begin + size
+            self.position, self._last_bytes = begin + size, size
             record = header + self._stream.read(size - len(header))
             return decode_response(kind.prefix + record), None
         self.report(f"a record is damaged: it claims {size} bytes", min(begin, following - 1))
@@ -353,19 +357,18 @@ class _DataFileReader:
         header = self._stream.read(kind.header.itemsize)
         return at == self.size or _record_end(header, 0, self.size - at, kind) is not None
 
-    def _next_records(self, damaged: int, kind: BinaryKind) -> int | None:
+    def _next_records(self, first: int, damaged: int, kind: BinaryKind) -> int | None:
         """Return where plausible records go on: behind a damaged one, or already in the one before.
 
-        For it may be the size of that one that is damaged.
+        For it may be the size of that one that is damaged. ``first`` is where the search begins.
         """
-        first = self._before + 1
         self._stream.seek(first)
         start = self._stream.read(2 * _LARGEST_PLAUSIBLE_RECORD)
         size = self.size - first
         for place in range(len(start)):
             # one record before the end is found by chance too easily among values
-            end = size if first + place > damaged else size + 1
-            if _records_follow(start, place, end, kind):
+            may_be_last = first + place > damaged
+            if _records_follow(start, place, size, kind, may_be_last=may_be_last):
                 return first + place
         return None
 
@@ -436,14 +439,15 @@ def _user_header_bytes(start: bytes, size: int, kind: DataFileKind) -> int:
     return next((at for at in places if _records_follow(start, at, size, kind)), 0)
 
 
-def _records_follow(start: bytes, position: int, size: int, kind: BinaryKind) -> bool:
-    """Whether plausible records stand from ``position`` on: two of them, or one and the end."""
-    for _ in range(2):
-        end = _record_end(start[position : position + kind.header.itemsize], position, size, kind)
-        if end is None or end == size:
-            return end is not None
-        position = end
-    return True
+def _records_follow(
+    start: bytes, position: int, size: int, kind: BinaryKind, *, may_be_last: bool = True
+) -> bool:
+    """Whether plausible records stand from ``position`` on: two, or one if it may be the last."""
+    header_bytes = kind.header.itemsize
+    end = _record_end(start[position : position + header_bytes], position, size, kind)
+    if end is None or end == size:
+        return end is not None and may_be_last
+    return _record_end(start[end : end + header_bytes], end, size, kind) is not None
 
 
 def _record_end(header: bytes, position: int, size: int, kind: BinaryKind) -> int | None:

@@ -68,6 +68,23 @@ def test_any_user_header_is_found_without_an_index(
 
 
 @pytest.mark.parametrize(
+    "prefix", ["pulsedoppler_byte", "noisemap_byte", "radar_baseband_q15", "radar_rf"]
+)
+def test_a_cut_file_of_small_numbers_holds_its_whole_records_only(
+    prefix: str, tmp_path: Path
+) -> None:
+    """Small numbers look like heads of records; the cut by one byte is the hardest."""
+    (file,) = (RECORDINGS / "every_kind").glob(f"xethru_{prefix}_2*.dat")
+    record = file.read_bytes()
+    for cut in range(1, len(record)):
+        copy = tmp_path / file.name
+        copy.write_bytes(3 * record)
+        os.truncate(copy, 3 * len(record) - cut)
+        found, faults = read_with_faults(copy)
+        assert (len(found), [fault.offset for fault in faults]) == (2, [2 * len(record)])
+
+
+@pytest.mark.parametrize(
     ("name", "cut", "offset"),
     [
         *(("single", cut, 1909 - 47) for cut in (1, 10, 46)),
