@@ -106,9 +106,11 @@ class _Clock(Generic[Item]):
     def _set_back(self, last: _Row[Item], fallen: _Row[Item], following: _Row[Item] | None) -> None:
         right_ns = self._right_ns([*self._recent, last], fallen)
         told = "their order tells no more"
-        if right_ns is not None:
+        if right_ns is None or right_ns < last.t_ns:
+            right_ns = last.t_ns
+        else:
             told = f"by the counter {_seconds(right_ns - last.t_ns)} s passed"
-        later_ns = max(last.t_ns if right_ns is None else right_ns, last.t_ns) - fallen.t_ns
+        later_ns = right_ns - fallen.t_ns
         self._note(
             fallen.number,
             f"the clock of the recorder was set back by {_seconds(last.t_ns - fallen.t_ns)} s; "

@@ -12,6 +12,7 @@ positions leave out the time between them; here a position is the time since the
 
 from __future__ import annotations
 
+import heapq
 import json
 import os
 import re
@@ -493,11 +494,11 @@ def _messages(
             if meta is not None:
                 file_of = _files_by_entry(part, files, on_fault, whole=whole)
                 yield from _along_index(meta, file_of)
-            for file in files:
-                rest: TimedMessages = _rest(file)
-                if meta is None:
-                    rest = steady_messages(rest, file.path.name, on_fault)
-                yield from rest
+                # lines have times of their own, which are those of the other files' lines, too
+                yield from heapq.merge(*map(_rest, files), key=lambda timed: timed[1] or 0)
+            else:
+                for file in files:
+                    yield from steady_messages(_rest(file), file.path.name, on_fault)
         finally:
             for file in files:
                 file.close()

@@ -164,3 +164,18 @@ def test_the_shipped_example_of_a_restart(tmp_path: Path) -> None:
     shutil.copytree(tmp_path / "rec", tmp_path / "again")
     rate_hz = load(tmp_path / "again").radar.frame_rate_hz
     assert rate_hz == pytest.approx(10, abs=0.6)
+
+
+def test_lines_behind_the_end_of_an_index_keep_their_own_times(tmp_path: Path) -> None:
+    """A killed recorder leaves files of lines whose times overlap; no clock was set back."""
+    times_ns = [(START_MS + 500 * number) * MS for number in range(12)]
+    with RecordingWriter(tmp_path / "r") as writer:
+        for number, t_ns in enumerate(times_ns):
+            text = m.DataString(content_id=0, info=number, text=str(number))
+            writer.write(text if number % 2 else presence(number), t_ns)
+    meta = tmp_path / "r" / META
+    third = meta.read_bytes().index(struct.pack("<IB", 1000, 1))
+    meta.write_bytes(meta.read_bytes()[:third])
+    found, faults = read_with_faults(tmp_path / "r")
+    assert [t_ns for _, t_ns in found] == times_ns
+    assert ["never completed" in fault.reason for fault in faults] == [True]
