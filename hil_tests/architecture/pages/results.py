@@ -68,7 +68,8 @@ SWEEPS = {
         "before slips were decided when they happen, after that, after landmarks that fit "
         "elsewhere, too, ceased to confirm a pose, and after doubts covered the slips that they "
         "are about. All were developed with rooms 0 to 9; `doors` 40, 41 and 45, carried, "
-        "`doors` 40 and 45 and `twins` 44, 45 and 48, `slip_large`, were run in between. @ROWS@ "
+        "`doors` 40 and 45 and `twins` 44, 45 and 48, `slip_large`, were run in between. "
+        "The rows of `noise_stated_low` are those of the third time. "
         "Rig, speed and course are drawn with the room. `make harm FIRST_SEED=40` runs "
         "them. The picture shows a room of each family with the version before carries were "
         "judged by all ranges, and with the first of these three.",
