@@ -353,8 +353,10 @@ def firmware_named(name: str) -> FirmwareVersions:
 
     Without version it is the newest. Raises `ValueError`, which lists the known versions.
 
-    >>> firmware_named("sensor"), firmware_named("xep-3.3.0")
-    (Firmware(sensor='1.6.8', xep='3.4.8'), Firmware(sensor=None, xep='3.3.0'))
+    >>> firmware_named("sensor")
+    FirmwareVersions(sensor='1.6.8', xep='3.4.8')
+    >>> firmware_named("xep-3.3.0")
+    FirmwareVersions(sensor=None, xep='3.3.0')
     """
     if name not in FIRMWARE_NAMES:
         raise ValueError(

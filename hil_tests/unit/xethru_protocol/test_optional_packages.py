@@ -3,6 +3,7 @@
 import importlib.metadata
 import json
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -124,7 +125,7 @@ def test_the_command_names_what_was_installed(
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
     assert install_command("slam") == f"pip install {expected}"
     monkeypatch.setenv("PATH", "/nowhere")
-    assert install_command("slam") == f"{sys.executable} -m pip install {expected}"
+    assert install_command("slam") == f"{shlex.quote(sys.executable)} -m pip install {expected}"
 
 
 def test_in_a_clone_the_command_is_that_of_its_pages(
