@@ -64,7 +64,7 @@ def test_what_a_run_keeps_of_a_state_does_not_grow_with_the_map(
     The covariance alone has 8 kB with 14 landmarks and 164 kB with 70.
     """
     # The report's picture of echoes holds so many frames and no more: it is full before the first.
-    monkeypatch.setattr("slam.app.commands.report._ECHO_ROWS", 16)
+    monkeypatch.setattr("slam.app.commands.report._ECHO_ROWS", 2)
     made = session_info(1)
     info = replace(made, radars=(replace(made.radars[0], n_bins=N_BINS),))
     ends = [along_x(np.array([t_ns]))[0] for t_ns in (0, 10**12)]
