@@ -256,7 +256,7 @@ class Trial:
         self._device = FaultyDevice(self._module, "radar", plan)
         self._module.port_opened(self._now_ns)
         for kind in self._rng.choices(list(KINDS), k=2 if self._what == "faults" else 0):
-            self._device.add(fault_spec(kind, count=0, probability=self._rng.choice((0.1, 1.0))))
+            self._device.add(fault_spec(kind, count=0, probability=self._rng.choice((0.1, 0.9))))
 
     def run(self, commands: int) -> None:
         """Send commands until one ends the module or makes it hang."""
