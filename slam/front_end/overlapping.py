@@ -87,7 +87,7 @@ _WINDOW = np.arange(2 * REACH_STEPS + 1)
 _TAYLOR = np.linalg.inv(np.vander(_WINDOW - REACH_STEPS, increasing=True)).T.copy()
 
 
-class Window(NamedTuple):
+class FitWindow(NamedTuple):
     """One window to be fitted, its carrier and its samples zero where a sample is not usable."""
 
     samples: Array  # (n,)
@@ -108,7 +108,7 @@ class _Fit(NamedTuple):
         return self.state[U, : self.n_echoes]
 
 
-def _on_grid(data: Window, samples: Array, envelopes: Array) -> tuple[ComplexArray, Array]:
+def _on_grid(data: FitWindow, samples: Array, envelopes: Array) -> tuple[ComplexArray, Array]:
     """Return the correlation of samples with pulses on a grid, and their squared norms; (n_grid,).
 
     Cosine and sine columns are orthogonal but for cut pulses.
@@ -123,13 +123,13 @@ def _envelopes(positions: Array, n_bins: int, sigma: float) -> Array:
     return envelopes
 
 
-def _best_single(data: Window, grid: Array, envelopes: Array) -> Array:
+def _best_single(data: FitWindow, grid: Array, envelopes: Array) -> Array:
     """Return the place of the grid where one echo explains most; shape (1,)."""
     matched, norm = _on_grid(data, data.samples, envelopes)
     return grid[[np.argmax(np.abs(matched) ** 2 / norm)]]
 
 
-def _best_pair(data: Window, grid: Array, envelopes: Array, separation: float) -> Array:
+def _best_pair(data: FitWindow, grid: Array, envelopes: Array, separation: float) -> Array:
     """Return the pair of the grid that explains most; shape (2,)."""
     one, other = np.triu_indices(len(grid), k=math.ceil(separation / (grid[1] - grid[0])))
     if not one.size:  # a search interval shorter than two echoes' distance
@@ -144,7 +144,7 @@ def _best_pair(data: Window, grid: Array, envelopes: Array, separation: float) -
     return grid[[one[best], other[best]]]
 
 
-def _one_more(data: Window, fit: _Fit, grid: Array, *, sigma: float, separation: float) -> Array:
+def _one_more(data: FitWindow, fit: _Fit, grid: Array, *, sigma: float, separation: float) -> Array:
     """Return starts with one more echo: where it explains most, or as a split of one; (s, K)."""
     positions, n = fit.positions, fit.n_echoes
     mine = _envelopes(positions, data.samples.size, sigma)
@@ -218,7 +218,7 @@ def fit_echoes(
     first, last = search_bins or (_OFF_THE_ENDS * sigma, n_bins - 1 - _OFF_THE_ENDS * sigma)
     angle = pulse.carrier_rad_per_bin * np.arange(n_bins)
     weight = np.ones(n_bins) if usable is None else usable.astype(np.float64)
-    data = Window(
+    data = FitWindow(
         np.where(weight > 0.0, samples, 0.0),
         np.cos(angle) * weight,
         np.sin(angle) * weight,

@@ -586,7 +586,7 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Identity:
+class Correspondence:
     """The statement that things seen or mapped are one and the same, in pairs."""
 
     pairs: Pairs  # of keys of things
@@ -598,7 +598,7 @@ class Identity:
         limit = float(chdtri(2 * len(self.pairs), TAIL_PROBABILITY))
         return self.mahalanobis_sq <= limit and self.evidence > 0.0
 
-    def contradicts(self, other: Identity) -> bool:
+    def contradicts(self, other: Correspondence) -> bool:
         """Return whether not both can be true: one thing would be two others."""
         return any(
             mine != theirs and not set(mine).isdisjoint(theirs)
@@ -607,7 +607,7 @@ class Identity:
         )
 
 
-def identity(pairs: Pairs, residual: Array, S: Array, density: float) -> Identity:
+def identity(pairs: Pairs, residual: Array, S: Array, density: float) -> Correspondence:
     """Judge pairs of things by their residuals (2 k,), with covariance S (2 k, 2 k).
 
     ``density`` is that of all things of the kind: how likely a chance neighbour is.
@@ -615,10 +615,12 @@ def identity(pairs: Pairs, residual: Array, S: Array, density: float) -> Identit
     distance = float(residual @ np.linalg.solve(S, residual))
     log_det = float(np.linalg.slogdet(math.tau * S)[1])
     evidence = -0.5 * (distance + log_det) - len(pairs) * math.log(density)
-    return Identity(pairs=pairs, mahalanobis_sq=distance, evidence=evidence)
+    return Correspondence(pairs=pairs, mahalanobis_sq=distance, evidence=evidence)
 
 
-def certain(identities: Sequence[Identity], refused: Collection[Pairs] = ()) -> Identity | None:
+def certain(
+    identities: Sequence[Correspondence], refused: Collection[Pairs] = ()
+) -> Correspondence | None:
     """Return the likeliest of those that are possible and that nothing speaks against.
 
     That all things are new, and each identity that contradicts it, possible or not, must be less

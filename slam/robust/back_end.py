@@ -32,9 +32,9 @@ from slam.robust.association import (
 )
 from slam.robust.initialisation import (
     BodyPoint,
-    Detection,
     FeatureRows,
     Option,
+    PointDetection,
     Question,
     Search,
     Sightings,
@@ -617,7 +617,7 @@ class RobustBackEnd:
         state.apply(gain, weighted)
         return float(white @ white), likelihoods
 
-    def _log_detections(self, landmark_id: int, seen: Sequence[Detection]) -> None:
+    def _log_detections(self, landmark_id: int, seen: Sequence[PointDetection]) -> None:
         for one in seen:
             self._log.add_range(
                 one.pose,

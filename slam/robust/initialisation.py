@@ -749,7 +749,7 @@ def _radar_part(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Detection:
+class PointDetection:
     """A detection with range and bearing, as measured."""
 
     radar: int
@@ -767,7 +767,7 @@ class Detection:
 
 def detections_of(
     scan: RangeScan, indices: Sequence[int], pose: int, antennas: Antennas, noise: RangeNoise
-) -> list[Detection]:
+) -> list[PointDetection]:
     """Return some detections of a scan with bearings."""
     assert scan.bearings_rad is not None
     radar, variances = scan.radar, point_variances(scan, indices, noise)
@@ -775,7 +775,7 @@ def detections_of(
     turn_rad = float(antennas.turns_rad[radar])
     yaw_rad = float(antennas.yaw_rad[radar]) - turn_rad
     return [
-        Detection(
+        PointDetection(
             radar=radar,
             label=None if scan.labels is None else scan.labels[index],
             pose=pose,
@@ -793,7 +793,7 @@ def detections_of(
 
 
 def body_point(
-    state: State, antennas: Antennas, detection: Detection, share: float = 1.0
+    state: State, antennas: Antennas, detection: PointDetection, share: float = 1.0
 ) -> BodyPoint:
     """Return where a detection lies: at its range and bearing, the offset of the radar removed.
 
@@ -822,7 +822,7 @@ class TentativePoint:
     """What may be a landmark: a point in the newest body frame, and the detections of it."""
 
     point: BodyPoint
-    seen: list[Detection]
+    seen: list[PointDetection]
     chi_square: float = 0.0
     misses: int = 0  # scans since the last one that held it
 
@@ -889,7 +889,7 @@ class TentativePoints:
             if one.label is None or one.label not in {other.label for other in found[:k]}
         ]
 
-    def take(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> None:
+    def take(self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]) -> None:
         """Take in the detections of a scan, with their points."""
         rule, waiting = self._parameters.tracklets, self._points
         chosen = self._assigned(seen, points)
@@ -911,7 +911,9 @@ class TentativePoints:
         is_at_rest = one.chi_square <= chi_square_limit(2 * (hits - 1), excess)
         return hits >= self._parameters.tracklets.min_hits_per_radar and is_at_rest
 
-    def _assigned(self, seen: Sequence[Detection], points: Sequence[BodyPoint]) -> dict[int, int]:
+    def _assigned(
+        self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]
+    ) -> dict[int, int]:
         """Return which tentative point each detection is of, by index."""
         noise, n = self._parameters.ranges, len(self._points)
         if not n or not seen:
@@ -938,7 +940,7 @@ class TentativePoints:
         columns = linear_sum_assignment(cost)[1].tolist()
         return {k: at for k, at in enumerate(columns) if at < n}
 
-    def _fuse(self, one: TentativePoint, detection: Detection, point: BodyPoint) -> None:
+    def _fuse(self, one: TentativePoint, detection: PointDetection, point: BodyPoint) -> None:
         before = one.point
         S = before.covariance + point.covariance
         nu = point.point_m - before.point_m

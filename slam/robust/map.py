@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from slam.robust.association import Identity, Pairs, certain, density_per_m2, identity
+from slam.robust.association import Correspondence, Pairs, certain, density_per_m2, identity
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
 from slam.robust.state import Array, Indices, State
 
@@ -103,7 +103,7 @@ def merge_rows(state: State, pairs: Pairs, sigma_m: float) -> tuple[Indices, Arr
     return at, H, -np.concatenate(apart), sigma_m**2 * np.eye(2 * len(pairs))
 
 
-def judge(state: State, pairs: Pairs, sigma_m: float, density: float) -> Identity:
+def judge(state: State, pairs: Pairs, sigma_m: float, density: float) -> Correspondence:
     """Judge whether landmarks, by row, are one, in pairs."""
     at, H, residual, R = merge_rows(state, pairs, sigma_m)
     return identity(pairs, residual, H @ state.P.block(at) @ H.T + R, density)
@@ -139,7 +139,7 @@ def find_merge(
     rule: MapRule,
     refused: Collection[Pairs] = (),
     distinct: Collection[int] = (),
-) -> Identity | None:
+) -> Correspondence | None:
     """Return the merge to be tried now, of one pair or two, or None.
 
     ``refused`` are those not to be tried, as ``named_pairs`` returns them; of the rows ``distinct``
@@ -164,13 +164,13 @@ def find_merge(
 
 
 def _certain(
-    state: State, merges: Sequence[Identity], refused: Collection[Pairs]
-) -> Identity | None:
+    state: State, merges: Sequence[Correspondence], refused: Collection[Pairs]
+) -> Correspondence | None:
     pairs = [one.pairs for one in merges]
     return certain(merges, [rows for rows in pairs if named_pairs(state, rows) in refused])
 
 
-def _candidates(state: State, density: float, neighbourhood_m: float) -> list[Identity]:
+def _candidates(state: State, density: float, neighbourhood_m: float) -> list[Correspondence]:
     """Return all merges of two landmarks within reach, those far from passing the test left out."""
     if len(state.landmark_ids) < 2:
         return []

@@ -52,8 +52,8 @@ class ProtocolRecord:
 
 
 Observer = Callable[[ProtocolRecord], None]
-Listener = Callable[[Response, int], None]
-RawListener = Callable[[Literal["rx", "tx"], bytes, int], None]
+Listener = Callable[[Response, int], object]
+RawListener = Callable[[Literal["rx", "tx"], bytes, int], object]
 
 
 P = ParamSpec("P")
@@ -68,6 +68,19 @@ class Listeners(Generic[P]):
 
     def __init__(self) -> None:
         self.all: tuple[Callable[P, object], ...] = ()
+        self._single: Callable[P, object] | None = None
+
+    @property
+    def single(self) -> Callable[P, object] | None:
+        """One of the functions: setting it replaces the one set before, None removes it."""
+        return self._single
+
+    @single.setter
+    def single(self, listener: Callable[P, object] | None) -> None:
+        self.remove(self._single)
+        self._single = listener
+        if listener is not None:
+            self.add(listener)
 
     def add(self, listener: Callable[P, object]) -> None:
         """Call a function from now on; adding it again has no effect."""

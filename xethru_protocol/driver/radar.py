@@ -103,8 +103,6 @@ class RadarState(Part[KindT]):
             name = type(self).__name__
             raise TypeError(f"{name} needs an open line; {name}.open({transport!r}) opens a port")
         self._transport = transport
-        self._listener: Listener | None = None
-        self._raw_listener: RawListener | None = None
         self._link = Link(
             transport.name,
             clock=clock,
@@ -204,26 +202,20 @@ class RadarState(Part[KindT]):
     @property
     def listener(self) -> Listener | None:
         """One of `listeners`: setting it replaces the one that was set before, None removes it."""
-        return self._listener
+        return self.listeners.single
 
     @listener.setter
     def listener(self, listener: Listener | None) -> None:
-        self.listeners.remove(self._listener)
-        self._listener = listener
-        if listener is not None:
-            self.listeners.add(listener)
+        self.listeners.single = listener
 
     @property
     def raw_listener(self) -> RawListener | None:
         """One of `raw_listeners`; as `listener`."""
-        return self._raw_listener
+        return self.raw_listeners.single
 
     @raw_listener.setter
     def raw_listener(self, listener: RawListener | None) -> None:
-        self.raw_listeners.remove(self._raw_listener)
-        self._raw_listener = listener
-        if listener is not None:
-            self.raw_listeners.add(listener)
+        self.raw_listeners.single = listener
 
     @property
     def geometry(self) -> FrameGeometry | None:

@@ -134,7 +134,7 @@ def noisier(state: State, same: Mapping[int, int]) -> dict[int, float]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Split:
+class SplitLandmark:
     """Ranges that are not of the landmark that they were taken for."""
 
     rows: Indices  # of the log
@@ -143,7 +143,7 @@ class Split:
 
 def find_split(
     log: RunLog, state: State, parameters: BackEndParameters, whole: Collection[int] = ()
-) -> Split | None:
+) -> SplitLandmark | None:
     """Return the passage, or the landmark merged into another, that disagrees most with the rest.
 
     The ranges of the rows ``whole`` are surely of their landmarks. To be called after a solution,
@@ -160,7 +160,7 @@ def find_split(
     costs = of_rows[:n]
     costs[problem.with_bearing] += of_rows[n:]
     dof[problem.with_bearing] += 1.0
-    found: list[tuple[float, Split]] = []
+    found: list[tuple[float, SplitLandmark]] = []
     for edges in log.edges(problem.range_rows):
         order = np.lexsort((edges, problem.range_landmarks))
         keys = np.column_stack([problem.range_landmarks, edges])[order]
@@ -175,7 +175,7 @@ def find_split(
             point_m, apart = _place_apart(problem, estimate, at, limit, rule.tried_m)
             gain = (float(costs[at].sum()) - apart) / problem.variance_share
             if gain > 2.0 * price and apart < 0.5 * float(costs[at].sum()):
-                found.append((gain, Split(rows=problem.range_rows[at], point_m=point_m)))
+                found.append((gain, SplitLandmark(rows=problem.range_rows[at], point_m=point_m)))
     return max(found, key=lambda pair: pair[0])[1] if found else None
 
 

@@ -14,7 +14,7 @@ from hil_tests.unit.slam.robust.range_world import (
 )
 from slam.config import WheelNoise, load_preset, override
 from slam.geometry import paper_rig
-from slam.robust.association import Identity, Pairs
+from slam.robust.association import Correspondence, Pairs
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import BodyPoint, initialise_landmark
 from slam.robust.map import Existence, find_merge, judge, named_pairs
@@ -162,7 +162,7 @@ def test_only_the_likeliest_merges_are_tried_in_twos(monkeypatch: pytest.MonkeyP
     state = mapped(rng.uniform(0.0, 0.05, (40, 2)), 0.1)
     original = judge
 
-    def counted(state: State, pairs: Pairs, sigma_m: float, density: float) -> Identity:
+    def counted(state: State, pairs: Pairs, sigma_m: float, density: float) -> Correspondence:
         judged.append(pairs)
         return original(state, pairs, sigma_m, density)
 
