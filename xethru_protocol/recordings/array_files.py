@@ -52,7 +52,10 @@ from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.recordings.clock import steady_times
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
+    MAT_MAGIC,
     NO_TIME_NS,
+    NPY_MAGIC,
+    ZIP_MAGIC,
     FaultHandler,
     RecordingError,
     RecordingFault,
@@ -75,7 +78,7 @@ DTYPES: Mapping[FrameKind, np.dtype[Any]] = {
 }
 SUFFIXES = (".csv", ".mat", ".npz")
 _TEXT = ".txt"  # of complex numbers
-_MAGICS = {b"\x93NUMPY": ".npy", b"PK\x03\x04": ".npz", b"MATLAB 5.0 MAT": ".mat"}
+_MAGICS = {NPY_MAGIC: ".npy", ZIP_MAGIC: ".npz", MAT_MAGIC: ".mat"}
 _LONGEST_START = 1 << 16  # bytes; a line of numbers is shorter
 _AT_ONCE = 256  # frames of a file that are read together
 _LINES_AT_ONCE = 8  # a number as text is ten times as large

@@ -15,6 +15,9 @@ from xethru_protocol.recordings.array_files import is_array_file
 from xethru_protocol.recordings.clock import steady_messages
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
+    MCAP_MAGIC,
+    RERUN_MAGIC,
+    WIRE_MAGIC,
     FaultHandler,
     RadarFacts,
     RecordingContent,
@@ -67,8 +70,8 @@ class RecordingSummary:
 
 
 _MAGICS: dict[bytes, RecordingFormat] = {
-    wire_capture.MAGIC: "wire",
-    b"\x89MCAP0\r\n": "mcap",
+    WIRE_MAGIC: "wire",
+    MCAP_MAGIC: "mcap",
 }
 
 
@@ -92,7 +95,7 @@ def recording_format(path: Path | str) -> RecordingFormat:
             f"{path} is read for arrays only, by xethru_protocol.load and 'xethru convert';"
             f" messages are kept in .mcap"
         )
-    if start.startswith(b"RRF"):
+    if start.startswith(RERUN_MAGIC):
         raise RecordingError(f"{path} is a view in Rerun's format; 'uwb-slam view' opens it")
     raise RecordingError(
         f"{path} is not a recording that can be read: a directory or data file of ModuleConnector,"

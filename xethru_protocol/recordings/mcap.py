@@ -44,6 +44,7 @@ from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.operating_system import written_whole
 from xethru_protocol.recordings.frame_layout import FrameGeometries
 from xethru_protocol.recordings.recorded_messages import (
+    MCAP_MAGIC,
     MODULE_METRES,
     FaultHandler,
     RecordingContent,
@@ -152,7 +153,7 @@ def _body(data: bytes) -> bytes:
     return data[4:]
 
 
-MAGIC = b"\x89MCAP0\r\n"
+MAGIC = MCAP_MAGIC
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 2, 3, 4, 5, 6
 _HEADER, _MESSAGE_INDEX, _ATTACHMENT, _STATISTICS, _DATA_END = 1, 7, 9, 11, 15
 _IN_CHUNKS = (SCHEMA, CHANNEL, MESSAGE)

@@ -13,6 +13,14 @@ from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.table import Response
 
+# Bytes that files begin with
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+WIRE_MAGIC = b"\x89XTWIRE\n"
+NPY_MAGIC = b"\x93NUMPY"
+ZIP_MAGIC = b"PK\x03\x04"  # .npz, too
+MAT_MAGIC = b"MATLAB 5.0 MAT"
+RERUN_MAGIC = b"RRF"
+
 
 class RecordingError(XeThruError):
     """A recording cannot be read or written."""

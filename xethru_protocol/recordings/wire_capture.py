@@ -30,6 +30,7 @@ from typing import Any, BinaryIO, Literal
 
 from xethru_protocol.recordings.recorded_messages import (
     NO_TIME_NS,
+    WIRE_MAGIC,
     FaultHandler,
     GrowingFile,
     RecordingError,
@@ -43,7 +44,7 @@ from xethru_protocol.recordings.recorded_messages import (
 from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.framing import Direction, FramingFault, NeedData, PacketReader
 
-MAGIC = b"\x89XTWIRE\n"
+MAGIC = WIRE_MAGIC
 VERSION = 1
 SUFFIX = ".xtwire"
 

@@ -30,8 +30,8 @@ from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
 from slam.app.view.viewer import LiveView, SlamViewerProcess
 from xethru_protocol.cli.live.viewer import ViewerKind
 from xethru_protocol.operating_system import StopFlag, one_line, written_whole
+from xethru_protocol.recordings.recorded_messages import RERUN_MAGIC
 
-_MAGIC = b"RRF"
 _OLDEST = (0, 23)
 """Of files that later versions open."""
 
@@ -43,7 +43,7 @@ def _require_readable(path: Path) -> None:
             head = stream.read(8)
     except OSError as error:
         raise AppError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if len(head) < 8 or not head.startswith(_MAGIC):
+    if len(head) < 8 or not head.startswith(RERUN_MAGIC):
         raise AppError(f"{path}: is not a Rerun recording")
     written = (head[4], head[5])
     major, minor, *_ = version("rerun-sdk").split(".")

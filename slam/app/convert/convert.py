@@ -18,6 +18,7 @@ from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
 from xethru_protocol.recordings import RecordingError, WireCapture
 from xethru_protocol.recordings.mcap import MAGIC
+from xethru_protocol.recordings.recorded_messages import MAT_MAGIC
 from xethru_protocol.validation import shown, suffix_of
 
 
@@ -98,7 +99,7 @@ def run_convert(
             "a new folder for a bag of ROS 2"
         )
     else:
-        is_mat = source.suffix == _MAT_SUFFIX or begins_with(source, b"MATLAB 5.0")
+        is_mat = source.suffix == _MAT_SUFFIX or begins_with(source, MAT_MAGIC)
         name = preset or (_MAT_PRESET if is_mat else _PRESET)
         _config(name)  # reports a wrong name before anything is read
         given_rig = None if rig is None else load_rig(rig).rig

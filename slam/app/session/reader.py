@@ -56,19 +56,25 @@ from xethru_protocol.recordings.mcap import (
     unpack_string,
 )
 from xethru_protocol.recordings.mcap import read_entries as entries_of
-from xethru_protocol.recordings.recorded_messages import RecordingError, is_like
+from xethru_protocol.recordings.recorded_messages import (
+    MAT_MAGIC,
+    RERUN_MAGIC,
+    ZIP_MAGIC,
+    RecordingError,
+    is_like,
+)
 from xethru_protocol.validation import reason_of
 
 _KINDS = {
-    b"RRF": "a Rerun recording (.rrd), a view that other versions of Rerun may not open; the "
+    RERUN_MAGIC: "a Rerun recording (.rrd), a view that other versions of Rerun may not open; the "
     "record of the run is the session.mcap beside it",
     b"#ROSBAG V2": "a bag of ROS 1; `uwb-slam convert` makes a session of it",
     b"#ROSBAG": "a bag of ROS 1 of an old version; `rosbag migrate` it first",
     b"SQLite format 3\0": "an SQLite file, like those in a rosbag2 folder; give that folder to "
     "`uwb-slam convert`",
-    b"MATLAB 5.0 MAT-file": "a MATLAB file; `uwb-slam convert` reads detections from it",
+    MAT_MAGIC: "a MATLAB file; `uwb-slam convert` reads detections from it",
     b"\x89HDF": "an HDF5 file",
-    b"PK\x03\x04": "a zip archive, or arrays of numpy; `xethru view` shows arrays",
+    ZIP_MAGIC: "a zip archive, or arrays of numpy; `xethru view` shows arrays",
     b"\x1f\x8b": "a gzip file; unpack it first",
     b"\x28\xb5\x2f\xfd": "a zstd file; unpack it first",
 }

@@ -27,7 +27,13 @@ import numpy.typing as npt
 
 from xethru_protocol.recordings.clock import counter_of, steady_messages, steady_times
 from xethru_protocol.recordings.recorded_messages import (
+    MAT_MAGIC,
+    MCAP_MAGIC,
     MS_NS,
+    NPY_MAGIC,
+    RERUN_MAGIC,
+    WIRE_MAGIC,
+    ZIP_MAGIC,
     FaultHandler,
     RecordingError,
     RecordingFacts,
@@ -158,8 +164,8 @@ def _kind_of_entry(entry: Entry) -> DataFileKind | None:
 
 
 # What follows the magic numbers of others may look like any records.
-_LONG_MAGICS = (b"\x89XTWIRE\n", b"\x89MCAP0\r\n", b"\x93NUMPY", b"MATLAB 5.0")
-_SHORT_MAGICS = (b"PK\x03\x04", b"RRF")  # of .npz and of Rerun
+_LONG_MAGICS = (WIRE_MAGIC, MCAP_MAGIC, NPY_MAGIC, MAT_MAGIC)
+_SHORT_MAGICS = (ZIP_MAGIC, RERUN_MAGIC)  # where one damaged byte would leave too little
 
 
 def is_vendor_file(path: Path) -> bool:
