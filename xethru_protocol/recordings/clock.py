@@ -21,6 +21,7 @@ import numpy.typing as npt
 from xethru_protocol.recordings.recorded_messages import (
     NO_TIME_NS,
     FaultHandler,
+    RecordingError,
     RecordingFault,
     TimedMessages,
     report,
@@ -54,8 +55,18 @@ class _Clock(Generic[Item]):
         self._later_ns = 0
 
     def right(self, rows: Iterable[tuple[Item, int | None]]) -> Iterator[tuple[Item, int | None]]:
+        """Yield the rows; an error of theirs comes behind what they gave before it."""
         held: list[_Row[Item]] = []  # what the next time may put right: if two, the second fell
-        for number, (item, t_ns) in enumerate(rows, start=1):
+        numbered = enumerate(rows, start=1)
+        while True:
+            try:
+                number, (item, t_ns) = next(numbered)
+            except StopIteration:
+                yield from self._released(held)
+                return
+            except RecordingError:
+                yield from self._released(held)
+                raise
             if t_ns is None:
                 yield from self._released(held)
                 held = []
@@ -75,7 +86,6 @@ class _Clock(Generic[Item]):
             else:
                 self._settle(last, row, None)
                 held = [row]
-        yield from self._released(held)
 
     def _released(self, held: list[_Row[Item]]) -> Iterator[tuple[Item, int | None]]:
         if len(held) == 2:

@@ -1,5 +1,6 @@
 """A recorder's clock that is set back, or stored damaged: times do not fall, the counter tells."""
 
+import itertools
 import shutil
 import struct
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from hil_tests.unit.xethru_protocol.recordings.messages import (
     write_capture,
 )
 from xethru_protocol.recordings import (
+    RecordingError,
     RecordingFacts,
     RecordingFault,
     RecordingReader,
@@ -26,6 +28,7 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.recordings.clock import steady_messages
 from xethru_protocol.recordings.mcap import write_mcap
+from xethru_protocol.recordings.recorded_messages import TimedMessages
 from xethru_protocol.wire import messages as m
 
 START_MS = 1_700_000_000_000
@@ -179,3 +182,17 @@ def test_lines_behind_the_end_of_an_index_keep_their_own_times(tmp_path: Path) -
     found, faults = read_with_faults(tmp_path / "r")
     assert [t_ns for _, t_ns in found] == times_ns
     assert ["never completed" in fault.reason for fault in faults] == [True]
+
+
+def test_an_error_comes_behind_all_messages_before_it() -> None:
+    """Also behind the last one, which the next time might have put right."""
+    timed = _timed(RIGHT_MS)
+
+    def cut() -> TimedMessages:
+        yield from timed
+        raise RecordingError("cut")
+
+    read = steady_messages(cut(), "a.xtwire", None)
+    assert list(itertools.islice(read, len(timed))) == timed
+    with pytest.raises(RecordingError):
+        next(iter(read))
