@@ -429,7 +429,7 @@ class Link:
         yield from self._check_version(command)
         reply = yield from self._exchange(command, timeout_s)
         # the conversation checked it: the row's replies are what ReplyT stands for
-        return reply  # type: ignore[return-value]
+        return reply  # type: ignore[return-value]  # matched by the kind that is asked for
 
     def _catch_up(self, command: Command[Response], timeout_s: float) -> Steps[None]:
         """Receive until answers to an abandoned request can no longer come."""

@@ -36,7 +36,7 @@ class ModuleConnectorError(XeThruError, RuntimeError):
 
 def report(text: str) -> None:
     """Write a line for the script's user."""
-    print(text, file=sys.stderr)  # noqa: T201
+    print(text, file=sys.stderr)  # noqa: T201 - what the vendor prints
 
 
 class MessageSource(Protocol):
@@ -161,9 +161,9 @@ class MessageQueues:
         began_s, warned = time.monotonic(), False
         with self._came:
             while True:
-                queue = self._queues.get(kind)  # type: ignore[arg-type]
+                queue = self._queues.get(kind)  # type: ignore[arg-type]  # as the keys
                 if queue:
-                    return queue.popleft()  # type: ignore[return-value]
+                    return queue.popleft()  # type: ignore[return-value]  # a queue holds one kind
                 if reason := self.source.why_ended():
                     raise ModuleConnectorError(f"{call}: {reason}")
                 self._came.wait(_LISTEN_S)

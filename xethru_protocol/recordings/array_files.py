@@ -233,7 +233,7 @@ def _frames(
     if dtype.kind not in ("fciub" if kind == "iq" else "fiub"):
         raise ValueError(f"{kind} holds {dtype}, must hold {_NUMBERS[kind]}")
 
-    def vector(name: str, length: int, dtype: Any) -> npt.NDArray[Any] | None:  # noqa: ANN401
+    def vector(name: str, length: int, dtype: Any) -> npt.NDArray[Any] | None:  # noqa: ANN401 - as numpy names types
         values = beside.get(name)
         if values is None or np.size(values) == 0 != length:
             return None
@@ -451,7 +451,7 @@ def _write_mat(fresh: Path, frames: Frames, kind: FrameKind, path: Path) -> None
         }
     with fresh.open("wb") as stream:
         # takes files, the stubs know names
-        savemat(stream, variables, oned_as="column")  # type: ignore[arg-type]
+        savemat(stream, variables, oned_as="column")  # type: ignore[arg-type]  # its stubs know no stream
 
 
 _MAT_HEAD = 128

@@ -644,10 +644,10 @@ class McapWriter(Writer):
         """Write a copy of what a reader needs, between two chunks."""
         # Private, since registering a schema again would make a new one. pyproject pins the minor
         # version of mcap for these lines; the tests of damaged heads fail if they do less.
-        chunk = self._Writer__chunk_builder  # type: ignore[attr-defined]
-        for schema in self._Writer__schemas.values():  # type: ignore[attr-defined]
+        chunk = self._Writer__chunk_builder  # type: ignore[attr-defined]  # private
+        for schema in self._Writer__schemas.values():  # type: ignore[attr-defined]  # private
             chunk.add_schema(schema)
-        for channel in self._Writer__channels.values():  # type: ignore[attr-defined]
+        for channel in self._Writer__channels.values():  # type: ignore[attr-defined]  # private
             chunk.add_channel(channel)
         sequence = self._n_messages & 0xFFFFFFFF
         for number, last in self._latched.items():

@@ -70,7 +70,7 @@ def lap(tmp_path_factory: pytest.TempPathFactory) -> Any:  # noqa: ANN401 - of a
     return outlier_filter.drive(str(scene), seed=0)
 
 
-def test_a_true_fix_lies_where_a_landmark_is(lap: Any) -> None:  # noqa: ANN401
+def test_a_true_fix_lies_where_a_landmark_is(lap: Any) -> None:  # noqa: ANN401 - of a script
     gaps_m = [
         np.linalg.norm(transform(pose, np.array([[fix.x_m, fix.y_m]])) - lap.landmarks_m, axis=1)
         for state, pose, origins in zip(lap.states, lap.truth, lap.origins, strict=True)
@@ -82,7 +82,7 @@ def test_a_true_fix_lies_where_a_landmark_is(lap: Any) -> None:  # noqa: ANN401
     assert float(np.median([gap.min() for gap in gaps_m])) < 0.057
 
 
-def test_a_filter_that_asks_for_more_keeps_less(lap: Any) -> None:  # noqa: ANN401
+def test_a_filter_that_asks_for_more_keeps_less(lap: Any) -> None:  # noqa: ANN401 - of a script
     lax, table_i, strict, narrow = (
         outlier_filter.outcome(lap, outlier_filter.Setting(min_opc=count, search_rad_m=radius_m))
         for count, radius_m in ((1, 0.2), (9, 0.2), (15, 0.2), (9, 0.025))
@@ -144,7 +144,7 @@ def white() -> Any:  # noqa: ANN401 - of a script
     return frames_of(iq)
 
 
-def test_white_noise_is_its_own_floor_and_all_new_with_every_frame(white: Any) -> None:  # noqa: ANN401
+def test_white_noise_is_its_own_floor_and_all_new_with_every_frame(white: Any) -> None:  # noqa: ANN401 - of a script
     numbers = statistics_of(white)
     for name in ("far_sigma", "far_white", "far_floor"):
         assert numbers[name] == pytest.approx(SIGMA, rel=0.03), name
@@ -180,7 +180,7 @@ def test_first_order_process_has_its_autocorrelation() -> None:
     np.testing.assert_allclose(correlation, 0.9 ** np.arange(6), atol=0.02)
 
 
-def test_the_quietest_stretch_is_found(white: Any) -> None:  # noqa: ANN401
+def test_the_quietest_stretch_is_found(white: Any) -> None:  # noqa: ANN401 - of a script
     loud = white.iq.copy()
     loud[:1000] *= 5
     loud[1128:] *= 3

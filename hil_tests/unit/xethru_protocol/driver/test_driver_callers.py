@@ -260,11 +260,11 @@ class Trickle:
 
 
 class AsyncTrickle(Trickle):
-    async def read(self, timeout_s: float) -> bytes:  # type: ignore[override]
+    async def read(self, timeout_s: float) -> bytes:  # type: ignore[override]  # asyncio
         await asyncio.sleep(0)
         return super().read(timeout_s)
 
-    async def write(self, data: bytes) -> None:  # type: ignore[override]
+    async def write(self, data: bytes) -> None:  # type: ignore[override]  # asyncio
         """Hear nothing."""
 
 

@@ -203,7 +203,7 @@ def test_a_port_that_a_script_leaves_open_is_closed(script: Script, module: PtyM
     )
     assert script(text, module.path) == 0
     open_line(module.path).close()
-    del sys.kept  # type: ignore[attr-defined]
+    del sys.kept  # type: ignore[attr-defined]  # set by the script
 
 
 def test_threads_of_a_script_are_waited_for(

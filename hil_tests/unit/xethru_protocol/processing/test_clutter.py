@@ -119,4 +119,4 @@ def test_other_frames_need_a_reset(frames: NDArray[np.complex64]) -> None:
 )
 def test_what_makes_no_filter_raises(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        ClutterFilter(**wrong)  # type: ignore[arg-type]
+        ClutterFilter(**wrong)  # type: ignore[arg-type]  # wrong on purpose

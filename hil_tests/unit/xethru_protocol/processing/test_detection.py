@@ -59,7 +59,7 @@ def test_profile_is_the_root_of_the_mean_power() -> None:
 )
 def test_what_makes_no_threshold_raises(wrong: dict[str, float], match: str) -> None:
     with pytest.raises(ValueError, match=match):
-        cfar(np.ones(20), **wrong)  # type: ignore[arg-type]
+        cfar(np.ones(20), **wrong)  # type: ignore[arg-type]  # wrong on purpose
 
 
 def test_the_shortest_profile_has_a_training_bin_for_each_bin() -> None:

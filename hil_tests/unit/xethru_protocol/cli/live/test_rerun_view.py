@@ -11,11 +11,11 @@ from hil_tests.unit.xethru_protocol.cli.live.test_terminal_picture import update
 
 rr = pytest.importorskip("rerun")
 
-from rerun.chunk import Chunk, RrdReader  # noqa: E402
+from rerun.chunk import Chunk, RrdReader  # noqa: E402 - behind importorskip
 
-from xethru_protocol.cli.live.analysis import LiveUpdate  # noqa: E402
-from xethru_protocol.cli.live.rerun_view import RerunPicture, blueprint  # noqa: E402
-from xethru_protocol.processing.vital import Breathing  # noqa: E402
+from xethru_protocol.cli.live.analysis import LiveUpdate  # noqa: E402 - behind importorskip
+from xethru_protocol.cli.live.rerun_view import RerunPicture, blueprint  # noqa: E402 - behind importorskip
+from xethru_protocol.processing.vital import Breathing  # noqa: E402 - behind importorskip
 
 
 def sent(path: Path, *pictures: LiveUpdate) -> list[Chunk]:

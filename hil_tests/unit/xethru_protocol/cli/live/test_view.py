@@ -152,7 +152,7 @@ def test_clutter_goes_and_the_chest_stays(clutter: str, tmp_path: Path) -> None:
     path = recording(tmp_path / "wall.npz", iq)
     arguments = parse(["view", str(path), "--rate", "0", "--clutter", clutter])
     with open_source(arguments) as source:
-        analysis = LiveAnalysis(source, clutter=clutter, window_s=20.0)  # type: ignore[arg-type]
+        analysis = LiveAnalysis(source, clutter=clutter, window_s=20.0)  # type: ignore[arg-type]  # a str
         for frame in source.frames:
             analysis.take(frame)
         update = analysis.update()
