@@ -607,7 +607,7 @@ class Correspondence:
         )
 
 
-def identity(pairs: Pairs, residual: Array, S: Array, density: float) -> Correspondence:
+def correspondence(pairs: Pairs, residual: Array, S: Array, density: float) -> Correspondence:
     """Judge pairs of things by their residuals (2 k,), with covariance S (2 k, 2 k).
 
     ``density`` is that of all things of the kind: how likely a chance neighbour is.
@@ -619,14 +619,14 @@ def identity(pairs: Pairs, residual: Array, S: Array, density: float) -> Corresp
 
 
 def certain(
-    identities: Sequence[Correspondence], refused: Collection[Pairs] = ()
+    correspondences: Sequence[Correspondence], refused: Collection[Pairs] = ()
 ) -> Correspondence | None:
     """Return the likeliest of those that are possible and that nothing speaks against.
 
-    That all things are new, and each identity that contradicts it, possible or not, must be less
-    likely by `MARGIN_NATS`. Those with the pairs ``refused`` are not returned.
+    That all things are new, and each correspondence that contradicts it, possible or not, must be
+    less likely by `MARGIN_NATS`. Those with the pairs ``refused`` are not returned.
     """
-    ranked = sorted(identities, key=lambda one: -one.evidence)
+    ranked = sorted(correspondences, key=lambda one: -one.evidence)
     for one in ranked:
         rivals = [other for other in ranked if other is not one and one.contradicts(other)]
         least = max([0.0, *(rival.evidence for rival in rivals)])

@@ -429,7 +429,7 @@ class Branches:
                 position_m=position_m,
                 probabilities=probabilities,
                 covariances=probabilities[:, None, None] * variances,
-                variances=np.diag(variances[int(carried > 0.0)]),
+                variances=np.diag(variances[1] if carried else variances[0]),
             )
             doubts.append(newest)
         # Those with the same evidence end together: they are one, so a long run needs few.
@@ -597,16 +597,16 @@ class Branches:
         ]
         # Where the map lies, most of what is seen must be known.
         fewest, is_shown = max(rule.least_landmarks, 2 * account.n_new), carry.price_nats < 0.0
-        # After a slip that is still doubted the robot may be where it has never been.
-        saved_nats = found.price_nats - slipped_nats(self._doubts)
-        if is_shown or found is carry.hidden:
-            saved_nats = 0.0
+        # After a slip that is still doubted the robot may be where it has never been, for less.
+        saved_nats = 0.0
+        if not is_shown and found is not carry.hidden:
+            saved_nats = max(found.price_nats - slipped_nats(self._doubts), 0.0)
         is_there = (
             account.n_seen > account.n_new
             and (found is carry.hidden or account.n_seen >= fewest)
             and (is_shown or account.misses - stay.misses > found.price_nats + MARGIN_NATS)
             and gains[best] > MARGIN_NATS
-            and advantage(account, elsewhere, rule) - max(saved_nats, 0.0) > MARGIN_NATS
+            and advantage(account, elsewhere, rule) - saved_nats > MARGIN_NATS
             and all(margin > rule.placement_nats for margin in margins)
         )
         return found if is_there and self._is_only_there(carry, found, account) else None

@@ -50,9 +50,9 @@ from slam.robust.association import (
     Antennas,
     RangeScan,
     certain,
+    correspondence,
     crossings,
     density_per_m2,
-    identity,
     point_variances,
 )
 from slam.robust.parameters import (
@@ -324,7 +324,10 @@ def certain_row(found: Mapping[int, FeatureRows], density: float) -> int | None:
     unit of the residuals' plane (1/m^2 of points, 1/(m rad) of walls).
     """
     best = certain(
-        [identity(((SEEN, row),), rows.residual, rows.S, density) for row, rows in found.items()]
+        [
+            correspondence(((SEEN, row),), rows.residual, rows.S, density)
+            for row, rows in found.items()
+        ]
     )
     return None if best is None else best.pairs[0][1]
 
@@ -369,7 +372,7 @@ def options_of(
     landmarks that are not in the map [1/m^2].
     """
     judged = {
-        row: identity(((SEEN, row),), rows.residual, rows.S, density).evidence
+        row: correspondence(((SEEN, row),), rows.residual, rows.S, density).evidence
         for row, rows in found.items()
     }
     limit = float(chdtri(2, TAIL_PROBABILITY))

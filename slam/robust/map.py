@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from slam.robust.association import Correspondence, Pairs, certain, density_per_m2, identity
+from slam.robust.association import Correspondence, Pairs, certain, correspondence, density_per_m2
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
 from slam.robust.state import Array, Indices, State
 
@@ -106,7 +106,7 @@ def merge_rows(state: State, pairs: Pairs, sigma_m: float) -> tuple[Indices, Arr
 def judge(state: State, pairs: Pairs, sigma_m: float, density: float) -> Correspondence:
     """Judge whether landmarks, by row, are one, in pairs."""
     at, H, residual, R = merge_rows(state, pairs, sigma_m)
-    return identity(pairs, residual, H @ state.P.block(at) @ H.T + R, density)
+    return correspondence(pairs, residual, H @ state.P.block(at) @ H.T + R, density)
 
 
 def apply_merge(state: State, pairs: Pairs, sigma_m: float) -> None:

@@ -22,9 +22,9 @@ from slam.robust.association import (
     Known,
     RangeScan,
     antennas_of,
+    correspondence,
     find_known,
     find_points,
-    identity,
     point_view,
     view,
     weigh_known,
@@ -401,7 +401,7 @@ def test_an_identity_is_worth_its_density_over_that_of_chance_neighbours(
     root = rng.standard_normal((2 * n, 2 * n))
     S = root @ root.T + 0.1 * np.eye(2 * n)
     residual = rng.standard_normal(2 * n)
-    judged = identity(tuple((k, k) for k in range(n)), residual, S, per_m2)
+    judged = correspondence(tuple((k, k) for k in range(n)), residual, S, per_m2)
     log_density = float(multivariate_normal.logpdf(residual, np.zeros(2 * n), S))
     assert judged.evidence == pytest.approx(log_density - n * math.log(per_m2), abs=1e-9)
     squared = float(residual @ np.linalg.inv(S) @ residual)
