@@ -68,7 +68,9 @@ def pytest_configure(config: pytest.Config) -> None:
 def _compile_once() -> None:
     """Compile the kernels, those of each file in a process: the first time it takes seconds."""
     program = (
-        "import slam.{}.kernels, slam.numba_compilation; slam.numba_compilation.compile_kernels()"
+        "import slam.{}.kernels\n"
+        "from slam.front_end.numba_compilation import compile_kernels\n"
+        "compile_kernels()"
     )
     compilers = [
         subprocess.Popen([sys.executable, "-c", program.format(folder)], cwd=HERE.parent)
@@ -106,8 +108,9 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if "slam.numba_compilation" in sys.modules:  # not within the time limit of the first test
-        sys.modules["slam.numba_compilation"].compile_kernels()
+    compilation = sys.modules.get("slam.front_end.numba_compilation")
+    if compilation is not None:  # not within the time limit of the first test
+        compilation.compile_kernels()
     if not config.pluginmanager.hasplugin("timeout") or config.getoption("timeout") is not None:
         return
     usual_s = float(config.getini("timeout") or 0)

@@ -253,7 +253,7 @@ class InputCheck:
         return stamps_ns
 
 
-class Slam(Protocol):
+class Pipeline(Protocol):
     """The paper's pipeline or the robust one; the map frame is the body frame at the first pose."""
 
     config: SlamConfig

@@ -14,9 +14,9 @@ from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol, Self, TypeVar
 
-from xethru_protocol.operating_system import one_line
+from xethru_protocol.operating_system import one_line, read_bounded
 
 _MUST = {
     "string_type": "be text in quotes",
@@ -73,6 +73,58 @@ def problem_text(problems: Sequence[Problem], model: Any) -> str:  # noqa: ANN40
     kinds = [each.partition(", not ")[0] for each in first[:-1]]
     text = " or ".join([*kinds, first[-1].removeprefix("must be ")]) if kinds else first[0]
     return f"{key}: {text}{more}" if key else f"{text}{more}"
+
+
+class Model(Protocol):
+    """A table that is checked, as pydantic's are."""
+
+    @classmethod
+    def model_validate(cls, obj: Any, /) -> Self: ...  # noqa: ANN401 - see the module
+
+
+ModelT = TypeVar("ModelT", bound=Model)
+
+
+def load_toml(
+    model: type[ModelT], path: Path, *, source: str, what: str, error: type[Exception]
+) -> ModelT:
+    """Return the model in a TOML file.
+
+    Raises ``error`` with one line that begins with ``source`` and calls the file ``what``.
+    """
+    try:
+        content = read_bounded(path).decode()
+    except OSError as problem:
+        raise error(f"{source}: cannot read the {what} file: {problem.strerror}") from problem
+    except UnicodeDecodeError as problem:
+        raise error(f"{source}: not UTF-8 text at byte {problem.start}") from problem
+    return parse_toml(model, content, source=source, error=error)
+
+
+def parse_toml(model: type[ModelT], text: str, *, source: str, error: type[Exception]) -> ModelT:
+    """Return the model in TOML text; raise ``error`` naming the source otherwise."""
+    import tomllib  # commands that read no such file start without it
+
+    try:
+        return model.model_validate(tomllib.loads(text))
+    except RecursionError as problem:
+        raise error(f"{source}: brackets are nested too deep") from problem
+    except ValueError as problem:
+        if (problems := getattr(problem, "errors", None)) is not None:  # the model refuses it
+            raise error(f"{source}: {problem_text(problems(), model)}") from problem
+        # not TOML, or an integer of thousands of digits
+        raise error(f"{source}: not valid TOML: {problem}") from problem
+
+
+def matching(pattern: str, what: str) -> Callable[[str], str]:
+    """Return what refuses text that does not match, calling what it must be by its name."""
+
+    def check(text: str) -> str:
+        if not re.fullmatch(pattern, text):
+            raise ValueError(f"must be {what}, not {shown(text)}")
+        return text
+
+    return check
 
 
 def shown(value: object) -> str:

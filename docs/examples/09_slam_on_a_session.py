@@ -32,8 +32,8 @@ import numpy as np
 from slam.app.cli import main as uwb_slam
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
-from slam.app.session.reader import open_session
 from slam.evaluation import ate_rmse_m
+from slam.live.session.reader import open_session
 from xethru_protocol.operating_system import StopFlag
 
 

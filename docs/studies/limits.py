@@ -22,7 +22,6 @@ from emulator.chip.chip import CaptureSettings
 from emulator.echo.pulse import sum_of_pulses
 from emulator.echo.receiver import Receiver
 from emulator.scene.scene import NoiseSpec, RadarSpec, empty_room
-from slam.app.rig.frame_sources import sampler_limits
 from slam.app.run.output import print_table
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, label, picture
 from slam.config import MatchedFilterConfig, SlamConfig, override
@@ -30,6 +29,7 @@ from slam.frames import RadarFrame
 from slam.front_end import make_detector
 from slam.front_end.matched_filter import threshold_sigmas
 from slam.front_end.pulse import PulseModel
+from slam.live.frame_sources import sampler_limits
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire.x4 import Normalisation
 

@@ -19,7 +19,6 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene, load_scene
-from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.emulated import rig_of, true_landmarks_m
 from slam.app.run.output import print_table
 from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, TRUTH, label, picture
@@ -27,6 +26,7 @@ from slam.app.run.runner import execute
 from slam.app.sweep.run import StepKeeper, first_laps, loopback_source
 from slam.config import load_preset, override
 from slam.geometry import transform
+from slam.live.odometry_track import NS_PER_S
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Fix

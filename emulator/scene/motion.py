@@ -14,9 +14,10 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from emulator.scene.toml_files import Number, Table, matching
+from emulator.scene.toml_files import Number, Table
+from xethru_protocol.validation import matching
 
 AMPLITUDE_OF_1_M2 = 0.06
 """Echo of 1 m**2 on boresight at 1 m, normalised units at TX power 2.
@@ -28,7 +29,7 @@ Metres = Annotated[Number, Field(ge=-1000, le=1000)]
 Name = Annotated[
     str,
     Field(max_length=40),
-    matching("[a-z][a-z0-9_]*", "of small letters, digits and _, a letter first"),
+    AfterValidator(matching("[a-z][a-z0-9_]*", "of small letters, digits and _, a letter first")),
 ]
 Degrees = Annotated[Number, Field(ge=-360, le=360)]
 

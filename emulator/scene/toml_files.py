@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, TypeGuard, TypeVar
 
@@ -14,11 +12,9 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     StrictFloat,
-    ValidationError,
 )
 
-from xethru_protocol.operating_system import read_bounded
-from xethru_protocol.validation import choices, problem_text, shown
+from xethru_protocol.validation import choices, load_toml, matching
 
 # Beside this package, in the repository and in the wheel alike. Not importlib.resources on the
 # name "fixtures": a folder of that name in the user's own project would come first.
@@ -32,19 +28,8 @@ def finite(value: object) -> object:
     return value
 
 
-def matching(pattern: str, what: str) -> AfterValidator:
-    """Return what refuses text that does not match, calling what it must be by its name."""
-
-    def check(text: str) -> str:
-        if not re.fullmatch(pattern, text):
-            raise ValueError(f"must be {what}, not {shown(text)}")
-        return text
-
-    return AfterValidator(check)
-
-
 Number = Annotated[StrictFloat, BeforeValidator(finite)]
-SerialNumber = Annotated[str, matching("[0-9]{12}", "12 digits")]
+SerialNumber = Annotated[str, AfterValidator(matching("[0-9]{12}", "12 digits"))]
 
 
 class Table(BaseModel):
@@ -94,22 +79,4 @@ def load_table(
                 f"{choices(text, shipped_names(folder))}"
             )
         source = _FIXTURES / folder / f"{text}.toml"
-    try:
-        content = read_bounded(source).decode()
-    except OSError as problem:
-        raise error(f"{text}: cannot read the {what} file: {problem.strerror}") from problem
-    except UnicodeDecodeError as problem:
-        raise error(f"{text}: not UTF-8 text at byte {problem.start}") from problem
-    return parse_table(model, content, source=text, error=error)
-
-
-def parse_table(model: type[TableT], text: str, *, source: str, error: type[Exception]) -> TableT:
-    """Return the model in TOML text; raise ``error`` naming the source otherwise."""
-    try:
-        return model.model_validate(tomllib.loads(text))
-    except ValidationError as problem:
-        raise error(f"{source}: {problem_text(problem.errors(), model)}") from problem
-    except ValueError as problem:  # not TOML, or an integer of thousands of digits
-        raise error(f"{source}: not valid TOML: {problem}") from problem
-    except RecursionError as problem:
-        raise error(f"{source}: brackets are nested too deep") from problem
+    return load_toml(model, source, source=text, what=what, error=error)

@@ -16,14 +16,14 @@ from itertools import cycle, islice
 from pathlib import Path
 
 from emulator.scene.scene import Scene
-from slam.app.odometry.track import NS_PER_S, OdometryTrack
 from slam.app.rig.emulated import rig_of, scene_and_config, wheels_of
 from slam.app.run.result_files import finish
 from slam.app.run.runner import execute, make_slam
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import Scan, SessionObserver, Snapshot
 from slam.app.sweep.run import loopback_source
 from slam.app.view.session_view import RerunView
+from slam.live.odometry_track import NS_PER_S, OdometryTrack
+from slam.live.session_records import Scan, SessionObserver, Snapshot
 from xethru_protocol.operating_system import StopFlag
 
 BYTES_PER_MB = 1_000_000

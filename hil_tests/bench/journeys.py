@@ -26,11 +26,11 @@ from emulator.chip import Pace
 from hil_tests.bench.virtual_time import lab_radar
 from hil_tests.paths import REPOSITORY
 from slam.app.cli import main as uwb_slam
-from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG
 from slam.app.run.runner import run_slam
 from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import make_case, source_of
+from slam.live.odometry_track import OdometryTrack
 
 ROOT = REPOSITORY
 PRODUCT = ("xethru_protocol", "emulator", "slam")

@@ -113,8 +113,8 @@ def matched(path: Path, drivers: Mapping[str, X4M300]) -> Mapping[str, X4M300]:
 
     The test fails if they are not its modules.
     """
-    from slam.app.errors import AppError
     from slam.app.rig.rig_files import load_rig
+    from slam.live.errors import AppError
 
     try:
         wanted = {radar.serial: radar.name for radar in load_rig(path).radars}

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from emulator.scene.wheels import scene_odometry
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -24,9 +23,10 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.app.session.constants import slam_constants
-from slam.app.session.description import settings_text
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import LogLine, Scan, SessionInfo
+from slam.live.odometry_track import OdometryTrack
+from slam.live.session.description import settings_text
+from slam.live.session_records import LogLine, Scan, SessionInfo
 from slam.robust.parameters import BackEndParameters
 from xethru_protocol.operating_system import StopFlag
 

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from slam.app.benchmarks import BENCHMARKS
-from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
+from slam.app.errors import EXIT_USAGE
 from slam.app.sweep import FAMILIES, STRESSES
 from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
+from slam.live.errors import EXIT_FAILED, AppError
 from xethru_protocol.cli.version import add_version
 from xethru_protocol.operating_system import (
     STDERR,

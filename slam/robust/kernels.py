@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.numba_compilation import kernel
+from slam.front_end.numba_compilation import kernel
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

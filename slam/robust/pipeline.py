@@ -14,12 +14,12 @@ from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.geometry import Rig, between, has_moved
-from slam.growing_arrays import PackedRows
 from slam.results import Belief, InputCheck, PoseAt, SmoothedRun, StepResult
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
 from slam.robust.parameters import BackEndParameters, RangeNoise
+from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import quarter_turn
 
 Array = NDArray[np.float64]

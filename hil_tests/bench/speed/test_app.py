@@ -13,7 +13,6 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import scan, session_info
-from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -26,6 +25,7 @@ from slam.app.run.runner import execute, run_slam
 from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.session_view import RerunView
+from slam.live.odometry_track import OdometryTrack, TumSample
 from slam.paper.pipeline import UwbRadarSlam
 from xethru_protocol.operating_system import StopFlag
 

@@ -12,9 +12,9 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
-from slam.app.session_records import Scan, Snapshot
 from slam.app.view.session_view import RerunView
 from slam.frames import Detection
+from slam.live.session_records import Scan, Snapshot
 from slam.paper.ekf import start
 from slam.results import StepResult
 

@@ -14,10 +14,10 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of
 from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
-from slam.app.errors import AppError
-from slam.app.session.reader import open_session, read_entries
 from slam.app.session.repair import KEPT_SUFFIX, repair
 from slam.app.session.writer import SessionLog
+from slam.live.errors import AppError
+from slam.live.session.reader import open_session, read_entries
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY, Cut
 from xethru_protocol.recordings.mcap import McapMessage as StoredMessage

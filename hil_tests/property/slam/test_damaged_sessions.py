@@ -10,11 +10,11 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of
 from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
-from slam.app.session.reader import open_session
 from slam.app.session.repair import repair
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import LogLine
 from slam.frames import RadarFrame
+from slam.live.session.reader import open_session
+from slam.live.session_records import LogLine
 from xethru_protocol.operating_system import StopFlag
 
 N_BINS = 16

@@ -11,8 +11,8 @@ from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.convert.authors_bag import AuthorsBag
 from slam.app.cli import main
 from slam.app.commands.evaluate import evaluate
-from slam.app.odometry.track import OdometryTrack, read_tum
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
+from slam.live.odometry_track import OdometryTrack, read_tum
 from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow

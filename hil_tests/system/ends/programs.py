@@ -39,8 +39,9 @@ from hil_tests.system.recorded_session import record_session, write_shorter_scen
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.system.terminal import Command, in_terminal
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
-from slam.app.rig.rig_files import RigFile, RigRadar, write_rig
+from slam.app.rig.rig_files import write_rig
 from slam.app.view.rerun_recording import count_rows
+from slam.library.rig_files import RigFile, RigRadar
 from xethru_protocol.recordings import describe_recording
 
 UWB_SLAM, XETHRU, EMULATOR = "slam.app.cli", "xethru_protocol.cli", "emulator.cli"

@@ -11,7 +11,7 @@ from slam.app.cli import main
 from slam.app.commands import run
 from slam.app.run.runner import WrappedSlam, make_slam
 from slam.frames import RadarFrame
-from slam.results import PoseAt, Slam, StepResult
+from slam.results import Pipeline, PoseAt, StepResult
 
 
 class SlowSlam(WrappedSlam):
@@ -22,7 +22,7 @@ class SlowSlam(WrappedSlam):
         return self._slam.step(frames, pose_at, t_ns)
 
 
-def make_slow_slam(*of_slam: Any) -> Slam:  # noqa: ANN401 - passed on
+def make_slow_slam(*of_slam: Any) -> Pipeline:  # noqa: ANN401 - passed on
     return SlowSlam(make_slam(*of_slam))
 
 

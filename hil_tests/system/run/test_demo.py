@@ -16,12 +16,12 @@ from rosbags.highlevel import AnyReader
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.commands.demo import name_the_next
 from slam.app.commands.evaluate import evaluate
-from slam.app.odometry.track import read_tum
 from slam.app.run.runner import execute
 from slam.app.run.summary import summarise
-from slam.app.session import cdr as ros
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.rerun_recording import count_rows
+from slam.live.odometry_track import read_tum
+from slam.live.session import cdr as ros
 
 pytestmark = pytest.mark.slow
 

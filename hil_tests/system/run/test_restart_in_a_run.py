@@ -7,7 +7,6 @@ import pytest
 
 from emulator.cli import ask
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.rig import frame_sources
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -18,7 +17,8 @@ from slam.app.rig.emulated import (
     rig_of,
     scene_and_config,
 )
-from slam.app.session_records import Scan
+from slam.live import frame_sources
+from slam.live.session_records import Scan
 from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow

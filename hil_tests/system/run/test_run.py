@@ -22,8 +22,9 @@ from hil_tests.paths import REPOSITORY
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
-from slam.app.rig.rig_files import RigFile, RigRadar, write_rig
-from slam.app.session.reader import open_session
+from slam.app.rig.rig_files import write_rig
+from slam.library.rig_files import RigFile, RigRadar
+from slam.live.session.reader import open_session
 from slam.results import SmoothedRun
 
 pytestmark = pytest.mark.slow

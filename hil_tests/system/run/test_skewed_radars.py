@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene, TargetSpec
 from emulator.scene.wheels import odometry_times_ns, tum_line
-from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -27,9 +26,10 @@ from slam.app.rig.emulated import (
     rig_of,
 )
 from slam.app.run.runner import run_slam
-from slam.app.session_records import Scan
 from slam.app.sweep.run import StepKeeper
 from slam.config import FrontEnd, SampleTime, load_preset, override
+from slam.live.odometry_track import OdometryTrack
+from slam.live.session_records import Scan
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import StepResult
 from xethru_protocol.operating_system import StopFlag

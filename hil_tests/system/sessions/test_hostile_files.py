@@ -28,10 +28,10 @@ from hil_tests.unit.slam.app.sessions import (
     write_session,
 )
 from slam.app.cli import main
-from slam.app.session.description import settings_text
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import LogLine, SessionInfo
 from slam.config import WheelNoise, load_preset
+from slam.live.session.description import settings_text
+from slam.live.session_records import LogLine, SessionInfo
 from xethru_protocol.recordings.mcap import pack_string
 
 pytestmark = pytest.mark.slow

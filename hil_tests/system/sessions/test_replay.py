@@ -11,15 +11,15 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from hil_tests.system.recorded_session import record_session, write_shorter_scene
-from hil_tests.unit.slam.app.session.test_state_rows import assert_same_step
 from hil_tests.unit.slam.app.sessions import Listener
+from hil_tests.unit.slam.live.session.test_state_rows import assert_same_step
 from slam.app.cli import main
 from slam.app.run import replay
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
 from slam.app.session.constants import slam_constants
-from slam.app.session.reader import open_session
-from slam.app.session_records import Snapshot
+from slam.live.session.reader import open_session
+from slam.live.session_records import Snapshot
 from slam.robust.parameters import BackEndParameters, TrackletRule
 from xethru_protocol.operating_system import StopFlag
 

@@ -24,13 +24,13 @@ from hil_tests.system.recorded_session import (
     write_shorter_scene,
 )
 from slam.app.cli import main
-from slam.app.errors import AppError
 from slam.app.run.replay import is_finished, recorded_source, session_file
 from slam.app.run.runner import execute
-from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording
 from slam.app.view.rerun_recording import RrdReader, count_rows, rr
 from slam.app.view.viewer import LiveView, SlamViewerProcess
+from slam.live.errors import AppError
+from slam.live.session.reader import open_session
 from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow

@@ -22,7 +22,7 @@ from slam.config import (
 from slam.frames import Detection, RadarFrame, StepInputError
 from slam.geometry import Mount, Rig
 from slam.paper.pipeline import UwbRadarSlam
-from slam.results import PoseAt, Slam
+from slam.results import Pipeline, PoseAt
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters
@@ -59,7 +59,7 @@ class FoundElsewhere:
         return [self.detect(frame) for frame in frames]
 
 
-def make(back_end: BackEnd, *, elsewhere: bool = False) -> Slam:
+def make(back_end: BackEnd, *, elsewhere: bool = False) -> Pipeline:
     config = SlamConfig(
         back_end=back_end,
         window=WindowConfig(size=1),
@@ -91,7 +91,7 @@ def frame_of(radar: int, t_ns: int) -> RadarFrame:
     return replace(FRAME, radar=radar, t_ns=t_ns)
 
 
-BAD_STEPS: dict[str, Callable[[Slam, int], object]] = {
+BAD_STEPS: dict[str, Callable[[Pipeline, int], object]] = {
     "range of an unknown radar": lambda s, t: s.step_detections([of(2, t)], straight, t),
     "frame of an unknown radar": lambda s, t: s.step([frame_of(2, t)], straight, t),
     "ranges of two scans": lambda s, t: s.step_detections([of(0, t), of(0, t + 1)], straight, t),

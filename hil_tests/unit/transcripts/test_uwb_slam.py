@@ -17,10 +17,10 @@ from scipy.io import savemat
 from hil_tests.unit.slam.app.convert.authors_bag import authors_bag
 from hil_tests.unit.slam.app.sessions import session_info, write_session
 from hil_tests.unit.transcripts.test_transcripts import check_transcript
-from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.session.description import METADATA_NAME, session_table
 from slam.app.session.writer import SessionLog
 from slam.app.view.rerun_recording import rr
+from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.session.description import METADATA_NAME, session_table
 
 TEXTS = Path(__file__).parent / "uwb_slam"
 

@@ -13,9 +13,9 @@ import pytest
 
 from emulator.faults.plan import FaultPlanError, load_plan
 from emulator.scene.scene import SceneError, load_scene
-from slam.app.errors import AppError
 from slam.app.rig.rig_files import load_rig
 from slam.config import ConfigError, SlamConfig, config_from_tables, override
+from slam.live.errors import AppError
 from xethru_protocol.validation import shown
 
 FIXTURES = Path(__file__).parents[3] / "fixtures"

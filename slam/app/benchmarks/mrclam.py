@@ -34,8 +34,8 @@ from slam.app.benchmarks.data_set import (
     steps_at,
 )
 from slam.app.benchmarks.text_columns import REMEDY, folder_at, read_table
-from slam.app.errors import AppError
 from slam.config import WheelNoise
+from slam.live.errors import AppError
 
 _BARCODES = "Barcodes.dat"
 _LANDMARKS = "Landmark_Groundtruth.dat"

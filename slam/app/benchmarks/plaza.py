@@ -35,9 +35,9 @@ from slam.app.benchmarks.data_set import (
     steps_of,
 )
 from slam.app.benchmarks.text_columns import TableRow, found, number_of, read_rows
-from slam.app.errors import AppError
-from slam.app.odometry.track import NS_PER_S
 from slam.config import WheelNoise
+from slam.live.errors import AppError
+from slam.live.odometry_track import NS_PER_S
 from xethru_protocol.validation import shown
 
 _NAME = re.compile(r"[A-Za-z][0-9]{1,18}")

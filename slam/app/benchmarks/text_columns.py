@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError
+from slam.live.errors import AppError
 from xethru_protocol.operating_system import read_bounded
 from xethru_protocol.validation import reason_of, shown
 

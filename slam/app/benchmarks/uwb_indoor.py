@@ -31,8 +31,8 @@ from slam.app.benchmarks.data_set import (
     steps_at,
 )
 from slam.app.benchmarks.text_columns import check_ascending, found, read_rows
-from slam.app.errors import AppError
 from slam.config import WheelNoise
+from slam.live.errors import AppError
 
 _INPUT, _TRUTH = "_Input.txt", "_GT.txt"
 _RANGES = {

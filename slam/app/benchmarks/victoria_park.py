@@ -57,9 +57,9 @@ from slam.app.benchmarks.text_columns import (
     read_rows,
     read_table,
 )
-from slam.app.errors import AppError
 from slam.config import WheelNoise
 from slam.geometry import between, compose
+from slam.live.errors import AppError
 from xethru_protocol.validation import shown
 
 _GRAPH = "victoria_park.txt"

@@ -14,12 +14,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from emulator.scene.scene import Scene, SceneError, load_scene
-from slam.app.errors import AppError, UsageError
-from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.rig.rig_files import RigFile, RigPulse, RigRadar, write_rig
+from slam.app.errors import UsageError
+from slam.app.rig.rig_files import rounded_pulse, write_rig
 from slam.app.run.output import print_progress, print_text
-from slam.app.session.reader import RecordedSession, open_session
-from slam.app.session_records import SessionInfo
 from slam.calibration.calibration import Calibration, Drive, calibrate, make_drive
 from slam.calibration.observability import (
     OFFSET_LIMIT_M,
@@ -36,6 +33,11 @@ from slam.frames import Detection, RadarFrame
 from slam.front_end.matched_filter import MatchedFilterDetector
 from slam.front_end.pulse_estimation import PulseEstimator
 from slam.geometry import Rig
+from slam.library.rig_files import RigFile, RigRadar
+from slam.live.errors import AppError
+from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.session.reader import RecordedSession, open_session
+from slam.live.session_records import SessionInfo
 from xethru_protocol.operating_system import StopFlag, json_text, one_line, read_bounded
 from xethru_protocol.transport import is_network_port
 
@@ -207,7 +209,7 @@ def _rig_file(info: SessionInfo, report: _CalibrationReport) -> RigFile:
                 phase_offset_deg=math.degrees(radar.phase_offset_rad),
                 gain_db=float(report.gains.gains_db[index]) if has_gain else 0.0,
                 port=radar.port if is_network_port(radar.port) else None,
-                pulse=None if pulse is None else RigPulse.rounded(pulse),
+                pulse=None if pulse is None else rounded_pulse(pulse),
             )
         )
     return RigFile(radars=tuple(radars))

@@ -12,8 +12,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Literal
 
-from slam.app.errors import AppError, EmulatorError, RadarSilentError
-from slam.app.odometry.track import read_odometry_socket
+from slam.app.errors import EmulatorError
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -27,7 +26,6 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.rig.frame_sources import RigSource
 from slam.app.run.output import RunProgress, note, print_progress
 from slam.app.run.result_files import (
     REPORT,
@@ -40,12 +38,15 @@ from slam.app.run.result_files import (
 )
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.constants import slam_constants
-from slam.app.session.description import settings_text
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import Scan, SessionInfo, SessionObserver
 from slam.app.view.viewer import LiveView
 from slam.config import BackEnd
-from slam.numba_compilation import compile_kernels
+from slam.front_end.numba_compilation import compile_kernels
+from slam.live.errors import AppError, RadarSilentError
+from slam.live.frame_sources import RigSource
+from slam.live.odometry_track import read_odometry_socket
+from slam.live.session.description import settings_text
+from slam.live.session_records import Scan, SessionInfo, SessionObserver
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.optional_packages import install_command, what_is_missing
 

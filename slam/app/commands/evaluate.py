@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError
-from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum
 from slam.app.run.output import print_table, print_text
-from slam.app.session.reader import RecordedScan, begins_with, open_session
-from slam.app.session_records import Snapshot
 from slam.evaluation import associate_times, ate_rmse_m, ate_rotation_rmse_rad, relative_pose_errors
 from slam.geometry import align_se2, transform
+from slam.live.errors import AppError
+from slam.live.odometry_track import NS_PER_S, Trajectory, read_tum
+from slam.live.session.reader import RecordedScan, begins_with, open_session
+from slam.live.session_records import Snapshot
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.validation import recording_at

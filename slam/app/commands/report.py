@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from slam.app.errors import AppError, naming
-from slam.app.odometry.track import NS_PER_S
+from slam.app.errors import naming
 from slam.app.rig.echo_arcs import bscan_picture, n_shown_bins
 from slam.app.run.output import mm_text, print_text, run_rows, summary_rows
 from slam.app.run.pictures import (
@@ -46,12 +45,14 @@ from slam.app.run.summary import (
     summarise,
     world_from_odom,
 )
-from slam.app.session.reader import RecordedSession, open_session
-from slam.app.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import RadarFrame
 from slam.geometry import transform
-from slam.growing_arrays import PackedRows
+from slam.live.errors import AppError
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session.reader import RecordedSession, open_session
+from slam.live.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.robust.solver.growing_arrays import PackedRows
 from xethru_protocol.operating_system import StopFlag, each_line, one_line, written_whole
 
 _KEPT_WARNINGS = 200

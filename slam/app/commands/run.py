@@ -17,13 +17,10 @@ from typing import Self
 
 import numpy as np
 
-from slam.app.errors import AppError, UsageError
-from slam.app.odometry.arrival import ClockLine
+from slam.app.errors import UsageError
 from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_source
-from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.emulated import RAW_CONFIG, versions
-from slam.app.rig.frame_sources import RigSource, sampler_limits
-from slam.app.rig.rig_files import are_emulated, load_rig, open_rig
+from slam.app.rig.rig_files import load_rig
 from slam.app.run.live_source import (
     MOST_WAIT_NS,
     Inbox,
@@ -53,13 +50,18 @@ from slam.app.run.runner import (
     make_slam,
 )
 from slam.app.session.constants import slam_constants
-from slam.app.session.description import settings_text
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import SessionInfo, SessionObserver
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.frames import RadarFrame
-from slam.results import PoseAt, Slam, SmoothedRun, StepResult
+from slam.live.arrival_clock import ClockLine
+from slam.live.errors import AppError
+from slam.live.frame_sources import RigSource, sampler_limits
+from slam.live.modules import are_emulated, open_modules
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session.description import settings_text
+from slam.live.session_records import SessionInfo, SessionObserver
+from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 _STALE = (VIEW, REPORT)
@@ -110,7 +112,7 @@ def run_rig(
         hold_folder(out, held)
         requests = held.enter_context(SmoothingRequests(out))
         view = held.enter_context(LiveView(rerun, stop)) if rerun is not None else None
-        links = open_rig(
+        links = open_modules(
             rig_file,
             rig,
             None if ports is None else tuple(ports),
@@ -202,7 +204,7 @@ class PromptSlam(WrappedSlam):
     It watches the flag while it is entered, in the main thread. `step` raises StepGivenUpError.
     """
 
-    def __init__(self, slam: Slam, stop: StopFlag) -> None:
+    def __init__(self, slam: Pipeline, stop: StopFlag) -> None:
         super().__init__(slam)
         self._stop = stop
         self._in_step = False

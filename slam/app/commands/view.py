@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from slam.app.errors import AppError, UsageError, naming, refuse_pipe
+from slam.app.errors import UsageError, naming
 from slam.app.run.output import print_text
 from slam.app.run.replay import (
     is_finished,
@@ -24,10 +24,11 @@ from slam.app.run.replay import (
     session_file,
 )
 from slam.app.run.result_files import VIEW
-from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
 from slam.app.view.viewer import LiveView, SlamViewerProcess
+from slam.live.errors import AppError, refuse_pipe
+from slam.live.session.reader import RecordedSession, open_session
 from xethru_protocol.cli.live.viewer import ViewerKind
 from xethru_protocol.operating_system import StopFlag, one_line, written_whole
 from xethru_protocol.recordings.recorded_messages import RERUN_MAGIC

@@ -8,13 +8,14 @@ from pathlib import Path
 
 from slam.app.convert.matlab import convert_mat, write_detections
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
-from slam.app.errors import AppError, UsageError, naming, refuse_pipe
+from slam.app.errors import UsageError, naming
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_text
 from slam.app.run.replay import recorded_config
 from slam.app.run.result_files import made_folder
-from slam.app.session.reader import RecordedSession, begins_with, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
+from slam.live.errors import AppError, refuse_pipe
+from slam.live.session.reader import RecordedSession, begins_with, open_session
 from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
 from xethru_protocol.recordings import RecordingError, WireCapture
 from xethru_protocol.recordings.mcap import MAGIC

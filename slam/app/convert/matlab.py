@@ -32,18 +32,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 
+from slam.app.convert.imported_head import imported_info, imported_radar
 from slam.app.convert.rosbag import authors_rig, rig_of
-from slam.app.errors import AppError, OdometryError, naming
-from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
-from slam.app.rig.frame_sources import recorded_frame
-from slam.app.session.description import imported_info, imported_radar
-from slam.app.session.reader import RecordedSession, describe_kind
+from slam.app.errors import naming
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import RadarInfo, Scan
 from slam.config import SlamConfig
 from slam.frames import RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import Mount, RadarPair, Rig
+from slam.live.errors import AppError, OdometryError
+from slam.live.frame_sources import recorded_frame
+from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
+from slam.live.session.reader import RecordedSession, describe_kind
+from slam.live.session_records import RadarInfo, Scan
 from slam.paper.trilateration import Trilaterator
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.validation import reason_of

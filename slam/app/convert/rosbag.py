@@ -33,23 +33,22 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from slam.app.errors import AppError, OdometryError
-from slam.app.odometry.track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSample
-from slam.app.rig.frame_sources import recorded_frame
-from slam.app.session import cdr
-from slam.app.session.description import (
-    imported_info,
-    imported_radar,
+from slam.app.convert.imported_head import imported_info, imported_radar
+from slam.app.session.writer import SessionLog
+from slam.frames import RadarFrame
+from slam.geometry import Mount, Rig
+from slam.live.errors import AppError, OdometryError
+from slam.live.frame_sources import recorded_frame
+from slam.live.odometry_track import MOST_GAP_NS, NS_PER_S, OdometryTrack, TumSample
+from slam.live.session import cdr
+from slam.live.session.description import (
     radar_text,
     read_radar_text,
     read_session_table,
     session_table,
 )
-from slam.app.session.reader import RecordedSession, ScanEnd
-from slam.app.session.writer import SessionLog
-from slam.app.session_records import RadarInfo, Scan, SessionInfo, TruthAt
-from slam.frames import RadarFrame
-from slam.geometry import Mount, Rig
+from slam.live.session.reader import RecordedSession, ScanEnd
+from slam.live.session_records import RadarInfo, Scan, SessionInfo, TruthAt
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, STRING, pack_array, pack_string
 from xethru_protocol.validation import reason_of

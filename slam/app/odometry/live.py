@@ -22,9 +22,10 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import OdometryError, UsageError
-from slam.app.odometry.arrival import ClockLine, LowerEnvelope
-from slam.app.odometry.track import (
+from slam.app.errors import UsageError
+from slam.live.arrival_clock import ClockLine, LowerEnvelope
+from slam.live.errors import OdometryError
+from slam.live.odometry_track import (
     MOST_GAP_NS,
     NS_PER_S,
     OdometryTrack,

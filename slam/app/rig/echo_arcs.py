@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.session_records import RadarInfo
 from slam.geometry import FieldOfView
+from slam.live.session_records import RadarInfo
 
 _ARC_POINTS = 17
 

@@ -29,12 +29,13 @@ from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
 from emulator.x4m300 import radar_device
-from slam.app.errors import AppError, EmulatorError, UsageError
-from slam.app.odometry.track import NS_PER_S
-from slam.app.rig.frame_sources import RadarLink, RecordObserver, RigSource, StreamBegins
+from slam.app.errors import EmulatorError, UsageError
 from slam.app.rig.rig_files import rig_file_of
 from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Rig, transform
+from slam.live.errors import AppError
+from slam.live.frame_sources import RadarLink, RecordObserver, RigSource, StreamBegins
+from slam.live.odometry_track import NS_PER_S
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.operating_system import StopFlag, signal_at_parents_death

@@ -29,15 +29,15 @@ from dataclasses import replace
 from queue import Empty, Full, Queue
 from typing import Literal, NamedTuple, TypeAlias
 
-from slam.app.errors import AppError, OdometryError
-from slam.app.odometry.arrival import ArrivalClock
 from slam.app.odometry.live import MOST_STAMP_NS, LineSource, LiveOdometry, read_lines
-from slam.app.odometry.track import NS_PER_S, TumSample
-from slam.app.rig.frame_sources import RadarLink, radar_frame
 from slam.app.run.runner import LinkLog, frames_between
 from slam.app.session.writer import CannotWriteError, SessionLog
-from slam.app.session_records import LogLine, RadarInfo, Scan, Snapshot
 from slam.frames import RadarFrame
+from slam.live.arrival_clock import ArrivalClock
+from slam.live.errors import AppError, OdometryError
+from slam.live.frame_sources import RadarLink, radar_frame
+from slam.live.odometry_track import NS_PER_S, TumSample
+from slam.live.session_records import LogLine, RadarInfo, Scan, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.matching import ProtocolRecord

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from slam.app.errors import naming
-from slam.app.odometry.track import NS_PER_S
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, ratio
-from slam.app.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.evaluation import MIN_POSES, LandmarkScore
 from slam.geometry import transform
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from xethru_protocol.operating_system import STDERR, STDOUT, each_line, one_line, written_whole
 
 _LIVE_PERIOD_S = 0.2

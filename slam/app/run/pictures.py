@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from slam.app.errors import naming
-from slam.app.odometry.track import NS_PER_S
 from slam.app.run.runner import LinkState, RunRecord
 from slam.app.run.summary import Summary
-from slam.app.session_records import SessionInfo, Snapshot
 from slam.geometry import between, compose, transform
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import SessionInfo, Snapshot
 from xethru_protocol.operating_system import each_line, written_whole
 
 # What is drawn alike differs also for those who see two colours only.

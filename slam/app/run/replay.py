@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from slam.app.errors import AppError, OdometryError, UsageError
-from slam.app.odometry.track import OdometryTrack, TumSample
+from slam.app.errors import UsageError
 from slam.app.run.output import RunProgress, note
 from slam.app.run.result_files import SESSION, VIEW, finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import (
@@ -32,13 +31,15 @@ from slam.app.run.runner import (
     make_slam,
 )
 from slam.app.session.constants import different_constants, recorded_rules
-from slam.app.session.reader import RecordedScan, RecordedSession, begins_with, open_session
-from slam.app.session.state_rows import smoothed_row, state_row
-from slam.app.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
-from slam.growing_arrays import RowsByTime
-from slam.results import PoseAt, Slam, SmoothedRun, StepResult
+from slam.live.errors import AppError, OdometryError
+from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.session.reader import RecordedScan, RecordedSession, begins_with, open_session
+from slam.live.session.state_rows import smoothed_row, state_row
+from slam.live.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
+from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
+from slam.robust.solver.growing_arrays import RowsByTime
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.validation import problem_text
@@ -166,7 +167,7 @@ class _RecordedSlam(WrappedSlam):
     They are by the time of the scan [ns]; a scan without entry has none.
     """
 
-    def __init__(self, slam: Slam, detections: Mapping[int, Sequence[Detection]]) -> None:
+    def __init__(self, slam: Pipeline, detections: Mapping[int, Sequence[Detection]]) -> None:
         super().__init__(slam)
         self._detections = detections
 

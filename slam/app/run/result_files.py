@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, naming
-from slam.app.odometry.track import NS_PER_S, Trajectory, write_tum
+from slam.app.errors import naming
 from slam.app.run.output import ResultRow, print_result
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, summarise
-from slam.app.session_records import SessionInfo
 from slam.evaluation import LandmarkScore
+from slam.live.errors import AppError
+from slam.live.odometry_track import NS_PER_S, Trajectory, write_tum
+from slam.live.session_records import SessionInfo
 from slam.results import SmoothedRun
 from xethru_protocol.operating_system import (
     PathInUseError,

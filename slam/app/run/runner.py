@@ -17,8 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.app.errors import AppError
-from slam.app.session_records import (
+from slam.config import BackEnd, SlamConfig, WheelNoise
+from slam.evaluation import TrueAssociationNis, true_range_nis
+from slam.frames import Detector, RadarFrame, StepInputError
+from slam.front_end.numba_compilation import compile_kernels
+from slam.geometry import Rig
+from slam.live.errors import AppError
+from slam.live.session_records import (
     LogLine,
     RadarInfo,
     Scan,
@@ -27,16 +32,11 @@ from slam.app.session_records import (
     Snapshot,
     TruthAt,
 )
-from slam.config import BackEnd, SlamConfig, WheelNoise
-from slam.evaluation import TrueAssociationNis, true_range_nis
-from slam.frames import Detector, RadarFrame, StepInputError
-from slam.geometry import Rig
-from slam.growing_arrays import PackedRows, RowsByTime
-from slam.numba_compilation import compile_kernels
 from slam.paper.pipeline import UwbRadarSlam
-from slam.results import Slam, SmoothedRun, StepResult
+from slam.results import Pipeline, SmoothedRun, StepResult
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
+from slam.robust.solver.growing_arrays import PackedRows, RowsByTime
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.matching import ProtocolRecord
 
@@ -49,7 +49,7 @@ def make_slam(
     wheels: WheelNoise,
     detector: Detector | None = None,
     rules: BackEndParameters | None = None,
-) -> Slam:
+) -> Pipeline:
     """Return the pipeline that ``config.back_end`` names.
 
     ``wheels`` is the robot's odometry noise; preset ``paper`` has numbers of its own. ``detector``
@@ -64,7 +64,7 @@ def make_slam(
 class WrappedSlam:
     """Passes everything but `step` on to another pipeline; subclasses define that."""
 
-    def __init__(self, slam: Slam) -> None:
+    def __init__(self, slam: Pipeline) -> None:
         self._slam = slam
         self.config = slam.config
         self.step_detections, self.flush = slam.step_detections, slam.flush
@@ -148,7 +148,7 @@ class RunSource:
 
     info: SessionInfo
     rig: Rig
-    slam: Slam
+    slam: Pipeline
     scans: Iterable[Scan]
     odometry: Odometry
     truth_at: TruthAt = unknown_truth
@@ -338,7 +338,7 @@ def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunReco
 def run_slam(
     scans: Iterable[Scan],
     odometry: Odometry,
-    slam: Slam,
+    slam: Pipeline,
     truth_at: TruthAt,
     observers: Sequence[SessionObserver] = (),
     *,

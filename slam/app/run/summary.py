@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
-from slam.app.odometry.track import NS_PER_S
 from slam.app.run.runner import RunRecord
-from slam.app.session_records import SessionInfo, Snapshot
 from slam.evaluation import (
     LandmarkScore,
     ate_rmse_m,
@@ -25,6 +23,8 @@ from slam.evaluation import (
     observable_landmarks,
 )
 from slam.geometry import Rig, align_se2, between, compose, transform
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import SessionInfo, Snapshot
 from slam.results import SmoothedRun
 
 

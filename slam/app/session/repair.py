@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from slam.app.errors import AppError
-from slam.app.session.description import GAP_TOPIC, METADATA_NAME, SESSION_TOPIC
-from slam.app.session.lost_messages import GapFinder, gap_json
-from slam.app.session.reader import RADAR_INFO, open_mcap, open_session
-from slam.app.session_records import Gap
+from slam.live.errors import AppError
+from slam.live.session.description import GAP_TOPIC, METADATA_NAME, SESSION_TOPIC
+from slam.live.session.lost_messages import GapFinder, gap_json
+from slam.live.session.reader import RADAR_INFO, open_mcap, open_session
+from slam.live.session_records import Gap
 from xethru_protocol.operating_system import STDOUT, PathInUseError, StopFlag, each_line, locked
 from xethru_protocol.recordings import mcap
 from xethru_protocol.validation import reason_of

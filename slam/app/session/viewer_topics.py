@@ -31,15 +31,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.echo_arcs import envelope_db, wedge
-from slam.app.rig.frame_sources import TRUE_PER_MODULE_METRE
-from slam.app.session import cdr
-from slam.app.session.cdr import Marker, Shape
-from slam.app.session_records import RadarInfo, Scan, SessionInfo, Snapshot
 from slam.config import WheelNoise
 from slam.frames import RadarFrame
 from slam.geometry import between, compose
+from slam.live.frame_sources import TRUE_PER_MODULE_METRE
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session import cdr
+from slam.live.session.cdr import Marker, Shape
+from slam.live.session_records import RadarInfo, Scan, SessionInfo, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import STRING, pack_string
 

@@ -21,18 +21,19 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError
-from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.session import cdr
-from slam.app.session.description import (
+from slam.app.session.viewer_topics import Drawings, WheelMotion
+from slam.geometry import between, compose
+from slam.live.errors import AppError
+from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.session import cdr
+from slam.live.session.description import (
     METADATA_NAME,
     SESSION_TOPIC,
     radar_text,
     session_table,
 )
-from slam.app.session.state_rows import smoothed_row, state_row, step_row
-from slam.app.session.viewer_topics import Drawings, WheelMotion
-from slam.app.session_records import (
+from slam.live.session.state_rows import smoothed_row, state_row, step_row
+from slam.live.session_records import (
     LogLine,
     Scan,
     SessionInfo,
@@ -40,7 +41,6 @@ from slam.app.session_records import (
     Snapshot,
     TruthAt,
 )
-from slam.geometry import between, compose
 from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,

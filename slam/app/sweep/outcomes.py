@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from emulator.scene.scene import Scene
-from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.emulated import outlines_m
 from slam.app.run.runner import RunRecord
-from slam.app.session_records import SessionInfo, SessionObserver, Snapshot
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import Rig, between, transform, wrap_angles
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import SessionInfo, SessionObserver, Snapshot
 
 LANDMARKS_TO_FIND = 3
 """Landmarks in view that determine a pose on a map of points: two leave its mirror image."""

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from pydantic import BaseModel, Field, ValidationError
 
-from slam.app.errors import AppError
 from slam.app.run.output import print_table, write_json
 from slam.app.run.pictures import (
     ESTIMATE,
@@ -42,6 +41,7 @@ from slam.app.sweep.table import (
     table_of,
     times_clean,
 )
+from slam.live.errors import AppError
 from xethru_protocol.operating_system import StopFlag, read_bounded
 from xethru_protocol.validation import problem_text
 

@@ -23,8 +23,7 @@ from emulator.scene.rooms import MOST_ROOMS, room_of
 from emulator.scene.scene import CarriedSpec, Scene
 from emulator.scene.toml_files import TableT, is_name
 from emulator.scene.wheels import scene_odometry
-from slam.app.errors import AppError, UsageError
-from slam.app.odometry.track import NS_PER_S, OdometryTrack
+from slam.app.errors import UsageError
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -38,8 +37,6 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.runner import RunSource, execute, make_slam
 from slam.app.run.summary import Summary, summarise
-from slam.app.session.description import settings_text
-from slam.app.session_records import Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.sweep import CLEAN, STRESSES, SceneKeys, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.app.sweep.outcomes import (
@@ -52,7 +49,11 @@ from slam.app.sweep.outcomes import (
 from slam.config import ConfigError, SlamConfig, override
 from slam.frames import Detection, Detector, RadarFrame
 from slam.front_end import make_detector
-from slam.results import Slam, StepResult
+from slam.live.errors import AppError
+from slam.live.odometry_track import NS_PER_S, OdometryTrack
+from slam.live.session.description import settings_text
+from slam.live.session_records import Scan, SessionInfo, SessionObserver, Snapshot
+from slam.results import Pipeline, StepResult
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.wire.x4 import FIRST_COUNTER
 
@@ -321,7 +322,7 @@ def first_laps(scene: Scene, count: int) -> Scene:
 def loopback_source(
     scene: Scene,
     preset: str,
-    slam: Slam,
+    slam: Pipeline,
     seed: int,
     *,
     noise_seed: int | None = None,

@@ -22,7 +22,7 @@ from pathlib import Path
 from joblib import cpu_count
 from pydantic import TypeAdapter, ValidationError
 
-from slam.app.errors import AppError, UsageError, naming
+from slam.app.errors import UsageError, naming
 from slam.app.rig.emulated import FRAME_RATE_HZ
 from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.run.result_files import made_folder
@@ -38,6 +38,7 @@ from slam.app.sweep.table import (
     stress_tables,
 )
 from slam.app.sweep.workers import dask_results, worker_results
+from slam.live.errors import AppError
 from xethru_protocol.operating_system import (
     PathInUseError,
     StopFlag,

@@ -21,7 +21,8 @@ from typing import Any, TypeVar, cast
 import joblib
 from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
-from slam.app.errors import AppError, UsageError
+from slam.app.errors import UsageError
+from slam.live.errors import AppError
 from xethru_protocol.operating_system import signal_at_parents_death
 from xethru_protocol.optional_packages import install_command
 

@@ -11,9 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.echo_arcs import bscan_picture, n_shown_bins
-from slam.app.session_records import RadarInfo, Scan, Snapshot
 from slam.app.view.rerun_recording import (
     FAULT_RGB,
     RADAR_RGB,
@@ -25,6 +23,8 @@ from slam.app.view.rerun_recording import (
     rr,
 )
 from slam.frames import RadarFrame
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import RadarInfo, Scan, Snapshot
 
 BLOCK_FRAMES = 128
 """Rows of one B-scan picture; as many frames are sent at once to a file."""

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.app.errors import EXIT_FAILED, EXIT_USAGE, AppError
+from slam.app.errors import EXIT_USAGE
+from slam.live.errors import EXIT_FAILED, AppError
 from xethru_protocol.operating_system import (
     STDERR,
     STDOUT,

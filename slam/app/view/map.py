@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.echo_arcs import arcs, wedge
 from slam.app.run.pictures import (
     ellipse_95,
@@ -19,7 +18,6 @@ from slam.app.run.pictures import (
     extent_m,
     rotate_covariances,
 )
-from slam.app.session_records import RadarInfo, SessionInfo, Snapshot
 from slam.app.view.rerun_recording import (
     ESTIMATE_RGB,
     FIX_RGB,
@@ -45,8 +43,10 @@ from slam.app.view.rerun_recording import (
     strips_column,
 )
 from slam.geometry import compose, transform
-from slam.growing_arrays import PackedRows
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import RadarInfo, SessionInfo, Snapshot
 from slam.results import Fix, Observation, SmoothedRun, StepResult
+from slam.robust.solver.growing_arrays import PackedRows
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 from rerun.experimental import ViewerClient
 
-from slam.app.errors import AppError
+from slam.live.errors import AppError
 
 __all__ = ["RrdReader", "ViewerClient", "rr", "rrb"]
 

@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError
-from slam.app.odometry.track import NS_PER_S
 from slam.app.run.pictures import LINK_COLOURS, half_axes_95_m
 from slam.app.run.runner import LinkChange, LinkStates
 from slam.app.run.summary import (
@@ -28,14 +26,6 @@ from slam.app.run.summary import (
     smoothed_errors,
     state_numbers,
     world_from_odom,
-)
-from slam.app.session_records import (
-    LogLine,
-    RadarInfo,
-    Scan,
-    SessionInfo,
-    SessionObserver,
-    Snapshot,
 )
 from slam.app.view.frames import BLOCK_FRAMES, FrameLayer
 from slam.app.view.map import TRAIL_STATES, Ground, MapLayer, known_world_m
@@ -56,8 +46,18 @@ from slam.app.view.rerun_recording import (
     rrb,
     screen,
 )
-from slam.growing_arrays import PackedRows
+from slam.live.errors import AppError
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import (
+    LogLine,
+    RadarInfo,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+)
 from slam.results import SmoothedRun
+from slam.robust.solver.growing_arrays import PackedRows
 
 _ABOUT = """\
 # What you see

@@ -14,10 +14,10 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import urlsplit
 
-from slam.app.errors import AppError
 from slam.app.run.output import note
-from slam.app.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.view import SERVE_WEB, SPAWN
+from slam.live.errors import AppError
+from slam.live.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.cli.live import viewer
 from xethru_protocol.cli.live.viewer import HERE, ViewerKind

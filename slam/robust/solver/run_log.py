@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import wrap_angle, wrap_angles
-from slam.growing_arrays import PackedRows
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
+from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import HEAD_SIZE, Array, Indices, Layout, Motion, State, quarter_turn
 
 # Standard deviations of calibration and offsets below this are taken as this, so that information

@@ -14,7 +14,8 @@ from emulator.faults.plan import (
     fault_spec,
     load_plan,
 )
-from emulator.scene.toml_files import parse_table, shipped_names
+from emulator.scene.toml_files import shipped_names
+from xethru_protocol.validation import parse_toml
 
 
 def test_shipped_scenarios_load() -> None:
@@ -25,7 +26,7 @@ def test_shipped_scenarios_load() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_example_of_every_kind_is_a_scenario(kind: str) -> None:
-    (spec,) = parse_table(
+    (spec,) = parse_toml(
         FaultPlan, example(KINDS[kind]), source="scenario", error=FaultPlanError
     ).fault
     assert spec.kind == kind
@@ -66,7 +67,7 @@ def test_every_parameter_has_a_meaning_and_a_limit(kind: str) -> None:
 )
 def test_a_mistake_is_one_line_that_names_the_place(text: str, place: str) -> None:
     with pytest.raises(FaultPlanError) as caught:
-        parse_table(FaultPlan, text, source="scenario", error=FaultPlanError)
+        parse_toml(FaultPlan, text, source="scenario", error=FaultPlanError)
     assert place in str(caught.value)
     assert "\n" not in str(caught.value).replace(text, "")
     assert str(caught.value).startswith("scenario: ")

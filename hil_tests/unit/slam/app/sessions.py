@@ -10,10 +10,12 @@ from mcap.reader import NonSeekingReader
 from numpy.typing import NDArray
 
 from slam.app.cli import main
-from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.run.runner import RunRecord, RunRecorder, snapshot_of_step
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import (
+from slam.config import load_preset
+from slam.frames import Detection, RadarFrame
+from slam.live.odometry_track import OdometryTrack, format_tum_line
+from slam.live.session_records import (
     LogLine,
     RadarInfo,
     Scan,
@@ -21,8 +23,6 @@ from slam.app.session_records import (
     SessionObserver,
     Snapshot,
 )
-from slam.config import load_preset
-from slam.frames import Detection, RadarFrame
 from slam.results import PoseAt, SmoothedRun, StepResult
 
 FRAME_NS = 199_261_498

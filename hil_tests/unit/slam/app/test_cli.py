@@ -15,9 +15,10 @@ from hil_tests.unit.slam.app.sessions import session_info, write_session
 from slam.app.cli import main
 from slam.app.errors import EmulatorError
 from slam.app.rig.emulated import EmulatorProcess
-from slam.app.rig.rig_files import RigFile, RigRadar, write_rig
+from slam.app.rig.rig_files import write_rig
 from slam.app.run.output import RunProgress, note, print_table
-from slam.app.session_records import LogLine
+from slam.library.rig_files import RigFile, RigRadar
+from slam.live.session_records import LogLine
 from xethru_protocol.operating_system import locked
 
 THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)

@@ -19,8 +19,8 @@ from hil_tests.unit.xethru_protocol.recordings.messages import (
     read_with_faults,
     write_capture,
 )
-from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.session.writer import SessionLog
+from slam.live.odometry_track import OdometryTrack, format_tum_line
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingWriter,

@@ -14,8 +14,8 @@ from slam.app.benchmarks.back_end import grouped
 from slam.app.benchmarks.data_set import LandmarkMeasurement, Positions, Run
 from slam.app.benchmarks.path_errors import associated, score_run
 from slam.app.cli import main
-from slam.app.errors import AppError
-from slam.app.odometry.track import Trajectory, read_tum
+from slam.live.errors import AppError
+from slam.live.odometry_track import Trajectory, read_tum
 from xethru_protocol.operating_system import StopFlag
 
 

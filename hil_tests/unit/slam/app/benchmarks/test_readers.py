@@ -20,9 +20,9 @@ from slam.app.benchmarks.data_set import (
     positions_of,
     step_times,
 )
-from slam.app.errors import AppError
 from slam.evaluation import ate_rmse_m
 from slam.geometry import between, compose
+from slam.live.errors import AppError
 
 
 def dead_reckoning_error_m(run: Run) -> float:

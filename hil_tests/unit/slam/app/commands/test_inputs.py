@@ -11,9 +11,9 @@ from emulator.scene.toml_files import shipped_names
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.slam.app.sessions import odometry, run, session_info, write_session
 from slam.app.cli import _COMMANDS
-from slam.app.errors import AppError
 from slam.app.run.result_files import hold_folder
 from slam.app.session.writer import SessionLog
+from slam.live.errors import AppError
 from xethru_protocol.cli import main as xethru
 
 COMMANDS = {

@@ -18,15 +18,15 @@ from slam.app.commands import run
 from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
-from slam.app.odometry.track import OdometryTrack, TumSample, parse_tum_line, read_tum
 from slam.app.run.live_source import LiveLog
 from slam.app.run.runner import run_slam, unknown_truth
-from slam.app.session import cdr as ros
-from slam.app.session.cdr import wheel_odometry
-from slam.app.session.reader import open_session
 from slam.app.session.writer import CannotWriteError, SessionLog
-from slam.app.session_records import Scan
 from slam.frames import RadarFrame
+from slam.live.odometry_track import OdometryTrack, TumSample, parse_tum_line, read_tum
+from slam.live.session import cdr as ros
+from slam.live.session.cdr import wheel_odometry
+from slam.live.session.reader import open_session
+from slam.live.session_records import Scan
 from slam.results import PoseAt, SmoothedRun
 from xethru_protocol.operating_system import StopFlag
 

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from slam.app.session.cdr import Message
+from slam.live.session.cdr import Message
 
 Pose = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""

@@ -15,13 +15,13 @@ from scipy.io import loadmat, savemat
 from hil_tests.unit.slam.app.sessions import run, scan, session_info, write_scans
 from slam.app.cli import main
 from slam.app.convert.matlab import MAT_RIG, MatDrive, read_mat, write_mat
-from slam.app.errors import AppError
-from slam.app.odometry.track import OdometryTrack, format_tum_line
-from slam.app.session.description import settings_text
-from slam.app.session.reader import open_session
-from slam.app.session_records import SessionInfo
 from slam.config import SlamConfig, load_preset
 from slam.frames import Detection
+from slam.live.errors import AppError
+from slam.live.odometry_track import OdometryTrack, format_tum_line
+from slam.live.session.description import settings_text
+from slam.live.session.reader import open_session
+from slam.live.session_records import SessionInfo
 from slam.paper.trilateration import Trilaterator
 
 N_STATES = 6

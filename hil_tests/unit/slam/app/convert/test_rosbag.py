@@ -32,9 +32,9 @@ from hil_tests.unit.slam.app.sessions import (
     write_scans,
 )
 from slam.app.convert.convert import run_convert
-from slam.app.odometry.track import OdometryTrack, format_tum_line
-from slam.app.session.reader import RecordedSession, open_session
 from slam.app.session.writer import SessionLog
+from slam.live.odometry_track import OdometryTrack, format_tum_line
+from slam.live.session.reader import RecordedSession, open_session
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 KINDS = ("bag.bag", "bag")

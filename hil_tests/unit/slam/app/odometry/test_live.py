@@ -13,8 +13,7 @@ import pytest
 
 from hil_tests.patience import seconds
 from hil_tests.unit.slam.app.run.virtual_rig import straight_odometry
-from slam.app.errors import OdometryError, UsageError
-from slam.app.odometry.arrival import ClockLine
+from slam.app.errors import UsageError
 from slam.app.odometry.live import (
     LineSource,
     LiveOdometry,
@@ -22,6 +21,8 @@ from slam.app.odometry.live import (
     parse_source,
     read_lines,
 )
+from slam.live.arrival_clock import ClockLine
+from slam.live.errors import OdometryError
 
 NS_PER_S = 1_000_000_000
 

@@ -21,8 +21,8 @@ from slam.app.rig.emulated import (
     open_loopback,
     scene_and_config,
 )
-from slam.app.session.reader import open_session
 from slam.app.session.writer import SessionLog
+from slam.live.session.reader import open_session
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings import read_chunks, read_note, read_recording
 from xethru_protocol.wire.messages import DataFloat

@@ -24,11 +24,8 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
 )
 from hil_tests.unit.slam.app.sessions import Listener
 from hil_tests.unit.slam.simulation import frame_of
-from slam.app.errors import AppError
-from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry, parse_source
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
-from slam.app.rig.frame_sources import RadarLink, sampler_limits
 from slam.app.run import live_source as run_readers
 from slam.app.run.live_source import (
     GRACE_NS,
@@ -39,10 +36,13 @@ from slam.app.run.live_source import (
     reading,
 )
 from slam.app.run.runner import RunRecord, make_slam, run_slam
-from slam.app.session_records import Scan
 from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount
+from slam.live.arrival_clock import ClockLine
+from slam.live.errors import AppError
+from slam.live.frame_sources import RadarLink, sampler_limits
+from slam.live.session_records import Scan
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from hil_tests.unit.slam.app.sessions import FRAME_NS, NoSlam, scan, session_info
 from slam.app.commands.report import _ReportData
-from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry
-from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample, format_tum_line
 from slam.app.run.runner import run_slam
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import Scan, SessionObserver
 from slam.app.view.session_view import RerunView
 from slam.frames import RadarFrame
+from slam.live.arrival_clock import ClockLine
+from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample, format_tum_line
+from slam.live.session_records import Scan, SessionObserver
 from slam.results import Belief, PoseAt, StepResult, UpdateReport
 
 BLOCK = 128

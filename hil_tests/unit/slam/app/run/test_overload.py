@@ -21,20 +21,20 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
     drive_through,
 )
 from hil_tests.unit.slam.app.sessions import Listener
-from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
-from slam.app.rig.frame_sources import sampler_limits
 from slam.app.run.live_source import Inbox, LiveLog, LiveSource, SourceEvent
 from slam.app.run.replay import Comparison, recorded_source
 from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute, make_slam
-from slam.app.session.description import settings_text
-from slam.app.session.reader import open_session
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import LogLine, Scan, SessionInfo
 from slam.config import load_preset
 from slam.frames import RadarFrame
-from slam.results import PoseAt, Slam, StepResult
+from slam.live.arrival_clock import ClockLine
+from slam.live.frame_sources import sampler_limits
+from slam.live.session.description import settings_text
+from slam.live.session.reader import open_session
+from slam.live.session_records import LogLine, Scan, SessionInfo
+from slam.results import Pipeline, PoseAt, StepResult
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 MOST_WAIT_S = 2.0
@@ -49,7 +49,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 class SlowSlam(WrappedSlam):
     """SLAM whose every step takes so much longer, of virtual time."""
 
-    def __init__(self, slam: Slam, inbox: VirtualInbox, more_s: float) -> None:
+    def __init__(self, slam: Pipeline, inbox: VirtualInbox, more_s: float) -> None:
         super().__init__(slam)
         self._inbox, self._more_ns = inbox, round(more_s * NS_PER_S)
 

@@ -21,10 +21,10 @@ from hil_tests.unit.slam.app.sessions import (
 )
 from slam.app.run.replay import Comparison, play_states, recorded_source
 from slam.app.session.constants import different_constants, recorded_rules, slam_constants
-from slam.app.session.description import settings_text
-from slam.app.session.reader import open_session
-from slam.app.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.config import WheelNoise, load_preset
+from slam.live.session.description import settings_text
+from slam.live.session.reader import open_session
+from slam.live.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.robust.parameters import BackEndParameters, MapRule, TrackletRule
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.operating_system import StopFlag, StopRequestedError

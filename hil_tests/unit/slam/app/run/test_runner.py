@@ -18,14 +18,14 @@ from hil_tests.unit.slam.app.sessions import (
     session_info,
     snapshot,
 )
-from slam.app.errors import AppError
-from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.run.output import RunProgress
 from slam.app.run.runner import LinkStates, make_slam, run_slam, unknown_truth
-from slam.app.session_records import LogLine
 from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.frames import RadarFrame
 from slam.geometry import paper_rig
+from slam.live.errors import AppError
+from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.session_records import LogLine
 from slam.results import Belief, PoseAt, StepResult
 
 COUNTERS = (5, 6, 8, 11, 12)

@@ -24,16 +24,16 @@ from hil_tests.unit.slam.app.sessions import (
 )
 from slam.app.cli import main
 from slam.app.commands.evaluate import Errors, evaluate, trajectory_at
-from slam.app.errors import AppError
-from slam.app.odometry.track import Trajectory, write_tum
 from slam.app.run.output import summary_rows, table_text
 from slam.app.run.runner import RunRecord
 from slam.app.run.summary import NEES_AT, Summary, summarise
-from slam.app.session.description import settings_text
 from slam.app.session.writer import SessionLog
 from slam.config import BackEnd, DetectionConfig, RobustConfig, SlamConfig, TrilaterationConfig
 from slam.evaluation import LandmarkScore, ate_rmse_m
 from slam.geometry import Mount, Rig
+from slam.live.errors import AppError
+from slam.live.odometry_track import Trajectory, write_tum
+from slam.live.session.description import settings_text
 from slam.results import Association, Belief, Observation, SmoothedRun, StepResult
 from xethru_protocol.operating_system import StopFlag
 

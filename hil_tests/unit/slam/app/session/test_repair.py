@@ -21,11 +21,11 @@ from hil_tests.unit.slam.app.sessions import (
     session_info,
     write_session,
 )
-from slam.app.session.reader import ScanEnd, open_session
 from slam.app.session.repair import repair
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import Gap, LogLine
 from slam.frames import RadarFrame
+from slam.live.session.reader import ScanEnd, open_session
+from slam.live.session_records import Gap, LogLine
 from xethru_protocol.operating_system import StopFlag, StopRequestedError, locked
 from xethru_protocol.recordings.mcap import is_latched
 

@@ -16,7 +16,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from hil_tests.paths import FIXTURES
-from hil_tests.unit.slam.app.session.test_state_rows import robust_state
 from hil_tests.unit.slam.app.sessions import (
     FRAME_NS,
     feed,
@@ -26,11 +25,12 @@ from hil_tests.unit.slam.app.sessions import (
     smoothed_run,
     snapshot,
 )
-from slam.app.odometry.track import TumSample
-from slam.app.session import cdr
+from hil_tests.unit.slam.live.session.test_state_rows import robust_state
 from slam.app.session.viewer_topics import Drawings
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import Scan, SessionInfo, Snapshot
+from slam.live.odometry_track import TumSample
+from slam.live.session import cdr
+from slam.live.session_records import Scan, SessionInfo, Snapshot
 
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
 Messages = dict[str, list[tuple[int, Any]]]

@@ -27,11 +27,11 @@ from hil_tests.unit.slam.app.sessions import (
     write_scans,
     write_session,
 )
-from slam.app.session import cdr
-from slam.app.session.reader import open_session
 from slam.app.session.writer import CannotWriteError, SessionLog
-from slam.app.session_records import LogLine
 from slam.geometry import ReceivedPulse
+from slam.live.session import cdr
+from slam.live.session.reader import open_session
+from slam.live.session_records import LogLine
 from xethru_protocol.recordings.mcap import McapWriter
 
 N_SCANS = 300

@@ -21,7 +21,6 @@ from hil_tests.unit.slam.robust.range_world import (
     reported,
     true_path,
 )
-from slam.app.errors import AppError
 from slam.app.sweep.bound import (
     ALONE_RANGES,
     KnownAssociation,
@@ -40,6 +39,7 @@ from slam.app.sweep.bound import (
 from slam.config import WheelNoise
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, compose, mount_at, paper_rig
+from slam.live.errors import AppError
 from slam.paper.ekf import start
 from slam.results import StepResult
 from slam.robust.parameters import BackEndParameters, RangeNoise, RelinearisationRule

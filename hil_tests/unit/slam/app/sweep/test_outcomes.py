@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.run.runner import RunRecord, States
-from slam.app.session_records import RadarInfo, SessionInfo, Snapshot
 from slam.app.sweep.outcomes import (
     CarryOutcome,
     carry_of,
@@ -22,6 +21,7 @@ from slam.app.sweep.outcomes import (
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import outcomes, summarise_groups
 from slam.geometry import paper_rig
+from slam.live.session_records import RadarInfo, SessionInfo, Snapshot
 
 S = 1_000_000_000
 DOWN_NS = 10 * S

@@ -11,10 +11,10 @@ import pytest
 
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.cli import main
-from slam.app.errors import AppError
 from slam.app.sweep.pictures import experiment_of
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
+from slam.live.errors import AppError
 
 TIMES_S = tuple(float(second) for second in range(1, 11))
 

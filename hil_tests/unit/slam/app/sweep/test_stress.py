@@ -13,9 +13,7 @@ from emulator.scene.scene import BurstSpec, PulseSpec, Scene, WanderSpec, load_s
 from emulator.scene.toml_files import shipped_names
 from emulator.scene.wheels import scene_odometry
 from hil_tests.unit.slam.simulation import frame_of
-from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
-from slam.app.session_records import Scan
 from slam.app.sweep import CLEAN, FAMILIES, STRESSES, Stress
 from slam.app.sweep.run import (
     DisturbedDetector,
@@ -26,6 +24,8 @@ from slam.app.sweep.run import (
 )
 from slam.config import RobustConfig, SlamConfig
 from slam.frames import Detection, RadarFrame
+from slam.live.odometry_track import OdometryTrack
+from slam.live.session_records import Scan
 from xethru_protocol.wire.x4 import real_frame_rate
 
 PERIOD_NS = 200_000_000

@@ -15,10 +15,10 @@ import pytest
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.full_disk import full_disk
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
-from slam.app.errors import AppError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, RunKey, SweepRun, finite, make_case
 from slam.app.sweep.sweep import PartFile, run_sweep
+from slam.live.errors import AppError
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
 

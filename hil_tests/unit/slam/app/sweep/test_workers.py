@@ -12,10 +12,10 @@ import pytest
 
 from hil_tests.patience import seconds
 from slam.app.cli import main
-from slam.app.errors import AppError
 from slam.app.sweep import workers
 from slam.app.sweep.run import make_case, run_case
 from slam.app.sweep.workers import _end_workers
+from slam.live.errors import AppError
 
 LIMIT_S = seconds(15)
 OUTLASTS_S = 10 * LIMIT_S

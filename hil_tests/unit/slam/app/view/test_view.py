@@ -10,13 +10,13 @@ import pytest
 from rerun.chunk import RrdReader
 
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info, smoothed_run, snapshot
-from slam.app.errors import AppError
 from slam.app.rig.echo_arcs import bscan_picture, wedge
-from slam.app.session_records import LogLine, Scan, SessionInfo, Snapshot
 from slam.app.view.rerun_recording import count_rows
 from slam.app.view.session_view import RerunView
 from slam.frames import Detection
 from slam.geometry import compose, transform
+from slam.live.errors import AppError
+from slam.live.session_records import LogLine, Scan, SessionInfo, Snapshot
 from slam.paper.ekf import start
 from slam.results import Fix, Observation, StepResult, UpdateReport
 

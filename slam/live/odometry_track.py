@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, OdometryError
 from slam.geometry import wrap_angle
+from slam.live.errors import AppError, OdometryError
 from xethru_protocol.operating_system import read_bounded
 from xethru_protocol.validation import shown
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from slam.app.odometry.arrival import ArrivalClock, ClockLine, LowerEnvelope
+from slam.live.arrival_clock import ArrivalClock, ClockLine, LowerEnvelope
 from xethru_protocol.wire.x4 import frame_time_ns, real_frame_rate
 
 NS_PER_S = 1_000_000_000

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.numba_compilation import compile_kernels, kernel
+from slam.front_end.numba_compilation import compile_kernels, kernel
 
 
 @kernel("f8(f8[::1], i8)")

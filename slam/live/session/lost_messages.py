@@ -13,8 +13,8 @@ from typing import TypeAlias
 
 from pydantic import TypeAdapter
 
-from slam.app.session.description import checked
-from slam.app.session_records import Gap
+from slam.live.session.description import checked
+from slam.live.session_records import Gap
 
 _SCANS = ("/scan", "/scan_unused")
 

@@ -51,8 +51,8 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.session_records import Snapshot
 from slam.frames import Detection
+from slam.live.session_records import Snapshot
 from slam.results import (
     LANDMARK_SIZE,
     POSE_SIZE,

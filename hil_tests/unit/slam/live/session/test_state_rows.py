@@ -11,12 +11,12 @@ import pytest
 from mcap.reader import make_reader
 
 from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
-from slam.app.errors import AppError
-from slam.app.session.reader import open_session
-from slam.app.session.state_rows import step_row, with_step
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import Snapshot
 from slam.frames import Detection
+from slam.live.errors import AppError
+from slam.live.session.reader import open_session
+from slam.live.session.state_rows import step_row, with_step
+from slam.live.session_records import Snapshot
 from slam.results import (
     Association,
     Belief,

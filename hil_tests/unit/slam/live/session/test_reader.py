@@ -20,16 +20,16 @@ from hil_tests.unit.slam.app.sessions import (
     write_scans,
     write_session,
 )
-from slam.app.errors import AppError
-from slam.app.odometry.track import TumSample
 from slam.app.run.replay import play_states
-from slam.app.session.description import read_radar_text, settings_text
-from slam.app.session.reader import begins_with, open_session
-from slam.app.session.state_rows import smoothed_of, smoothed_row, snapshot_of, state_row
 from slam.app.session.writer import SessionLog
-from slam.app.session_records import LogLine, Scan, Snapshot
 from slam.config import SlamConfig, load_preset
 from slam.frames import RadarFrame
+from slam.live.errors import AppError
+from slam.live.odometry_track import TumSample
+from slam.live.session.description import read_radar_text, settings_text
+from slam.live.session.reader import begins_with, open_session
+from slam.live.session.state_rows import smoothed_of, smoothed_row, snapshot_of, state_row
+from slam.live.session_records import LogLine, Scan, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC

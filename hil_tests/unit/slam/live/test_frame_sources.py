@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from emulator.scene.scene import PathSpec, Scene, load_scene
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.errors import AppError, RadarSilentError
-from slam.app.rig import frame_sources
 from slam.app.rig.emulated import RAW_CONFIG, end_tick, open_loopback, rig_of
-from slam.app.rig.frame_sources import RadarLink, RigSource, radar_frame
 from slam.geometry import Mount
+from slam.live import frame_sources
+from slam.live.errors import AppError, RadarSilentError
+from slam.live.frame_sources import RadarLink, RigSource, radar_frame
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300

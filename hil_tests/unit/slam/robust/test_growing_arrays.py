@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam.growing_arrays import PackedRows
+from slam.robust.solver.growing_arrays import PackedRows
 
 INT = np.dtype(np.int64)
 # Which of several copies does what: append, write to a row, or be copied

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
-from slam.app.odometry.track import NS_PER_S, TumSample
-from slam.app.session_records import LogLine, Snapshot
+from slam.live.odometry_track import NS_PER_S, TumSample
+from slam.live.session_records import LogLine, Snapshot
 from slam.results import SmoothedRun
 
 Array = NDArray[np.float64]

@@ -16,11 +16,11 @@ from typing import Literal, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, RadarSilentError
-from slam.app.odometry.track import NS_PER_S
-from slam.app.session_records import RadarInfo, Scan
 from slam.frames import RadarFrame
 from slam.geometry import Mount
+from slam.live.errors import AppError, RadarSilentError
+from slam.live.odometry_track import NS_PER_S
+from slam.live.session_records import RadarInfo, Scan
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.matching import ProtocolRecord

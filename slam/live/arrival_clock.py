@@ -15,7 +15,7 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
 
-from slam.app.odometry.track import NS_PER_S
+from slam.live.odometry_track import NS_PER_S
 from xethru_protocol.wire.x4 import frame_time_ns
 
 WINDOW_S = 300

@@ -20,11 +20,13 @@ from typing import BinaryIO, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, OdometryError, refuse_pipe
-from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.rig.frame_sources import recorded_frame, sampler_limits
-from slam.app.session import cdr
-from slam.app.session.description import (
+from slam.frames import Detection, RadarFrame
+from slam.geometry import Rig
+from slam.live.errors import AppError, OdometryError, refuse_pipe
+from slam.live.frame_sources import recorded_frame, sampler_limits
+from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.session import cdr
+from slam.live.session.description import (
     GAP_TOPIC,
     METADATA_NAME,
     SESSION_TOPIC,
@@ -32,11 +34,9 @@ from slam.app.session.description import (
     read_radar_text,
     read_session_table,
 )
-from slam.app.session.lost_messages import read_gap
-from slam.app.session.state_rows import smoothed_of, snapshot_of, with_step
-from slam.app.session_records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
-from slam.frames import Detection, RadarFrame
-from slam.geometry import Rig
+from slam.live.session.lost_messages import read_gap
+from slam.live.session.state_rows import smoothed_of, snapshot_of, with_step
+from slam.live.session_records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.operating_system import StopFlag

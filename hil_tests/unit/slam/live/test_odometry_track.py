@@ -11,10 +11,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from slam.app.errors import OdometryError
-from slam.app.odometry import track
 from slam.app.odometry.live import LiveOdometry
-from slam.app.odometry.track import (
+from slam.geometry import wrap_angle
+from slam.live import odometry_track as track
+from slam.live.errors import OdometryError
+from slam.live.odometry_track import (
     OdometryTrack,
     Trajectory,
     TumError,
@@ -25,7 +26,6 @@ from slam.app.odometry.track import (
     read_tum,
     write_tum,
 )
-from slam.geometry import wrap_angle
 
 
 def lines_of(rows: list[tuple[int, float, float, float]]) -> list[str]:

@@ -72,7 +72,7 @@ class SessionInfo:
     versions
         Of what the numbers depend on.
     config_json
-        SLAM's settings, by `slam.app.session.description.settings_text`; "" if not recorded.
+        SLAM's settings, by `slam.live.session.description.settings_text`; "" if not recorded.
     wheels
         Fields of `WheelNoise`: the wheel errors that SLAM assumes.
     outlines_m

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from slam.app.errors import AppError
-from slam.app.session.constants import slam_constants
-from slam.app.session_records import RadarInfo, SessionInfo
-from slam.config import SlamConfig, WheelNoise, load_preset
-from slam.geometry import Mount
+from slam.config import SlamConfig
+from slam.live.errors import AppError
+from slam.live.session_records import RadarInfo, SessionInfo
 from xethru_protocol.validation import reason_of, shown
 
 METADATA_NAME = "xethru-hil session"
@@ -154,44 +152,3 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
     if unit != LENGTH_UNIT:
         raise AppError(f"{path}: {topic}: lengths in {shown(unit)}, must be in {LENGTH_UNIT}")
     return radar
-
-
-def imported_info(
-    source: Path,
-    radars: tuple[RadarInfo, ...],
-    preset: str,
-    *,
-    time_base: str,
-    has_detections: bool = False,
-) -> SessionInfo:
-    """Return the head of a session made of a file; it is named after the file."""
-    return SessionInfo(
-        scene=source.resolve().stem,
-        preset=preset,
-        seed=None,
-        radars=radars,
-        true_landmarks_m=np.zeros((0, 2)),
-        versions={},
-        config_json=settings_text(load_preset(preset)),
-        constants=slam_constants(),
-        wheels=asdict(WheelNoise()),
-        simulated=False,
-        time_base=time_base,
-        has_detections=has_detections,
-    )
-
-
-def imported_radar(
-    mount: Mount, *, range_start_m: float, bin_length_m: float, n_bins: int, rate_hz: float
-) -> RadarInfo:
-    """Return a radar with unknown serial number, port and settings; module metres."""
-    return RadarInfo(
-        **{each.name: getattr(mount, each.name) for each in fields(mount)},
-        serial="",
-        port="",
-        range_start_m=range_start_m,
-        bin_length_m=bin_length_m,
-        n_bins=n_bins,
-        rate_hz=rate_hz,
-        settings={},
-    )

@@ -1,0 +1,1 @@
+"""The class `Slam`, and what it is made with."""

@@ -1,0 +1,1 @@
+"""Scans of modules and of recorded sessions, with their times."""

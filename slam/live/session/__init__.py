@@ -1,0 +1,1 @@
+"""Recorded sessions: what describes them, and their reader."""
