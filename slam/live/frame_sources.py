@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import Literal, Self, cast
 
@@ -116,6 +116,18 @@ def radar_frame(
         limits=limits,
         stream=frame.stream,
     )
+
+
+def less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
+    """Return a frame as a radar without gain would give it, with its limits scaled, too."""
+    if gain_db == 0.0:
+        return frame
+    scale = np.float32(10.0 ** (-gain_db / 20.0))
+    limits = frame.limits
+    if limits is not None:  # as float32, for samples at a limit are compared with it exactly
+        low, high = (float(np.float32(limit) * scale) for limit in limits)
+        limits = (low, high)
+    return replace(frame, samples=frame.samples * scale, limits=limits)
 
 
 def recorded_frame(

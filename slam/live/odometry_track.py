@@ -13,7 +13,7 @@ import math
 import re
 import socket
 from array import array
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry import wrap_angle
+from slam.library.pose_track import PoseTrack
 from slam.live.errors import AppError, OdometryError
 from xethru_protocol.operating_system import read_bounded
 from xethru_protocol.validation import shown
@@ -160,32 +160,20 @@ def read_tum(path: Path) -> Trajectory:
 _HOLD_NS = NS_PER_S // 2
 
 
-_FEWEST_FORGOTTEN = 64
-"""Forgetting moves all later samples, so it is done for some at a time."""
+class OdometryTrack(PoseTrack):
+    """Odometry as TUM lines in time order, asked for the pose at any time between them.
 
-
-class OdometryTrack:
-    """Odometry samples in time order, asked for the pose at any time between them.
-
-    Later ones may be appended while a robot drives; what lies between earlier ones stays the same
-    to the last bit. Iterating gives the samples.
+    Iterating gives the samples.
     """
 
     def __init__(self, samples: Iterable[TumSample]) -> None:
-        self._stamps_ns = array("q")
-        # Of each sample: x [m], y [m], and the quaternion's z and w
-        self._x_m, self._y_m, self._qz, self._qw = (array("d") for _ in range(4))
-        # Unwrapped, so that interpolation across +-pi takes the short way round.
-        self._heading_rad = array("d")
-        self._turns_rad = 0.0  # what unwrapping adds to the newest heading
+        super().__init__()
+        self._qz, self._qw = array("d"), array("d")  # the quaternion of each sample
         self._n_forgotten = 0
         for sample in samples:
             self.append(sample)
         if not self._stamps_ns:
             raise OdometryError("odometry: the source sent no pose")
-
-    def __len__(self) -> int:
-        return len(self._stamps_ns)
 
     def __iter__(self) -> Iterator[TumSample]:
         return map(self._sample, range(len(self)))
@@ -207,10 +195,6 @@ class OdometryTrack:
     def first_ns(self) -> int:
         return self._stamps_ns[0]
 
-    @property
-    def last_ns(self) -> int:
-        return self._stamps_ns[-1]
-
     def gap_ns(self, t_ns: int) -> float:
         """Return how far apart the two samples around a time are; infinite outside of all.
 
@@ -229,27 +213,18 @@ class OdometryTrack:
 
     def append(self, sample: TumSample) -> None:
         """Take a sample; OdometryError if it is not later than all before it."""
-        if self._stamps_ns:
-            if sample.t_ns <= self._stamps_ns[-1]:
-                number = self._n_forgotten + len(self) + 1
-                raise OdometryError(f"odometry: line {number} is not later than the line before")
-            self._turns_rad += _unwrapping(self.last.heading_rad, sample.heading_rad)
-        self._stamps_ns.append(sample.t_ns)
-        self._x_m.append(sample.x_m)
-        self._y_m.append(sample.y_m)
+        if self._stamps_ns and sample.t_ns <= self.last_ns:
+            number = self._n_forgotten + len(self) + 1
+            raise OdometryError(f"odometry: line {number} is not later than the line before")
+        self.add(sample.t_ns, (sample.x_m, sample.y_m, sample.heading_rad))
         self._qz.append(sample.qz)
         self._qw.append(sample.qw)
-        self._heading_rad.append(sample.heading_rad + self._turns_rad)
 
-    def forget_before(self, t_ns: int) -> None:
-        """Forget samples, now or later, that no pose from a session time on depends on."""
-        n_needless = bisect_right(self._stamps_ns, t_ns) - 1
-        if n_needless < _FEWEST_FORGOTTEN:
-            return
-        self._n_forgotten += n_needless
-        columns = (self._x_m, self._y_m, self._qz, self._qw, self._heading_rad)
-        for column in (self._stamps_ns, *columns):
-            del column[:n_needless]
+    def forget_before(self, t_ns: int) -> int:
+        n_forgotten = super().forget_before(t_ns)
+        self._n_forgotten += n_forgotten
+        del self._qz[:n_forgotten], self._qw[:n_forgotten]
+        return n_forgotten
 
     @classmethod
     def from_lines(cls, lines: Iterable[str]) -> OdometryTrack:
@@ -263,50 +238,17 @@ class OdometryTrack:
         return cls(samples)
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
-        """Return the pose at a session time: x [m], y [m], heading [rad] in [-pi, pi), odom frame.
+        """Return the pose at a session time; see `PoseTrack`.
 
-        Position and heading are linear between two samples. That is exact on straight legs and for
-        turns on the spot. On an arc the position half way between samples is
-        chord / 2 * tan(turn / 4) off, 0.12 mm for 1 cm and 5.6 degrees; an arc instead would help
-        only there, and fits no wheel that stops or starts between samples either. Raises
-        OdometryError if the time is more than half a second outside the samples.
+        Up to half a second outside the samples it is the nearest one. OdometryError beyond that.
         """
-        stamps_ns = self._stamps_ns
-        first, last = stamps_ns[0], stamps_ns[-1]
+        first, last = self.first_ns, self.last_ns
         if not first - _HOLD_NS <= t_ns <= last + _HOLD_NS:
             raise OdometryError(
                 f"odometry covers {first / NS_PER_S:.2f} .. {last / NS_PER_S:.2f} s, "
                 f"but a frame came at {t_ns / NS_PER_S:.2f} s"
             )
-        after = bisect_right(stamps_ns, t_ns)
-        if after in (0, len(stamps_ns)):
-            row = min(after, len(stamps_ns) - 1)
-            return np.array([self._x_m[row], self._y_m[row], wrap_angle(self._heading_rad[row])])
-        part = (t_ns - stamps_ns[after - 1]) / (stamps_ns[after] - stamps_ns[after - 1])
-        x_m, y_m = self._x_m[after - 1], self._y_m[after - 1]
-        turn_rad = self._heading_rad[after] - self._heading_rad[after - 1]
-        heading_rad = self._heading_rad[after - 1] + part * turn_rad
-        return np.array(
-            [
-                x_m + part * (self._x_m[after] - x_m),
-                y_m + part * (self._y_m[after] - y_m),
-                wrap_angle(heading_rad),
-            ]
-        )
-
-
-def _unwrapping(before_rad: float, after_rad: float) -> float:
-    """Return what to add to a heading so that it follows on the one before the short way round.
-
-    One step of `numpy.unwrap`, to the last bit.
-    """
-    turn_rad = after_rad - before_rad
-    if abs(turn_rad) < math.pi:
-        return 0.0
-    short_rad = (turn_rad + math.pi) % math.tau - math.pi
-    if short_rad == -math.pi and turn_rad > 0:
-        short_rad = math.pi
-    return short_rad - turn_rad
+        return super().pose_at(t_ns)
 
 
 def read_odometry_socket(path: str, timeout_s: float = 10.0) -> OdometryTrack:

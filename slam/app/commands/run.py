@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -21,14 +22,7 @@ from slam.app.errors import UsageError
 from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_source
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.rig_files import load_rig
-from slam.app.run.live_source import (
-    MOST_WAIT_NS,
-    Inbox,
-    LiveLog,
-    LiveSource,
-    drift_text,
-    reading,
-)
+from slam.app.run.live_source import LiveLog, LiveSource, drift_text, read_odometry
 from slam.app.run.output import ResultRow, RunProgress, note
 from slam.app.run.result_files import (
     REPORT,
@@ -61,6 +55,7 @@ from slam.live.modules import are_emulated, open_modules
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session.description import settings_text
 from slam.live.session_records import SessionInfo, SessionObserver
+from slam.live.ticks import MOST_WAIT_NS, Inbox, reading
 from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
@@ -139,7 +134,7 @@ def run_rig(
             stop,
             duration_s=duration_s,
         )
-        with reading(links, line_source, inbox) as end_reading:
+        with reading(links, inbox, odometry=partial(read_odometry, line_source)) as end_reading:
             _prepare_the_end()
             start_ns = live.settle()
             info = SessionInfo(

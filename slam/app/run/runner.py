@@ -23,6 +23,7 @@ from slam.frames import Detector, RadarFrame, StepInputError
 from slam.front_end.numba_compilation import compile_kernels
 from slam.geometry import Rig
 from slam.live.errors import AppError
+from slam.live.frame_sources import less_gain
 from slam.live.session_records import (
     LogLine,
     RadarInfo,
@@ -396,7 +397,7 @@ def run_slam(
                         world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
                     counters.put(scan.t_ns, scan.counter)
                     frames = [
-                        _less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames
+                        less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames
                     ]
                     results = slam.step(frames, odometry.pose_at, scan.t_ns)
             except StepGivenUpError:
@@ -413,18 +414,6 @@ def run_slam(
             take(slam.flush())
             smooth()
     return recorder.record()
-
-
-def _less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
-    """Return a frame as a radar without gain would give it, with its limits scaled, too."""
-    if gain_db == 0.0:
-        return frame
-    scale = np.float32(10.0 ** (-gain_db / 20.0))
-    limits = frame.limits
-    if limits is not None:  # as float32, for samples at a limit are compared with it exactly
-        low, high = (float(np.float32(limit) * scale) for limit in limits)
-        limits = (low, high)
-    return replace(frame, samples=frame.samples * scale, limits=limits)
 
 
 def snapshot_of_step(

@@ -4,6 +4,7 @@ import os
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,23 +27,17 @@ from hil_tests.unit.slam.app.sessions import Listener
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.odometry.live import LiveOdometry, parse_source
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
-from slam.app.run import live_source as run_readers
-from slam.app.run.live_source import (
-    GRACE_NS,
-    Inbox,
-    LiveSource,
-    SourceEvent,
-    TickAssembler,
-    reading,
-)
+from slam.app.run.live_source import LiveSource, read_odometry
 from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount
+from slam.live import ticks as run_readers
 from slam.live.arrival_clock import ClockLine
 from slam.live.errors import AppError
 from slam.live.frame_sources import RadarLink, sampler_limits
 from slam.live.session_records import Scan
+from slam.live.ticks import GRACE_NS, Inbox, SourceEvent, TickAssembler, reading
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
@@ -92,7 +87,7 @@ def told_until(
 ) -> list[SourceEvent]:
     inbox = Inbox()
     events: list[SourceEvent] = []
-    with reading(links, parse_source(str(source)), inbox):
+    with reading(links, inbox, odometry=partial(read_odometry, parse_source(str(source)))):
         while not done(events):
             events.append(inbox.get(timeout=seconds(10)))
     return events

@@ -23,7 +23,7 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
 from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.odometry.live import LiveOdometry
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
-from slam.app.run.live_source import Inbox, LiveLog, LiveSource, SourceEvent
+from slam.app.run.live_source import LiveLog, LiveSource
 from slam.app.run.replay import Comparison, recorded_source
 from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute, make_slam
 from slam.app.session.writer import SessionLog
@@ -34,6 +34,7 @@ from slam.live.frame_sources import sampler_limits
 from slam.live.session.description import settings_text
 from slam.live.session.reader import open_session
 from slam.live.session_records import LogLine, Scan, SessionInfo
+from slam.live.ticks import Inbox, SourceEvent
 from slam.results import Pipeline, PoseAt, StepResult
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 

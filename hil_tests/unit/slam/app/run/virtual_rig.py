@@ -17,9 +17,10 @@ from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
 from emulator.x4m300 import radar_device
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
-from slam.app.run.live_source import Inbox, LiveLog, SourceEvent
+from slam.app.run.live_source import LiveLog
 from slam.live.frame_sources import RadarLink, RigSource
 from slam.live.session_records import RadarInfo
+from slam.live.ticks import Inbox, SourceEvent
 from xethru_protocol.driver.radar import X4M300
 
 NS_PER_S = 1_000_000_000
