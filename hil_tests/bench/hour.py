@@ -16,6 +16,7 @@ from itertools import cycle, islice
 from pathlib import Path
 
 from emulator.scene.scene import Scene
+from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import rig_of, scene_and_config, wheels_of
 from slam.app.run.result_files import finish
 from slam.app.run.runner import execute, make_slam
@@ -101,7 +102,7 @@ def curve(
     if views:
         sinks.append(RerunView(folder / "session.rrd", source.info))
     record = execute(source, sinks)
-    finish(folder, source, record, StopFlag())
+    finish(folder, source, record, StopFlag(), publishing=Publishing(()))
     return memory.resident_mb
 
 

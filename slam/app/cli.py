@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from slam.app.benchmarks import BENCHMARKS
 from slam.app.errors import EXIT_USAGE
+from slam.app.publish import SINKS
 from slam.app.sweep import FAMILIES, STRESSES
 from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
 from slam.live.errors import EXIT_FAILED, AppError
@@ -166,6 +167,7 @@ _seed, _count = partial(_whole_number, least=0), partial(_whole_number, least=1)
 
 _seconds = number(float, lambda value: 0.0 <= value < math.inf, "seconds, 0 or more")
 _metres = number(float, lambda value: 0.0 < value < math.inf, "metres, more than 0")
+_rate = number(float, lambda value: 0.0 < value < math.inf, "more than 0")
 
 
 def _setting(text: str) -> tuple[str, tuple[str, ...]]:
@@ -221,6 +223,18 @@ def _add_session_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_publish(parser: argparse.ArgumentParser) -> None:
+    """Add `--publish` of a command that runs SLAM."""
+    parser.add_argument(
+        "--publish",
+        action="append",
+        default=[],
+        metavar="SINK",
+        help="give the poses and the map to other programs meanwhile; may be given several times: "
+        + "; ".join(kind.help for kind in SINKS.values()),
+    )
+
+
 def _rerun_target(text: str) -> str:
     if text in {SPAWN, SERVE_WEB}:
         return text
@@ -247,6 +261,7 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
     )
     _add_preset(demo)
     _add_session_options(demo)
+    _add_publish(demo)
 
 
 def _add_view(view: argparse.ArgumentParser) -> None:
@@ -327,11 +342,19 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         help="end after so many seconds",
     )
     _add_session_options(run)
+    _add_publish(run)
 
 
 def _add_replay(replay: argparse.ArgumentParser) -> None:
     _add_session(replay)
     _add_out(replay, "out/replay")
+    replay.add_argument(
+        "--rate",
+        type=_rate,
+        metavar="R",
+        help="so many times as fast as it was driven, 1 is real time (default: at full speed)",
+    )
+    _add_publish(replay)
 
 
 def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +13,7 @@ from shlex import quote
 from typing import Literal
 
 from slam.app.errors import EmulatorError
+from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -64,6 +65,7 @@ def run_demo(
     wire: bool = False,
     lean: bool = False,
     rerun: str | None = None,
+    publish: Sequence[str] = (),
 ) -> None:
     """Run the emulated robot through its scene and write everything into one folder.
 
@@ -71,7 +73,9 @@ def run_demo(
     driven until then is recorded, mapped and summed up.
     """
     loaded, config = scene_and_config(scene, preset)
+    publishing = Publishing(publish)
     with ExitStack() as held:
+        held.enter_context(publishing)
         live = None
         if rerun is not None:  # before an earlier run's files are removed
             live = held.enter_context(LiveView(rerun, stop))
@@ -130,6 +134,7 @@ def run_demo(
             sinks: list[SessionObserver] = [
                 RunProgress(info, source.lost_frames, end_ns=trajectory.duration_ns),
                 log,  # closed before the views: the record must not wait for them
+                publishing.observer(info, link_log.log),
                 *([live.observer(info)] if live is not None else []),
                 *([make_view(out / VIEW, info)] if make_view is not None else []),
             ]
@@ -140,7 +145,7 @@ def run_demo(
             record = execute(source, sinks)
         if record.last is not None:
             # without the flag: the signal that ended the drive does not end the writing
-            finish(out, source, record, StopFlag())
+            finish(out, source, record, StopFlag(), publishing=publishing)
         if stop.received is not None:
             raise StopRequestedError(stop.received, kept)
         if scans.failure is not None:

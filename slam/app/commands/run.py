@@ -20,6 +20,7 @@ import numpy as np
 
 from slam.app.errors import UsageError
 from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_source
+from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.live_source import LiveLog, LiveSource, drift_text, read_odometry
@@ -78,6 +79,7 @@ def run_rig(
     wire: bool = False,
     lean: bool = False,
     rerun: str | None = None,
+    publish: Sequence[str] = (),
 ) -> None:
     """Run SLAM on a rig until odometry ends, the time is over, or a signal comes.
 
@@ -98,6 +100,7 @@ def run_rig(
     line_source = parse_source(odometry)
     live_odometry = LiveOdometry(line_source.name, parse_clock(clock, line_source))
     inbox = Inbox()
+    publishing = Publishing(publish)
     with ExitStack() as held:
         if (out / SESSION).exists():
             raise AppError(
@@ -105,6 +108,7 @@ def run_rig(
                 "choose another --out, or move it away"
             )
         hold_folder(out, held)
+        held.enter_context(publishing)
         requests = held.enter_context(SmoothingRequests(out))
         view = held.enter_context(LiveView(rerun, stop)) if rerun is not None else None
         links = open_modules(
@@ -167,6 +171,7 @@ def run_rig(
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [
+                publishing.observer(info, log.log, start_ns),
                 RunProgress(info, source.lost_frames, also=lambda: _dropped_text(live)),
                 requests,
             ]
@@ -175,7 +180,8 @@ def run_rig(
             record = execute(source, sinks)
             end_reading()  # the modules are stopped while the results are written
             # without the flag: the signal that ended the drive does not end the writing
-            finish(out, source, record, StopFlag(), _rows(record, live, live_odometry, slam))
+            rows = _rows(record, live, live_odometry, slam)
+            finish(out, source, record, StopFlag(), rows, publishing=publishing)
         rig_source.close()  # while a page is served, others may have the modules
         _report_end(live, log, out)
         if view is not None:

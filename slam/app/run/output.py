@@ -17,7 +17,14 @@ from slam.evaluation import MIN_POSES, LandmarkScore
 from slam.geometry import transform
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
-from xethru_protocol.operating_system import STDERR, STDOUT, each_line, one_line, written_whole
+from xethru_protocol.operating_system import (
+    STDERR,
+    STDOUT,
+    Outlet,
+    each_line,
+    one_line,
+    written_whole,
+)
 
 _LIVE_PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 10.0
@@ -118,12 +125,12 @@ def print_progress(line: str) -> None:
     STDERR.write_soon(f"{one_line(line)}\n")
 
 
-def print_text(lines: str) -> None:
+def print_text(lines: str, outlet: Outlet = STDOUT) -> None:
     """Print lines of a result on standard output, after its files are written.
 
     What cannot be printed does not raise here: the exit code reports it.
     """
-    STDOUT.write(each_line(lines) + "\n")
+    outlet.write(each_line(lines) + "\n")
 
 
 def write_json(path: Path, numbers: Mapping[str, object]) -> None:
@@ -137,8 +144,13 @@ ResultRow = tuple[str, str, str]
 """Name, value and note."""
 
 
-def print_table(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
-    print_text(table_text(title, header, rows).rstrip("\n"))
+def print_table(
+    title: str,
+    header: Sequence[str] | None,
+    rows: Sequence[Sequence[str]],
+    outlet: Outlet = STDOUT,
+) -> None:
+    print_text(table_text(title, header, rows).rstrip("\n"), outlet)
 
 
 def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> str:
@@ -164,7 +176,11 @@ def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence
 
 
 def print_result(
-    source: RunSource, record: RunRecord, summary: Summary | None, also: Sequence[ResultRow] = ()
+    source: RunSource,
+    record: RunRecord,
+    summary: Summary | None,
+    also: Sequence[ResultRow] = (),
+    outlet: Outlet = STDOUT,
 ) -> None:
     """Print the table of a run; without `summary` no truth is known. `also` are more rows."""
     info, lost_frames = source.info, source.lost_frames()
@@ -179,7 +195,7 @@ def print_result(
         rows = summary_rows(
             summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
         )
-    print_table(title, None, [*rows, *also])
+    print_table(title, None, [*rows, *also], outlet)
 
 
 def summary_rows(

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from slam.app.errors import UsageError
+from slam.app.publish.sinks import Publishing
 from slam.app.run.output import RunProgress, note
 from slam.app.run.result_files import SESSION, VIEW, finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import (
@@ -34,7 +38,7 @@ from slam.app.session.constants import different_constants, recorded_rules
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
 from slam.live.errors import AppError, OdometryError
-from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
 from slam.live.session.reader import RecordedScan, RecordedSession, begins_with, open_session
 from slam.live.session.state_rows import smoothed_row, state_row
 from slam.live.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
@@ -177,20 +181,65 @@ class _RecordedSlam(WrappedSlam):
         return self.step_detections(self._detections.get(t_ns, ()), pose_at, t_ns)
 
 
-def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
-    """Replay a session, write its results into a folder and print its table."""
+_LONGEST_WAIT_S = 10.0
+"""Longer gaps in the time of scans, as where a clock was set, are not waited for."""
+_POLL_S = 0.1
+
+
+def paced(
+    scans: Iterable[Scan],
+    rate: float,
+    stop: StopFlag,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[Scan]:
+    """Yield scans when they are due, `rate` times as fast as they were taken.
+
+    Scans that are late are yielded at once, until they are due again. Session time that falls, or
+    jumps by more than ten seconds of waiting, begins the pace anew.
+    """
+    start_s, start_ns, last_ns = -math.inf, 0, -1
+    for scan in scans:
+        due_s = start_s + (scan.t_ns - start_ns) / NS_PER_S / rate
+        if last_ns < 0 or scan.t_ns < last_ns or due_s - clock() > _LONGEST_WAIT_S:
+            start_s = due_s = clock()
+            start_ns = scan.t_ns
+        last_ns = scan.t_ns
+        while (rest_s := due_s - clock()) > 0.0:
+            stop.check()
+            sleep(min(rest_s, _POLL_S))
+        yield scan
+
+
+def run_replay(
+    stop: StopFlag,
+    *,
+    session: Path,
+    out: Path,
+    rate: float | None = None,
+    publish: Sequence[str] = (),
+) -> None:
+    """Replay a session, write its results into a folder and print its table.
+
+    `rate` is how many times as fast as it was driven; None: at full speed.
+    """
+    publishing = Publishing(publish)
     recorded = open_session(session, stop)
     comparison = Comparison(different_constants(recorded.info.constants))
     source = recorded_source(recorded, stop, comparison)
+    if rate is not None:
+        source = replace(source, scans=paced(source.scans, rate, stop))
     with ExitStack() as held:
         hold_folder(out, held)
+        held.enter_context(publishing)
         progress = RunProgress(source.info, source.lost_frames, end_ns=recorded.end_ns)
-        record = execute(source, [comparison, progress])
+        published = publishing.observer(source.info, source.link_log.log)
+        record = execute(source, [published, comparison, progress])
         if recorded.cut_at_byte is not None:
             note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")
         note(comparison.verdict())
         with saying_what_is_left(f"; {out} is not complete"):
-            finish(out, source, record, stop)
+            finish(out, source, record, stop, publishing=publishing)
 
 
 def recorded_config(session: RecordedSession) -> SlamConfig:

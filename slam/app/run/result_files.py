@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import naming
+from slam.app.publish.sinks import Publishing
 from slam.app.run.output import ResultRow, print_result
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, summarise
@@ -21,6 +22,8 @@ from slam.live.odometry_track import NS_PER_S, Trajectory, write_tum
 from slam.live.session_records import SessionInfo
 from slam.results import SmoothedRun
 from xethru_protocol.operating_system import (
+    STDERR,
+    STDOUT,
     PathInUseError,
     StopFlag,
     StopRequestedError,
@@ -34,23 +37,32 @@ RESULTS = ("map.png", "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "od
 
 
 def finish(
-    out: Path, source: RunSource, record: RunRecord, stop: StopFlag, also: Sequence[ResultRow] = ()
+    out: Path,
+    source: RunSource,
+    record: RunRecord,
+    stop: StopFlag,
+    also: Sequence[ResultRow] = (),
+    *,
+    publishing: Publishing,
 ) -> None:
     """Write a run's results into an existing folder, then print its table; `also` are more rows.
 
     The files of an earlier run are removed first, and each new one has its name once it is whole.
-    If one cannot be written, the table is printed nevertheless.
+    If one cannot be written, the table is printed nevertheless. Where a sink of `publishing` has
+    standard output, it is printed on standard error.
     """
     stop.check()
+    also = [*also, *publishing.rows()]
+    outlet = STDERR if publishing.takes_stdout else STDOUT
     summary = summarise(record, source.info, source.rig)
     try:
         remove_earlier(out, RESULTS)
         _write(out, source.info, record, summary, stop)
     except AppError:
-        print_result(source, record, summary, also)
+        print_result(source, record, summary, also, outlet)
         raise
     with stop.at_once():  # a stream may block
-        print_result(source, record, summary, also)
+        print_result(source, record, summary, also, outlet)
 
 
 def _write(
