@@ -19,6 +19,7 @@ PACKAGES = {
     "emulator": ("pydantic", "scipy"),
     "slam": ("joblib", "matplotlib", "numba", "PIL", "rosbags", "sklearn", "threadpoolctl"),
     "live": ("pyarrow", "rerun", "rerun_cli"),
+    "foxglove": ("foxglove",),
     "dask": ("distributed",),
     "gtsam": ("gtsam",),
 }

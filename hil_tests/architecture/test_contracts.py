@@ -146,6 +146,7 @@ def test_small_files_with_one_importer_are_part_of_it() -> None:
 
 # What a distribution is imported as, where that is another name.
 IMPORTED_AS = {
+    "foxglove-sdk": "foxglove",
     "pillow": "PIL",
     "pyserial": "serial",
     "pytest-timeout": "pytest_timeout",

@@ -22,5 +22,9 @@ SINKS: Mapping[str, SinkKind] = {
         "jsonl:FILE or jsonl:- (standard output): a line of JSON for every pose",
     ),
     "udp": SinkKind("slam.app.publish.udp:UdpSink", "udp://HOST:PORT: the same as datagrams"),
+    "foxglove": SinkKind(
+        "slam.app.publish.foxglove:FoxgloveSink",
+        "foxglove or foxglove:PORT: a server for Foxglove and Lichtblick",
+    ),
 }
 """By what stands before the first colon of a SINK; the class gets what stands behind it."""

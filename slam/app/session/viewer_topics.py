@@ -47,11 +47,19 @@ Array = NDArray[np.float64]
 
 
 class Topics(Protocol):
-    """Takes messages in CDR; see `SessionLog`."""
+    """Takes messages in CDR; see `SessionMessages`."""
 
     def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None: ...
 
-    def write(self, topic: str, t_ns: int, data: bytes) -> None: ...
+    def write(
+        self,
+        topic: str,
+        t_ns: int,
+        data: bytes,
+        *,
+        sequence: int = 0,
+        publish_ns: int | None = None,
+    ) -> None: ...
 
 
 class Drawings:
@@ -122,10 +130,10 @@ class Drawings:
         self._paths["/estimate"].add(t_ns, snapshot.estimate)
         if "/truth" in self._paths and np.isfinite(snapshot.truth).all():
             self._paths["/truth"].add(t_ns, snapshot.truth)
-        if t_ns - self._markers_ns >= _MARKERS_EVERY_NS:
+        if not 0 <= t_ns - self._markers_ns < _MARKERS_EVERY_NS:  # session time may fall
             self._markers_ns = t_ns
             self._write_landmarks(snapshot)
-        if t_ns - self._paths_ns >= _PATHS_EVERY_NS:
+        if not 0 <= t_ns - self._paths_ns < _PATHS_EVERY_NS:
             self._paths_ns = t_ns
             self._write_paths(t_ns, most=_SHOWN_POSES)
 

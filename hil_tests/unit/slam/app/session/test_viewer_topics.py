@@ -261,7 +261,15 @@ class Kept:
     def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None:
         self.messages.setdefault(topic, [])
 
-    def write(self, topic: str, t_ns: int, data: bytes) -> None:
+    def write(
+        self,
+        topic: str,
+        t_ns: int,
+        data: bytes,
+        *,
+        sequence: int = 0,
+        publish_ns: int | None = None,
+    ) -> None:
         self.messages[topic].append(data)
 
 

@@ -1,0 +1,134 @@
+"""The sink that serves the messages of a session to Foxglove and Lichtblick, while it happens."""
+
+from __future__ import annotations
+
+import re
+
+from foxglove import Channel, Context, Schema, start_server
+from foxglove.websocket import (
+    Capability,
+    ChannelView,
+    Client,
+    ServerListener,
+    WebSocketServer,
+)
+
+from slam.app.errors import UsageError
+from slam.app.publish.sinks import Sink
+from slam.app.session.writer import SessionMessages
+from slam.live.errors import AppError
+from slam.live.odometry_track import TumSample
+from slam.live.session import cdr
+from slam.live.session_records import LogLine, Scan, SessionInfo, Snapshot
+from slam.results import SmoothedRun
+
+DEFAULT_PORT = 8765
+"""Where Foxglove and Lichtblick look for a server by default."""
+_HOST = "127.0.0.1"
+_LARGEST_PORT = 65_535
+
+
+class _ServedTopics(ServerListener):
+    """Sends messages to those who subscribed to their topics.
+
+    Whoever subscribes gets the last message of the topic at once: what is latched, and of the
+    others what may come again in some seconds only.
+    """
+
+    def __init__(self, server_context: Context) -> None:
+        self._context = server_context
+        self._channels: dict[str, Channel] = {}
+        self._last: dict[str, tuple[int, bytes]] = {}
+
+    def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None:
+        if topic not in self._channels:
+            schema = Schema(
+                name=message_type, encoding="ros2msg", data=cdr.schema_text(message_type)
+            )
+            self._channels[topic] = Channel(
+                topic, schema=schema, message_encoding="cdr", context=self._context
+            )
+
+    def write(
+        self,
+        topic: str,
+        t_ns: int,
+        data: bytes,
+        *,
+        sequence: int = 0,
+        publish_ns: int | None = None,
+    ) -> None:
+        """Send a message; its time is that of the session, and the server adds none."""
+        self._last[topic] = t_ns, data
+        self._channels[topic].log(data, log_time=t_ns)
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """Send the last message again, in a thread of the server: others get it twice."""
+        if (last := self._last.get(channel.topic)) is not None:
+            t_ns, data = last
+            self._channels[channel.topic].log(data, log_time=t_ns)
+
+
+class FoxgloveSink(Sink):
+    """Serves what a session holds, and the drawings of it, at `PORT` of this machine.
+
+    With `HOST:PORT` it is that address of the machine, which others may reach. The wheels'
+    poses in /odom are those of the states.
+    """
+
+    def __init__(self, text: str) -> None:
+        host, _, port = text.rpartition(":")
+        if text and not (re.fullmatch("[0-9]{1,5}", port) and 0 < int(port) <= _LARGEST_PORT):
+            raise UsageError("must be foxglove, foxglove:PORT or foxglove:HOST:PORT")
+        self._host, self._port = host or _HOST, int(port or DEFAULT_PORT)
+        self._messages: SessionMessages | None = None
+        self._server: WebSocketServer | None = None
+
+    def open(self) -> None:
+        """Start the server; topics are there once the run begins."""
+        context = Context()
+        self._topics = _ServedTopics(context)
+        try:
+            self._server = start_server(
+                name="uwb-slam",
+                host=self._host,
+                port=self._port,
+                capabilities=[Capability.Time],
+                server_listener=self._topics,
+                context=context,
+            )
+        except RuntimeError as error:
+            raise AppError(
+                f"--publish foxglove: port {self._port} of {self._host} cannot be opened: {error}; "
+                "if another run is published there, choose another port with foxglove:PORT"
+            ) from None
+
+    def begin(self, info: SessionInfo, start_ns: int, map_id: str) -> None:
+        self._messages = SessionMessages(self._topics, info, start_ns=start_ns)
+
+    def on_scan(self, scan: Scan) -> None:
+        assert self._server is not None
+        assert self._messages is not None
+        self._server.broadcast_time(scan.t_ns)
+        self._messages.on_scan(scan)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        assert self._messages is not None
+        x_m, y_m, *_, qz, qw = cdr.planar(snapshot.odometry)
+        self._messages.on_odometry(TumSample(t_ns=snapshot.t_ns, x_m=x_m, y_m=y_m, qz=qz, qw=qw))
+        self._messages.on_snapshot(snapshot)
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        assert self._messages is not None
+        self._messages.on_smoothed(smoothed)
+
+    def on_log(self, line: LogLine) -> None:
+        assert self._messages is not None
+        self._messages.on_log(line)
+
+    def close(self) -> None:
+        """Send what is drawn at the end, and end the connections."""
+        if self._messages is not None:
+            self._messages.close()
+        if self._server is not None:
+            self._server.stop()
