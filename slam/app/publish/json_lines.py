@@ -144,14 +144,14 @@ class JsonLinesSink(Sink):
             self._descriptor = os.dup(_STDOUT)
         elif not self._path.is_fifo():
             with naming(self._path):
-                self._descriptor = self._opened()
+                self._descriptor = self._opened(os.O_RDWR)
                 self._is_file = S_ISREG(os.fstat(self._descriptor).st_mode)
                 self._go_on_behind_lines()
 
     def begin(self, info: SessionInfo, start_ns: int, map_id: str) -> None:
         self._lines = LineMaker(map_id)
         if self._descriptor is None:
-            self._descriptor = self._opened()
+            self._descriptor = self._opened(os.O_WRONLY)  # else it would be a reader itself
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         self._write(self._lines.state(snapshot))
@@ -163,8 +163,8 @@ class JsonLinesSink(Sink):
         if self._descriptor is not None:
             os.close(self._descriptor)
 
-    def _opened(self) -> int:
-        return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+    def _opened(self, way: int) -> int:
+        return os.open(self._path, way | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
 
     def _go_on_behind_lines(self) -> None:
         """End a line that a killed program left; AppError if the file holds something else."""
