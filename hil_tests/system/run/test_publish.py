@@ -27,9 +27,9 @@ from hil_tests.system.recorded_session import record_session
 from hil_tests.unit.slam.app.sessions import run
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
-from slam.app.session.reader import open_session
-from slam.app.session.state_rows import smoothed_row, state_row, step_row
-from slam.app.session_records import Scan, SessionObserver, Snapshot
+from slam.live.session.reader import open_session
+from slam.live.session.state_rows import smoothed_row, state_row, step_row
+from slam.live.session_records import Scan, SessionObserver, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.operating_system import StopFlag
 

@@ -14,15 +14,16 @@ import pytest
 
 from hil_tests.patience import wait_until
 from hil_tests.unit.full_disk import full_disk
-from hil_tests.unit.slam.app.session.test_state_rows import robust_state
 from hil_tests.unit.slam.app.session.test_viewer_topics import Kept
 from hil_tests.unit.slam.app.sessions import FRAME_NS, run, session_info, smoothed_run, snapshot
-from slam.app.errors import AppError, UsageError
+from hil_tests.unit.slam.live.session.test_state_rows import robust_state
+from slam.app.errors import UsageError
 from slam.app.publish.json_lines import LineMaker
 from slam.app.publish.sinks import Publishing, make_sink
 from slam.app.publish.udp import MOST_BYTES
 from slam.app.session.viewer_topics import Drawings
-from slam.app.session_records import Snapshot
+from slam.live.errors import AppError
+from slam.live.session_records import Snapshot
 
 
 def with_landmarks(counter: int, n_landmarks: int) -> Snapshot:
