@@ -101,6 +101,9 @@ PROMISES: dict[str, tuple[Promise, ...]] = {
     ),
     "view": _VIEW,
     "all": (*_DRIVER, *_EMULATOR, *_VIEW, *_HIL),
+    "foxglove": (
+        Promise("uwb-slam demo --scene {scene} --publish foxglove --out demo", "events sent"),
+    ),
     "dask": (
         Promise("python sweep.py sweep --scene {scene} --seeds 1 --json sweep.json", "short"),
     ),

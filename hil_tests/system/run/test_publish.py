@@ -169,10 +169,11 @@ def served(session: Path, out: Path, *, rate: float) -> Iterator[int]:
             process.kill()
 
 
+@pytest.mark.rare  # seconds: a replay in another process
 def test_a_client_of_foxglove_gets_frames_pose_and_landmarks(session: Path, tmp_path: Path) -> None:
     modules, node = os.environ.get(MODULES), shutil.which("node")
     if not modules or node is None:
-        pytest.skip(f"needs node, and {MODULES}: node_modules of @foxglove/ws-protocol, see docs")
+        pytest.skip(f"needs node, and {MODULES}, see CONTRIBUTING.md")
     with served(session, tmp_path, rate=2) as port:
         client = subprocess.run(
             [node, str(CLIENT), modules, str(port), *WANTED],
@@ -199,6 +200,7 @@ def test_a_client_of_foxglove_gets_frames_pose_and_landmarks(session: Path, tmp_
     assert found["/landmarks"]["message"]["width"] > 0
 
 
+@pytest.mark.rare  # as above
 def test_who_comes_late_gets_what_is_latched_at_once(session: Path, tmp_path: Path) -> None:
     websocket = pytest.importorskip("tornado.websocket", reason="tornado is in the extra dask")
     with served(session, tmp_path, rate=1) as port:

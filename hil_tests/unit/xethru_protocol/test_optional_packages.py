@@ -73,6 +73,7 @@ def test_the_table_of_included_extras_agrees_with_the_requirements(extra: str) -
         ("rerun", "slam", ("Rerun", "view")),
         ("rerun", "live", ("Rerun", "live")),
         ("rerun", None, ("Rerun", "live")),
+        ("foxglove.websocket", "slam", ("foxglove", "foxglove")),
         ("PIL", "view", ("PIL", "view")),
         ("PIL", "slam", ("PIL", "slam")),
         ("xethru_protocol.nothing", "slam", None),
