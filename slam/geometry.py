@@ -7,6 +7,7 @@ x forward, y left and its origin at the base footprint.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
@@ -151,7 +152,7 @@ class ReceivedPulse:
 class Mount:
     """Where one radar sits on the robot and how its range zero is off."""
 
-    name: str  # the radar's name in messages
+    name: str = ""  # the radar's name in messages; without one the rig numbers it
     # Antenna position in the body frame
     x_m: float
     y_m: float
@@ -201,11 +202,20 @@ class RadarPair:
     boresights_rad: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Rig:
     """The mounts of all radars of one robot, indexed as in frames."""
 
-    mounts: tuple[Mount, ...]
+    mounts: Sequence[Mount]  # kept as a tuple
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a mount that is nowhere."""
+        for number, mount in enumerate(self.mounts):
+            where = mount.x_m, mount.y_m, mount.yaw_rad, mount.range_offset_m
+            if not all(map(math.isfinite, where)):
+                raise ValueError(f"mount {number}, {mount}: its numbers must be finite")
+        named = (m if m.name else replace(m, name=f"radar{k}") for k, m in enumerate(self.mounts))
+        object.__setattr__(self, "mounts", tuple(named))
 
     def pairs(self, field: FieldOfView = PAPERS_FIELD) -> tuple[RadarPair, ...]:
         """Return the radars that can trilaterate, two by two: ``common_share`` is at least 0.05.

@@ -224,9 +224,11 @@ class InputCheck:
         """Return the odometry pose (3,) of a step, which may not be before the last one."""
         if self._last_ns is not None and not t_ns >= self._last_ns:
             raise StepInputError(f"t_ns is {t_ns}, before that of the last step, {self._last_ns}")
-        pose = self.pose(pose_at, t_ns)
+        return self.pose(pose_at, t_ns)
+
+    def accept(self, t_ns: int) -> None:
+        """Note that the step of a time is taken."""
         self._last_ns = t_ns
-        return pose
 
     def pose(self, pose_at: PoseAt, t_ns: int) -> Array:
         """Return the odometry pose at a time, shape (3,), three finite numbers."""

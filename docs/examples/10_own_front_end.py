@@ -21,10 +21,11 @@ import numpy as np
 from scipy.signal import find_peaks, hilbert
 
 from slam.app.rig.emulated import rig_of, wheels_of
-from slam.app.run.runner import execute, make_slam
+from slam.app.run.runner import execute
 from slam.app.run.summary import summarise
 from slam.app.sweep.run import loopback_source, make_case
 from slam.frames import Detection, RadarFrame
+from slam.library.slam import make_slam
 
 
 class EnvelopePeaks:

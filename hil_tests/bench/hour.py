@@ -19,10 +19,11 @@ from emulator.scene.scene import Scene
 from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import rig_of, scene_and_config, wheels_of
 from slam.app.run.result_files import finish
-from slam.app.run.runner import execute, make_slam
+from slam.app.run.runner import execute
 from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import loopback_source
 from slam.app.view.session_view import RerunView
+from slam.library.slam import make_slam
 from slam.live.odometry_track import NS_PER_S, OdometryTrack
 from slam.live.session_records import Scan, SessionObserver, Snapshot
 from xethru_protocol.operating_system import StopFlag

@@ -21,9 +21,10 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.runner import RunRecord, make_slam, run_slam
+from slam.app.run.runner import RunRecord, run_slam
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
+from slam.library.slam import make_slam
 from slam.live.odometry_track import OdometryTrack
 from slam.live.session.description import settings_text
 from slam.live.session_records import LogLine, Scan, SessionInfo

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from array import array
 from bisect import bisect_right
@@ -39,6 +40,10 @@ class PoseTrack:
         return len(self._stamps_ns)
 
     @property
+    def first_ns(self) -> int:
+        return self._stamps_ns[0]
+
+    @property
     def last_ns(self) -> int:
         return self._stamps_ns[-1]
 
@@ -52,6 +57,9 @@ class PoseTrack:
         self._y_m.append(y_m)
         self._heading_rad.append(heading_rad + self._turns_rad)
         self._last_heading_rad = heading_rad
+
+    def copy(self) -> PoseTrack:
+        return copy.deepcopy(self)
 
     def forget_before(self, t_ns: int) -> int:
         """Forget what no pose from a time on depends on, now or later; return how many poses."""

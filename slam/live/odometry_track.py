@@ -191,10 +191,6 @@ class OdometryTrack(PoseTrack):
     def last(self) -> TumSample:
         return self._sample(-1)
 
-    @property
-    def first_ns(self) -> int:
-        return self._stamps_ns[0]
-
     def gap_ns(self, t_ns: int) -> float:
         """Return how far apart the two samples around a time are; infinite outside of all.
 

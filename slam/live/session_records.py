@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from types import TracebackType
 from typing import Any, Self
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
 from slam.geometry import PAPERS_FIELD, FieldOfView, Mount, ReceivedPulse
-from slam.results import SmoothedRun, StepResult
+from slam.live.errors import AppError
+from slam.results import PoseAt, SmoothedRun, StepResult
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 """True poses, shape (n, 3), world frame, at n session times [ns]; NaN if unknown."""
@@ -145,7 +146,10 @@ class Scan:
     radar without start skew samples. Every frame has its own stamp, in the period that begins with
     `t_ns`, and the chip's counter, which begins anew with every stream. `host_ns` holds the arrival
     of each frame, nanoseconds since 1970; () if unknown. A scan that is not `used` is recorded
-    only: SLAM was not stepped with it.
+    only: SLAM was not stepped with it. Iterating gives the frames.
+
+    Where they are known, `odometry` returns the wheels' pose at a time [ns], and `truth` is the
+    true pose at `t_ns`; both of shape (3,), the latter in the world frame.
     """
 
     counter: int
@@ -153,6 +157,18 @@ class Scan:
     frames: tuple[RadarFrame, ...]
     host_ns: tuple[int, ...] = ()
     used: bool = True
+    odometry: PoseAt | None = None
+    truth: NDArray[np.float64] | None = None
+
+    def __iter__(self) -> Iterator[RadarFrame]:
+        return iter(self.frames)
+
+    @property
+    def odometry_pose(self) -> NDArray[np.float64]:
+        """Return the wheels' pose at `t_ns`, shape (3,); AppError if it is not known."""
+        if self.odometry is None:
+            raise AppError("modules know no odometry; it is the robot's own")
+        return self.odometry(self.t_ns)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

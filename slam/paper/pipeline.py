@@ -74,13 +74,16 @@ class UwbRadarSlam:
         """Collect a state where the robot has moved; estimate the oldest once w are there."""
         pose = self._check.begin(pose_at, t_ns)
         if self._collected_pose is None:  # Odom[0] <- origin
+            self._check.accept(t_ns)
             self._collected_pose = self._estimated_pose = pose
             return ()
         window = self.config.window
         if not has_moved(self._collected_pose, pose, window.min_distance_m, window.min_turn_rad):
+            self._check.accept(t_ns)
             return ()
         detections = detect()
         motions = self._motions(detections, pose, pose_at, t_ns)
+        self._check.accept(t_ns)
         fixes = self._trilaterator.locate(detections, t_ns, motions)
         self._collected_pose = pose
         self._window.append(

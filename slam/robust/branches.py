@@ -386,7 +386,12 @@ class Branches:
             raise ValueError("scans without a motion before them")
         next_id, carry_nats = self.main.state.next_id, self._carry_nats
         if self._has_stood and self._now - 1 in self._steps:
-            carry_nats -= self._shown(self._steps[self._now - 1].scans, scans, self._increment)
+            before, after = (
+                # ranges of beacons, and what has bearings, are of other sensors with other noise
+                [scan for scan in some if scan.looks and scan.bearings_rad is None]
+                for some in (self._steps[self._now - 1].scans, scans)
+            )
+            carry_nats -= self._shown(before, after, self._increment)
         position_m = self.main.state.position_m.copy()
         report = self.main.update(scans)
         step = Step(

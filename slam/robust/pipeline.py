@@ -63,9 +63,7 @@ class RobustSlam:
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Return the state if the robot has moved; without any frame there is odometry alone."""
-        stamps_ns = self._check.stamps_ns(frames)
-        detect = partial(detect_all, self._detector, frames, self.rig)
-        return self._take(detect, stamps_ns, pose_at, t_ns)
+        return self.step_scans(frames, (), pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
@@ -74,6 +72,21 @@ class RobustSlam:
         stamps_ns = dict.fromkeys(range(len(self.rig.mounts)), t_ns)
         stamps_ns |= self._check.stamps_ns(detections)
         return self._take(lambda: tuple(detections), stamps_ns, pose_at, t_ns)
+
+    def step_scans(
+        self,
+        frames: Sequence[RadarFrame],
+        given: Sequence[RangeScan],
+        pose_at: PoseAt,
+        t_ns: int,
+    ) -> tuple[StepResult, ...]:
+        """Do what ``step`` does, with ready scans of other mounts beside the frames.
+
+        A mount with neither did not look.
+        """
+        stamps_ns = self._check.stamps_ns(frames)
+        detect = partial(detect_all, self._detector, frames, self.rig)
+        return self._take(detect, stamps_ns, pose_at, t_ns, given)
 
     def flush(self) -> tuple[StepResult, ...]:
         return ()
@@ -92,29 +105,30 @@ class RobustSlam:
         stamps_ns: dict[int, int],
         pose_at: PoseAt,
         t_ns: int,
+        given: Sequence[RangeScan] = (),
     ) -> tuple[StepResult, ...]:
         pose = self._check.begin(pose_at, t_ns)
-        if has_moved(self._still, pose, _STILL_M, _STILL_RAD):
-            self._still, self._still_ns = pose, t_ns
-        self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
         if self._pose is None:
+            self._check.accept(t_ns)
             self._pose, self._t_ns = pose, t_ns
             self._still, self._still_ns, self._stood_ns = pose, t_ns, 0
             return ()
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         window = self.config.window
         if not has_moved(self._pose, pose, window.min_distance_m, window.min_turn_rad):
+            self._stand(pose, t_ns)
             return ()
         moved = {
             radar: None if stamp_ns == t_ns else between(pose, self._check.pose(pose_at, stamp_ns))
             for radar, stamp_ns in stamps_ns.items()
         }
         detections = detect()
+        self._stand(pose, t_ns)
         sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         branches = self._branches
         elapsed_s = (t_ns - self._t_ns) / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, self._stood_ns / _NS_PER_S)
-        report = branches.update(self._scans(detections, sigmas_m, moved))
+        report = branches.update([*self._scans(detections, sigmas_m, moved), *given])
         self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
         self._stamps_ns.append(t_ns)
         return (
@@ -127,6 +141,13 @@ class RobustSlam:
                 range_sigmas_m=sigmas_m,
             ),
         )
+
+    def _stand(self, pose: Array, t_ns: int) -> None:
+        """Take a step: note for how long the wheels have stood."""
+        self._check.accept(t_ns)
+        if has_moved(self._still, pose, _STILL_M, _STILL_RAD):
+            self._still, self._still_ns = pose, t_ns
+        self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
 
     def _sigma_m(self, detection: Detection) -> float:
         """Return the standard deviation of a range; infinite for one to be left out."""

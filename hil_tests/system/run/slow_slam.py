@@ -9,8 +9,9 @@ from unittest.mock import patch
 
 from slam.app.cli import main
 from slam.app.commands import run
-from slam.app.run.runner import WrappedSlam, make_slam
+from slam.app.run.runner import WrappedSlam
 from slam.frames import RadarFrame
+from slam.library.slam import make_slam
 from slam.results import Pipeline, PoseAt, StepResult
 
 

@@ -37,12 +37,13 @@ from slam.app.run.result_files import (
     hold_folder,
     remove_earlier,
 )
-from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
+from slam.app.run.runner import LinkLog, RunSource, execute
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
 from slam.config import BackEnd
 from slam.front_end.numba_compilation import compile_kernels
+from slam.library.slam import make_slam
 from slam.live.errors import AppError, RadarSilentError
 from slam.live.frame_sources import RigSource
 from slam.live.odometry_track import read_odometry_socket

@@ -36,19 +36,13 @@ from slam.app.run.result_files import (
     remove_earlier,
     write_smoothed,
 )
-from slam.app.run.runner import (
-    RunRecord,
-    RunSource,
-    StepGivenUpError,
-    WrappedSlam,
-    execute,
-    make_slam,
-)
+from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, WrappedSlam, execute
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.frames import RadarFrame
+from slam.library.slam import make_slam
 from slam.live.arrival_clock import ClockLine
 from slam.live.errors import AppError
 from slam.live.frame_sources import RigSource, sampler_limits

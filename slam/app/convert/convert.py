@@ -11,7 +11,6 @@ from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import UsageError, naming
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_text
-from slam.app.run.replay import recorded_config
 from slam.app.run.result_files import made_folder
 from slam.config import ConfigError, SlamConfig, load_preset
 from slam.live.errors import AppError, refuse_pipe
@@ -162,7 +161,7 @@ def _from_session(
     if out.suffix != _MAT_SUFFIX:
         return write_bag(session, out, stop)
     if preset is None and session.info.config_json:
-        config = recorded_config(session)
+        config = session.config
     else:
         config = _config(preset or _PRESET)
     return write_detections(session, out, config, stop)

@@ -8,7 +8,6 @@ The states that the run recorded are compared on the way.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from slam.app.errors import UsageError
 from slam.app.publish.sinks import Publishing
@@ -32,11 +30,10 @@ from slam.app.run.runner import (
     RunSource,
     WrappedSlam,
     execute,
-    make_slam,
 )
 from slam.app.session.constants import different_constants, recorded_rules
-from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
+from slam.library.slam import make_slam
 from slam.live.errors import AppError, OdometryError
 from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
 from slam.live.session.reader import RecordedScan, RecordedSession, begins_with, open_session
@@ -46,7 +43,6 @@ from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
 from slam.robust.solver.growing_arrays import RowsByTime
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
-from xethru_protocol.validation import problem_text
 
 _END = b"FOOT"
 """Ends a finished file, with four bytes behind it."""
@@ -242,25 +238,6 @@ def run_replay(
             finish(out, source, record, stop, publishing=publishing)
 
 
-def recorded_config(session: RecordedSession) -> SlamConfig:
-    """Return the settings of the run; raise AppError if this version cannot read them."""
-    try:
-        tables = json.loads(session.info.config_json)
-        if isinstance(tables, dict):
-            tables = without_removed_keys(tables, str(session.path))
-        return SlamConfig.model_validate(tables)
-    except json.JSONDecodeError as error:
-        raise AppError(f"{session.path}: its settings cannot be read: {error}") from None
-    except ConfigError as error:
-        raise AppError(str(error)) from None
-    except ValidationError as error:
-        text = problem_text(error.errors(), SlamConfig)
-        raise AppError(
-            f"{session.path}: its settings are not those of this version: {text}; "
-            f"it was recorded with xethru-hil {session.info.versions.get('xethru-hil', '?')}"
-        ) from None
-
-
 def recorded_source(
     session: RecordedSession, stop: StopFlag, comparison: Comparison | None = None
 ) -> RunSource:
@@ -273,16 +250,7 @@ def recorded_source(
     AppError
         The session cannot be replayed.
     """
-    if not session.info.config_json or not session.info.wheels:
-        raise AppError(
-            f"{session.path}: does not hold SLAM's settings; "
-            "its frames can be read, but not be replayed; record it again"
-        )
-    config = recorded_config(session)
-    try:
-        wheels = WheelNoise(**session.info.wheels)
-    except TypeError:
-        raise AppError(f"{session.path}: its description of the wheels is unknown here") from None
+    config, wheels = session.config, session.wheels
     try:
         odometry = OdometryTrack(_samples(session, stop, comparison))
     except OdometryError as error:

@@ -17,10 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import TrueAssociationNis, true_range_nis
-from slam.frames import Detector, RadarFrame, StepInputError
-from slam.front_end.numba_compilation import compile_kernels
+from slam.frames import RadarFrame, StepInputError
 from slam.geometry import Rig
 from slam.live.errors import AppError
 from slam.live.frame_sources import less_gain
@@ -33,33 +31,12 @@ from slam.live.session_records import (
     Snapshot,
     TruthAt,
 )
-from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Pipeline, SmoothedRun, StepResult
-from slam.robust.parameters import BackEndParameters
-from slam.robust.pipeline import RobustSlam
 from slam.robust.solver.growing_arrays import PackedRows, RowsByTime
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.matching import ProtocolRecord
 
 _NO_LANDMARKS_M = np.empty((0, 2))
-
-
-def make_slam(
-    config: SlamConfig,
-    rig: Rig,
-    wheels: WheelNoise,
-    detector: Detector | None = None,
-    rules: BackEndParameters | None = None,
-) -> Pipeline:
-    """Return the pipeline that ``config.back_end`` names.
-
-    ``wheels`` is the robot's odometry noise; preset ``paper`` has numbers of its own. ``detector``
-    replaces the front end that the configuration names, ``rules`` those of the robust back end.
-    """
-    if config.back_end is BackEnd.ROBUST:
-        compile_kernels()  # so that the first scans need not wait
-        return RobustSlam(config, rig, wheels, detector, rules)
-    return UwbRadarSlam(config, rig, detector)
 
 
 class WrappedSlam:

@@ -35,7 +35,7 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.runner import RunSource, execute, make_slam
+from slam.app.run.runner import RunSource, execute
 from slam.app.run.summary import Summary, summarise
 from slam.app.sweep import CLEAN, STRESSES, SceneKeys, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
@@ -49,6 +49,7 @@ from slam.app.sweep.outcomes import (
 from slam.config import ConfigError, SlamConfig, override
 from slam.frames import Detection, Detector, RadarFrame
 from slam.front_end import make_detector
+from slam.library.slam import make_slam
 from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S, OdometryTrack
 from slam.live.session.description import settings_text

@@ -13,17 +13,19 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import BinaryIO, Literal, NamedTuple, TypeAlias
+from typing import BinaryIO, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
+from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Rig
 from slam.live.errors import AppError, OdometryError, refuse_pipe
-from slam.live.frame_sources import recorded_frame, sampler_limits
+from slam.live.frame_sources import less_gain, recorded_frame, sampler_limits
 from slam.live.odometry_track import OdometryTrack, TumSample
 from slam.live.session import cdr
 from slam.live.session.description import (
@@ -63,7 +65,7 @@ from xethru_protocol.recordings.recorded_messages import (
     RecordingError,
     is_like,
 )
-from xethru_protocol.validation import reason_of
+from xethru_protocol.validation import problem_text, reason_of
 
 _KINDS = {
     RERUN_MAGIC: "a Rerun recording (.rrd), a view that other versions of Rerun may not open; the "
@@ -312,6 +314,65 @@ class RecordedSession:
     def rig(self) -> Rig:
         return Rig(mounts=tuple(radar.mount for radar in self.info.radars))
 
+    @property
+    def config(self) -> SlamConfig:
+        """The settings that SLAM had; AppError if the file has none, or those of another version.
+
+        `Slam` with these, `rig` and `wheels` makes the recorded states again.
+        """
+        self._need(self.info.config_json)
+        try:
+            tables = json.loads(self.info.config_json)
+            if isinstance(tables, dict):
+                tables = without_removed_keys(tables, str(self.path))
+            return SlamConfig.model_validate(tables)
+        except json.JSONDecodeError as error:
+            raise AppError(f"{self.path}: its settings cannot be read: {error}") from None
+        except ConfigError as error:
+            raise AppError(str(error)) from None
+        except ValidationError as error:
+            text = problem_text(error.errors(), SlamConfig)
+            raise AppError(
+                f"{self.path}: its settings are not those of this version: {text}; "
+                f"it was recorded with xethru-hil {self.info.versions.get('xethru-hil', '?')}"
+            ) from None
+
+    @property
+    def wheels(self) -> WheelNoise:
+        """The wheel errors that SLAM assumed; AppError if they are unknown here."""
+        self._need(self.info.wheels)
+        try:
+            return WheelNoise(**self.info.wheels)
+        except TypeError:
+            text = "its description of the wheels is unknown here"
+            raise AppError(f"{self.path}: {text}") from None
+
+    def _need(self, part: object) -> None:
+        if not part:
+            raise AppError(
+                f"{self.path}: does not hold SLAM's settings; "
+                "its frames can be read, but not be replayed; record it again"
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: every reading opens the file and closes it."""
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Yield the scans that SLAM was stepped with, their frames without the radars' gains.
+
+        AppError if ranges were recorded and no frames, or the file is damaged.
+        """
+        if self.info.has_detections:
+            raise AppError(f"{self.path}: holds ranges in place of frames: see `detections`")
+        gains_db, odometry = [radar.gain_db for radar in self.info.radars], self.odometry()
+        for scan, truth in self.scans():
+            if scan.used:
+                frames = tuple(less_gain(frame, gains_db[frame.radar]) for frame in scan.frames)
+                yield replace(scan, frames=frames, odometry=odometry.pose_at, truth=truth)
+
     def records(self) -> Iterator[SessionRecord]:
         """Yield what was recorded, in the order of the file; may be called again.
 
@@ -485,7 +546,7 @@ class _Head:
 RADAR_INFO = re.compile(r"/radar/(.+)/info")
 
 
-def open_session(path: Path, stop: StopFlag | None = None) -> RecordedSession:
+def open_session(path: str | Path, stop: StopFlag | None = None) -> RecordedSession:
     """Read what describes a session: at its head, or where that is damaged in a later copy.
 
     A signal that ``stop`` catches ends reading at once, here and later.
@@ -495,6 +556,7 @@ def open_session(path: Path, stop: StopFlag | None = None) -> RecordedSession:
     AppError
         Missing, foreign, cut before the radars are named, or damaged beyond all copies.
     """
+    path = Path(path)
     try:
         size = path.stat().st_size
     except OSError:

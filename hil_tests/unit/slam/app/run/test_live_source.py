@@ -28,10 +28,11 @@ from hil_tests.unit.slam.simulation import frame_of
 from slam.app.odometry.live import LiveOdometry, parse_source
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.run.live_source import LiveSource, read_odometry
-from slam.app.run.runner import RunRecord, make_slam, run_slam
+from slam.app.run.runner import RunRecord, run_slam
 from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount
+from slam.library.slam import make_slam
 from slam.live import ticks as run_readers
 from slam.live.arrival_clock import ClockLine
 from slam.live.errors import AppError

@@ -25,10 +25,11 @@ from slam.app.odometry.live import LiveOdometry
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.run.live_source import LiveLog, LiveSource
 from slam.app.run.replay import Comparison, recorded_source
-from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute, make_slam
+from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute
 from slam.app.session.writer import SessionLog
 from slam.config import load_preset
 from slam.frames import RadarFrame
+from slam.library.slam import make_slam
 from slam.live.arrival_clock import ClockLine
 from slam.live.frame_sources import sampler_limits
 from slam.live.session.description import settings_text

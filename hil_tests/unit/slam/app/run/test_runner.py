@@ -19,10 +19,11 @@ from hil_tests.unit.slam.app.sessions import (
     snapshot,
 )
 from slam.app.run.output import RunProgress
-from slam.app.run.runner import LinkStates, make_slam, run_slam, unknown_truth
+from slam.app.run.runner import LinkStates, run_slam, unknown_truth
 from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.frames import RadarFrame
 from slam.geometry import paper_rig
+from slam.library.slam import make_slam
 from slam.live.errors import AppError
 from slam.live.odometry_track import OdometryTrack, TumSample
 from slam.live.session_records import LogLine

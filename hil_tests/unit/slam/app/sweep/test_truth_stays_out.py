@@ -21,8 +21,9 @@ from emulator.scene.scene import (
     load_scene,
 )
 from slam.app.rig.emulated import outlines_m, rig_of, true_landmarks_m, wheels_of
-from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
+from slam.app.run.runner import RunRecord, RunSource, execute
 from slam.app.sweep.run import make_case, source_of
+from slam.library.slam import make_slam
 
 N_SCANS = 200
 

@@ -1,0 +1,474 @@
+"""`Slam`: one class in front of both pipelines, for a loop of your own."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import ThreadpoolController
+
+from slam.config import BackEnd, SlamConfig, WheelNoise, load_preset
+from slam.frames import Detection, Detector, RadarFrame, StepInputError
+from slam.front_end.numba_compilation import compile_kernels
+from slam.geometry import Rig, between, compose, transform
+from slam.library.pose_track import PoseTrack
+from slam.library.rig_files import RigFile
+from slam.paper.ekf import motion_jacobian
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Belief, Pipeline, PoseAt, SmoothedRun, StepResult
+from slam.robust.association import LONGEST_M, RangeScan
+from slam.robust.parameters import BackEndParameters
+from slam.robust.pipeline import RobustSlam
+
+Array = NDArray[np.float64]
+Range: TypeAlias = "tuple[int, float, float] | tuple[int, float, float, int | None]"
+"""(radar, range_m, sigma_m[, landmark_id]); see `Slam.step`."""
+Point: TypeAlias = (
+    "tuple[int, float, float, float, float] | tuple[int, float, float, float, float, int | None]"
+)
+"""(radar, range_m, bearing_rad, sigma_m, bearing_sigma_rad[, landmark_id]); see `Slam.step`."""
+
+_MOST_AHEAD_NS = 100_000_000
+_KEPT_NS = 2_000_000_000
+_MOST_M = 1e8  # farther than once around the Earth; the filter squares positions
+_MOST_STAMP_NS = 2**63 - 1
+
+
+def make_slam(
+    config: SlamConfig,
+    rig: Rig,
+    wheels: WheelNoise,
+    detector: Detector | None = None,
+    rules: BackEndParameters | None = None,
+) -> Pipeline:
+    """Return the pipeline that ``config.back_end`` names.
+
+    ``wheels`` is the robot's odometry noise; preset ``paper`` has numbers of its own. ``detector``
+    replaces the front end that the configuration names, ``rules`` those of the robust back end.
+    """
+    if config.back_end is BackEnd.ROBUST:
+        compile_kernels()  # so that the first scans need not wait
+        return RobustSlam(config, rig, wheels, detector, rules)
+    return UwbRadarSlam(config, rig, detector)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SlamState:
+    """Where the robot is at one time, map frame.
+
+    Between the states of the pipeline, which makes one when the robot has moved (preset ``paper``
+    14 states later), the pose is that of the newest one and odometry since then.
+    """
+
+    t_ns: int | None  # time of the step; None before the first one
+    pose: Array  # shape (3,): x [m], y [m], heading [rad] in [-pi, pi)
+    covariance: Array  # shape (3, 3), of the pose, errors additive, [m, m, rad]
+    # Whether the place on the map is unknown: the robot was carried. The pose is then that before
+    # it and odometry since, and the covariance covers the map.
+    is_lost: bool = False
+    # The states that the pipeline made in this step, in its own map frame, which begins at the
+    # first pose: what was seen, and what it was taken for
+    results: tuple[StepResult, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landmarks:
+    """The reported landmarks, map frame; those of preset ``robust`` keep their ids."""
+
+    ids: tuple[int, ...]
+    positions_m: Array  # shape (n, 2)
+    covariances_m2: Array  # shape (n, 2, 2), errors additive
+    # The ``landmark_id`` that ranges or points gave it, None where they gave none
+    given_ids: tuple[int | None, ...]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+class Slam:
+    """SLAM step by step, with whatever a robot's own loop has: frames, ranges or points.
+
+    Lengths are true metres, angles radians, counter-clockwise. The body frame has x forward and y
+    left; the map frame begins at the first pose.
+
+    Parameters
+    ----------
+    rig
+        The mounts, or a rig file by `load_rig`, which has the wheels' noise, too.
+    preset
+        ``"robust"`` or ``"paper"``, or settings of your own (`load_preset`, `override`).
+    wheels
+        How odometry errs; None: as the rig file says, or the defaults of `WheelNoise`. Preset
+        ``paper`` has numbers of its own.
+    start
+        Where the map has the first pose: x [m], y [m], heading [rad].
+    front_end
+        Finds ranges in frames, in place of the preset's; see `Detector`.
+
+    Attributes
+    ----------
+    state
+        Where the robot was at the last step.
+    """
+
+    def __init__(
+        self,
+        rig: Rig | RigFile,
+        preset: str | SlamConfig = "robust",
+        *,
+        wheels: WheelNoise | None = None,
+        start: ArrayLike = (0.0, 0.0, 0.0),
+        front_end: Detector | None = None,
+    ) -> None:
+        if isinstance(rig, RigFile):
+            wheels = wheels or rig.wheels.noise
+            rig = rig.rig
+        if not rig.mounts:
+            raise ValueError("the rig has no mount; what measures ranges sits at one")
+        self.rig = rig
+        self.config = load_preset(preset) if isinstance(preset, str) else preset
+        self._wheels = wheels or WheelNoise()
+        self._start = _pose(start, "start")
+        self._pipeline = make_slam(self.config, rig, self._wheels, front_end)
+        self._threads = ThreadpoolController()
+        self._odometry = PoseTrack()
+        self._newest: dict[int, tuple[int, int]] = {}  # stream and counter, by radar
+        self._is_lost = False
+        # The newest belief, and odometry at it
+        self._belief = Belief(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+        self._belief_at: Array | None = None
+        self.state = SlamState(t_ns=None, pose=self._start, covariance=np.zeros((3, 3)))
+
+    def add_odometry(self, t_ns: int, pose: ArrayLike) -> None:
+        """Take a pose of the wheels between steps: frames get their poses from it.
+
+        Times rise. A robot whose odometry comes more often than its scans calls this for each pose.
+        Raises StepInputError, a ValueError, and forgets the pose, if it cannot be one.
+        """
+        t_ns, pose = _stamp(t_ns), _pose(pose, f"odometry at {t_ns} ns")
+        if len(self._odometry) and t_ns <= self._odometry.last_ns:
+            raise StepInputError(
+                f"odometry at {t_ns} ns is not later than that before it, {self._odometry.last_ns}"
+            )
+        self._odometry.add(t_ns, pose.tolist())
+
+    def step(
+        self,
+        t_ns: int,
+        odometry_pose: ArrayLike | PoseAt | None = None,
+        *,
+        frames: Iterable[RadarFrame] = (),
+        ranges: Iterable[Range] = (),
+        points: Iterable[Point] = (),
+    ) -> SlamState:
+        """Take what was seen around one time; return where the robot is.
+
+        Parameters
+        ----------
+        t_ns
+            Time of the state, whole nanoseconds of any clock; times of steps do not fall.
+        odometry_pose
+            Pose of the wheels then, in a frame of their own: x [m], y [m], heading [rad], which
+            need not be unwrapped. None: from `add_odometry`. Or a function that returns the pose
+            at a time [ns], such as `Scan.odometry` of a session.
+        frames
+            At most one of each radar, each with its own time of the same clock. Its pose lies
+            between those given; up to 100 ms behind the newest one it is extrapolated.
+        ranges
+            (radar, range_m, sigma_m) or (radar, range_m, sigma_m, landmark_id): index of the mount,
+            true metres from there at ``t_ns``, standard deviation. With an id, any whole number, it
+            is known what was ranged, as from a UWB anchor, and range and field of view do not
+            matter. All that a mount measured without ids must be given at once: what should be
+            there and is not counts against a landmark. A mount that is not mentioned did not look.
+        points
+            (radar, range_m, bearing_rad, sigma_m, bearing_sigma_rad), and an id in the same way:
+            the bearing is counted from the mount's ``yaw_rad``.
+
+        Preset ``paper`` takes either frames or ranges without ids; ``robust`` takes all, but of one
+        mount only one kind in a step.
+
+        Raises
+        ------
+        StepInputError
+            A ValueError: something cannot be taken. Then nothing of the step was: later results are
+            the same, to the last bit, as without it.
+        """
+        t_ns, taken = _stamp(t_ns), tuple(frames)
+        if self.state.t_ns is not None and t_ns < self.state.t_ns:
+            raise StepInputError(f"t_ns is {t_ns}, before that of the last step, {self.state.t_ns}")
+        scans = self._scans(taken, tuple(ranges), tuple(points))
+        track = self._odometry.copy()
+        pose_at = self._pose_at(track, t_ns, odometry_pose)
+        is_first = self._belief_at is None  # frames at the first pose are not looked at
+        stamps_ns = {t_ns} if is_first else {t_ns, *(frame.t_ns for frame in taken)}
+        poses = {stamp: _pose(pose_at(stamp), f"odometry at {stamp} ns") for stamp in stamps_ns}
+        if not len(track) or t_ns > track.last_ns:
+            track.add(t_ns, poses[t_ns].tolist())
+        with self._threads.limit(limits=1):  # the same bits on every machine
+            results = self._stepped(taken, scans, poses.__getitem__, t_ns)
+        track.forget_before(t_ns - _KEPT_NS)
+        self._odometry = track
+        self._newest |= {frame.radar: (frame.stream, frame.counter) for frame in taken}
+        if self._belief_at is None:
+            self._belief_at = poses[t_ns]
+        for result in results:
+            self._belief, self._belief_at = result.belief, result.odometry_pose
+            self._is_lost = result.report is not None and result.report.lost
+        self.state = self._state(t_ns, poses[t_ns], results)
+        return self.state
+
+    @property
+    def landmarks(self) -> Landmarks:
+        belief = self._belief
+        n, given = len(belief.landmark_ids), dict[int, int]()
+        if isinstance(self._pipeline, RobustSlam):
+            of_label = self._pipeline.back_end.landmark_of_label
+            given = {landmark: label for label, landmark in of_label.items()}
+        covariances = np.array([belief.landmark_covariance(row) for row in range(n)])
+        return Landmarks(
+            ids=belief.landmark_ids,
+            positions_m=self._placed(belief.landmarks),
+            covariances_m2=self._turned(covariances.reshape(-1, 2, 2)),
+            given_ids=tuple(given.get(id_) for id_ in belief.landmark_ids),
+        )
+
+    @property
+    def walls(self) -> Array:
+        """Return the ends of the stretches of wall that answered, (k, 2, 2) [m], map frame."""
+        spans = self._pipeline.wall_spans_m()
+        return self._placed(spans.reshape(-1, 2)).reshape(-1, 2, 2)
+
+    def smoothed(self) -> SmoothedRun | None:
+        """Return the solution over all states until now, map frame; None if there is none.
+
+        It takes up to a second after an hour; later steps return the same as without it. Preset
+        ``paper`` has none.
+        """
+        with self._threads.limit(limits=1):
+            run = self._pipeline.smoothed()
+        if run is None or not self._start.any():
+            return run
+        return replace(
+            run,
+            poses=np.array([compose(self._start, pose) for pose in run.poses]).reshape(-1, 3),
+            pose_covariances=self._turned(run.pose_covariances),
+            landmarks_m=self._placed(run.landmarks_m),
+            landmark_covariances_m2=self._turned(run.landmark_covariances_m2),
+        )
+
+    def _scans(
+        self, frames: Sequence[RadarFrame], ranges: Sequence[Range], points: Sequence[Point]
+    ) -> list[RangeScan]:
+        """Check all that was seen; return ranges and points as one scan of each mount."""
+        seen: dict[int, str] = {}
+        for frame in frames:
+            if not isinstance(frame, RadarFrame):
+                raise StepInputError(f"frames: a {type(frame).__name__} is no RadarFrame")
+            if np.isinf(frame.samples).any():
+                raise StepInputError(f"frame {frame.counter} of radar {frame.radar} is not finite")
+            if self._newest.get(frame.radar) == (frame.stream, frame.counter):
+                raise StepInputError(f"frame {frame.counter} of radar {frame.radar} came before")
+            if frame.radar in seen:
+                raise StepInputError(f"two frames of radar {frame.radar}; a step takes one of each")
+            self._note(seen, frame.radar, "frame")
+        of_radar: dict[int, list[_Measured]] = {}
+        for kind, rows in (("range", ranges), ("point", points)):
+            for row in rows:
+                one = _measured(row, kind)
+                self._note(seen, one.radar, kind)
+                of_radar.setdefault(one.radar, []).append(one)
+        if self.config.back_end is BackEnd.PAPER:
+            has_ids = any(one.label is not None for many in of_radar.values() for one in many)
+            if points or has_ids or (frames and ranges):
+                what = "points" if points else "ids of landmarks" if has_ids else "both kinds"
+                raise StepInputError(
+                    f"{what}: the back end of preset paper takes frames, or ranges without ids; "
+                    "preset robust takes all of them"
+                )
+        return [_scan_of(radar, many, seen[radar]) for radar, many in of_radar.items()]
+
+    def _note(self, seen: dict[int, str], radar: int, kind: str) -> None:
+        """Note what a mount gave; raise StepInputError if there is no such, or it gave others."""
+        if not 0 <= radar < len(self.rig.mounts):
+            raise StepInputError(
+                f"{kind} of radar {radar}: the rig has {len(self.rig.mounts)}, numbered from 0 in "
+                "the order of its mounts"
+            )
+        if seen.setdefault(radar, kind) != kind:
+            raise StepInputError(
+                f"radar {radar} gave a {seen[radar]} and a {kind}; a step takes one frame of a "
+                "mount, or its ranges, or its points"
+            )
+
+    def _pose_at(
+        self, track: PoseTrack, t_ns: int, odometry_pose: ArrayLike | PoseAt | None
+    ) -> Callable[[int], ArrayLike]:
+        """Return what gives poses at the times of a step; a pose that is given joins the track."""
+        if callable(odometry_pose):
+            return odometry_pose
+        if odometry_pose is not None:
+            pose = _pose(odometry_pose, f"odometry at {t_ns} ns")
+            if len(track) and t_ns <= track.last_ns:
+                if t_ns < track.last_ns or not np.array_equal(track.pose_at(t_ns), pose):
+                    raise StepInputError(
+                        f"odometry_pose at {t_ns} ns: poses until {track.last_ns} ns were given "
+                        "before; leave it out, and the pose comes from them"
+                    )
+            else:
+                track.add(t_ns, pose.tolist())
+
+        def pose_at(stamp_ns: int) -> Array:
+            if not len(track) or not track.first_ns <= stamp_ns <= track.last_ns + _MOST_AHEAD_NS:
+                known = f"{track.first_ns} to {track.last_ns} ns" if len(track) else "none so far"
+                raise StepInputError(
+                    f"no odometry at {stamp_ns} ns: known {known}; give poses until then first "
+                    "(add_odometry), or frames of that time in a later step"
+                )
+            if stamp_ns > track.last_ns:
+                return track.extrapolated(stamp_ns)
+            return track.pose_at(stamp_ns)
+
+        return pose_at
+
+    def _stepped(
+        self,
+        frames: Sequence[RadarFrame],
+        scans: Sequence[RangeScan],
+        pose_at: PoseAt,
+        t_ns: int,
+    ) -> tuple[StepResult, ...]:
+        if isinstance(self._pipeline, RobustSlam):
+            return self._pipeline.step_scans(frames, scans, pose_at, t_ns)
+        if scans:
+            detections = [
+                Detection(radar=scan.radar, t_ns=t_ns, range_m=range_m, amplitude=math.nan)
+                for scan in scans
+                for range_m in scan.ranges_m
+            ]
+            return self._pipeline.step_detections(detections, pose_at, t_ns)
+        return self._pipeline.step(frames, pose_at, t_ns)
+
+    def _state(self, t_ns: int, odometry: Array, results: tuple[StepResult, ...]) -> SlamState:
+        """Return the newest belief's pose, moved on by odometry since then."""
+        assert self._belief_at is not None
+        pose, covariance = self._belief.pose, self._belief.pose_covariance
+        if not np.array_equal(odometry, self._belief_at):
+            moved = between(self._belief_at, odometry)
+            G = motion_jacobian(float(pose[2]), moved)
+            covariance = G @ covariance @ G.T + _motion_noise(moved, float(pose[2]), self._wheels)
+            pose = compose(pose, moved)
+        if self._start.any():
+            pose, covariance = compose(self._start, pose), self._turned(covariance)
+        return SlamState(
+            t_ns=t_ns, pose=pose, covariance=covariance, is_lost=self._is_lost, results=results
+        )
+
+    def _placed(self, points_m: Array) -> Array:
+        """Return points (n, 2) of the pipeline's map in the map that begins at ``start``."""
+        return transform(self._start, points_m) if self._start.any() else points_m
+
+    def _turned(self, covariances: Array) -> Array:
+        """Return covariances (..., 2, 2) or (..., 3, 3) in the same way."""
+        if not self._start.any():
+            return covariances
+        R = np.eye(covariances.shape[-1])
+        cosine, sine = math.cos(self._start[2]), math.sin(self._start[2])
+        R[:2, :2] = [[cosine, -sine], [sine, cosine]]
+        return np.asarray(R @ covariances @ R.T)
+
+
+class _Measured(NamedTuple):
+    """One range, or one point with a bearing, of a mount."""
+
+    radar: int
+    label: int | None
+    range_m: float
+    sigma_m: float
+    bearing_rad: float = 0.0
+    bearing_sigma_rad: float = 0.0
+
+
+_FIELDS = {
+    "range": ("radar", "range_m", "sigma_m"),
+    "point": ("radar", "range_m", "bearing_rad", "sigma_m", "bearing_sigma_rad"),
+}
+"""What rows of numbers hold; the id of a landmark may follow."""
+
+
+def _measured(row: Sequence[Any], kind: str) -> _Measured:
+    """Return what a row of ``ranges`` or ``points`` says; StepInputError if it cannot be."""
+    names, values = _FIELDS[kind], tuple(row)
+    n = len(names)
+    try:
+        if len(values) not in (n, n + 1):
+            raise ValueError
+        radar, numbers = (
+            operator.index(values[0]),
+            dict(zip(names[1:], map(float, values[1:n]), strict=True)),
+        )
+        label = None if values[n:] in ((), (None,)) else operator.index(values[n])
+    except (TypeError, ValueError):
+        text = f"({', '.join(names)}), numbers, and perhaps the id of a landmark, a whole number"
+        raise StepInputError(f"{kind} {values}: must be {text}") from None
+    one = _Measured(radar, label, **numbers)
+    sigmas = [value for name, value in numbers.items() if "sigma" in name]
+    if not all(map(math.isfinite, numbers.values())) or min(sigmas) <= 0.0:
+        raise StepInputError(f"{kind} {values}: numbers must be finite, sigmas positive")
+    if not 0.0 < one.range_m < LONGEST_M:
+        raise StepInputError(f"{kind} {values}: range_m must be positive, and below {LONGEST_M:g}")
+    return one
+
+
+def _scan_of(radar: int, many: Sequence[_Measured], kind: str) -> RangeScan:
+    is_point, has_label = kind == "point", any(one.label is not None for one in many)
+    return RangeScan(
+        radar=radar,
+        ranges_m=tuple([one.range_m for one in many]),
+        sigmas_m=tuple([one.sigma_m for one in many]),
+        labels=tuple([one.label for one in many]) if has_label else None,
+        bearings_rad=tuple([one.bearing_rad for one in many]) if is_point else None,
+        bearing_sigmas_rad=tuple([one.bearing_sigma_rad for one in many]) if is_point else None,
+    )
+
+
+def _stamp(t_ns: int) -> int:
+    try:
+        stamp_ns = operator.index(t_ns)
+    except TypeError:
+        raise StepInputError(f"t_ns is {t_ns!r}; times are whole nanoseconds") from None
+    if abs(stamp_ns) > _MOST_STAMP_NS:
+        raise StepInputError(f"t_ns is {t_ns}; times are of 64 bits")
+    return stamp_ns
+
+
+def _pose(given: ArrayLike, what: str) -> Array:
+    """Return a pose as an array (3,); StepInputError if it is not three numbers of the Earth."""
+    try:
+        pose = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape != (3,) or not np.isfinite(pose).all() or np.abs(pose).max() > _MOST_M:
+        raise StepInputError(
+            f"{what} is {given!r}; a pose is three finite numbers, x [m], y [m] and heading [rad]"
+        )
+    return pose
+
+
+def _motion_noise(moved: Array, heading_rad: float, wheels: WheelNoise) -> Array:
+    """Return the covariance that a short motion (3,) adds, (3, 3), map axes.
+
+    White noise, and the three calibration errors as if nothing were known of them yet.
+    """
+    distance_m, turn_rad = math.hypot(moved[0], moved[1]), float(moved[2])
+    along, across, heading = wheels.step_variances(distance_m, turn_rad)
+    scale, turn_scale, curvature = wheels.calibration_sigmas
+    along += (scale * distance_m) ** 2
+    heading += (turn_scale * turn_rad) ** 2 + (curvature * distance_m) ** 2
+    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+    R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(R @ np.diag([along, across, heading]) @ R.T)
