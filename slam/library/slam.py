@@ -160,7 +160,7 @@ class Slam:
     def step(
         self,
         t_ns: int,
-        odometry_pose: ArrayLike | PoseAt | None = None,
+        odometry_pose: ArrayLike | Callable[[int], ArrayLike] | None = None,
         *,
         frames: Iterable[RadarFrame] = (),
         ranges: Iterable[Range] = (),
@@ -306,7 +306,10 @@ class Slam:
             )
 
     def _pose_at(
-        self, track: PoseTrack, t_ns: int, odometry_pose: ArrayLike | PoseAt | None
+        self,
+        track: PoseTrack,
+        t_ns: int,
+        odometry_pose: ArrayLike | Callable[[int], ArrayLike] | None,
     ) -> Callable[[int], ArrayLike]:
         """Return what gives poses at the times of a step; a pose that is given joins the track."""
         if callable(odometry_pose):

@@ -111,7 +111,8 @@ class LiveRig:
         yield from self._source.scans(_MOST_TICKS, StopFlag())
 
     def _arriving(self) -> Generator[Scan]:
-        inbox, arrivals = Inbox(), _Arrivals(self.radars, self._limits)
+        inbox = Inbox()
+        arrivals = _Arrivals(self.radars, self._limits, time.monotonic_ns())
         with reading(self._links, inbox):
             while True:
                 with suppress(Empty):
@@ -126,15 +127,17 @@ class LiveRig:
 
 
 class _Arrivals:
-    """Makes scans of frames by time base `arrival`; time is an argument but at the beginning."""
+    """Makes scans of frames by time base `arrival`; it reads no clock."""
 
-    def __init__(self, radars: Sequence[RadarInfo], limits: tuple[float, float] | None) -> None:
+    def __init__(
+        self, radars: Sequence[RadarInfo], limits: tuple[float, float] | None, now_ns: int
+    ) -> None:
         self._radars, self._limits = radars, limits
         self._clocks = [ArrivalClock(radar.rate_hz) for radar in radars]
         period_ns = round(NS_PER_S / radars[0].rate_hz)
         self._ticks = TickAssembler(len(radars), period_ns, _NoOdometry())
         self._unheard = {radar.name for radar in radars}
-        self._began_ns = self._alive_ns = time.monotonic_ns()
+        self._began_ns = self._alive_ns = now_ns
         self._ready_ns: int | None = None
 
     def take(self, event: SourceEvent) -> None:

@@ -25,7 +25,7 @@ least sum is found by branch and bound, as joint compatibility is (Neira and Tar
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -655,23 +655,29 @@ def predicted_ranges(
 
     Those of walls are left out: their echoes have no fixed place to compare with a true landmark's.
     """
+    which = [
+        (radar, row, float(known.prior[place, radar, radar]))
+        for side, place in np.argwhere(known.of_side[:, :, 0]).tolist()
+        if (row := int(known.rows[place])) < len(state.landmark_ids)
+        for radar in np.flatnonzero((side_of == side) & antennas.has_frame).tolist()
+    ]
+    return ranges_predicted(state, seen, antennas, which)
+
+
+def ranges_predicted(
+    state: State, seen: View, antennas: Antennas, which: Iterable[tuple[int, int, float]]
+) -> list[PredictedRange]:
+    """Return the predictions for radars and rows of landmarks, with variances [m^2]."""
     places = antennas.position_m.tolist()
     points = (state.landmarks_m - state.position_m) @ rotation(state.heading_rad)
-    predicted = []
-    for side, place in np.argwhere(known.of_side[:, :, 0]).tolist():
-        row = int(known.rows[place])
-        if row >= len(state.landmark_ids):
-            continue
-        point_m = (float(points[row, 0]), float(points[row, 1]))
-        predicted += [
-            PredictedRange(
-                radar=radar,
-                landmark_id=state.landmark_ids[row],
-                range_m=float(seen.ranges_m[radar, row]),
-                variance=float(known.prior[place, radar, radar]),
-                antenna_m=(places[radar][0], places[radar][1]),
-                point_m=point_m,
-            )
-            for radar in np.flatnonzero((side_of == side) & antennas.has_frame).tolist()
-        ]
-    return predicted
+    return [
+        PredictedRange(
+            radar=radar,
+            landmark_id=state.landmark_ids[row],
+            range_m=float(seen.ranges_m[radar, row]),
+            variance=variance,
+            antenna_m=(places[radar][0], places[radar][1]),
+            point_m=(float(points[row, 0]), float(points[row, 1])),
+        )
+        for radar, row, variance in which
+    ]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import Rig, wrap_angles
-from slam.results import SmoothedRun, UpdateReport
+from slam.results import PredictedRange, SmoothedRun, UpdateReport
 from slam.robust import kernels
 from slam.robust.association import (
     LONGEST_M,
@@ -27,6 +27,7 @@ from slam.robust.association import (
     point_variances,
     point_view,
     predicted_ranges,
+    ranges_predicted,
     view,
     weigh_known,
 )
@@ -307,9 +308,9 @@ class RobustBackEnd:
             self._existence.heard(id_)
         if any(scan.labelled for scan in scans):
             used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
-            of_beacons, nis_of_beacons, evidence = self._take_labelled(scans, added_m)
+            of_beacons, nis_of_beacons, evidence, more = self._take_labelled(scans, added_m)
             continued, nis = continued + of_beacons, nis + nis_of_beacons
-            likelihoods = [*likelihoods, *evidence]
+            likelihoods, predicted = [*likelihoods, *evidence], [*predicted, *more]
         dof = len(continued)
         for scan in with_bearings:
             points, nis_of_points, evidence = self._take_points(scan, added_m)
@@ -446,12 +447,14 @@ class RobustBackEnd:
 
     def _take_labelled(
         self, scans: Sequence[RangeScan], added_m: float
-    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
+    ) -> tuple[
+        tuple[tuple[int, int, int], ...], float, list[tuple[int, float]], list[PredictedRange]
+    ]:
         """Correct the state with the ranges that have labels, and log them all.
 
-        Returns what `_correct` does. A range beyond the gate corrects nothing now; it is logged,
-        too: which are outliers, the solution over the whole run decides. ``added_m`` is added in
-        squares to the noise of ranges in the gate.
+        Returns what `_correct` does, and what was predicted. A range beyond the gate corrects
+        nothing now; it is logged, too: which are outliers, the solution over the whole run decides.
+        ``added_m`` is added in squares to the noise of ranges in the gate.
         """
         state = self.state
         antennas = antennas_of(self.rig, scans, state.calibration, state.mounts_m)
@@ -462,6 +465,12 @@ class RobustBackEnd:
         }
         seen = view(state, antennas)
         known, refused = find_labelled(state, seen, widened, row_of_label, self.parameters)
+        variances = np.sum((known.H @ state.P.block(known.at)) * known.H, axis=1).tolist()
+        which = [
+            (radar, int(known.rows[place]), variance)
+            for (radar, _, place), variance in zip(known.assigned.tolist(), variances, strict=True)
+        ]
+        predicted = ranges_predicted(state, seen, antennas, which)
         ids = state.landmark_ids.copy()
         miss = math.log(1.0 - self.parameters.ranges.detection_probability)
         for row in known.rows[known.assigned[:, 2]].tolist():
@@ -483,7 +492,7 @@ class RobustBackEnd:
                     waiting = self._waiting[label]
                     waiting.n_ranges += 1
                     self._log_range(scan, index, waiting.log_id, antennas)
-        return continued, nis, evidence
+        return continued, nis, evidence, predicted
 
     def _log_range(self, scan: RangeScan, index: int, id_: int, antennas: Antennas) -> None:
         x_m, y_m = antennas.nominal_m[scan.radar].tolist()

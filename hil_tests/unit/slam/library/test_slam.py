@@ -1,0 +1,340 @@
+"""`Slam`: what it refuses moves nothing, what it takes is taken at the right pose and place."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike, NDArray
+
+import slam as library
+from slam import (
+    Detection,
+    Mount,
+    RadarFrame,
+    Rig,
+    Slam,
+    SlamState,
+    StepInputError,
+    WheelNoise,
+    load_preset,
+    load_rig,
+    override,
+)
+from slam.geometry import between, compose, transform
+from slam.results import PoseAt
+
+TICK_NS = 200_000_000
+RIG = Rig([Mount(x_m=x_m, y_m=0.2, yaw_rad=math.pi / 2) for x_m in (-0.1, 0.1)])
+ANCHORS = {7: (4.0, 3.0), -2: (-3.0, 2.0), 30: (2.0, -4.0), 11: (-2.0, -3.0)}
+ROD = (0.6, 1.0)
+FRAME = RadarFrame(
+    radar=0,
+    t_ns=0,
+    counter=1,
+    samples=np.zeros(200, dtype=np.float32),
+    range_start_m=0.2,
+    bin_length_m=0.0064,
+)
+Pose = NDArray[np.float64]
+
+
+class Rod:
+    """A front end that sees a rod from where the robot is, a straight drive along x."""
+
+    def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
+        mount = RIG.mounts[frame.radar]
+        x_m = mount.x_m + drive(frame.t_ns)[0]
+        range_m = math.hypot(ROD[0] - x_m, ROD[1] - mount.y_m)
+        return (Detection(radar=frame.radar, t_ns=frame.t_ns, range_m=range_m, amplitude=0.01),)
+
+    def detect_many(
+        self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
+    ) -> list[tuple[Detection, ...]]:
+        return [self.detect(frame) for frame in frames]
+
+
+def drive(t_ns: int) -> Pose:
+    return np.array([0.03 * t_ns / TICK_NS, 0.0, 0.0])
+
+
+def frames(number: int, late_ns: Sequence[int] = (-30_000_000, -70_000_000)) -> list[RadarFrame]:
+    return [
+        replace(FRAME, radar=radar, t_ns=number * TICK_NS + late, counter=number + 1)
+        for radar, late in enumerate(late_ns)
+    ]
+
+
+def made(preset: str = "robust", start: ArrayLike = (0.0, 0.0, 0.0)) -> Slam:
+    return Slam(RIG, preset, front_end=Rod(), start=start)
+
+
+def stepped(slam: Slam, number: int) -> SlamState:
+    return slam.step(number * TICK_NS, drive(number * TICK_NS), frames=frames(number))
+
+
+def assert_same(one: SlamState, other: SlamState) -> None:
+    assert (one.t_ns, one.is_lost) == (other.t_ns, other.is_lost)
+    assert one.pose.tobytes() == other.pose.tobytes()
+    assert one.covariance.tobytes() == other.covariance.tobytes()
+    assert len(one.results) == len(other.results)
+    for mine, its in zip(one.results, other.results, strict=True):
+        assert mine.t_ns == its.t_ns
+        assert mine.belief.mean.tobytes() == its.belief.mean.tobytes()
+        assert mine.belief.covariance.tobytes() == its.belief.covariance.tobytes()
+
+
+T, P = TICK_NS, (0.5, 0.0, 0.0)
+FOREIGN: Any = object()
+REFUSED: dict[str, Callable[[Slam, int], object]] = {
+    "stamp in seconds": lambda s, t: s.step(t / 1e9, P),  # type: ignore[arg-type]
+    "stamp of 80 bits": lambda s, t: s.step(1 << 80, P),
+    "stamp that runs back": lambda s, t: s.step(t - 3 * T, P),
+    "NaN heading": lambda s, t: s.step(t, (0.5, 0.0, math.nan)),
+    "two numbers": lambda s, t: s.step(t, (0.5, 0.0)),
+    "text": lambda s, t: s.step(t, "here"),
+    "nowhere on Earth": lambda s, t: s.step(t, (1e9, 0.0, 0.0)),
+    "no odometry": lambda s, t: s.step(t),
+    "pose of an older time": lambda s, t: s.add_odometry(t - 2 * T, P),
+    "NaN between steps": lambda s, t: s.add_odometry(t, (math.nan, 0.0, 0.0)),
+    "function without a pose": lambda s, t: s.step(t, lambda _: np.zeros(2)),
+    "function that fails at a frame": lambda s, t: s.step(
+        t, lambda stamp: P if stamp == t else (math.inf, 0.0, 0.0), frames=frames(t // T)
+    ),
+    "unknown radar": lambda s, t: s.step(t, P, frames=[replace(FRAME, radar=2, t_ns=t)]),
+    "two frames": lambda s, t: s.step(t, P, frames=[*frames(t // T), *frames(t // T)]),
+    "frame again": lambda s, t: s.step(t, P, frames=frames(t // T - 1)),
+    "frame too new": lambda s, t: s.step(t, P, frames=frames(t // T, (0, T))),
+    "frame older than odometry": lambda s, t: s.step(t, P, frames=frames(t // T, (0, -99 * T))),
+    "infinite samples": lambda s, t: s.step(
+        t, P, frames=[replace(FRAME, samples=np.full(9, np.inf, np.float32), t_ns=t)]
+    ),
+    "no frame": lambda s, t: s.step(t, P, frames=[FOREIGN]),
+    "range of an unknown radar": lambda s, t: s.step(t, P, ranges=[(2, 1.0, 0.1)]),
+    "negative radar": lambda s, t: s.step(t, P, ranges=[(-1, 1.0, 0.1)]),
+    "NaN range": lambda s, t: s.step(t, P, ranges=[(0, math.nan, 0.1)]),
+    "range of 0": lambda s, t: s.step(t, P, ranges=[(0, 0.0, 0.1)]),
+    "sigma of 0": lambda s, t: s.step(t, P, ranges=[(0, 1.0, 0.1), (0, 1.0, 0.0)]),
+    "too few numbers": lambda s, t: s.step(t, P, ranges=[(0, 1.0)]),  # type: ignore[list-item]
+    "id that is a name": lambda s, t: s.step(t, P, ranges=[(0, 1.0, 0.1, FOREIGN)]),
+    "range and frame of one": lambda s, t: s.step(
+        t, P, frames=frames(t // T), ranges=[(0, 1.0, 0.1)]
+    ),
+    "range and point of one": lambda s, t: s.step(
+        t, P, ranges=[(0, 1.0, 0.1)], points=[(0, 1.0, 0.0, 0.1, 0.1)]
+    ),
+    "bearing without sigma": lambda s, t: s.step(
+        t,
+        P,
+        points=[(0, 1.0, 0.0, 0.1)],  # type: ignore[list-item]
+    ),
+}
+OF_PAPER: dict[str, Callable[[Slam, int], object]] = {
+    "points": lambda s, t: s.step(t, P, points=[(0, 1.0, 0.0, 0.1, 0.1)]),
+    "ids": lambda s, t: s.step(t, P, ranges=[(0, 1.0, 0.1, 7)]),
+    "both kinds": lambda s, t: s.step(t, P, frames=frames(t // T)[:1], ranges=[(1, 1.0, 0.1)]),
+}
+CASES = [("robust", name) for name in REFUSED] + [("paper", name) for name in REFUSED | OF_PAPER]
+
+
+@settings(max_examples=12, deadline=None)
+@given(case=st.sampled_from(CASES), at=st.integers(2, 24), more=st.integers(1, 4))
+def test_after_a_refused_step_all_is_as_without_it(
+    case: tuple[str, str], at: int, more: int
+) -> None:
+    preset, name = case
+    disturbed, calm = made(preset), made(preset)
+    for number in range(at):
+        stepped(disturbed, number), stepped(calm, number)
+    refuse_all(disturbed, at, {name})
+    for number in range(at, at + more):
+        assert_same(stepped(disturbed, number), stepped(calm, number))
+
+
+def refuse_all(slam: Slam, number: int, names: set[str]) -> None:
+    before = slam.state
+    for name in names:
+        with pytest.raises(StepInputError):
+            (REFUSED | OF_PAPER)[name](slam, number * TICK_NS)
+    assert slam.state is before
+
+
+@pytest.mark.parametrize("preset", ["robust", "paper"])
+def test_whatever_is_refused_moves_nothing(preset: str) -> None:
+    names = set(REFUSED if preset == "robust" else REFUSED | OF_PAPER)
+    disturbed, calm = made(preset), made(preset)
+    for number in range(20):
+        assert_same(stepped(disturbed, number), stepped(calm, number))
+        if number > 1:
+            refuse_all(disturbed, number + 1, names)
+
+
+def test_frames_have_the_poses_between_those_of_the_steps() -> None:
+    """On a straight way interpolation is exact: the same as with the pose at every time."""
+    between_steps, by_function, often = made(), made(), made()
+    for number in range(30):
+        t_ns = number * TICK_NS
+        states = [
+            stepped(between_steps, number),
+            by_function.step(t_ns, drive, frames=frames(number)),
+        ]
+        for stamp_ns in range(t_ns - 4 * TICK_NS // 5, t_ns + 1, TICK_NS // 5):
+            often.add_odometry(stamp_ns, drive(stamp_ns))
+        states.append(often.step(t_ns, frames=frames(number)))
+        for state in states[1:]:
+            assert state.pose == pytest.approx(states[0].pose, abs=1e-9)
+    assert len(by_function.landmarks) == 1
+    assert by_function.landmarks.positions_m[0] == pytest.approx(ROD, abs=0.03)
+
+
+def test_a_frame_just_behind_the_newest_pose_is_where_the_robot_goes_on_to() -> None:
+    extrapolated, known = made(), made()
+    for number in range(30):
+        late = frames(number, (20_000_000, 40_000_000))
+        t_ns = number * TICK_NS
+        one = extrapolated.step(t_ns, drive(t_ns), frames=late)
+        other = known.step(t_ns, drive, frames=late)
+        assert one.pose == pytest.approx(other.pose, abs=1e-9)
+
+
+def test_headings_need_not_be_unwrapped() -> None:
+    """A frame half way between two poses on both sides of pi looks the way between them."""
+    slam = Slam(RIG, front_end=Rod())
+    seen: list[Pose] = []
+
+    def spy(frames: object, scans: object, pose_at: PoseAt, t_ns: int) -> tuple[()]:
+        seen.append(pose_at(t_ns - TICK_NS // 2))
+        return ()
+
+    slam.step(0, (0.0, 0.0, math.pi - 0.1))
+    slam._stepped = spy  # type: ignore[method-assign]
+    frame = replace(FRAME, t_ns=TICK_NS // 2)
+    slam.step(TICK_NS, (0.0, 0.0, 3 * math.pi + 0.1 - 2 * math.tau), frames=[frame])
+    assert abs(seen[0][2]) == pytest.approx(math.pi)
+
+
+@pytest.mark.parametrize("preset", ["robust", "paper"])
+def test_there_is_a_state_before_the_first_landmark_and_between_states(preset: str) -> None:
+    slam = made(preset, start=(1.0, 2.0, math.pi / 2))
+    assert slam.state.t_ns is None
+    assert slam.state.pose.tolist() == [1.0, 2.0, math.pi / 2]
+    assert slam.smoothed() is None
+    for k, x_m in enumerate((5.0, 5.0, 5.003)):  # too little for a state
+        state = slam.step(k, (x_m, 1.0, 0.0))
+        assert state.t_ns == k
+        assert state.results == ()
+        assert state.pose == pytest.approx([1.0, 2.0 + x_m - 5.0, math.pi / 2])
+    sigma_m = math.sqrt(state.covariance[1, 1])
+    along_m = WheelNoise().along_m_per_sqrt_m * math.sqrt(0.003)
+    assert sigma_m == pytest.approx(math.hypot(along_m, WheelNoise().scale_sigma * 0.003), rel=0.01)
+    assert (len(slam.landmarks), slam.walls.shape) == (0, (0, 2, 2))
+
+
+def test_the_map_lies_where_it_was_started() -> None:
+    start = np.array([3.0, -1.0, 2.0])
+    there, here = made(start=start), made()
+    for number in range(30):
+        moved, plain = stepped(there, number), stepped(here, number)
+        assert moved.pose == pytest.approx(compose(start, plain.pose))
+        R = np.eye(3)
+        R[:2, :2] = np.array([[math.cos(2), -math.sin(2)], [math.sin(2), math.cos(2)]])
+        assert moved.covariance == pytest.approx(R @ plain.covariance @ R.T)
+    assert there.landmarks.positions_m == pytest.approx(
+        transform(start, here.landmarks.positions_m)
+    )
+    one, other = there.smoothed(), here.smoothed()
+    assert one is not None
+    assert other is not None
+    assert between(start, one.poses[-1]) == pytest.approx(other.poses[-1])
+
+
+def test_ranges_of_anchors_with_ids_place_robot_and_anchors() -> None:
+    """A circle of 3 m, wheels 2 % too long: ranges of 2 cm keep the robot within centimetres."""
+    rng = np.random.default_rng(1)
+    slam = Slam(Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0)]))
+    step = np.array([0.08, 0.0, 0.08 / 1.5])
+    pose, wheels = np.zeros(3), np.zeros(3)
+    for number in range(250):
+        ranges = [
+            (0, math.dist(at, pose[:2]) + rng.normal(0.0, 0.02), 0.02, id_)
+            for id_, at in ANCHORS.items()
+        ]
+        state = slam.step(number * TICK_NS, wheels, ranges=ranges)
+        if number < 249:
+            pose = compose(pose, step)
+            wheels = compose(wheels, step * np.array([1.007, 1.0, 1.0]))
+    assert math.dist(state.pose[:2], pose[:2]) < 0.04
+    error = between(pose, state.pose)
+    assert error @ np.linalg.solve(state.covariance, error) < 16.3  # chi-square, 3 dof, 0.1 %
+    marks = slam.landmarks
+    assert set(marks.given_ids) == set(ANCHORS)
+    for id_, at, covariance in zip(
+        marks.given_ids, marks.positions_m, marks.covariances_m2, strict=True
+    ):
+        assert id_ is not None
+        away = at - ANCHORS[id_]
+        assert math.hypot(*away) < 0.1
+        assert away @ np.linalg.solve(covariance, away) < 13.8  # 2 dof
+
+
+def test_points_are_landmarks_at_once() -> None:
+    config = override(
+        load_preset("robust"), {"detection.max_range_m": 8.0, "robust.field_of_view_deg": 170}
+    )
+    slam = Slam(Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0)]), config)
+    places = {1: (3.0, 1.0), 2: (3.0, -1.0), None: (5.0, 0.5)}
+    for number in range(25):
+        pose = drive(number * TICK_NS)
+        points = []
+        for id_, at in places.items():
+            x_m, y_m = at[0] - pose[0], at[1]
+            points.append((0, math.hypot(x_m, y_m), math.atan2(y_m, x_m), 0.02, 0.01, id_))
+        state = slam.step(number * TICK_NS, pose, points=points)
+    assert state.pose == pytest.approx(drive(24 * TICK_NS), abs=0.02)
+    found = dict(zip(slam.landmarks.given_ids, slam.landmarks.positions_m, strict=True))
+    assert set(found) == set(places)
+    for id_, at in places.items():
+        assert found[id_] == pytest.approx(at, abs=0.06)
+
+
+def test_a_rig_takes_a_list_and_names_its_mounts() -> None:
+    assert [mount.name for mount in RIG.mounts] == ["radar0", "radar1"]
+    with pytest.raises(ValueError, match="finite"):
+        Rig([Mount(x_m=math.nan, y_m=0.0, yaw_rad=0.0)])
+    with pytest.raises(ValueError, match="mount"):
+        Slam(Rig([]))
+
+
+def test_every_name_is_there_and_loaded_when_it_is_used() -> None:
+    for module in (library, __import__("slam.live", fromlist=["live"])):
+        assert {*module.__all__} == {*module._HOMES}
+        for name in module.__all__:
+            assert getattr(module, name).__name__ == name
+    with pytest.raises(AttributeError):
+        library.nothing  # noqa: B018 - raises
+    program = "import slam, slam.live, sys; print({'numpy', 'pydantic', 'scipy'} & {*sys.modules})"
+    printed = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert printed.stdout == "set()\n"
+
+
+def test_a_rig_file_brings_its_wheels(tmp_path: Path) -> None:
+    (file := tmp_path / "robot.toml").write_text(
+        '[[radars]]\nname = "left"\nserial = "202305070101"\nx_m = 0.1\ny_m = 0.2\nyaw_deg = 90.0\n'
+        "[wheels]\nscale_sigma = 0.05\n"
+    )
+    slam = Slam(load_rig(file))
+    assert slam.rig.mounts[0].yaw_rad == math.pi / 2
+    slam.step(0, (0.0, 0.0, 0.0))
+    state = slam.step(T, (1.0, 0.0, 0.0))
+    assert state.covariance[0, 0] > 0.05**2
