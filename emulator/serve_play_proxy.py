@@ -32,14 +32,13 @@ from emulator.ports.runtime_folders import (
     socket_path,
 )
 from emulator.ports.sockets import OdometryFeed
-from emulator.ports.tcp import is_loopback
 from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
 from emulator.x4m300 import PortDevice, radar_device
 from xethru_protocol.operating_system import STDOUT, StopFlag, json_text, waiting
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
-from xethru_protocol.transport import open_line
+from xethru_protocol.transport import is_loopback, open_line
 from xethru_protocol.validation import choices, shown
 from xethru_protocol.wire.errors import PortUnavailable
 

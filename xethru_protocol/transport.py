@@ -15,6 +15,7 @@ pseudo-terminals appear in no list of ports.
 import asyncio
 import errno
 import fcntl
+import ipaddress
 import json
 import math
 import os
@@ -484,6 +485,37 @@ def _address(url: str) -> tuple[str, int]:
             f"{url}: must be {scheme}://HOST:PORT with a port of 1...65535, and nothing behind it"
         )
     return found[1].strip("[]"), int(found[2])
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or address surely stands for this machine only.
+
+    >>> [is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "0.0.0.0", "lab-pc")]
+    [True, True, True, False, False]
+    """
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name may lead anywhere
+
+
+def listening_socket(host: str, port: int, backlog: int) -> socket.socket:
+    """Return a socket that listens at a port, 0: at any that is free, and does not block.
+
+    Raises PortUnavailable if it cannot be had.
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        listener = socket.create_server((address[0], port), family=family, backlog=backlog)
+    except (OSError, UnicodeError) as error:  # the latter of a name that no host can have
+        reason = str(error.args[-1])
+        if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
+            reason = os.strerror(error.errno)  # without the address that Python adds to it
+        raise PortUnavailable(f"{host}:{port}: cannot listen: {reason}") from error
+    listener.setblocking(False)
+    return listener
 
 
 def _why_unreachable(url: str, host: str, error: Exception) -> str:

@@ -5,32 +5,16 @@ A client that comes while another one has the module is hung up on at once.
 
 from __future__ import annotations
 
-import ipaddress
-import os
 import socket
 from collections.abc import Callable
 
 from emulator.ports.pty import LARGEST_READ, LinkError
 from emulator.ports.sockets import Listener
+from xethru_protocol.transport import listening_socket
+from xethru_protocol.wire.errors import PortUnavailable
 
 BACKLOG = 16
 LAST_PORT = 65535
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a name or address surely stands for this machine only.
-
-    Examples
-    --------
-    >>> [is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "0.0.0.0", "lab-pc")]
-    [True, True, True, False, False]
-    """
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False  # a name may lead anywhere
 
 
 class TcpLink(Listener):
@@ -60,13 +44,9 @@ class TcpLink(Listener):
         if port > LAST_PORT:
             raise LinkError(f"{host}:{port}: cannot listen: ports end at {LAST_PORT}; lower --tcp")
         try:
-            family, _, _, _, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
-            listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)
-        except (OSError, UnicodeError) as error:  # the latter of a name that no host can have
-            raise LinkError(
-                f"{host}:{port}: cannot listen: {_reason(error)}; "
-                "choose another --tcp or --tcp-host"
-            ) from error
+            listener = listening_socket(host, port, BACKLOG)
+        except PortUnavailable as error:
+            raise LinkError(f"{error}; choose another --tcp or --tcp-host") from error
         super().__init__(listener)
         self.port: int = listener.getsockname()[1]
 
@@ -115,10 +95,3 @@ class TcpLink(Listener):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self._client = connection
-
-
-def _reason(error: OSError | UnicodeError) -> str:
-    """Return the message of the system without the address that Python adds to it."""
-    if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
-        return os.strerror(error.errno)
-    return str(error.args[-1])

@@ -55,6 +55,7 @@ seconds = number(float, lambda value: 0 < value <= _LONGEST_S, "seconds, more th
 metres = number(float, lambda value: -1000 <= value <= 1000, "metres between -1000 and 1000")
 sensitivity = number(int, lambda value: 0 <= value <= 9, "a whole number from 0 to 9")
 at_least_one = number(int, lambda value: value >= 1, "a whole number from 1 on")
+tcp_port = number(int, lambda value: 0 <= value < 65536, "a whole number from 0 to 65535")
 playback_rate = number(float, lambda value: 0 <= value < math.inf, "a number from 0 on")
 window = number(float, lambda value: 20 <= value <= 600, "seconds, from 20 to 600")
 # rates that a module could be set to (Protocol reference 4.10)
@@ -187,8 +188,27 @@ def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def raw_config(arguments: argparse.Namespace) -> "RawConfig":
-    """Return the settings of raw radar frames; ends the program on wrong usage."""
+def _add_attach(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--attach",
+        action="store_true",
+        help="take the frames that the module sends for another program, as beside 'xethru share', "
+        "and change nothing",
+    )
+
+
+def raw_config(arguments: argparse.Namespace) -> "RawConfig | None":
+    """Return the settings of raw radar frames, None for those that the module has (--attach).
+
+    Ends the program on wrong usage.
+    """
+    if arguments.attach:
+        for option in ("frame_area", "fps", "baseband"):
+            if getattr(arguments, option):
+                arguments.refuse(
+                    f"--attach changes nothing: leave --{option.replace('_', '-')} out"
+                )
+        return None
     from xethru_protocol.driver.link import RawConfig
 
     start_m, end_m = arguments.frame_area or _FRAME_AREA_M
@@ -291,6 +311,7 @@ def _add_live_source(one: argparse.ArgumentParser) -> None:
     )
     _add_radar(one)
     _add_raw_settings(one)
+    _add_attach(one)
     one.add_argument("--count", type=at_least_one, help="stop after COUNT frames")
     one.add_argument(
         "--window",
@@ -350,6 +371,30 @@ def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
         f"rewritten. {_NO_MEDICAL_DEVICE}",
     )
     _add_live_source(one)
+    _add_json(one)
+
+
+def _add_share(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    one = _add_command(
+        commands,
+        "share",
+        "give one module to several programs",
+        "share:share",
+        "Programs open it as tcp://HOST:PORT. All get every message and may ask; settings are "
+        "changed by the first that does, until it leaves, and refused to others, which take its "
+        "frames with --attach. One that is too slow loses whole messages, the others none. Ends by "
+        "Ctrl-C, with exit code 0.",
+    )
+    _add_port(one)
+    one.add_argument(
+        "--tcp", type=tcp_port, required=True, metavar="PORT", help="where, 0: any that is free"
+    )
+    one.add_argument(
+        "--host",
+        type=not_empty,
+        default="127.0.0.1",
+        help="address to listen at (default 127.0.0.1, which only this machine reaches)",
+    )
     _add_json(one)
 
 
@@ -469,6 +514,7 @@ def _add_record(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         "send it nothing",
     )
     _add_raw_settings(one)
+    _add_attach(one)
     group = one.add_argument_group("presence and respiration")
     group.add_argument(
         "--output",
@@ -546,10 +592,12 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     _add_port(one)
     _add_json(one)
     _add_raw_settings(one)
+    _add_attach(one)
     one.add_argument("--count", type=at_least_one, help="stop after COUNT frames")
     one.add_argument("--samples", action="store_true", help="print the samples, too")
     _add_live(commands)
     _add_record(commands)
+    _add_share(commands)
     one = _add_command(
         commands,
         "dump",

@@ -12,13 +12,14 @@ from xethru_protocol.cli.output import (
     Progress,
     bytes_text,
     counted,
-    frame_rate,
+    let_send,
     module_at,
     print_json,
     print_line,
     print_text,
     print_warnings,
     rewriting,
+    set_up,
     warn,
 )
 from xethru_protocol.driver.firmware import UNFINISHED, FirmwareImage
@@ -150,8 +151,8 @@ def stream(arguments: Namespace) -> int:
     """Print frames until ``--count``, a signal, or the reader's end; the module is stopped then."""
     config = raw_config(arguments)
     with module_at(arguments.port, arguments.baudrate) as radar:
-        radar.configure_raw(config)
-        rate = radar.start(frame_rate(radar, arguments.fps))
+        set_up(radar, config)
+        rate = let_send(radar, config, arguments.fps)
         print_warnings(radar)
         as_json = arguments.json or arguments.samples or not STDOUT.is_terminal
         live = None if as_json else _Live(radar)

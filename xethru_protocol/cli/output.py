@@ -14,6 +14,8 @@ from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 
 if TYPE_CHECKING:
+    from xethru_protocol.driver.frames import FrameGeometry
+    from xethru_protocol.driver.link import RawConfig
     from xethru_protocol.driver.radar import X4M300
     from xethru_protocol.recordings import RecordingFault
 
@@ -197,6 +199,18 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
         _print_end(radar, losses)
         raise
     _print_end(radar, losses)
+
+
+def set_up(radar: X4M300, config: RawConfig | None) -> FrameGeometry:
+    """Configure raw radar frames; None: take those that come already."""
+    return radar.attach() if config is None else radar.configure_raw(config)
+
+
+def let_send(radar: X4M300, config: RawConfig | None, wanted_hz: float | None) -> float:
+    """Start what was set up, if that is for us to do; returns the rate of the frames [Hz]."""
+    if config is None:
+        return float(radar.description["rate_hz"])
+    return radar.start(frame_rate(radar, wanted_hz))
 
 
 _USUAL_FPS = 17.0

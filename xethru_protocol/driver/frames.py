@@ -474,9 +474,9 @@ class FrameQueue:
             why = f"data with content id {message.content_id} came, which radar frames do not have"
         elif self.geometry is None:
             why = (
-                f"radar frames of {message.values.size} values come, but configure_raw() was not "
-                "called, so where their bins lie is not known and they are discarded; call it, "
-                "or set the driver's geometry"
+                f"radar frames of {message.values.size} values come, but where their bins lie is "
+                "not known, so they are discarded; call configure_raw(), or attach() if they are "
+                "another program's, or set the driver's geometry"
             )
         else:
             why = (

@@ -29,7 +29,6 @@ from typing import (
 
 from xethru_protocol.driver.frames import Frame, FrameQueue, Lattice
 from xethru_protocol.driver.matching import (
-    BOOTLOADER_ERRORS,
     FRAMES,
     Conversation,
     Observer,
@@ -57,6 +56,7 @@ from xethru_protocol.wire.errors import (
     RemoteProtocolError,
     ResponseTimeout,
 )
+from xethru_protocol.wire.sharing import SETTINGS_CHANGE
 from xethru_protocol.wire.table import ROWS, Command, Response
 from xethru_protocol.wire.versions import STOP_WITHOUT_PROFILE, FirmwareVersions, needed_by
 
@@ -345,6 +345,8 @@ class Link:
         What the line carries at most; infinite if it has no known limit.
     raw_mode
         Whether this driver put the module into raw radar mode.
+    attached
+        Whether its frames come for another program, which may change their geometry.
     """
 
     def __init__(
@@ -376,6 +378,7 @@ class Link:
         self.bytes_per_s = math.inf
         self.reconnects = 0
         self.raw_mode = False
+        self.attached = False
         self.closed = False
         self._make_gate = make_gate
         self._lines: defaultdict[type, deque[Gate | None]] = defaultdict(deque)
@@ -395,6 +398,9 @@ class Link:
             return
         if isinstance(message, m.System) and message.code == SystemCode.XTS_SPRS_BOOTING:
             self.frames.restart()
+            self._lose_geometry("the module restarted")
+        if isinstance(message, m.DataString) and message.text == SETTINGS_CHANGE:
+            self._lose_geometry(message.text)
         if self.keeps_messages or isinstance(message, m.DataString):
             if len(self.messages) >= _MESSAGES:
                 self.messages.popleft()
@@ -405,6 +411,12 @@ class Link:
         elif isinstance(message, m.RadarMessage):
             name = ROWS[type(message)].name
             self.frames.discard(f"{name} comes, which read_message() and messages() return")
+
+    def _lose_geometry(self, why: str) -> None:
+        if self.attached:
+            self.attached = False
+            self.frames.geometry = self.plan = None
+            self.warn(f"{why}, so where the bins of later frames lie is not known; attach again")
 
     @property
     def name(self) -> str:
@@ -467,8 +479,10 @@ class Link:
         matcher.settle()
         if isinstance(answer, m.Error):
             meaning = error_name(answer.code, ROWS[type(command)].errors)
+            # the reason, where the module gives one (Protocol reference 4.1)
+            meaning = ": ".join(filter(None, (meaning, conversation.text)))
             raise DeviceError(answer.code, summary(command), meaning)
-        if isinstance(answer, BOOTLOADER_ERRORS):
+        if isinstance(answer, m.BOOTLOADER_ERRORS):
             raise bootloader_error(answer, command)
         self._follow(command)
         return answer

@@ -26,11 +26,6 @@ from xethru_protocol.wire.table import ROWS, Command, Response, UnknownMessage
 
 FRAMES = (m.DataFloat, m.BasebandIq)  # a tuple is the faster argument of isinstance
 _ENDLESS_S = 1e9
-BOOTLOADER_ERRORS = (m.BootloaderError, m.BootloaderFramingError)
-_ANSWERS = (
-    *(m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString),
-    *(m.BootloaderSuccess, m.BootloaderEchoed, *BOOTLOADER_ERRORS),
-)
 _ANSWER_CODES = (b"\x01", b"\x10", b"\x11", b"\x20")  # PONG, ACK, REPLY, ERROR
 _SHOWN = 160  # characters of an answer in an error
 # The module answers PINGs that waited for it one right after the other; a PONG that does not come
@@ -185,7 +180,7 @@ class Matcher:
     def take(self, message: Response) -> bool:
         """Take a message that came, if it is an answer; return whether it is."""
         # some firmware answers with a message that other firmware sends unasked
-        if not isinstance(message, (_ANSWERS, self.expected)):
+        if not isinstance(message, (m.ANSWERS, self.expected)):
             makes_no_sense = (
                 isinstance(message, UnknownMessage) and message.payload[:1] in _ANSWER_CODES
             )
@@ -221,7 +216,7 @@ class Matcher:
                 elif isinstance(answer, m.ReplyString) and self._tokens_out:
                     self._tokens_out -= 1
                 elif not (
-                    self._as_token or self.unexpected or isinstance(answer, BOOTLOADER_ERRORS)
+                    self._as_token or self.unexpected or isinstance(answer, m.BOOTLOADER_ERRORS)
                 ):
                     self.unexpected = answer
                     patience_s = self._timeout_s * _AFTER_A_WRONG_ONE
@@ -230,7 +225,7 @@ class Matcher:
     def _fits(self, answer: Response) -> bool:
         if isinstance(answer, m.Error):
             return not self._as_token
-        if isinstance(answer, BOOTLOADER_ERRORS):  # an ECHO has no errors: they are of another
+        if isinstance(answer, m.BOOTLOADER_ERRORS):  # an ECHO has no errors: they are of another
             return not isinstance(self._command, m.BootloaderEcho)
         return isinstance(answer, self.expected) and all(
             getattr(answer, name, None) == value for name, value in self._repeated.items()
@@ -292,6 +287,7 @@ class Conversation:
         self.fault_count = 0
         self.reboots = 0
         self.readies = 0
+        self.text = ""  # the last DATA STRING since the last question
         self.is_known = True  # whether it is the module that is meant; see `new_line`
         self._clock = clock
         self._observer = observer
@@ -311,6 +307,7 @@ class Conversation:
         data = self._connection.send(command)
         self.matcher.ask(command, timeout_s, as_token=as_token)
         self._frames_since = False
+        self.text = ""
         if self._observer is not None:
             self.report("tx", summary(command))
         return data
@@ -340,7 +337,7 @@ class Conversation:
             raise
 
     def _sort(self, message: Response, arrival_ns: int) -> None:
-        if not self.is_known and not isinstance(message, _ANSWERS):
+        if not self.is_known and not isinstance(message, m.ANSWERS):
             self._frames_since |= isinstance(message, FRAMES)
             return
         if self.listeners.all and self.is_known:
@@ -354,6 +351,8 @@ class Conversation:
             self._damaged_since = self._rebooted_since = False
         else:
             self._take_data(message, arrival_ns)
+            if isinstance(message, m.DataString):
+                self.text = message.text
             if isinstance(message, m.System):
                 self.readies += message.code == SystemCode.XTS_SPRS_READY
                 if message.code == SystemCode.XTS_SPRS_BOOTING:

@@ -125,7 +125,9 @@ class RadarState(Part[KindT]):
 
     def __del__(self) -> None:
         link = getattr(self, "_link", None)  # missing if the driver could not be made
-        if link is not None and link.frames.rate_hz and not link.closed:
+        if link is None or link.closed or link.attached:
+            return
+        if link.frames.rate_hz:
             warnings.warn(
                 f"a driver of {link.path} was dropped while its radar transmits, which it still "
                 f"does; write 'with {type(self).__name__}.open(...) as radar', or call close()",
@@ -413,6 +415,20 @@ class RadarState(Part[KindT]):
         return raw_mode.configure_raw(link, config)
 
     @sends
+    def attach(link: Link) -> Steps[FrameGeometry]:
+        """Take the frames that the module sends already; nothing is changed, also by `close`.
+
+        For frames that another program started, as beside ``xethru share``. If that program changes
+        the settings, later frames are discarded with a warning. `description` has the rate.
+
+        Raises
+        ------
+        LocalProtocolError
+            If the module sends none.
+        """
+        return raw_mode.attach(link)
+
+    @sends
     def start(link: Link, fps: float) -> Steps[float]:
         """Start frames at ``fps`` [Hz]; returns the rate at which the chip really runs.
 
@@ -491,7 +507,8 @@ class X4M300(RadarState[Blocking]):
     The methods, by task:
 
     - begin and end: `open`, `ping`, `info`, `close`
-    - raw frames: `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`
+    - raw frames: `configure_raw`, `start`, `read_frame`, `frames`, `frames_waiting`, `stop`;
+      `attach` for those that another program started
     - all other messages: `messages`, `read_message`, `messages_waiting`; `listeners` are called
       with every one, `raw_listeners` with the bytes of both directions
     - the module and its line: `mode`, `set_mode`, `reset`, `reconnect`, `set_baud_rate`,

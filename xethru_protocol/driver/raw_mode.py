@@ -26,7 +26,11 @@ class RawPlan:
     fps: float | None = None
 
     def restore(self, link: Link) -> Steps[None]:
-        """Configure and start again; frames that wait stay in the queue."""
+        """Configure and start again, or attach again; frames that wait stay in the queue."""
+        if link.attached:
+            link.frames.interrupt()
+            yield from attach(link)
+            return
         yield from _apply(link, self.config)
         # setting up took its time, too
         link.frames.interrupt(x4.real_frame_rate(self.fps or 0.0))
@@ -50,10 +54,14 @@ def _apply(link: Link, config: RawConfig) -> Steps[FrameGeometry]:
     """As `configure_raw`, but keep the frames that wait."""
     if (yield from link.wait_until_ready()) is PongCode.XTS_SPRP_SAFEMODE:
         link.warn("the module is in safe mode after repeated faults; reset it")
-    link.raw_mode = True
+    link.raw_mode, link.attached = True, False
     yield from link.set_mode_if_known(SensorMode.XTID_SM_STOP)
     yield from link.set_mode_if_known(SensorMode.XTID_SM_MANUAL)
-    yield from link.request(X4DriverInit(), SLOW_TIMEOUT_S)
+    try:
+        yield from link.request(X4DriverInit(), SLOW_TIMEOUT_S)
+    except DeviceError as error:
+        link.raw_mode = error.code != ErrorCode.XTS_SPRE_BUSY  # another program's, to leave alone
+        raise
     offset_m = yield from _offset_m(link, config)
     predicted = None if offset_m is None else config.area(offset_m)
     for setting, value in config.settings():
@@ -185,7 +193,7 @@ def _take_over(link: Link) -> Steps[None]:
     if mode is not SensorMode.XTID_SM_MANUAL:
         raise LocalProtocolError(
             f"{link.name} is in mode {mode.label}, in which no radar frames come; "
-            "call configure_raw() first"
+            "call configure_raw() first, or start the program that does"
         )
     values: dict[str, X4Value] = {}
     for name, setting in CONFIG_SETTINGS.items():
@@ -197,9 +205,31 @@ def _take_over(link: Link) -> Steps[None]:
     link.plan = RawPlan(config=config)
 
 
+def attach(link: Link) -> Steps[FrameGeometry]:
+    yield from link.ping()  # behind its answer no news come of earlier changes
+    link.attached = True
+    try:
+        yield from _take_over(link)
+        rate = yield from link.x4_get(X4Setting.FPS)
+        geometry = link.frames.geometry
+        if geometry is None or not isinstance(rate, float) or not 0 < rate < math.inf:
+            raise LocalProtocolError(
+                f"{link.name} sends no frames yet; start the program that commands it first, or "
+                "configure it yourself"
+            )
+        if not link.attached:
+            raise LocalProtocolError(f"{link.name} is just being set up; try again")
+    except BaseException:
+        link.attached = False
+        link.frames.geometry = link.plan = None
+        raise
+    link.frames.rate_hz = x4.real_frame_rate(rate)
+    return geometry
+
+
 def run_at(link: Link, fps: float) -> Steps[float]:
     """Let frames come as part of the stream that there is."""
-    link.raw_mode = True
+    link.raw_mode, link.attached = True, False
     yield from link.request(X4DriverSet(setting=X4Setting.FPS, value=fps))
     rate = yield from link.x4_get(X4Setting.FPS)
     if not isinstance(rate, float) or not 0 < rate < math.inf:

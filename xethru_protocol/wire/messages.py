@@ -662,7 +662,7 @@ class BootloaderFramingError(Response):
     code: Annotated[int, fields.U8.of(codes.BootloaderFraming)]
 
 
-_BOOTLOADER_ERRORS = (
+_BOOTLOADER_ERROR_CODES = (
     int(BootloaderReply.UNKNOWN_COMMAND),
     int(BootloaderReply.WRITING_REFUSED),
     int(BootloaderReply.WRONG_CHECKSUM),
@@ -674,7 +674,7 @@ _BOOTLOADER_ERRORS = (
 class BootloaderError(Response):
     """A bootloader refuses a command: ``code`` is a `BootloaderReply`, E2 to E5. 4.12."""
 
-    code: Annotated[int, fields.Spelling(_BOOTLOADER_ERRORS, shown=int)]
+    code: Annotated[int, fields.Spelling(_BOOTLOADER_ERROR_CODES, shown=int)]
 
 
 @response(BootloaderReply.ECHO, name="BOOTLOADER_ECHO")
@@ -683,6 +683,13 @@ class BootloaderEchoed(Response):
 
     data: Annotated[bytes, fields.RestBytes()]
 
+
+BOOTLOADER_ERRORS = (BootloaderError, BootloaderFramingError)
+ANSWERS = (
+    *(Ack, Error, Pong, ReplyByte, ReplyInt, ReplyFloat, ReplyString),
+    *(BootloaderSuccess, BootloaderEchoed, *BOOTLOADER_ERRORS),
+)
+"""Messages that answer a command and come for no other reason. Protocol reference 3."""
 
 # --- commands ---------------------------------------------------------------------------------
 

@@ -63,6 +63,7 @@ ROWS = [
     (XETHRU, "vital --port SILENT", False),
     (XETHRU, "record --port SILENT --out OUT", False),
     (XETHRU, "flash --port SILENT --yes PIPE", False),
+    (XETHRU, "share --port SILENT --tcp 0", True),
     (XETHRU, "dump SESSION", True),
     (XETHRU, "convert SESSION OUT.mcap", True),
     (XETHRU, "export kaitai", True),
@@ -154,7 +155,7 @@ def test_a_command_that_waits_is_ended_by_a_signal(
         code = command.process.wait(timeout=60)
         command.read()
     assert not command.tracebacks
-    serves = module == EMULATOR and line.split()[0] in {"serve", "play", "proxy"}
+    serves = line.split()[0] in {"serve", "play", "proxy", "share"}
     # by the signal itself: after the program gave its handlers back, or where it has none
     assert code in ({0} if serves else {128 + which, -which}), f"{time.monotonic() - ended_s:.1f} s"
     check_nothing_is_left(tmp_path, folder)

@@ -17,8 +17,10 @@ from xethru_protocol.cli.arguments import raw_config
 from xethru_protocol.cli.output import (
     CommandFailed,
     frame_rate,
+    let_send,
     module_at,
     print_warnings,
+    set_up,
     warn,
     warn_of,
 )
@@ -85,6 +87,8 @@ def open_source(arguments: Namespace) -> Iterator[FrameSource]:
     """Open what the command line names; the module is stopped and closed when the block ends."""
     if (arguments.recording is None) == (arguments.port is None):
         arguments.refuse("name a recording, or the --port of a module")
+    if arguments.recording is not None and arguments.attach:
+        arguments.refuse("--attach is for the --port of a module")
     if arguments.recording is not None:
         source = _recorded(arguments)
         yield source
@@ -92,15 +96,16 @@ def open_source(arguments: Namespace) -> Iterator[FrameSource]:
         return
     config = raw_config(arguments)
     with module_at(arguments.port, arguments.baudrate) as radar:
-        geometry = radar.configure_raw(config)
-        wanted_hz = frame_rate(radar, arguments.fps)
-        frames = _Finite(_streamed(radar, wanted_hz, arguments.count))
+        geometry = set_up(radar, config)
+        wanted_hz = None if config is None else frame_rate(radar, arguments.fps)
+        rate_hz = radar.description["rate_hz"] if wanted_hz is None else real_frame_rate(wanted_hz)
+        frames = _Finite(_streamed(radar, config, wanted_hz, arguments.count))
         yield FrameSource(
             name=arguments.port,
             ranges_m=geometry.ranges_m,
             is_iq=geometry.downconversion,
-            frame_rate_hz=real_frame_rate(wanted_hz),
-            tx_center_frequency=config.tx_center_frequency,
+            frame_rate_hz=rate_hz,
+            tx_center_frequency=radar.description["settings"][X4Setting.TXCENTERFREQUENCY.name],
             frames=frames,
             lost=lambda: radar.frames_lost + frames.n_left_out,
         )
@@ -121,9 +126,11 @@ class _Finite:
                 self.n_left_out += 1
 
 
-def _streamed(radar: X4M300, wanted_hz: float, count: int | None) -> Iterator[TimedFrame]:
+def _streamed(
+    radar: X4M300, config: RawConfig | None, wanted_hz: float | None, count: int | None
+) -> Iterator[TimedFrame]:
     """Yield frames as they come; their times follow from the chip's counter."""
-    rate_hz = radar.start(wanted_hz)
+    rate_hz = let_send(radar, config, wanted_hz)
     print_warnings(radar)
     steps, before = 0, None
     for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate_hz)):

@@ -37,6 +37,8 @@ def record(arguments: Namespace) -> int:
         arguments.refuse("--out DIR is missing, or --wire FILE, or both")
     if arguments.out == arguments.wire:
         arguments.refuse("--out and --wire must not be the same")
+    if config is None and arguments.profile != "raw":
+        arguments.refuse("--attach takes radar frames: leave --profile out")
     mode = Listen()
     profile = profile_of(arguments)
     if arguments.profile == "raw":

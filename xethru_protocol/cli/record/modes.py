@@ -8,7 +8,8 @@ from typing import Any
 
 from xethru_protocol.cli.output import (
     CommandFailed,
-    frame_rate,
+    let_send,
+    set_up,
     warn,
 )
 from xethru_protocol.driver.link import RawConfig
@@ -67,16 +68,16 @@ class Listen:
 class RawFrames(Listen):
     """Radar frames of raw mode."""
 
-    def __init__(self, config: RawConfig, fps: float | None) -> None:
+    def __init__(self, config: RawConfig | None, fps: float | None) -> None:
         self._config = config
         self._fps = fps
         self._rate_hz = 0.0
 
     def prepare(self, radar: X4M300) -> None:
-        radar.configure_raw(self._config)
+        set_up(radar, self._config)
 
     def start(self, radar: X4M300) -> float:
-        self._rate_hz = radar.start(frame_rate(radar, self._fps))
+        self._rate_hz = let_send(radar, self._config, self._fps)
         return max(2.0, 3.0 / self._rate_hz)
 
     def about(self, radar: X4M300) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def test_frames_before_configure_raw_are_reported(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     for k in range(50):
         line.say_later(0.05 * k, frame(k))
-    with pytest.raises(ResponseTimeout, match=r"1431 values come, but configure_raw\(\) was not"):
+    with pytest.raises(ResponseTimeout, match=r"1431 values come, but where their bins lie"):
         radar.read_frame()
     assert len(radar.warnings) == 1
     assert "configure_raw() was not called" in radar.warnings[0]
