@@ -36,6 +36,7 @@ def test_unknown_modes_are_refused(radar: X4M300) -> None:
     assert radar.mode() is SensorMode.XTID_SM_STOP
 
 
+@pytest.mark.requires("presence")
 def test_a_loaded_profile_does_not_run_yet(radar: X4M300) -> None:
     """Protocol reference 8.3: STOP unloads it again."""
     radar.profile.load(ProfileId.XTS_ID_APP_PRESENCE_2)

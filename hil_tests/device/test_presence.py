@@ -20,7 +20,7 @@ from xethru_protocol.wire.codes import (
 )
 from xethru_protocol.wire.errors import DeviceError, LocalProtocolError
 
-pytestmark = [pytest.mark.requires("settings"), pytest.mark.requires("profiles")]
+pytestmark = [pytest.mark.requires("settings"), pytest.mark.requires("presence")]
 
 
 def test_zone_limits(radar: X4M300) -> None:

@@ -108,6 +108,7 @@ class TappedTransport:
 CAPABILITIES: Mapping[str, str] = {
     "settings": "a recording that is played takes none",
     "profiles": "bare XEP firmware has none",
+    "presence": "an X4M300 has this profile; X4M200 and X4M210 have respiration",
     "files": "a file system that answers",
     "unplug": "only emulated ones can be unplugged by a program",
     "power": "--hil-power-cmd CMD switches the power of a real one",
@@ -294,7 +295,7 @@ class ProcessTarget(RadarTarget):
 
     def __init__(self, spec: RadarArgument) -> None:
         played = spec.kind is RadarKind.REPLAY
-        able = {"settings", "profiles", "files", "unplug", "power", "faults"}
+        able = {"settings", "profiles", "presence", "files", "unplug", "power", "faults"}
         if spec.line == "uart":
             able.add("uart")
         self._scene = None if played else _scene(spec)
@@ -384,7 +385,7 @@ class PortTarget(RadarTarget):
 
     def __init__(self, spec: RadarArgument, power: PowerCommand | None = None) -> None:
         path = _port_of(spec.target) if spec.kind is RadarKind.SERIAL_NUMBER else spec.target
-        able = {"settings", "profiles", "files"} | ({"power"} if power else set())
+        able = {"settings", "profiles", "presence", "files"} | ({"power"} if power else set())
         able |= set() if spec.known_range_m is None else {"known_range"}
         super().__init__(spec, frozenset(able), f"module at {path}")
         self._path, self._power = path, power

@@ -265,7 +265,9 @@ class RadarUnderTest:
         info = radar.info()
         self.place.serial_number = info.serial_number or ""
         if info.order_code is None:  # base firmware, without profiles
-            self.place.capabilities -= {"profiles"}
+            self.place.capabilities -= {"profiles", "presence"}
+        elif info.order_code.startswith("X4M2"):
+            self.place.capabilities -= {"presence"}
         known = (info.order_code or "bare", info.serial_number, info.firmware_id, info.version)
         self.identity = one_line(" ".join(part for part in known if part))
 

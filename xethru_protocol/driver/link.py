@@ -493,6 +493,8 @@ class Link:
             case m.X4DriverInit() | m.ModReset() | m.X4DriverSet(setting=X4Setting.ENABLE):
                 self.frames.rate_hz = 0.0
                 self.frames.restart()
+                if isinstance(command, m.ModReset):
+                    self.conversation.begin()
             case m.LoadApp():
                 self.frames.rate_hz = None
                 self.frames.restart()

@@ -294,6 +294,7 @@ class Conversation:
         self._take_data = take_data
         self._connection = Connection(Role.HOST, self.statistics)
         self._winding_down = False
+        self.begin()
         self._frames_since = False  # the last question
         self._damaged_since = False  # since the last frame or answer
         self._rebooted_since = False
@@ -317,6 +318,20 @@ class Conversation:
         if self.raw_listeners.all and self.is_known:
             self.raw_listeners(direction, data, t_ns)
 
+    def begin(self) -> None:
+        """Count no damage before the next message, or the answer to a question that is asked.
+
+        Of what a module sent before, to another program or until a reset, the rest may still come.
+        """
+        seen = self.statistics
+        self._before = seen.junk_bytes, seen.resyncs, seen.faults.copy(), self.fault_count
+        self._has_begun = False
+
+    def _leave_out_damage(self) -> None:
+        seen, (junk_bytes, resyncs, faults, self.fault_count) = self.statistics, self._before
+        seen.bytes -= seen.junk_bytes - junk_bytes
+        seen.junk_bytes, seen.resyncs, seen.faults = junk_bytes, resyncs, faults.copy()
+
     def receive(self, data: bytes, arrival_ns: int) -> None:
         self.hear("rx", data, arrival_ns)
         connection = self._connection
@@ -337,6 +352,9 @@ class Conversation:
             raise
 
     def _sort(self, message: Response, arrival_ns: int) -> None:
+        if not self._has_begun:
+            self._leave_out_damage()
+            self._has_begun = not self.matcher.expected or isinstance(message, m.ANSWERS)
         if not self.is_known and not isinstance(message, m.ANSWERS):
             self._frames_since |= isinstance(message, FRAMES)
             return

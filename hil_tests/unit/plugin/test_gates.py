@@ -190,3 +190,17 @@ def test_a_radar_that_cannot_be_reached_is_not_tried_again() -> None:
     with pytest.raises(TargetError):
         bench.radar(name, again=True)
     assert len(tried) == 2
+
+
+@pytest.mark.requires("profiles", "presence")
+@pytest.mark.parametrize(
+    ("target", "says"), [("emu", "runs"), ("emu:sleeper", "skipped: "), ("emu:desk", "skipped: ")]
+)
+def test_a_test_of_the_presence_profile_is_not_for_an_x4m200(
+    target: str, says: str, request: pytest.FixtureRequest
+) -> None:
+    bench = Bench(parse_specs([target]), InProcessTarget)
+    (name,) = bench.specs
+    came = outcome(request, bench, name)
+    assert came.startswith(says)
+    assert ("presence" in came) == (says != "runs")

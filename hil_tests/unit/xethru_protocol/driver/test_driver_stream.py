@@ -56,6 +56,28 @@ def test_queue_that_is_never_empty_warns_once(driver_on: DriverOn) -> None:
     assert len(radar.warnings) == 1
 
 
+def test_what_an_earlier_program_left_half_read_is_no_damage(driver_on: DriverOn) -> None:
+    left = PlainModule()
+    radar, line = driver_on(left)
+    half = line.bytes_of(frame(7))[4000:]
+    left.instead = {m.Ping(): [half, line.bytes_of(frame(8)), half, READY]}
+    radar.ping()
+    assert (radar.fault_count, radar.statistics.clean) == (0, True)
+    assert radar.statistics.bytes == 9 + 14 + 4 * 1431 + len(line.bytes_of(READY))
+    left.instead = {m.Ping(): [half, READY]}
+    radar.ping()  # it is damage now
+    faults = radar.fault_count, radar.statistics.junk_bytes
+    assert faults[0] > 0
+    assert faults[1] == len(half)
+    left.instead = {m.ModReset(): [m.Ack(), half, m.System(code=0x10)]}
+    radar.reset()
+    radar.ping()
+    assert (radar.fault_count, radar.statistics.junk_bytes) == faults
+    line.say(half, frame(1))
+    radar.ping()
+    assert radar.fault_count > faults[0]
+
+
 def test_queue_without_room_is_refused(driver_on: DriverOn) -> None:
     with pytest.raises(LocalProtocolError, match="needs room for a frame, not for 0"):
         driver_on(queue_frames=0)
@@ -136,7 +158,7 @@ def test_frames_before_configure_raw_are_reported(driver_on: DriverOn) -> None:
     with pytest.raises(ResponseTimeout, match=r"1431 values come, but where their bins lie"):
         radar.read_frame()
     assert len(radar.warnings) == 1
-    assert "configure_raw() was not called" in radar.warnings[0]
+    assert "call configure_raw()" in radar.warnings[0]
     assert radar.frames_discarded > 30
     line.timed.clear()
     radar.configure_raw()
