@@ -31,7 +31,7 @@ from xethru_protocol.operating_system import (
     one_line,
 )
 from xethru_protocol.optional_packages import what_is_missing
-from xethru_protocol.validation import Parser, number, output, shown
+from xethru_protocol.validation import Parser, number, output, recording_at, shown
 
 if TYPE_CHECKING:
     from emulator.faults.kind import KindOfFault
@@ -224,16 +224,15 @@ def request_of(words: Sequence[str]) -> dict[str, Any]:  # noqa: PLR0911 - one r
 
 
 def _fault(kind: str, keys: Sequence[str]) -> dict[str, Any]:
-    from emulator.faults.plan import FaultSpec
+    from emulator.faults.plan import fault_table
 
-    fault: dict[str, Any] = {"kind": kind}
-    parameters: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for key in keys:
         name, equals, value = key.partition("=")
         if not equals:
             raise ValueError(f"{key}: must be KEY=VALUE")
-        (fault if name in FaultSpec.model_fields else parameters)[name] = _value(value)
-    return {**fault, "parameters": parameters}
+        values[name] = _value(value)
+    return fault_table(kind, **values)
 
 
 def _value(text: str) -> Any:  # noqa: ANN401 - whatever the text stands for
@@ -449,7 +448,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         description=_PLAY_HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    play.add_argument("recording", type=Path, metavar="RECORDING", help="recording to play")
+    play.add_argument(
+        "recording",
+        type=lambda text: Path(recording_at(text)),
+        metavar="RECORDING",
+        help="recording to play",
+    )
     play.add_argument(
         "--rate",
         type=_rate,

@@ -27,6 +27,8 @@ from emulator.ports.pty import LinkError, PortWatch
 from emulator.ports.runtime_folders import (
     Announcement,
     DirectoryMemory,
+    keep_first_serial,
+    kept_first_serial,
     link_folder,
     make_state_directory,
     socket_path,
@@ -228,8 +230,10 @@ def _serials(options: Namespace, of_scene: Sequence[str]) -> list[str]:
     first = options.serial
     if first is None:
         first = FIRST_BARE + BARE_SERIALS * secrets.randbelow(FIRST_BARE // BARE_SERIALS)
-        kept = [] if options.state_dir is None else options.state_dir.glob(f"1{'[0-9]' * 11}.json")
-        first = min((int(path.stem) // BARE_SERIALS * BARE_SERIALS for path in kept), default=first)
+        if options.state_dir is not None:
+            first = kept_first_serial(options.state_dir, BARE_SERIALS) or first
+    if options.bare and options.state_dir is not None:
+        keep_first_serial(options.state_dir, first)
     return [f"{first + index:012d}" for index in range(len(of_scene))]
 
 

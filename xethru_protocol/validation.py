@@ -10,7 +10,7 @@ import json
 import math
 import os.path
 import re
-from argparse import ArgumentParser, ArgumentTypeError
+from argparse import PARSER, REMAINDER, ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -170,7 +170,25 @@ _BETWEEN_CHOICES = re.compile("'?, '?")
 
 
 class Parser(ArgumentParser):
-    """A parser of a command line that asks which choice was meant by a misspelt one."""
+    """A parser of a command line that asks which choice or option was meant by a misspelt one."""
+
+    def parse_known_args(  # type: ignore[override] # only as the other methods call it
+        self,
+        args: Sequence[str] | None = None,
+        namespace: Any = None,  # noqa: ANN401 - as the base
+    ) -> tuple[Any, list[str]]:
+        """Parse; an option that is not there is refused before one that is missing."""
+        takes_all = any(action.nargs in {PARSER, REMAINDER} for action in self._actions)
+        for word in () if takes_all or args is None else args:
+            name = word.partition("=")[0]
+            if name == "--":
+                break
+            options = self._option_string_actions
+            if name.startswith("--") and not any(each.startswith(name) for each in options):
+                close = get_close_matches(name, options, n=1)
+                meant = f"; did you mean {close[0]}?" if close else ""
+                self.error(f"there is no option {name}{meant}")
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         if found := _INVALID_CHOICE.fullmatch(message):
@@ -241,6 +259,8 @@ def output(*suffixes: str, what: str = "a file") -> Callable[[str], Path]:
 
     def read(text: str) -> Path:
         found = suffix_of(Path(text))
+        if found not in suffixes and found.lower() in suffixes:
+            raise ArgumentTypeError(f"write {found} in small letters: {found.lower()}")
         if found and found not in suffixes:
             allowed = " or ".join(
                 [*(f"that ends in {name}" for name in suffixes), "without suffix"]

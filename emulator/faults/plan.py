@@ -15,7 +15,8 @@ file, key and what is allowed::
     every = 50                 # every 50th opportunity
     probability = 0.01         # each opportunity with this chance
     packet = "frame"           # faults of any packet: frame, reply, system or data only
-    count = 3                  # how often; 1 if left out, 0: without end, at every opportunity
+    count = 3                  # how often; 1 if left out, 0: without end, at every opportunity;
+                               # those of faults of a moment are the next frames
     parameters = { }           # of the kind
 
 The truth log is JSON lines, one object per injected fault: ``t_ns`` (device time), ``radar``,
@@ -191,6 +192,7 @@ class FaultSpec(Table):
         if self.command is not None:
             return Target.REPLY
         by_frame = self.frame is not None or self.every > 1 or self.probability < 1
+        by_frame |= self.count > 1  # else all would be at one moment
         return Target.FRAME if by_frame else Target.MOMENT
 
     def kind_parameters(self) -> Parameters:
@@ -205,8 +207,27 @@ class FaultPlan(Table):
     fault: tuple[FaultSpec, ...] = ()
 
 
+def fault_table(kind: str, **keys: Any) -> dict[str, Any]:  # noqa: ANN401 - any key
+    """Return one fault as in a scenario; other keys than a fault's are parameters of its kind.
+
+    Raises
+    ------
+    FaultPlanError
+        If a number of frames was meant and a frame was named.
+    """
+    parameters = dict(keys.pop("parameters", {}))
+    parameters |= {key: keys.pop(key) for key in set(keys) - set(FaultSpec.model_fields)}
+    takes = KINDS[kind].parameters.model_fields if kind in KINDS else {}
+    if "frame" in keys and "frames" in takes and "frames" not in parameters:
+        raise FaultPlanError(
+            f"fault: {kind} takes frames, how many; frame is the counter from which on it comes: "
+            f"write frames={keys['frame']}, or frames=1 as well"
+        )
+    return {"kind": kind, "parameters": parameters, **keys}
+
+
 def fault_spec(kind: str, **keys: Any) -> FaultSpec:  # noqa: ANN401 - any key, all validated
-    """Return one fault; other keys than a fault's are parameters of its kind.
+    """Return one fault, its keys as of `fault_table`.
 
     Raises
     ------
@@ -216,9 +237,7 @@ def fault_spec(kind: str, **keys: Any) -> FaultSpec:  # noqa: ANN401 - any key, 
     >>> fault_spec("missing_frames", frames=2, count=3).parameters
     {'frames': 2}
     """
-    parameters = dict(keys.pop("parameters", {}))
-    parameters |= {key: keys.pop(key) for key in set(keys) - set(FaultSpec.model_fields)}
-    return parse_fault({"kind": kind, "parameters": parameters, **keys})
+    return parse_fault(fault_table(kind, **keys))
 
 
 def parse_fault(table: object, source: str = "fault") -> FaultSpec:

@@ -30,6 +30,7 @@ from xethru_protocol.transport import is_private, is_running, run_directory
 from xethru_protocol.validation import problem_text, reason_of
 
 _PORTS = "ports-"
+_FIRST_SERIAL = "first_serial"  # a file of a directory of states
 
 
 def fresh_port_folder() -> Path:
@@ -161,6 +162,21 @@ def make_state_directory(directory: Path) -> None:
         raise LinkError(
             f"{directory}: cannot keep state there: {error.strerror}; choose another --state-dir"
         ) from error
+
+
+def kept_first_serial(directory: Path, block: int) -> int | None:
+    """Return the serial number with which earlier bare modules here began; None without any."""
+    with contextlib.suppress(OSError, ValueError):
+        return int((directory / _FIRST_SERIAL).read_text())
+    states = directory.glob(f"1{'[0-9]' * 11}.json")  # all that older versions kept
+    return min((int(path.stem) // block * block for path in states), default=None)
+
+
+def keep_first_serial(directory: Path, first: int) -> None:
+    try:
+        (directory / _FIRST_SERIAL).write_text(f"{first}\n")
+    except OSError as error:
+        raise LinkError(f"{directory}: cannot keep serial numbers: {error.strerror}") from error
 
 
 class DirectoryMemory:

@@ -38,14 +38,14 @@ def utf8_text(text: str) -> str:
 
 
 def wire_file(text: str) -> str:
-    what = "a wire capture, --out FILE.mcap writes MCAP, 'xethru convert' any other format"
-    output(".xtwire", what=what)(not_empty(text))
+    output(".xtwire", what="a wire capture, --out MCAP")(not_empty(text))
     return text
 
 
 def recording_file(text: str) -> str:
-    what = "MCAP or a directory in the vendor's format, 'xethru convert' any other format"
-    output(".mcap", what=what)(not_empty(text))
+    if text.endswith(".xtwire"):
+        raise ArgumentTypeError(f"a wire capture is written by --wire {text}")
+    output(".mcap", what="MCAP or a directory in the vendor's format")(not_empty(text))
     return text
 
 

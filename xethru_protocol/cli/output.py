@@ -142,6 +142,15 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+def rate_text(count: int, span_s: float) -> str:
+    """Write how often something came, as a further part of a line; nothing of no time.
+
+    >>> rate_text(17, 2.0), rate_text(1, 0.0)
+    (', 8.5/s', '')
+    """
+    return f", {count / span_s:.1f}/s" if span_s > 0 else ""
+
+
 def bytes_text(count: int) -> str:
     """Amount of data, for people.
 

@@ -83,6 +83,8 @@ def recording_format(path: Path | str) -> RecordingFormat:
             raise RecordingError(f"there is no recording {path}")
         if path.is_dir() or is_vendor_file(path):
             return "vendor"
+        if path.is_char_device():
+            raise RecordingError(f"{path} is a port, not a recording; name it with --port")
         if not path.is_file():  # a pipe would be waited for
             raise RecordingError(f"{path} is not a file; a recording is read from files only")
         with path.open("rb") as stream:
@@ -98,10 +100,8 @@ def recording_format(path: Path | str) -> RecordingFormat:
     if start.startswith(RERUN_MAGIC):
         raise RecordingError(f"{path} is a view in Rerun's format; 'uwb-slam view' opens it")
     raise RecordingError(
-        f"{path} is not a recording that can be read: a directory or data file of ModuleConnector,"
-        " a wire capture (.xtwire), MCAP, or arrays. Of a data file its name, as"
-        " xethru_datafloat_*.dat, decides, else its first records; of arrays .csv, .mat, .npz or"
-        " .npy, else a first line of complex numbers"
+        f"{path} is not a recording: those are .mcap, .xtwire, arrays (.npz, .npy, .mat, .csv), and"
+        " directories or files of ModuleConnector, such as xethru_datafloat_*.dat"
     )
 
 

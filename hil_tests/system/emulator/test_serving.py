@@ -101,6 +101,10 @@ def test_bare_modules_have_serial_numbers_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "100000012301.json").touch()  # of the second module
     with emulator(*two, "--state-dir", tmp_path) as kept:
         assert kept.serials == ("100000012300", "100000012301")
+    with emulator(*two, "--state-dir", tmp_path, "--serial", "202611260001") as given:
+        assert given.serials == ("202611260001", "202611260002")
+    with emulator(*two, "--state-dir", tmp_path) as again:
+        assert again.serials == given.serials
 
 
 def test_a_file_survives_the_emulator(tmp_path: Path) -> None:
@@ -110,7 +114,8 @@ def test_a_file_survives_the_emulator(tmp_path: Path) -> None:
         with open_radar(served.paths[0]) as radar:
             radar.files.write(FILE.file_type, FILE.identifier, content)
         assert served.end() == 0
-    assert [path.name for path in tmp_path.iterdir()] == [f"{served.serials[0]}.json"]
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"first_serial", f"{served.serials[0]}.json"}
     with emulator(*serve) as served, open_radar(served.paths[0]) as radar:
         assert radar.files.find(FILE.file_type) == (FILE,)
         assert radar.files.read(FILE.file_type, FILE.identifier) == content

@@ -85,8 +85,10 @@ class FrameSource:
 @contextmanager
 def open_source(arguments: Namespace) -> Iterator[FrameSource]:
     """Open what the command line names; the module is stopped and closed when the block ends."""
-    if (arguments.recording is None) == (arguments.port is None):
+    if arguments.recording is None and arguments.port is None:
         arguments.refuse("name a recording, or the --port of a module")
+    if arguments.recording is not None and arguments.port is not None:
+        arguments.refuse(f"--port {arguments.port} or {arguments.recording}, not both")
     if arguments.recording is not None and arguments.attach:
         arguments.refuse("--attach is for the --port of a module")
     if arguments.recording is not None:

@@ -10,6 +10,7 @@ from typing import Any, Literal, Self
 from xethru_protocol.cli.output import (
     bytes_text,
     counted,
+    rate_text,
 )
 from xethru_protocol.cli.record.modes import ANSWERS
 from xethru_protocol.cli.recordings import (
@@ -172,9 +173,9 @@ class RecordingFiles:
 
     def numbers(self) -> str:
         span_s = (self._newest_ns - self._began_ns) * 1e-9
-        rate = f", {self.messages / span_s:.1f}/s" if span_s > 0 else ""
         return (
-            f"{counted(self.messages, 'message')} in {span_s:.1f} s{rate}, "
+            f"{counted(self.messages, 'message')} in {span_s:.1f} s"
+            f"{rate_text(self.messages, span_s)}, "
             f"{bytes_text(self._statistics.bytes)}, {self._statistics.frames_lost} lost"
         )
 

@@ -20,6 +20,7 @@ from xethru_protocol.cli.output import (
     print_json,
     print_line,
     print_warnings,
+    rate_text,
     warn,
 )
 from xethru_protocol.cli.record.modes import ANSWERS, POLL_S, Listen
@@ -98,12 +99,12 @@ class _RecordedModule(_Source):
         self._mode = mode
         self._serial = serial
         self._silence_s = float("inf")
-        self._newest_ns = time.monotonic_ns()
+        self._began_ns = self._newest_ns = time.monotonic_ns()
         self._early: list[tuple[Response, int]] | None = []  # before it is described
 
     def let_it_send(self) -> None:
         """Start what it sends, which is recorded from now on."""
-        self._newest_ns = time.monotonic_ns()
+        self._began_ns = self._newest_ns = time.monotonic_ns()
         self._radar.listeners.add(self._take)
         try:
             self._silence_s = self._mode.start(self._radar)
@@ -114,6 +115,10 @@ class _RecordedModule(_Source):
         early, self._early = self._early or [], None
         for message, arrival_ns in early:
             self._take(message, arrival_ns)
+
+    def numbers(self) -> str:
+        rate = rate_text(self.recorded, (self._newest_ns - self._began_ns) * 1e-9)
+        return f"{super().numbers()}{rate}, {self._radar.frames_lost} lost"
 
     def summary(self) -> dict[str, Any]:
         return super().summary() | {"link": self._radar.statistics.summary()}
@@ -241,8 +246,8 @@ class _Session:
             progress.finish(self.numbers)
 
     def numbers(self) -> str:
-        parts = ", ".join(source.numbers() for source in self.sources)
-        return f"{parts} in {self._ended_s - self._began_s:.1f} s"
+        parts = "; ".join(source.numbers() for source in self.sources)
+        return f"{parts}; in {self._ended_s - self._began_s:.1f} s"
 
     def summary(self) -> dict[str, Any]:
         return {

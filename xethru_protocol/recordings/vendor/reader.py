@@ -73,6 +73,7 @@ _LONGEST_USER_HEADER = 4096  # bytes; searched where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16
 _LAST_CONTENT_ID = 14  # Protocol reference 6.1
 _FURTHEST = 1 << 48  # byte of a recording; sums of such numbers stay within 64 bits
+_MOST_NAMED = 4
 _MOST_LOOKED_AT = 100  # files of a directory
 _DIRECTORY_PREFIX = "xethru_recording_"
 _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT")
@@ -231,6 +232,8 @@ def _parts_of(path: Path) -> list[_RecordingDirectory]:
         others = sorted(path.iterdir())[:_MOST_LOOKED_AT] if path.is_dir() else []
         if renamed := next(filter(kind_of_data_file, others), None):
             wanted += f"; {renamed} is one by its content: files under other names are read singly"
+        if held := [one.name for one in others if one.suffix in {".mcap", ".xtwire"}]:
+            raise RecordingError(f"{path} holds {', '.join(held[:_MOST_NAMED])}; name one of them")
         raise RecordingError(f"{path} holds no recording this can read; it needs a file {wanted}")
     return parts
 

@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 
+import numpy as np
 import pytest
 
 from emulator.faults.faulty_device import fault
@@ -69,3 +70,13 @@ def test_as_many_frames_are_missing_as_were_injected(count: int, faulty_line: Fa
         list(radar.frames(20))
     assert injection.injected == count
     assert radar.statistics.frames_lost == 2 * count
+
+
+def test_a_moment_comes_again_when_frames_come_again(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.streaming(reconnect_s=20.0)
+    radar.read_frame()
+    with fault(faulty_line.device, "unplug", count=3, away_s=0.5) as injection:
+        list(radar.frames(20))
+    assert (injection.injected, radar.reconnects) == (3, 3)
+    times_ns = [one.t_ns for one in faulty_line.truth]
+    assert min(np.diff(times_ns)) >= 500_000_000

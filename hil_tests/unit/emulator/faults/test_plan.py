@@ -98,3 +98,11 @@ def test_what_is_no_key_of_a_fault_is_a_parameter() -> None:
     assert (spec.parameters, spec.count) == ({"frames": 2}, 3)
     with pytest.raises(FaultPlanError, match=r"parameters\.fames"):
         fault_spec("missing_frames", fames=2)
+
+
+def test_a_number_of_frames_is_not_taken_for_the_frame_it_begins_at() -> None:
+    with pytest.raises(FaultPlanError, match="frames=2"):
+        fault_spec("missing_frames", frame=2)
+    spec = fault_spec("missing_frames", frame=2, frames=1)
+    assert (spec.frame, spec.parameters) == (2, {"frames": 1})
+    assert fault_spec("bad_checksum", frame=2).frame == 2

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -60,6 +61,16 @@ def started(*arguments: str | Path) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def test_the_summary_has_rate_and_lost_frames_of_each_module(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    ports = ["--port", f"left={module.path}"]
+    assert main(["record", *ports, "--out", str(tmp_path / "x.mcap"), "--count", "9"]) == 0
+    found = re.search(r"left 9 messages, ([\d.]+)/s, 0 lost", capsys.readouterr().out)
+    assert found is not None
+    assert float(found[1]) > 0
 
 
 def test_modules_are_recorded_to_the_count_of_each(
@@ -253,7 +264,7 @@ def test_a_module_that_falls_silent_is_named(
         (["--port", "a", "--text", "x=b", "--text", "x=c", "--out", "x.mcap"], "x is given twice"),
         (["--port", "a", "--out", "x.mcap", "--wire", "w.xtwire"], "--wire is for one module"),
         (["--port", "a", "--out", "x.mcap", "--session-id", "s", "--interval", "2"], "--out DIR"),
-        (["--port", "a", "--wire", "x.mcap"], "--out FILE.mcap writes MCAP"),
+        (["--port", "a", "--wire", "x.mcap"], "--out MCAP"),
         ([*(f"--port=n{at}=p{at}" for at in range(9)), "--out", "x.mcap"], "at most 8"),
     ],
 )

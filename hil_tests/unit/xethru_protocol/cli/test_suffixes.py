@@ -58,6 +58,51 @@ def test_the_suffix_of_another_format_is_wrong_usage(
     assert [path.name for path in here.iterdir()] == ["rec"]
 
 
+@pytest.mark.parametrize(
+    ("main", "line", "meant"),
+    [
+        (XETHRU, "record --port p --out x.MCAP", ".mcap"),
+        (XETHRU, "record --port p --out x.xtwire", "--wire x.xtwire"),
+        (XETHRU, "record --port p --out y --fsp 3", "--fps"),
+        (XETHRU, "stream --prot p", "--port"),
+        (XETHRU, "view --port p rec", "rec"),
+        (EMULATOR, "serve --bare --cuont 2", "--count"),
+        (SLAM, "sweep --scene lab --sed 1 --json x", "--seed"),
+    ],
+)
+def test_the_error_names_what_is_meant(
+    main: Main, line: str, meant: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    assert ended.value.code == 2
+    assert meant in capsys.readouterr().err.splitlines()[-1]
+    assert [path.name for path in here.iterdir()] == ["rec"]
+
+
+def test_an_argument_that_looks_like_an_option_of_another_program_is_left_to_it(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "script.py").write_text("import sys; print(sys.argv[1:])")
+    assert XETHRU(["legacy", "script.py", "--prot", "--"]) == 0
+    assert capsys.readouterr().out == "['--prot', '--']\n"
+
+
+def test_what_is_no_recording_is_answered_with_what_there_is(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recordings = here / "recordings"
+    recordings.mkdir()
+    for name in ("one.mcap", "two.mcap"):
+        assert XETHRU(["convert", "rec", str(recordings / name)]) == 0
+    capsys.readouterr()
+    for main, command in ((XETHRU, "dump"), (EMULATOR, "play")):
+        assert main([command, str(recordings)]) == 1
+        assert "one.mcap, two.mcap" in capsys.readouterr().err
+    assert XETHRU(["view", "/dev/null"]) == 1
+    assert "--port" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("target", ["x.mcpa", "x.txt", "x.h5"])
 def test_an_unknown_suffix_is_refused_by_convert(target: str, here: Path) -> None:
     assert XETHRU(["convert", "rec", target]) == 1
