@@ -74,9 +74,8 @@ def run_demo(
     driven until then is recorded, mapped and summed up.
     """
     loaded, config = scene_and_config(scene, preset)
-    publishing = Publishing(publish)
     with ExitStack() as held:
-        held.enter_context(publishing)
+        publishing = held.enter_context(Publishing(publish))
         live = None
         if rerun is not None:  # before an earlier run's files are removed
             live = held.enter_context(LiveView(rerun, stop))
@@ -135,7 +134,7 @@ def run_demo(
             sinks: list[SessionObserver] = [
                 RunProgress(info, source.lost_frames, end_ns=trajectory.duration_ns),
                 log,  # closed before the views: the record must not wait for them
-                publishing.observer(info, link_log.log),
+                publishing,
                 *([live.observer(info)] if live is not None else []),
                 *([make_view(out / VIEW, info)] if make_view is not None else []),
             ]
@@ -143,6 +142,7 @@ def run_demo(
                 log.on_wire(*row)
             if wire:
                 rig_source.listen(log.on_wire)
+            publishing.begin(info, link_log.log)
             record = execute(source, sinks)
         if record.last is not None:
             # without the flag: the signal that ended the drive does not end the writing

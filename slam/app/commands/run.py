@@ -94,15 +94,14 @@ def run_rig(
     line_source = parse_source(odometry)
     live_odometry = LiveOdometry(line_source.name, parse_clock(clock, line_source))
     inbox = Inbox()
-    publishing = Publishing(publish)
     with ExitStack() as held:
+        publishing = held.enter_context(Publishing(publish))
         if (out / SESSION).exists():
             raise AppError(
                 f"{out}: holds the session of an earlier drive, which cannot be repeated; "
                 "choose another --out, or move it away"
             )
         hold_folder(out, held)
-        held.enter_context(publishing)
         requests = held.enter_context(SmoothingRequests(out))
         view = held.enter_context(LiveView(rerun, stop)) if rerun is not None else None
         links = open_modules(
@@ -165,12 +164,13 @@ def run_rig(
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
             sinks: list[SessionObserver] = [
-                publishing.observer(info, log.log, start_ns),
+                publishing,
                 RunProgress(info, source.lost_frames, also=lambda: _dropped_text(live)),
                 requests,
             ]
             if view is not None:
                 sinks.append(view.observer(info))
+            publishing.begin(info, log.log, start_ns)
             record = execute(source, sinks)
             end_reading()  # the modules are stopped while the results are written
             # without the flag: the signal that ended the drive does not end the writing

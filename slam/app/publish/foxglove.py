@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import re
+from contextlib import ExitStack
 
 from foxglove import Channel, Context, Schema, start_server
-from foxglove.websocket import (
-    Capability,
-    ChannelView,
-    Client,
-    ServerListener,
-    WebSocketServer,
-)
+from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
 from slam.app.errors import UsageError
 from slam.app.publish.sinks import Sink
-from slam.app.session.writer import SessionMessages
+from slam.app.session.viewer_topics import Topics
+from slam.app.session.writer import SessionLog
 from slam.live.errors import AppError
 from slam.live.odometry_track import TumSample
 from slam.live.session import cdr
@@ -28,23 +24,22 @@ _HOST = "127.0.0.1"
 _LARGEST_PORT = 65_535
 
 
-class _ServedTopics(ServerListener):
-    """Sends messages to those who subscribed to their topics.
+class _ServedTopics(Topics, ServerListener):
+    """Sends messages, with session time, to those who subscribed to their topics.
 
     Whoever subscribes gets the last message of the topic at once: what is latched, and of the
-    others what may come again in some seconds only.
+    others what comes again in some seconds only. Those who had it get it again.
     """
 
-    def __init__(self, server_context: Context) -> None:
-        self._context = server_context
+    def __init__(self, context: Context) -> None:
+        self._context = context
         self._channels: dict[str, Channel] = {}
         self._last: dict[str, tuple[int, bytes]] = {}
 
     def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None:
         if topic not in self._channels:
-            schema = Schema(
-                name=message_type, encoding="ros2msg", data=cdr.schema_text(message_type)
-            )
+            text = cdr.schema_text(message_type)
+            schema = Schema(name=message_type, encoding="ros2msg", data=text)
             self._channels[topic] = Channel(
                 topic, schema=schema, message_encoding="cdr", context=self._context
             )
@@ -58,12 +53,10 @@ class _ServedTopics(ServerListener):
         sequence: int = 0,
         publish_ns: int | None = None,
     ) -> None:
-        """Send a message; its time is that of the session, and the server adds none."""
         self._last[topic] = t_ns, data
         self._channels[topic].log(data, log_time=t_ns)
 
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Send the last message again, in a thread of the server: others get it twice."""
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # by the server's thread
         if (last := self._last.get(channel.topic)) is not None:
             t_ns, data = last
             self._channels[channel.topic].log(data, log_time=t_ns)
@@ -72,8 +65,8 @@ class _ServedTopics(ServerListener):
 class FoxgloveSink(Sink):
     """Serves what a session holds, and the drawings of it, at `PORT` of this machine.
 
-    With `HOST:PORT` it is that address of the machine, which others may reach. The wheels'
-    poses in /odom are those of the states.
+    With `HOST:PORT` it is that address of the machine, which others may reach. The wheels' poses in
+    /odom are those of the states.
     """
 
     def __init__(self, text: str) -> None:
@@ -81,8 +74,7 @@ class FoxgloveSink(Sink):
         if text and not (re.fullmatch("[0-9]{1,5}", port) and 0 < int(port) <= _LARGEST_PORT):
             raise UsageError("must be foxglove, foxglove:PORT or foxglove:HOST:PORT")
         self._host, self._port = host or _HOST, int(port or DEFAULT_PORT)
-        self._messages: SessionMessages | None = None
-        self._server: WebSocketServer | None = None
+        self._ending = ExitStack()
 
     def open(self) -> None:
         """Start the server; topics are there once the run begins."""
@@ -104,31 +96,24 @@ class FoxgloveSink(Sink):
             ) from None
 
     def begin(self, info: SessionInfo, start_ns: int, map_id: str) -> None:
-        self._messages = SessionMessages(self._topics, info, start_ns=start_ns)
+        self._log = self._ending.enter_context(SessionLog(self._topics, info, start_ns=start_ns))
 
     def on_scan(self, scan: Scan) -> None:
-        assert self._server is not None
-        assert self._messages is not None
         self._server.broadcast_time(scan.t_ns)
-        self._messages.on_scan(scan)
+        self._log.on_scan(scan)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        assert self._messages is not None
         x_m, y_m, *_, qz, qw = cdr.planar(snapshot.odometry)
-        self._messages.on_odometry(TumSample(t_ns=snapshot.t_ns, x_m=x_m, y_m=y_m, qz=qz, qw=qw))
-        self._messages.on_snapshot(snapshot)
+        self._log.on_odometry(TumSample(t_ns=snapshot.t_ns, x_m=x_m, y_m=y_m, qz=qz, qw=qw))
+        self._log.on_snapshot(snapshot)
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        assert self._messages is not None
-        self._messages.on_smoothed(smoothed)
+        self._log.on_smoothed(smoothed)
 
     def on_log(self, line: LogLine) -> None:
-        assert self._messages is not None
-        self._messages.on_log(line)
+        self._log.on_log(line)
 
     def close(self) -> None:
         """Send what is drawn at the end, and end the connections."""
-        if self._messages is not None:
-            self._messages.close()
-        if self._server is not None:
-            self._server.stop()
+        self._ending.close()
+        self._server.stop()

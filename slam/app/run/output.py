@@ -125,12 +125,12 @@ def print_progress(line: str) -> None:
     STDERR.write_soon(f"{one_line(line)}\n")
 
 
-def print_text(lines: str, outlet: Outlet = STDOUT) -> None:
+def print_text(lines: str) -> None:
     """Print lines of a result on standard output, after its files are written.
 
     What cannot be printed does not raise here: the exit code reports it.
     """
-    outlet.write(each_line(lines) + "\n")
+    STDOUT.write(each_line(lines) + "\n")
 
 
 def write_json(path: Path, numbers: Mapping[str, object]) -> None:
@@ -144,13 +144,8 @@ ResultRow = tuple[str, str, str]
 """Name, value and note."""
 
 
-def print_table(
-    title: str,
-    header: Sequence[str] | None,
-    rows: Sequence[Sequence[str]],
-    outlet: Outlet = STDOUT,
-) -> None:
-    print_text(table_text(title, header, rows).rstrip("\n"), outlet)
+def print_table(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
+    print_text(table_text(title, header, rows).rstrip("\n"))
 
 
 def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> str:
@@ -195,7 +190,7 @@ def print_result(
         rows = summary_rows(
             summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
         )
-    print_table(title, None, [*rows, *also], outlet)
+    outlet.write(table_text(title, None, [*rows, *also]))
 
 
 def summary_rows(

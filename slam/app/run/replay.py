@@ -219,18 +219,17 @@ def run_replay(
 
     `rate` is how many times as fast as it was driven; None: at full speed.
     """
-    publishing = Publishing(publish)
-    recorded = open_session(session, stop)
-    comparison = Comparison(different_constants(recorded.info.constants))
-    source = recorded_source(recorded, stop, comparison)
-    if rate is not None:
-        source = replace(source, scans=paced(source.scans, rate, stop))
     with ExitStack() as held:
+        publishing = held.enter_context(Publishing(publish))
+        recorded = open_session(session, stop)
+        comparison = Comparison(different_constants(recorded.info.constants))
+        source = recorded_source(recorded, stop, comparison)
+        if rate is not None:
+            source = replace(source, scans=paced(source.scans, rate, stop))
         hold_folder(out, held)
-        held.enter_context(publishing)
         progress = RunProgress(source.info, source.lost_frames, end_ns=recorded.end_ns)
-        published = publishing.observer(source.info, source.link_log.log)
-        record = execute(source, [published, comparison, progress])
+        publishing.begin(source.info, source.link_log.log)
+        record = execute(source, [publishing, comparison, progress])
         if recorded.cut_at_byte is not None:
             note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")
         note(comparison.verdict())

@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 
 
 class Topics(Protocol):
-    """Takes messages in CDR; see `SessionMessages`."""
+    """Takes messages in CDR; see `SessionLog`."""
 
     def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None: ...
 
@@ -60,6 +60,18 @@ class Topics(Protocol):
         sequence: int = 0,
         publish_ns: int | None = None,
     ) -> None: ...
+
+    def add_metadata(self, name: str, table: Mapping[str, str]) -> None:
+        """Take a table that describes the run; for files."""
+        return
+
+    def end_head(self) -> None:
+        """Note that all that describes the run was written; for files."""
+        return
+
+    def close(self) -> None:
+        """Take no more messages."""
+        return
 
 
 class Drawings:

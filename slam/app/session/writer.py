@@ -104,7 +104,7 @@ class _Disk(FileIO):
         return super().write(data)
 
 
-class _SessionFile:
+class _SessionFile(Topics):
     """An MCAP file of ROS 2 messages, in chunks that are cut by size and by time.
 
     If the disk refuses a chunk, the file is closed after the last whole one and CannotWriteError is
@@ -222,23 +222,24 @@ class _SessionFile:
             ) from None
 
 
-class SessionMessages(SessionObserver):
-    """Packs a session as it happens: into the topics of a file, or of a server.
+class SessionLog(SessionObserver):
+    """Writes a session as it happens, into a file or into other topics.
 
-    Topics: latched `/session/info`, the table of the run (`session_table`); `/radar/<name>/frame`
-    with the frame counter in the record's sequence number and a latched `/radar/<name>/info`
-    (JSON), `/radar/<name>/stream` before the first frame of every stream but number 0; `/scan`
-    after the frames of each scan, with their counters and the true pose where it is known, or
-    `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`, `/tf`, `/tf_static`, `/log`;
-    `/slam/state`, the same states to the last bit (`state_row`), `/slam/step`, what led to each
-    (`step_row`); `/slam/smoothed`, the solution over all states, at the end and when it was asked
-    for (`smoothed_row`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
-    that another program found in `/radar/<name>/detections`.
+    Topics: latched `/session/info`, the table of the run (`session_table`), which is also a
+    metadata record; `/radar/<name>/frame` with the frame counter in the record's sequence number
+    and a latched `/radar/<name>/info` (JSON), `/radar/<name>/stream` before the first frame of
+    every stream but number 0; `/scan` after the frames of each scan, with their counters and the
+    true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`,
+    `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`state_row`),
+    `/slam/step`, what led to each (`step_row`); `/slam/smoothed`, the solution over all states, at
+    the end and when it was asked for (`smoothed_row`); where there are such, raw bytes in
+    `/radar/<name>/rx` and `tx`, and ranges that another program found in
+    `/radar/<name>/detections`.
 
     Parameters
     ----------
-    topics
-        Takes the messages.
+    place
+        The file, replaced if it exists; or other topics that take the messages, as a server's.
     odometry
         The whole track where it is known before the run; None where `on_odometry` brings it.
     truth_at
@@ -248,19 +249,29 @@ class SessionMessages(SessionObserver):
         of latched messages and of lines about setting up.
     drawn
         Whether to write `viewer_topics` for other programs, too.
+    clock_ns
+        Monotonic time [ns]; ends chunks.
+
+    Raises
+    ------
+    CannotWriteError
+        Here and in every other method: the disk is full or fails.
     """
 
     def __init__(
         self,
-        topics: Topics,
+        place: Path | Topics,
         info: SessionInfo,
         odometry: OdometryTrack | None = None,
         *,
         truth_at: TruthAt | None = None,
         start_ns: int = 0,
         drawn: bool = True,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._topics = topics
+        self._file: Topics = (
+            _SessionFile(place, start_ns, clock_ns) if isinstance(place, Path) else place
+        )
         self._start_ns = start_ns
         self._samples: Iterator[TumSample] = iter(odometry or ())
         self._odometry_ns = -1  # of the newest sample written
@@ -268,24 +279,28 @@ class SessionMessages(SessionObserver):
         self._t_ns = start_ns
         self._names = [radar.name for radar in info.radars]
         self._streams = [0] * len(self._names)
-        self._topics.add_topic(SESSION_TOPIC, STRING, latched=True)
-        self._topics.write(SESSION_TOPIC, start_ns, pack_string(json.dumps(session_table(info))))
+        table = session_table(info)
+        self._file.add_metadata(METADATA_NAME, table)
+        # The same with a checksum, and repeated; metadata have neither, but other programs show it.
+        self._file.add_topic(SESSION_TOPIC, STRING, latched=True)
+        self._file.write(SESSION_TOPIC, start_ns, pack_string(json.dumps(table)))
         for radar in info.radars:
-            self._topics.add_topic(f"/radar/{radar.name}/frame", FLOAT_ARRAY)
-            self._topics.add_topic(f"/radar/{radar.name}/info", STRING, latched=True)
+            self._file.add_topic(f"/radar/{radar.name}/frame", FLOAT_ARRAY)
+            self._file.add_topic(f"/radar/{radar.name}/info", STRING, latched=True)
             text = pack_string(radar_text(radar))
-            self._topics.write(f"/radar/{radar.name}/info", start_ns, text)
+            self._file.write(f"/radar/{radar.name}/info", start_ns, text)
         for topic, message_type in _TOPICS.items():
-            self._topics.add_topic(topic, message_type, latched=topic == "/tf_static")
+            self._file.add_topic(topic, message_type, latched=topic == "/tf_static")
         # The topic is latched with depth 1, so each message holds all that is static so far.
         self._placements = {
             ("base_link", f"radar_{radar.name}"): np.array([radar.x_m, radar.y_m, radar.yaw_rad])
             for radar in info.radars
         }
-        self._topics.write("/tf_static", start_ns, cdr.transforms(start_ns, self._placements))
+        self._file.write("/tf_static", start_ns, cdr.transforms(start_ns, self._placements))
         self._wheels = WheelMotion(info.wheels)
         self._wheels_at: tuple[int, NDArray[np.float64]] | None = None
-        self._drawings = Drawings(self._topics, info, start_ns) if drawn else None
+        self._drawings = Drawings(self._file, info, start_ns) if drawn else None
+        self._file.end_head()
 
     def on_scan(self, scan: Scan) -> None:
         """Write the frames of one tick, and the odometry that their poses come from."""
@@ -299,7 +314,7 @@ class SessionMessages(SessionObserver):
                 self._streams[frame.radar] = frame.stream
                 number = cdr.number(frame.stream)
                 self._write_rare(frame.radar, "stream", cdr.NUMBER, frame.t_ns, number)
-            self._topics.write(
+            self._file.write(
                 f"/radar/{self._names[frame.radar]}/frame",
                 frame.t_ns,
                 pack_array(FLOAT_ARRAY, frame.samples),
@@ -313,7 +328,7 @@ class SessionMessages(SessionObserver):
         row = np.array([len(scan.frames), *members, *known], dtype=np.float64)
         mark = pack_array(DOUBLE_ARRAY, row, "n_frames_radars_counters_truth")
         topic = "/scan" if scan.used else "/scan_unused"
-        self._topics.write(topic, scan.t_ns, mark, sequence=scan.counter)
+        self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
         if self._drawings is not None:
             self._drawings.on_scan(scan)
 
@@ -329,7 +344,7 @@ class SessionMessages(SessionObserver):
             earlier_ns, earlier = self._wheels_at
             twist = self._wheels.twist(earlier, pose, t_ns - earlier_ns)
         self._wheels_at = t_ns, pose
-        self._topics.write("/odom", t_ns, cdr.wheel_odometry(sample, twist))
+        self._file.write("/odom", t_ns, cdr.wheel_odometry(sample, twist))
         self._odometry_ns = t_ns
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
@@ -337,35 +352,35 @@ class SessionMessages(SessionObserver):
         t_ns = snapshot.t_ns
         if ("world", "map") not in self._placements:
             self._placements["world", "map"] = snapshot.world_from_map
-            self._topics.write("/tf_static", t_ns, cdr.transforms(t_ns, self._placements))
+            self._file.write("/tf_static", t_ns, cdr.transforms(t_ns, self._placements))
         if np.all(np.isfinite(snapshot.truth)):
-            self._topics.write("/truth", t_ns, cdr.pose_stamped(t_ns, "world", snapshot.truth))
-        self._topics.write("/estimate", t_ns, cdr.pose_stamped(t_ns, "map", snapshot.estimate))
-        self._topics.write("/landmarks", t_ns, cdr.landmark_cloud(t_ns, snapshot))
+            self._file.write("/truth", t_ns, cdr.pose_stamped(t_ns, "world", snapshot.truth))
+        self._file.write("/estimate", t_ns, cdr.pose_stamped(t_ns, "map", snapshot.estimate))
+        self._file.write("/landmarks", t_ns, cdr.landmark_cloud(t_ns, snapshot))
         links = {
             ("map", "odom"): compose(snapshot.estimate, between(snapshot.odometry, _ORIGIN)),
             ("odom", "base_link"): snapshot.odometry,
         }
-        self._topics.write("/tf", t_ns, cdr.transforms(t_ns, links))
+        self._file.write("/tf", t_ns, cdr.transforms(t_ns, links))
         if snapshot.step is not None:  # before its state, which a reader waits for
             step = step_row(snapshot.step, snapshot.wall_spans_m)
             message = pack_array(DOUBLE_ARRAY, step, "step")
-            self._topics.write("/slam/step", t_ns, message, sequence=snapshot.counter)
+            self._file.write("/slam/step", t_ns, message, sequence=snapshot.counter)
         state = pack_array(DOUBLE_ARRAY, state_row(snapshot), "state")
-        self._topics.write("/slam/state", t_ns, state, sequence=snapshot.counter)
+        self._file.write("/slam/state", t_ns, state, sequence=snapshot.counter)
         if self._drawings is not None:
             self._drawings.on_snapshot(snapshot)
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        self._topics.add_topic("/slam/smoothed", DOUBLE_ARRAY)
+        self._file.add_topic("/slam/smoothed", DOUBLE_ARRAY)
         message = pack_array(DOUBLE_ARRAY, smoothed_row(smoothed), "smoothed")
-        self._topics.write("/slam/smoothed", int(smoothed.t_ns[-1]), message)
+        self._file.write("/slam/smoothed", int(smoothed.t_ns[-1]), message)
         if self._drawings is not None:
             self._drawings.on_smoothed(smoothed)
 
     def on_log(self, line: LogLine) -> None:
         t_ns = max(line.t_ns, self._start_ns)
-        self._topics.write("/log", t_ns, cdr.log_line(t_ns, line))
+        self._file.write("/log", t_ns, cdr.log_line(t_ns, line))
 
     def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
         """Write bytes as a radar's port gave (rx) or took (tx) them, at a host time [ns].
@@ -376,54 +391,19 @@ class SessionMessages(SessionObserver):
             return
         message = pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8))
         topic = f"/radar/{radar}/{way}"
-        self._topics.add_topic(topic, BYTE_ARRAY)
-        self._topics.write(topic, self._t_ns, message, publish_ns=host_ns)
+        self._file.add_topic(topic, BYTE_ARRAY)
+        self._file.write(topic, self._t_ns, message, publish_ns=host_ns)
 
     def _write_rare(self, radar: int, part: str, message_type: str, t_ns: int, data: bytes) -> None:
         """Write to a topic that few sessions have; its channel is made when it is first needed."""
         topic = f"/radar/{self._names[radar]}/{part}"
-        self._topics.add_topic(topic, message_type)
-        self._topics.write(topic, t_ns, data)
+        self._file.add_topic(topic, message_type)
+        self._file.write(topic, t_ns, data)
 
     def close(self) -> None:
         drawings, self._drawings = self._drawings, None
-        if drawings is not None:
-            drawings.close()
-
-
-class SessionLog(SessionMessages):
-    """Writes a session into a file, which is replaced if it exists; see `SessionMessages`.
-
-    The table of the run is also a metadata record. `clock_ns` is monotonic time [ns]; it ends
-    chunks.
-
-    Raises
-    ------
-    CannotWriteError
-        Here and in every other method: the disk is full or fails.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        info: SessionInfo,
-        odometry: OdometryTrack | None = None,
-        *,
-        truth_at: TruthAt | None = None,
-        start_ns: int = 0,
-        drawn: bool = True,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        self._file = _SessionFile(path, start_ns, clock_ns)
-        # /session/info has a checksum and copies; metadata have neither, but other programs show it
-        self._file.add_metadata(METADATA_NAME, session_table(info))
-        super().__init__(
-            self._file, info, odometry, truth_at=truth_at, start_ns=start_ns, drawn=drawn
-        )
-        self._file.end_head()
-
-    def close(self) -> None:
         try:
-            super().close()
+            if drawings is not None:
+                drawings.close()
         finally:
             self._file.close()

@@ -26,7 +26,7 @@ from hil_tests.unit.slam.app.sessions import (
     snapshot,
 )
 from hil_tests.unit.slam.live.session.test_state_rows import robust_state
-from slam.app.session.viewer_topics import Drawings
+from slam.app.session.viewer_topics import Drawings, Topics
 from slam.app.session.writer import SessionLog
 from slam.live.odometry_track import TumSample
 from slam.live.session import cdr
@@ -252,7 +252,7 @@ def test_the_smoothed_run_is_a_path_with_its_landmarks_in_the_map_frame() -> Non
     np.testing.assert_allclose(points["cov_xy"], [0.0, 1e-4], rtol=1e-6)
 
 
-class Kept:
+class Kept(Topics):
     """Topics that keep what is written."""
 
     def __init__(self) -> None:
