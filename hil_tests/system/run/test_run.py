@@ -110,7 +110,10 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
         [sys.executable, "-c", cat, robot.odometry], stdout=subprocess.PIPE
     ) as wheels:
         process = subprocess.run(
-            run_command(robot, out, "--odometry", "-", "--duration", "3", "--wire", "--lean"),
+            [
+                *run_command(robot, out, "--odometry", "-", "--duration", "3", "--wire", "--lean"),
+                *("--publish", f"jsonl:{tmp_path}/lines", "--publish", "udp://127.0.0.1:9"),
+            ],
             stdin=wheels.stdout,
             capture_output=True,
             text=True,
@@ -123,6 +126,12 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
     rows = {line.split("  ")[0]: line for line in process.stdout.splitlines()}
     assert {"time", "driven", "landmarks", "load", "rear_left", "front_right"} <= set(rows)
     assert "ppm" in rows["rear_left"]
+    lines = [json.loads(line) for line in (tmp_path / "lines").read_text().splitlines()]
+    poses = [line["pose"][:2] for line in lines if line["kind"] == "state"]
+    tum = [line.split()[1:3] for line in (out / "estimate.tum").read_text().splitlines()]
+    assert poses == [[float(value) for value in row] for row in tum]
+    assert f"{len(lines)}  events sent, 0 dropped, 0 failed" in rows["to jsonl"]
+    assert "to udp" in rows
     summary = json.loads((out / "summary.json").read_text())
     assert summary["ate_rmse_m"] is None
     assert summary["seed"] is None

@@ -19,7 +19,7 @@ from hil_tests.unit.slam.app.sessions import (
     write_scans,
     write_session,
 )
-from slam.app.run.replay import Comparison, play_states, recorded_source
+from slam.app.run.replay import Comparison, paced, play_states, recorded_source
 from slam.app.session.constants import different_constants, recorded_rules, slam_constants
 from slam.config import WheelNoise, load_preset
 from slam.live.session.description import settings_text
@@ -231,3 +231,55 @@ def test_a_replay_has_the_recorded_rules(tmp_path: Path) -> None:
     assert isinstance(slam, RobustSlam)
     assert slam.back_end.parameters.tracklets == TrackletRule(window=21)
     assert slam.back_end.parameters.map == MapRule()
+
+
+class VirtualTime:
+    """A clock that goes on while somebody sleeps; `work` passes time otherwise."""
+
+    def __init__(self) -> None:
+        self.now_s, self.longest_s = 1000.0, 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.longest_s = max(self.longest_s, seconds)
+        self.now_s += seconds
+
+
+@pytest.mark.parametrize(
+    ("rate", "stamps_s", "work_s", "due_s"),
+    [
+        (1.0, [5.0, 5.2, 5.4], {}, [0.0, 0.2, 0.4]),
+        (4.0, [5.0, 5.2, 6.0], {}, [0.0, 0.05, 0.25]),
+        (0.5, [0.0, 1.0], {}, [0.0, 2.0]),
+        # late ones at once, and then in step again
+        (1.0, [0.0, 1.0, 2.0, 3.0, 4.0], {1: 2.5}, [0.0, 1.0, 3.5, 3.5, 4.0]),
+        # time that falls, and a gap of more than ten seconds, begin anew
+        (1.0, [100.0, 101.0, 3.0, 4.0], {}, [0.0, 1.0, 1.0, 2.0]),
+        (1.0, [0.0, 9.0, 1000.0, 1001.0], {}, [0.0, 9.0, 9.0, 10.0]),
+        (2.0, [0.0, 19.0, 20.0], {}, [0.0, 9.5, 10.0]),
+    ],
+)
+def test_scans_come_when_they_are_due(
+    rate: float, stamps_s: list[float], work_s: dict[int, float], due_s: list[float]
+) -> None:
+    clock = VirtualTime()
+    scans = [Scan(counter=k, t_ns=round(1e9 * t_s), frames=()) for k, t_s in enumerate(stamps_s)]
+    came_s = []
+    for one in paced(scans, rate, StopFlag(), clock, clock.sleep):
+        came_s.append(clock.now_s - 1000.0)
+        clock.now_s += work_s.get(one.counter, 0.0)
+    assert came_s == pytest.approx(due_s)
+    assert clock.longest_s <= 0.2  # a signal is noticed soon
+
+
+def test_a_signal_ends_the_wait_for_a_scan() -> None:
+    stop, clock = StopFlag(), VirtualTime()
+    scans = [Scan(counter=k, t_ns=9 * k * 10**9, frames=()) for k in range(2)]
+    coming = paced(scans, 1.0, stop, clock, clock.sleep)
+    next(coming)
+    stop.received = signal.SIGTERM
+    with pytest.raises(StopRequestedError):
+        next(coming)
+    assert clock.now_s < 1001.0
