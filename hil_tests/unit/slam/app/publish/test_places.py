@@ -3,7 +3,9 @@
 import json
 import os
 import socket
+import struct
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -13,10 +15,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil_tests.patience import wait_until
+from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.full_disk import full_disk
 from hil_tests.unit.slam.app.session.test_viewer_topics import Kept
-from hil_tests.unit.slam.app.sessions import FRAME_NS, run, session_info, smoothed_run, snapshot
+from hil_tests.unit.slam.app.sessions import (
+    FRAME_NS,
+    run,
+    scan,
+    session_info,
+    smoothed_run,
+    snapshot,
+)
 from hil_tests.unit.slam.live.session.test_state_rows import robust_state
 from slam.app.errors import UsageError
 from slam.app.publish.json_lines import LineMaker
@@ -301,3 +310,35 @@ def test_a_port_in_use_is_an_error_before_the_run() -> None:
     for _ in range(2):  # a run that is started again has it again
         wait_until(lambda: is_free(port))  # the server lets it go a millisecond after its end
         assert publish(f"foxglove:{port}", range(2)) == ((2, 0, 0), [])
+
+
+def test_a_viewer_that_never_reads_holds_up_neither_the_run_nor_its_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("foxglove", reason="foxglove-sdk is in the extra foxglove")
+    monkeypatch.setattr("slam.app.publish.sinks.CLOSE_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    began_s = time.monotonic()
+    with Publishing([f"foxglove:{port}"]) as seen, socket.socket() as viewer:
+        viewer.connect(("127.0.0.1", port))
+        viewer.sendall(
+            b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+        )
+        assert viewer.recv(100).startswith(b"HTTP/1.1 101 ")
+        seen.begin(session_info(), Lines())
+        (queued,) = seen.queued
+        seen.on_snapshot(snapshot(0))
+        wait_until(lambda: queued.n_sent == 1)  # its topics are there
+        ids = [{"id": number, "channelId": number} for number in range(1, 50)]
+        text = json.dumps({"op": "subscribe", "subscriptions": ids}).encode()
+        viewer.sendall(b"\x81\xfe" + struct.pack(">H4x", len(text)) + text)
+        for counter in range(1, 401):
+            seen.on_scan(scan(counter))
+            if counter % 100 == 0:
+                wait_until(lambda sent=counter: queued.n_sent > sent)  # type: ignore[misc]
+        seen.close()  # the viewer does not answer
+    assert time.monotonic() - began_s < seconds(10)
+    assert (queued.n_dropped, queued.n_failed) == (0, 0)
