@@ -23,6 +23,10 @@ _NIS_DOF = 2
 PoseAt = Callable[[int], Array]
 """Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
 
+NoiseAt = Callable[[int], Array]
+"""Covariance (3, 3) of the noise that odometry has gathered at a session time [ns], in the order
+and frame of its pose. Steps are independent: the noise between two times is the difference."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:

@@ -22,6 +22,7 @@ PACKAGES = {
     "foxglove": ("foxglove",),
     "dask": ("distributed",),
     "gtsam": ("gtsam",),
+    "ros2": ("cyclonedds",),
 }
 """Names as imported, by the extra of pyproject.toml that lists their distributions."""
 

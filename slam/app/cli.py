@@ -40,25 +40,16 @@ _BY_A_SIGNAL = 128
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
 
-CSV_TO_TUM = (
-    r"s/^([0-9]+),([0-9]+),[^,]*,[^,]*,"
-    + ",".join([r"([^,]*)"] * 7)
-    + r",.*/\1.000000000\2 \3 \4 \5 \6 \7 \8 \9/; s/\.0*([0-9]{9}) /.\1 /"
-)
-"""For `sed -E`: a line of `ros2 topic echo --csv` of a nav_msgs/Odometry to a TUM line."""
-
 _RUN_DESCRIPTION = """\
 Opens the modules that a rig file names by their serial numbers, follows the robot's odometry, and
 runs SLAM while frames arrive. Ends with the odometry, after --duration, or by Ctrl-C; writes
 session, map, trajectories and numbers. SIGUSR1: writes smoothed.tum, the path smoothed so far.
 """
 
-_RUN_EPILOG = rf"""
-With ROS 2, whose stamps are seconds since 1970 (sed -u passes every line on at once; awk may not):
+_RUN_EPILOG = """
+With ROS 2, in the domain of ROS_DOMAIN_ID:
 
-  PYTHONUNBUFFERED=1 ros2 topic echo --csv /odom nav_msgs/msg/Odometry |
-    sed -uE '{CSV_TO_TUM}' |
-    uwb-slam run --rig robot.toml --odometry - --odometry-clock unix
+  uwb-slam run --rig robot.toml --odometry ros2:/odom --publish ros2
 
 With an emulator in another terminal, which has both radars and odometry:
 
@@ -314,7 +305,15 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         required=True,
         metavar="SRC",
         help="TUM lines (timestamp x y z qx qy qz qw) from: - (stdin), a file or FIFO, unix:PATH, "
-        "tcp://HOST:PORT, serial:PORT[@BAUD]",
+        "tcp://HOST:PORT, serial:PORT[@BAUD]; or ros2:TOPIC[:PARENT:CHILD], a nav_msgs/Odometry "
+        "or a transform of tf",
+    )
+    run.add_argument(
+        "--odometry-covariance",
+        dest="covariance",
+        action="store_true",
+        help="take the noise of the wheels from the odometry: a nav_msgs/Odometry's twist, or six "
+        "more numbers on a TUM line (xx xy xh yy yh hh of the velocity), not from the rig file",
     )
     run.add_argument(
         "--odometry-clock",

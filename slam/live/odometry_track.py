@@ -1,7 +1,8 @@
 """Trajectories as TUM text, and the pose at any time between their lines.
 
-`timestamp x y z qx qy qz qw`, seconds and metres, no header. Text carries the int64 nanoseconds as
-a decimal with nine places, and reading goes through Decimal, so no stamp passes through a float.
+`timestamp x y z qx qy qz qw`, seconds and metres, no header; of odometry six more numbers may
+follow, the covariance of its velocity. Text carries the int64 nanoseconds as a decimal with nine
+places, and reading goes through Decimal, so no stamp passes through a float.
 
 Odometry is canonical as text, once, at its source. Every path (a unix socket, a scene in this
 process, a recorded session) parses the same lines here, so all of them see the same floats.
@@ -13,8 +14,8 @@ import math
 import re
 import socket
 from array import array
-from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -31,6 +32,8 @@ NS_PER_S = 1_000_000_000
 MOST_GAP_NS = NS_PER_S
 """Between two samples farther apart the motion of the robot is unknown."""
 _FIELDS = 8
+_WITH_COVARIANCE = _FIELDS + 6
+_NOISE_SIZE = 9
 _BLANKS = re.compile(r"[ \t]+")
 # Python's own readers take digits of every script, underscores, hexadecimals and words, too.
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -46,13 +49,18 @@ class TumError(AppError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TumSample:
-    """One line of a planar trajectory, as written: position and the twist of the quaternion."""
+    """One line of a planar trajectory, as written: position and the twist of the quaternion.
+
+    `velocity_covariance` is the upper triangle, row by row, of the covariance of velocity forwards
+    and to the left [m/s] and turn rate [rad/s], as the last of 14 numbers; () if there are 8.
+    """
 
     t_ns: int
     x_m: float
     y_m: float
     qz: float
     qw: float
+    velocity_covariance: tuple[float, ...] = ()
 
     @property
     def heading_rad(self) -> float:
@@ -74,14 +82,14 @@ def parse_tum_line(line: str) -> TumSample:
     Raises
     ------
     TumError
-        Fewer or more than eight numbers, one that is not a finite decimal in ASCII, a stamp that
+        Not 8 or 14 numbers, one that is not a finite decimal in ASCII, a stamp that
         cannot be seconds, a quaternion without length.
 
     >>> parse_tum_line("12.000000005 1.5 -2 0 0 0 0 1")
     TumSample(t_ns=12000000005, x_m=1.5, y_m=-2.0, qz=0.0, qw=1.0)
     """
     fields = _BLANKS.split(line.strip(" \t\r\n"))
-    if len(fields) != _FIELDS:
+    if len(fields) not in (_FIELDS, _WITH_COVARIANCE):
         raise TumError(
             "expected 8 numbers (timestamp x y z qx qy qz qw), "
             f"found {len(fields)}: {shown(line.strip())}"
@@ -90,10 +98,10 @@ def parse_tum_line(line: str) -> TumSample:
         raise TumError(f"not a decimal number in TUM line {shown(line.strip())}")
     try:
         stamp_s = Decimal(fields[0])
-        x, y, _z, _qx, _qy, qz, qw = (float(field) for field in fields[1:])
+        x, y, _z, _qx, _qy, qz, qw, *covariance = (float(field) for field in fields[1:])
     except (InvalidOperation, ValueError):
         raise TumError(f"not a number in TUM line {shown(line.strip())}") from None
-    if not stamp_s.is_finite() or not all(map(math.isfinite, (x, y, qz, qw))):
+    if not stamp_s.is_finite() or not all(map(math.isfinite, (x, y, qz, qw, *covariance))):
         raise TumError(f"not a finite number in TUM line {shown(line.strip())}")
     # copy_abs, as abs would round to the context and overflow on a huge exponent
     if stamp_s.copy_abs() >= _MAX_STAMP_S:
@@ -102,7 +110,14 @@ def parse_tum_line(line: str) -> TumSample:
         )
     if qz == 0.0 and qw == 0.0:
         raise TumError(f"quaternion without a heading in TUM line {shown(line.strip())}")
-    return TumSample(t_ns=round(stamp_s * NS_PER_S), x_m=x, y_m=y, qz=qz, qw=qw)
+    return TumSample(
+        t_ns=round(stamp_s * NS_PER_S),
+        x_m=x,
+        y_m=y,
+        qz=qz,
+        qw=qw,
+        velocity_covariance=tuple(covariance),
+    )
 
 
 def format_tum_line(t_ns: int, pose: NDArray[np.float64]) -> str:
@@ -112,10 +127,16 @@ def format_tum_line(t_ns: int, pose: NDArray[np.float64]) -> str:
     '1.000000001 0.5 -1.0 0 0 0 0.0 1.0'
     """
     x, y, heading = (float(value) for value in pose)
-    sign = "-" if t_ns < 0 else ""
-    seconds, rest = divmod(abs(int(t_ns)), NS_PER_S)
     qz, qw = math.sin(heading / 2), math.cos(heading / 2)
-    return f"{sign}{seconds}.{rest:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}"
+    return format_sample(TumSample(t_ns=int(t_ns), x_m=x, y_m=y, qz=qz, qw=qw))
+
+
+def format_sample(sample: TumSample) -> str:
+    """Write a sample as the TUM line that it is read from."""
+    sign = "-" if sample.t_ns < 0 else ""
+    seconds, rest = divmod(abs(sample.t_ns), NS_PER_S)
+    numbers = (sample.x_m, sample.y_m, 0, 0, 0, sample.qz, sample.qw, *sample.velocity_covariance)
+    return f"{sign}{seconds}.{rest:09d} {' '.join(map(repr, numbers))}"
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -169,6 +190,8 @@ class OdometryTrack(PoseTrack):
     def __init__(self, samples: Iterable[TumSample]) -> None:
         super().__init__()
         self._qz, self._qw = array("d"), array("d")  # the quaternion of each sample
+        # Of each sample the nine numbers of `noise_at`, if all samples have covariances
+        self._noise = array("d")
         self._n_forgotten = 0
         for sample in samples:
             self.append(sample)
@@ -212,6 +235,7 @@ class OdometryTrack(PoseTrack):
         if self._stamps_ns and sample.t_ns <= self.last_ns:
             number = self._n_forgotten + len(self) + 1
             raise OdometryError(f"odometry: line {number} is not later than the line before")
+        self._noise.extend(self._noise_after(sample))
         self.add(sample.t_ns, (sample.x_m, sample.y_m, sample.heading_rad))
         self._qz.append(sample.qz)
         self._qw.append(sample.qw)
@@ -220,7 +244,44 @@ class OdometryTrack(PoseTrack):
         n_forgotten = super().forget_before(t_ns)
         self._n_forgotten += n_forgotten
         del self._qz[:n_forgotten], self._qw[:n_forgotten]
+        del self._noise[: _NOISE_SIZE * n_forgotten]
         return n_forgotten
+
+    def _noise_after(self, sample: TumSample) -> list[float]:
+        """Return the noise until a sample that comes next, as `noise_at` has it.
+
+        Its velocity is taken to err independently of the one before, for the time between the two.
+        """
+        if not sample.velocity_covariance or len(self._noise) != _NOISE_SIZE * len(self):
+            return []
+        if not len(self):
+            return [0.0] * _NOISE_SIZE
+        dt_s = (sample.t_ns - self.last_ns) / NS_PER_S
+        added = symmetric(sample.velocity_covariance)
+        turned = np.eye(3)
+        c, s = math.cos(sample.heading_rad), math.sin(sample.heading_rad)
+        turned[:2, :2] = [[c, -s], [s, c]]
+        noise = self._noise_of(-1) + dt_s**2 * (turned @ added @ turned.T)
+        return [float(number) for number in noise.ravel()]
+
+    def _noise_of(self, row: int) -> NDArray[np.float64]:
+        begin = _NOISE_SIZE * (row % len(self))
+        return np.array(self._noise[begin : begin + _NOISE_SIZE]).reshape(3, 3)
+
+    def noise_at(self, t_ns: int) -> NDArray[np.float64]:
+        """Return the noise gathered until a session time, see `slam.results.NoiseAt`.
+
+        It is linear between two samples. Raises OdometryError where samples lack covariances.
+        """
+        if len(self._noise) != _NOISE_SIZE * len(self):
+            raise OdometryError("odometry: its lines have no covariance")
+        after = bisect_right(self._stamps_ns, t_ns)
+        if after in (0, len(self)):
+            return self._noise_of(min(after, len(self) - 1))
+        before_ns, after_ns = self._stamps_ns[after - 1], self._stamps_ns[after]
+        part = (t_ns - before_ns) / (after_ns - before_ns)
+        before = self._noise_of(after - 1)
+        return before + part * (self._noise_of(after) - before)
 
     @classmethod
     def from_lines(cls, lines: Iterable[str]) -> OdometryTrack:
@@ -245,6 +306,13 @@ class OdometryTrack(PoseTrack):
                 f"but a frame came at {t_ns / NS_PER_S:.2f} s"
             )
         return super().pose_at(t_ns)
+
+
+def symmetric(triangle: Sequence[float]) -> NDArray[np.float64]:
+    """Return the matrix (3, 3) of an upper triangle of six numbers, row by row."""
+    matrix = np.zeros((3, 3))
+    matrix[np.triu_indices(3)] = triangle
+    return matrix + np.triu(matrix, 1).T
 
 
 def read_odometry_socket(path: str, timeout_s: float = 10.0) -> OdometryTrack:

@@ -87,6 +87,9 @@ class SessionInfo:
         day; None if it has no meaning.
     odometry_clock
         Text of the option --odometry-clock of a live run, "" of any other.
+    odometry_covariance
+        Whether the noise of the wheels is the one that came with the odometry; `wheels` has their
+        other errors.
     constants
         Every number SLAM ran with beyond its settings, by dotted name, as JSON has them; empty
         where they were not recorded.
@@ -106,6 +109,7 @@ class SessionInfo:
     started_unix_ns: int | None = None
     has_detections: bool = False
     odometry_clock: str = ""
+    odometry_covariance: bool = False
     constants: Mapping[str, object] = field(default_factory=dict)
 
     @property

@@ -227,17 +227,20 @@ class RobustBackEnd:
             landmark_covariances_m2=covariances_m2[rows],
         )
 
-    def predict(self, increment: Array, covariance: Array | None = None) -> None:
+    def predict(
+        self, increment: Array, covariance: Array | None = None, *, is_loose: bool = False
+    ) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
 
         ``covariance`` (3, 3) is its noise, where that is known better than from the wheels' model.
+        ``is_loose`` means that the robot moved in a way that the wheels did not report.
         """
         if not np.isfinite(increment).all():
             raise ValueError(f"increment is {increment}; dx, dy [m] and turn [rad] must be finite")
         wheels = self.parameters.wheels
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
-        self._log.add_motion(increment, motion, is_loose=covariance is not None)
-        before, self._motion = self._motion, motion if covariance is None else None
+        self._log.add_motion(increment, motion, is_loose=is_loose)
+        before, self._motion = self._motion, None if is_loose else motion
         self._course = None
         if before is not None and self._motion is not None:
             self._course = Course(pose=self.state.pose, before=before, reported=motion)

@@ -92,6 +92,7 @@ class Step:
     # How unlikely it is that the robot was carried before it; negative where the ranges before and
     # behind a stop show that
     carry_nats: float
+    covariance: Array | None = None  # shape (3, 3), noise of the increment; None: by the model
 
 
 class Hypotheses:
@@ -282,7 +283,7 @@ class Alternative:
         for number in range(self.next_step, end):
             step = steps[number]
             if number > self.since:
-                self.back_end.predict(step.increment)
+                self.back_end.predict(step.increment, step.covariance)
             report = self.back_end.update(step.scans, solve=self.merges)
             self.evidence.append(evidence_table(report))
             self.next_step = number + 1
@@ -333,6 +334,7 @@ class Branches:
         self._edge_rad = parameters.tracklets.edge_rad
         self._lever_m = max(math.hypot(mount.x_m, mount.y_m) for mount in rig.mounts)
         self._increment: Array | None = None
+        self._covariance: Array | None = None  # of its noise, where that is known
         self._carry_nats, self._has_stood = math.inf, False
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
         self._carry: Carry | None = None
@@ -365,18 +367,25 @@ class Branches:
         """
         return doubted_covariance(self._doubts, self.main.state.position_m)
 
-    def predict(self, increment: Array, elapsed_s: float = 1.0, stood_s: float = 0.0) -> None:
+    def predict(
+        self,
+        increment: Array,
+        elapsed_s: float = 1.0,
+        stood_s: float = 0.0,
+        covariance: Array | None = None,
+    ) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
 
-        It took ``elapsed_s``, and for ``stood_s`` of that the wheels stood still.
+        It took ``elapsed_s``, and for ``stood_s`` of that the wheels stood still. ``covariance``
+        (3, 3) is its noise, None: by the wheels' model.
         """
         if self._now % self._rule.snapshot_every == 0:
             self._keep_snapshot()
-        self._increment = increment
+        self._increment, self._covariance = increment, covariance
         self._has_stood = stood_s >= self._rule.stop_s
         stood_s = stood_s if self._has_stood else 0.0
         self._carry_nats = self._rule.carry_nats(elapsed_s, stood_s)
-        self.main.predict(increment)
+        self.main.predict(increment, covariance)
         if self._carry is not None:
             self._carry.moved = compose(self._carry.moved, increment)
 
@@ -400,6 +409,7 @@ class Branches:
             next_id=next_id,
             evidence=evidence_table(report),
             carry_nats=carry_nats,
+            covariance=self._covariance,
         )
         self._steps[self._now] = step
         self._doubt(step, report, position_m)
@@ -518,7 +528,7 @@ class Branches:
         begin = max(kept for kept in self._snapshots if kept <= number)
         back_end = self._snapshots[begin].copy()
         for step in (self._steps[between] for between in range(begin, number)):
-            back_end.predict(step.increment)
+            back_end.predict(step.increment, step.covariance)
             back_end.update(step.scans, solve=False)
         return back_end
 
@@ -734,7 +744,7 @@ class Branches:
         for number in range(since, self._now):
             moved = compose(moved, self._steps[number].increment)
         hidden = before.copy()
-        hidden.predict(step.increment, np.diag(self._rule.hidden_variances))
+        hidden.predict(step.increment, np.diag(self._rule.hidden_variances), is_loose=True)
         hidden.state.next_id = self.main.state.next_id + _IDS_APART
         self._carry = Carry(
             since=since,

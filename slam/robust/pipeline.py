@@ -14,13 +14,13 @@ from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.geometry import Rig, between, has_moved
-from slam.results import Belief, InputCheck, PoseAt, SmoothedRun, StepResult
+from slam.results import Belief, InputCheck, NoiseAt, PoseAt, SmoothedRun, StepResult
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
 from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.solver.growing_arrays import PackedRows
-from slam.robust.state import quarter_turn
+from slam.robust.state import quarter_turn, rotation
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,8 @@ class RobustSlam:
     """Ranges of all radars, each at its own time, into the robust back end; nothing is delayed.
 
     The belief's errors are additive, as everywhere outside ``slam.robust``; it holds the reported
-    landmarks, and their ids stay.
+    landmarks, and their ids stay. ``noise_at`` replaces the white noise of the wheels, not their
+    calibration errors.
     """
 
     def __init__(
@@ -42,11 +43,15 @@ class RobustSlam:
         wheels: WheelNoise,
         detector: Detector | None = None,
         rules: BackEndParameters | None = None,
+        *,
+        noise_at: NoiseAt | None = None,
     ) -> None:
         self.config = config
         self.rig = rig
         self._branches = Branches(rig, back_end_parameters(config, wheels, rules))
         self._detector = detector or make_detector(config, rig)
+        self._noise_at, self._noise = noise_at, np.zeros((3, 3))  # the latter at the last state
+        self._least_noise = np.diag(np.square([wheels.floor_m, wheels.floor_m, wheels.floor_rad]))
         self._check = InputCheck(rig)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
@@ -112,6 +117,7 @@ class RobustSlam:
             self._check.accept(t_ns)
             self._pose, self._t_ns = pose, t_ns
             self._still, self._still_ns, self._stood_ns = pose, t_ns, 0
+            self._noise_since(pose, t_ns)
             return ()
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         window = self.config.window
@@ -127,7 +133,9 @@ class RobustSlam:
         sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         branches = self._branches
         elapsed_s = (t_ns - self._t_ns) / _NS_PER_S
-        branches.predict(between(self._pose, pose), elapsed_s, self._stood_ns / _NS_PER_S)
+        covariance = self._noise_since(self._pose, t_ns)
+        stood_s = self._stood_ns / _NS_PER_S
+        branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
         report = branches.update([*self._scans(detections, sigmas_m, moved), *given])
         self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
         self._stamps_ns.append(t_ns)
@@ -148,6 +156,19 @@ class RobustSlam:
         if has_moved(self._still, pose, _STILL_M, _STILL_RAD):
             self._still, self._still_ns = pose, t_ns
         self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
+
+    def _noise_since(self, before: Array, t_ns: int) -> Array | None:
+        """Return the noise since the last state, (3, 3), body frame of the pose before.
+
+        None where the model of the wheels has it.
+        """
+        if self._noise_at is None:
+            return None
+        noise = self._noise_at(t_ns)
+        new, self._noise = noise - self._noise, noise
+        turned = np.eye(3)
+        turned[:2, :2] = rotation(-float(before[2]))
+        return np.asarray(turned @ new @ turned.T + self._least_noise)
 
     def _sigma_m(self, detection: Detection) -> float:
         """Return the standard deviation of a range; infinite for one to be left out."""

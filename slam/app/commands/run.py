@@ -40,7 +40,7 @@ from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, WrappedS
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
-from slam.config import ConfigError, load_preset
+from slam.config import BackEnd, ConfigError, load_preset
 from slam.frames import RadarFrame
 from slam.library.slam import make_slam
 from slam.live.arrival_clock import ClockLine
@@ -70,6 +70,7 @@ def run_rig(
     fps: int,
     clock: str,
     duration_s: float | None,
+    covariance: bool = False,
     wire: bool = False,
     lean: bool = False,
     rerun: str | None = None,
@@ -91,8 +92,12 @@ def run_rig(
         config = load_preset(preset)
     except ConfigError as error:
         raise UsageError(str(error)) from None
+    if covariance and config.back_end is not BackEnd.ROBUST:
+        raise UsageError("--odometry-covariance: preset paper has a noise of its own; use robust")
     line_source = parse_source(odometry)
-    live_odometry = LiveOdometry(line_source.name, parse_clock(clock, line_source))
+    live_odometry = LiveOdometry(
+        line_source.name, parse_clock(clock, line_source), has_covariance=covariance
+    )
     inbox = Inbox()
     with ExitStack() as held:
         publishing = held.enter_context(Publishing(publish))
@@ -120,7 +125,10 @@ def run_rig(
         stop.check()
         rig_source.start(RAW_CONFIG, fps)
         wheels = rig_file.wheels.noise
-        slam = held.enter_context(PromptSlam(make_slam(config, rig_file.rig, wheels), stop))
+        noise_at = live_odometry.noise_at if covariance else None
+        slam = held.enter_context(
+            PromptSlam(make_slam(config, rig_file.rig, wheels, noise_at=noise_at), stop)
+        )
         log = LiveLog()
         live = LiveSource(
             rig_source.radars,
@@ -146,8 +154,14 @@ def run_rig(
                 wheels=asdict(wheels),
                 simulated=are_emulated(links),
                 time_base="arrival",
-                started_unix_ns=0 if clock == "unix" else live.started_unix_ns(),
+                # stamps of ROS are the time of day, or of a simulation that all programs share
+                started_unix_ns=(
+                    0
+                    if clock == "unix" or line_source.kind is SourceKind.ROS2
+                    else live.started_unix_ns()
+                ),
                 odometry_clock=clock,
+                odometry_covariance=covariance,
             )
             source = RunSource(
                 info=info,

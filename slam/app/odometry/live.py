@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from slam.live.odometry_track import (
     TumError,
     TumSample,
     parse_tum_line,
+    symmetric,
 )
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire.errors import XeThruError
@@ -47,13 +49,14 @@ MOST_STAMP_NS = (2**31 - 1_000_000) * NS_PER_S
 MOST_M = 1e8
 """Farther than once around the Earth, as positions on a map may be; the filter squares them."""
 _MOST_WARNINGS = 5
+_ROUNDED = 1e-9  # of the largest eigenvalue, for covariances without full rank
 
 
 class LiveOdometry:
     """Turns lines into poses, and reports what is wrong with them.
 
     `name` is that of the source in messages, `clock` its clock against the host's, if known; None:
-    from when lines arrive.
+    from when lines arrive. `has_covariance` refuses lines that do not say how velocity errs.
 
     Attributes
     ----------
@@ -65,8 +68,11 @@ class LiveOdometry:
         Why they will not; "" where the source just ended.
     """
 
-    def __init__(self, name: str, clock: ClockLine | None = None) -> None:
+    def __init__(
+        self, name: str, clock: ClockLine | None = None, *, has_covariance: bool = False
+    ) -> None:
         self._name = name
+        self._has_covariance = has_covariance
         self._fixed = clock
         self._envelope = LowerEnvelope()
         self._track: OdometryTrack | None = None
@@ -112,7 +118,10 @@ class LiveOdometry:
             sample = parse_tum_line(line)
         except TumError as error:
             return None, self._refuse(str(error))
-        if trouble := _rejection(sample):
+        trouble = _rejection(sample)
+        if not trouble and self._has_covariance:
+            trouble = _covariance_rejection(sample.velocity_covariance)
+        if trouble:
             return None, self._refuse(trouble)
         if self._track is not None and sample.t_ns <= self._track.last_ns:
             back_s = (self._track.last_ns - sample.t_ns) / NS_PER_S
@@ -207,6 +216,9 @@ class LiveOdometry:
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
         return self._whole().pose_at(t_ns)
 
+    def noise_at(self, t_ns: int) -> NDArray[np.float64]:
+        return self._whole().noise_at(t_ns)
+
     def _whole(self) -> OdometryTrack:
         if self._track is None:
             raise OdometryError(f"odometry from {self._name}: no pose came")
@@ -225,6 +237,19 @@ def _rejection(sample: TumSample) -> str:
     return ""
 
 
+def _covariance_rejection(triangle: tuple[float, ...]) -> str:
+    """Return why an upper triangle is no covariance of a velocity; "" if it is."""
+    if not any(triangle):  # which in ROS means unknown
+        return "it does not say how its velocity errs, as --odometry-covariance needs"
+    least, _, most = np.linalg.eigvalsh(symmetric(triangle)).tolist()
+    if least >= -_ROUNDED * most and most <= MOST_SPEED_MPS**2:
+        return ""
+    return (
+        f"the covariance of its velocity has eigenvalues of {least:g} to {most:g}; no velocity is "
+        f"that uncertain, above {MOST_SPEED_MPS**2:g} drivers mean that it is unknown"
+    )
+
+
 BAUD = 115200
 _POLL_S = 0.2
 _CHUNK_BYTES = 65536
@@ -232,8 +257,8 @@ _LONGEST_LINE = 4096
 _CONNECT_S = 5.0
 
 HELP = (
-    "-, a file or FIFO, unix:PATH, tcp://HOST:PORT, serial:PORT[@BAUD]; a path to a socket or a "
-    "serial port will do"
+    "-, a file or FIFO, unix:PATH, tcp://HOST:PORT, serial:PORT[@BAUD], ros2:TOPIC[:PARENT:CHILD]; "
+    "a path to a socket or a serial port will do"
 )
 
 
@@ -246,15 +271,20 @@ class SourceKind(StrEnum):
     UNIX = "unix socket"
     TCP = "TCP socket"
     SERIAL = "serial port"
+    ROS2 = "ROS 2 topic"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineSource:
-    """A source as the user named it: a path, or host and number (a port's, or a rate in baud)."""
+    """A source as the user named it: a path, or host and number (a port's, or a rate in baud).
+
+    Of a topic of ROS 2 `frames` are parent and child of its poses, (): those of REP 105.
+    """
 
     kind: SourceKind
     place: str
     number: int = 0
+    frames: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -294,7 +324,23 @@ def parse_source(text: str) -> LineSource:
             if not path or (at and not re.fullmatch(r"[1-9][0-9]{0,7}", baud)):
                 raise UsageError(f"odometry {text}: must be serial:PORT or serial:PORT@BAUD")
             return LineSource(kind=SourceKind.SERIAL, place=path, number=int(baud or BAUD))
+        case "ros2":
+            return _topic_source(rest)
     return _path_source(text)
+
+
+def _topic_source(text: str) -> LineSource:
+    topic, *frames = text.split(":")
+    is_pair = len(frames) in (0, 2) and all(re.fullmatch(r"[\w/]+", frame) for frame in frames)
+    if not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", topic) or not is_pair:
+        raise UsageError(
+            f"odometry ros2:{text}: must be ros2:TOPIC, or ros2:TOPIC:PARENT:CHILD where the "
+            "frames are not odom and base_link or base_footprint"
+        )
+    # what is missing is reported before the modules are set up
+    import_module("slam.app.odometry.dds").domain_number()
+    place = f"/{topic.removeprefix('/')}"
+    return LineSource(kind=SourceKind.ROS2, place=place, frames=tuple(frames))
 
 
 def _path_source(text: str) -> LineSource:
@@ -322,6 +368,11 @@ def read_lines(source: LineSource, is_stopped: Callable[[], bool]) -> Iterator[t
     `is_stopped` is called a few times a second; reading ends when it returns True. Raises
     OdometryError if the source cannot be opened, or breaks off.
     """
+    if source.kind is SourceKind.ROS2:
+        from slam.app.odometry.ros2 import topic_lines  # its package is an extra of its own
+
+        yield from topic_lines(source.place, source.frames, is_stopped)
+        return
     pending = b""
     try:
         with _opened(source) as read:

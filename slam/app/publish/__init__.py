@@ -26,5 +26,10 @@ SINKS: Mapping[str, SinkKind] = {
         "slam.app.publish.foxglove:FoxgloveSink",
         "foxglove or foxglove:PORT: a server for Foxglove and Lichtblick",
     ),
+    "ros2": SinkKind(
+        "slam.app.publish.ros2:Ros2Sink",
+        "ros2 or ros2:NAMESPACE: topics and tf of ROS 2; with ,frames behind it frames of the "
+        "radars, too",
+    ),
 }
 """By what stands before the first colon of a SINK; the class gets what stands behind it."""

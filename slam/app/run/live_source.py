@@ -22,7 +22,7 @@ from slam.app.odometry.live import MOST_STAMP_NS, LineSource, LiveOdometry, read
 from slam.app.run.runner import LinkLog, frames_between
 from slam.app.session.writer import CannotWriteError, SessionLog
 from slam.live.arrival_clock import ArrivalClock
-from slam.live.errors import AppError, OdometryError
+from slam.live.errors import AppError
 from slam.live.frame_sources import radar_frame
 from slam.live.odometry_track import NS_PER_S, TumSample
 from slam.live.session_records import LogLine, RadarInfo, Scan, Snapshot
@@ -39,7 +39,7 @@ def read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) ->
     try:
         for text, arrival_ns in read_lines(source, stopped.is_set):
             inbox.hand_over(("odometry line", text, arrival_ns), stopped)
-    except OdometryError as error:
+    except AppError as error:
         trouble = str(error)
     except Exception as error:  # a bug, as above
         inbox.hand_over(("odometry end", f"its reader failed: {reason_of(error)}"), stopped)

@@ -255,7 +255,8 @@ def recorded_source(
     except OdometryError as error:
         raise AppError(f"{session.path}: {error}") from None
     rules = recorded_rules(session.info.constants)
-    slam = make_slam(config, session.rig, wheels, rules=rules)
+    noise_at = odometry.noise_at if session.info.odometry_covariance else None
+    slam = make_slam(config, session.rig, wheels, rules=rules, noise_at=noise_at)
     scans = RecordedScans(session, stop)
     return RunSource(
         info=session.info,

@@ -100,8 +100,8 @@ class Drawings:
         file.add_topic("/estimate/odometry", cdr.ODOMETRY)
         file.add_topic("/landmarks/markers", cdr.MARKERS)
         self._paths = {
-            "/odom": _Path("map"),
-            "/estimate": _Path("map"),
+            "/odom": GrowingPath("map"),
+            "/estimate": GrowingPath("map"),
         }
         for topic in self._paths:
             self._add_path(f"{topic}/path")
@@ -113,7 +113,7 @@ class Drawings:
         file.write("/rerun/tf_static", start_ns, link)
         if scene := _scene(info):
             self._write_latched("/scene", "world", scene)
-            self._paths["/truth"] = _Path("world")
+            self._paths["/truth"] = GrowingPath("world")
             self._add_path("/truth/path")
 
     def on_scan(self, scan: Scan) -> None:
@@ -223,50 +223,7 @@ class Drawings:
             self._file.write(f"/radar/{radar.name}/range", snapshot.t_ns, message)
 
     def _write_landmarks(self, snapshot: Snapshot) -> None:
-        drawn = []
-        if len(snapshot.wall_spans_m):
-            drawn.append(
-                Marker(
-                    group="walls",
-                    shape=Shape.LINE_LIST,
-                    size_m=(0.03, 0.0, 0.0),
-                    colour=_BLUE,
-                    points_m=snapshot.wall_spans_m.reshape(-1, 2),
-                )
-            )
-        if len(snapshot.landmark_ids):
-            drawn.append(
-                Marker(
-                    group="landmarks",
-                    shape=Shape.SPHERE_LIST,
-                    size_m=(0.05,) * 3,
-                    colour=_RED,
-                    points_m=snapshot.landmarks_m,
-                )
-            )
-            covariances = snapshot.landmark_covariances_m2
-            known = np.isfinite(covariances).all(axis=(1, 2))
-            variances, axes = np.linalg.eigh(covariances[known])
-            long_first = 2.0 * ENLARGED * _CHI_95 * np.sqrt(np.maximum(variances, 0.0))[:, ::-1]
-            turns = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
-            for id_, place, turn, size in zip(
-                snapshot.landmark_ids[known].tolist(),
-                snapshot.landmarks_m[known],
-                turns,
-                long_first.tolist(),
-                strict=True,
-            ):
-                drawn.append(
-                    Marker(
-                        group=f"95 % ellipses, {ENLARGED} x",
-                        shape=Shape.CYLINDER,
-                        number=id_,
-                        size_m=(size[0], size[1], 0.01),
-                        colour=_PALE_RED,
-                        pose=np.append(place, turn),
-                    )
-                )
-        message = cdr.markers(snapshot.t_ns, "map", drawn)
+        message = cdr.markers(snapshot.t_ns, "map", landmark_markers(snapshot))
         self._file.write("/landmarks/markers", snapshot.t_ns, message)
 
 
@@ -279,6 +236,54 @@ _RED, _PALE_RED, _BLUE = (0.84, 0.15, 0.16, 1.0), (0.84, 0.15, 0.16, 0.35), (0.1
 
 ENLARGED = 10
 """How many times larger than they are the ellipses of landmarks are drawn."""
+
+
+def landmark_markers(snapshot: Snapshot) -> list[Marker]:
+    """Draw landmarks, their 95 % ellipses, `ENLARGED`, and stretches of wall, map frame."""
+    drawn: list[Marker] = []
+    if len(snapshot.wall_spans_m):
+        drawn.append(
+            Marker(
+                group="walls",
+                shape=Shape.LINE_LIST,
+                size_m=(0.03, 0.0, 0.0),
+                colour=_BLUE,
+                points_m=snapshot.wall_spans_m.reshape(-1, 2),
+            )
+        )
+    if len(snapshot.landmark_ids):
+        drawn.append(
+            Marker(
+                group="landmarks",
+                shape=Shape.SPHERE_LIST,
+                size_m=(0.05,) * 3,
+                colour=_RED,
+                points_m=snapshot.landmarks_m,
+            )
+        )
+        covariances = snapshot.landmark_covariances_m2
+        known = np.isfinite(covariances).all(axis=(1, 2))
+        variances, axes = np.linalg.eigh(covariances[known])
+        long_first = 2.0 * ENLARGED * _CHI_95 * np.sqrt(np.maximum(variances, 0.0))[:, ::-1]
+        turns = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
+        for id_, place, turn, size in zip(
+            snapshot.landmark_ids[known].tolist(),
+            snapshot.landmarks_m[known],
+            turns,
+            long_first.tolist(),
+            strict=True,
+        ):
+            drawn.append(
+                Marker(
+                    group=f"95 % ellipses, {ENLARGED} x",
+                    shape=Shape.CYLINDER,
+                    number=id_,
+                    size_m=(size[0], size[1], 0.01),
+                    colour=_PALE_RED,
+                    pose=np.append(place, turn),
+                )
+            )
+    return drawn
 
 
 def _scene(info: SessionInfo) -> list[Marker]:
@@ -343,7 +348,7 @@ _SHOWN_POSES = 256
 _KEPT_POSES = 3600
 
 
-class _Path:
+class GrowingPath:
     """A path that grows: all poses up to 3600, then every second, every fourth, and so on."""
 
     def __init__(self, frame: str) -> None:

@@ -14,6 +14,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from io import BufferedWriter, FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from slam.app.session.viewer_topics import Drawings, Topics, WheelMotion
 from slam.geometry import between, compose
 from slam.live.errors import AppError
-from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.odometry_track import OdometryTrack, TumSample, symmetric
 from slam.live.session import cdr
 from slam.live.session.description import (
     METADATA_NAME,
@@ -298,6 +299,7 @@ class SessionLog(SessionObserver):
         }
         self._file.write("/tf_static", start_ns, cdr.transforms(start_ns, self._placements))
         self._wheels = WheelMotion(info.wheels)
+        self._has_covariance = info.odometry_covariance
         self._wheels_at: tuple[int, NDArray[np.float64]] | None = None
         self._drawings = Drawings(self._file, info, start_ns) if drawn else None
         self._file.end_head()
@@ -344,6 +346,8 @@ class SessionLog(SessionObserver):
             earlier_ns, earlier = self._wheels_at
             twist = self._wheels.twist(earlier, pose, t_ns - earlier_ns)
         self._wheels_at = t_ns, pose
+        if self._has_covariance:
+            twist = replace(twist, covariance=symmetric(sample.velocity_covariance))
         self._file.write("/odom", t_ns, cdr.wheel_odometry(sample, twist))
         self._odometry_ns = t_ns
 

@@ -40,23 +40,27 @@ NUMBER = "std_msgs/msg/UInt32"
 
 
 @cache
-def _typestore() -> Any:  # noqa: ANN401 - rosbags' Typestore; its messages are untyped anyway
+def typestore() -> Any:  # noqa: ANN401 - rosbags' Typestore; its messages are untyped anyway
+    """Return the definitions of the messages."""
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def schema_text(message_type: str) -> bytes:
     """Return the ros2msg schema of a type with everything it refers to."""
-    text, _digest = _typestore().generate_msgdef(message_type, ros_version=2)
+    text, _digest = typestore().generate_msgdef(message_type, ros_version=2)
     return bytes(text, "utf-8")
 
 
 def deserialise(data: bytes, message_type: str) -> Message:
     """Read CDR bytes back; arrays come as numpy arrays."""
-    return _typestore().deserialize_cdr(data, message_type)
+    return typestore().deserialize_cdr(data, message_type)
 
 
-def pose_sample(message: Message) -> TumSample:
-    """Return the pose of a message, however deep the message holds it, at its header's stamp."""
+def pose_sample(message: Message, *, with_covariance: bool = False) -> TumSample:
+    """Return the pose of a message, however deep the message holds it, at its header's stamp.
+
+    `with_covariance` takes that of an Odometry's velocity, too.
+    """
     pose = message.pose
     while not hasattr(pose, "position"):
         pose = pose.pose
@@ -67,6 +71,9 @@ def pose_sample(message: Message) -> TumSample:
         y_m=pose.position.y,
         qz=pose.orientation.z,
         qw=pose.orientation.w,
+        velocity_covariance=(
+            tuple(message.twist.covariance[_PLANAR_TRIANGLE].tolist()) if with_covariance else ()
+        ),
     )
 
 
@@ -154,6 +161,7 @@ def transforms(t_ns: int, links: Mapping[tuple[str, str], Array]) -> bytes:
 
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """Where the covariance of x, y and heading lies among x, y, z and the turns about them."""
+_PLANAR_TRIANGLE = np.arange(36).reshape(6, 6)[_PLANAR][np.triu_indices(3)]
 
 
 def _covariance(of_pose: Array) -> Array:

@@ -32,7 +32,8 @@ FORMAT = 2
 
 def session_table(info: SessionInfo) -> dict[str, str]:
     """Return the table of a run; floats in it are those of the run to the last bit."""
-    return {
+    rare = {"odometry_covariance": "true"} if info.odometry_covariance else {}
+    return rare | {
         "format": str(FORMAT),
         "radars": json.dumps([radar.name for radar in info.radars]),
         "scene": info.scene,
@@ -108,6 +109,7 @@ def read_session_table(
             has_detections=bool(json.loads(table.get("has_detections", "false"))),
             started_unix_ns=int(started) if started else None,
             odometry_clock=table.get("odometry_clock", ""),
+            odometry_covariance=bool(json.loads(table.get("odometry_covariance", "false"))),
         )
     except (KeyError, ValueError, TypeError) as error:
         raise AppError(

@@ -265,7 +265,6 @@ _READERS: Mapping[str, Callable[[McapMessage], SessionRecord]] = {
     GAP_TOPIC: lambda one: read_gap(unpack_string(one.data)),
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
-    "/odom": lambda one: cdr.pose_sample(cdr.deserialise(one.data, cdr.ODOMETRY)),
     "/log": lambda one: cdr.read_log_line(one.t_ns, one.data),
     "/slam/smoothed": lambda one: smoothed_of(one.t_ns, unpack_array(DOUBLE_ARRAY, one.data)),
 }
@@ -472,6 +471,10 @@ class RecordedSession:
                     step = entry
                 elif entry.topic == "/slam/state":
                     record = _state(entry, step)
+                elif entry.topic == "/odom":
+                    message = cdr.deserialise(entry.data, cdr.ODOMETRY)
+                    with_covariance = self.info.odometry_covariance
+                    record = cdr.pose_sample(message, with_covariance=with_covariance)
                 elif entry.topic in _READERS:
                     record = _READERS[entry.topic](entry)
             if record is not None:

@@ -247,3 +247,37 @@ def test_endless_input_is_no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(track, "_MAX_BYTES", 1000)
     with pytest.raises(TumError):
         read_tum(Path("/dev/zero"))
+
+
+def test_noise_is_the_sum_of_what_velocities_err_by_in_the_frame_of_the_odometry() -> None:
+    """Half a second at heading 0, then a second at a right angle, then between two samples."""
+    ahead = "0.09 0 0.006 0.01 0 0.04"
+    wheels = OdometryTrack.from_lines(
+        [
+            f"1.0 0 0 0 0 0 0 1 {ahead}",
+            f"1.5 0 0 0 0 0 0 1 {ahead}",
+            f"2.5 0 0 0 0 0 {math.sqrt(0.5)!r} {math.sqrt(0.5)!r} {ahead}",
+        ]
+    )
+    first = np.array([[0.09, 0.0, 0.006], [0.0, 0.01, 0.0], [0.006, 0.0, 0.04]])
+    turned = np.array([[0.01, 0.0, 0.0], [0.0, 0.09, 0.006], [0.0, 0.006, 0.04]])
+    np.testing.assert_array_equal(wheels.noise_at(track.NS_PER_S), np.zeros((3, 3)))
+    expected = 0.25 * first
+    np.testing.assert_allclose(wheels.noise_at(1_500_000_000), expected, atol=1e-17)
+    np.testing.assert_allclose(wheels.noise_at(2_000_000_000), expected + turned / 2, atol=1e-17)
+    np.testing.assert_allclose(wheels.noise_at(2_900_000_000), expected + turned, atol=1e-17)
+
+
+def test_noise_stays_the_same_bits_when_what_is_before_it_is_forgotten() -> None:
+    lines = [f"{k / 10} {k / 3} 0 0 0 0 {k / 7!r} 1 0.1 0.01 0 0.2 0.02 0.3" for k in range(200)]
+    whole, short = OdometryTrack.from_lines(lines), OdometryTrack.from_lines(lines)
+    short.forget_before(15 * track.NS_PER_S)
+    assert len(short) < len(whole)
+    for t_ns in (15 * track.NS_PER_S, 17_250_000_001, 19_900_000_000):
+        assert short.noise_at(t_ns).tobytes() == whole.noise_at(t_ns).tobytes()
+
+
+def test_a_track_of_lines_without_covariance_has_no_noise() -> None:
+    wheels = OdometryTrack.from_lines(["1 0 0 0 0 0 0 1", "2 0 0 0 0 0 0 1 1 0 0 1 0 1"])
+    with pytest.raises(OdometryError):
+        wheels.noise_at(track.NS_PER_S)

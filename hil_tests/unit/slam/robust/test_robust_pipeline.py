@@ -18,6 +18,7 @@ from slam.library.slam import make_slam
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Belief, PoseAt
 from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of
+from slam.robust.state import rotation
 
 Array = NDArray[np.float64]
 
@@ -329,9 +330,9 @@ def test_a_stop_of_a_second_is_told_from_slow_driving(
     rule = slam.back_end.parameters.branches
     predict = slam._branches.predict
 
-    def watched(increment: Array, elapsed_s: float, stood: float) -> None:
+    def watched(increment: Array, elapsed_s: float, stood: float, covariance: None) -> None:
         asked.append((elapsed_s, stood if stood >= rule.stop_s else 0.0))
-        predict(increment, elapsed_s, stood)
+        predict(increment, elapsed_s, stood, covariance)
 
     monkeypatch.setattr(slam._branches, "predict", watched)
     pause_ns = round(pause_s * 1e9)
@@ -346,3 +347,54 @@ def test_a_stop_of_a_second_is_told_from_slow_driving(
     assert longest[1] == pytest.approx(stood_s, abs=0.05)
     assert sum(stood > 0.0 for _, stood in asked) == (1 if stood_s else 0)
     assert all(elapsed > stood for elapsed, stood in asked)
+
+
+def test_noise_that_comes_with_odometry_replaces_the_wheels_white_noise() -> None:
+    """Straight on through an empty room: the closed form of a random walk.
+
+    Positions err by the sum of all steps' noise, and by each heading's error times what is left.
+    """
+    wheels = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
+    along, across, turn = 4e-4, 1e-4, 9e-4  # variances per second
+
+    def noise_at(t_ns: int) -> Array:
+        return np.diag([along, across, turn]) * t_ns * 1e-9
+
+    slam = RobustSlam(ROBUST, RIG, wheels, noise_at=noise_at)
+    (*_, belief) = [
+        row.belief
+        for tick in range(21)
+        for row in slam.step_detections([], straight, tick * TICK_NS)
+    ]
+    n, step_s = 20, TICK_NS * 1e-9
+    step_m = straight(TICK_NS)[0] - straight(0)[0]
+    left = np.arange(n)  # steps behind each turn: a turn comes at the end of its step
+    expected = np.diag([n * along, n * across, n * turn]) * step_s
+    expected[1, 1] += turn * step_s * np.sum((left * step_m) ** 2)
+    expected[1, 2] = expected[2, 1] = turn * step_s * np.sum(left * step_m)
+    curved = slam.back_end.state.curved_covariance()
+    linear = belief.pose_covariance - np.pad(curved, ((0, 1), (0, 1)))
+    np.testing.assert_allclose(linear, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_noise_of_the_wheels_own_model_changes_nothing_but_roundings() -> None:
+    """In a frame of odometry that is turned against the map; the floors count once."""
+    wheels, start = WheelNoise(), np.array([1.0, -2.0, 0.7])
+
+    def odometry(t_ns: int) -> Array:
+        return compose(start, straight(t_ns))
+
+    floors = np.square([wheels.floor_m, wheels.floor_m, wheels.floor_rad])
+    of_step = np.diag(wheels.step_variances(straight(TICK_NS)[0], 0.0) - floors)
+    turned = np.eye(3)
+    turned[:2, :2] = rotation(start[2])
+
+    def noise_at(t_ns: int) -> Array:
+        return np.asarray(turned @ of_step @ turned.T * (t_ns / TICK_NS))
+
+    by_odometry = RobustSlam(ROBUST, RIG, wheels, noise_at=noise_at)
+    for expected, belief in zip(
+        drive(robust(), 60, odometry), drive(by_odometry, 60, odometry), strict=True
+    ):
+        np.testing.assert_allclose(belief.mean, expected.mean, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(belief.covariance, expected.covariance, rtol=1e-6, atol=1e-12)

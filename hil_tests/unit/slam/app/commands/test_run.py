@@ -2,10 +2,8 @@
 
 import os
 import signal
-import subprocess
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,6 @@ import pytest
 
 from hil_tests.patience import seconds
 from hil_tests.unit.slam.app.sessions import Listener, NoSlam, scan, session_info, smoothed_run
-from slam.app.cli import CSV_TO_TUM, main
 from slam.app.commands import run
 from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
 from slam.app.errors import UsageError
@@ -22,9 +19,7 @@ from slam.app.run.live_source import LiveLog
 from slam.app.run.runner import run_slam, unknown_truth
 from slam.app.session.writer import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
-from slam.live.odometry_track import OdometryTrack, TumSample, parse_tum_line, read_tum
-from slam.live.session import cdr as ros
-from slam.live.session.cdr import wheel_odometry
+from slam.live.odometry_track import OdometryTrack, TumSample, read_tum
 from slam.live.session.reader import open_session
 from slam.live.session_records import Scan
 from slam.results import PoseAt, SmoothedRun
@@ -85,45 +80,6 @@ def test_a_last_chunk_that_does_not_fit_is_told_and_nothing_raised(
         listener.close()
     assert listener.failure.endswith("No space left on device")
     log.close()
-
-
-def csv_of(message: object) -> str:
-    """Write a message as `ros2 topic echo --csv` does: all fields in order, arrays spread."""
-
-    def values(part: object) -> Iterator[str]:
-        if isinstance(part, np.ndarray):
-            yield from map(str, part.tolist())
-        elif is_dataclass(part):
-            for field in fields(part):
-                if field.name != "__msgtype__":
-                    yield from values(getattr(part, field.name))
-        else:
-            yield str(part)
-
-    return ",".join(values(message))
-
-
-def test_lines_of_ros2_topic_echo_become_tum_lines_with_the_same_floats() -> None:
-    samples = [
-        TumSample(t_ns=1_700_000_000_000_000_005, x_m=1 / 3, y_m=-2e-17, qz=-0.6, qw=0.8),
-        TumSample(t_ns=1_700_000_001_234_567_890, x_m=-1.5, y_m=0.0, qz=0.0, qw=1.0),
-    ]
-    csv = "".join(
-        f"{csv_of(ros.deserialise(wheel_odometry(sample), ros.ODOMETRY))}\n" for sample in samples
-    )
-    assert csv.startswith("1700000000,5,odom,base_link,0.3333333333333333,-2e-17,0.0,0.0,0.0,-0.6,")
-    done = subprocess.run(
-        ["sed", "-uE", CSV_TO_TUM], input=csv, capture_output=True, text=True, check=True
-    )
-    assert [parse_tum_line(line) for line in done.stdout.splitlines()] == samples
-
-
-def test_the_help_shows_that_very_recipe(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["run", "--help"])
-    said = capsys.readouterr().out
-    assert f"sed -uE '{CSV_TO_TUM}'" in said
-    assert "--odometry-clock unix" in said
 
 
 @pytest.mark.parametrize("text", ["9" * 5000, "9" * 19, "²", "-5", ""])

@@ -267,3 +267,26 @@ def test_numbers_that_are_none_are_wrong_usage(text: str) -> None:
 def test_what_is_no_name_of_a_host_is_one_line(host: str) -> None:
     with pytest.raises(OdometryError):
         lines_of(parse_source(f"tcp://{host}:1"))
+
+
+@pytest.mark.parametrize(
+    ("triangle", "words"),
+    [
+        ("", "does not say how its velocity errs"),
+        (" 0 0 0 0 0 0", "does not say how its velocity errs"),
+        (" 1 2 0 1 0 1", "eigenvalues of -1 to "),
+        (" -1 0 0 1 0 1", "eigenvalues of -1 to "),
+        (" 0.01 0 0 1e6 0 0.01", "unknown"),
+    ],
+)
+def test_where_a_covariance_is_asked_for_lines_without_a_good_one_are_refused(
+    triangle: str, words: str
+) -> None:
+    odometry = LiveOdometry("a test", has_covariance=True)
+    assert words in odometry.take(line(1.0) + triangle, 0)[1]
+    assert not odometry.has_pose
+    sample, warning = odometry.take(line(1.0) + " 0.01 0 0 0 0 0.02", 0)  # no sideways error at all
+    assert sample is not None
+    assert sample.velocity_covariance == (0.01, 0.0, 0.0, 0.0, 0.0, 0.02)
+    assert "sound again" not in warning
+    assert LiveOdometry("a test").take(line(1.0) + triangle, 0)[0] is not None

@@ -32,6 +32,7 @@ from slam.frames import RadarFrame
 from slam.library.slam import make_slam
 from slam.live.arrival_clock import ClockLine
 from slam.live.frame_sources import sampler_limits
+from slam.live.odometry_track import TumSample
 from slam.live.session.description import settings_text
 from slam.live.session.reader import open_session
 from slam.live.session_records import LogLine, Scan, SessionInfo
@@ -102,12 +103,15 @@ class Overloaded:
     odometry_s: float | None = None
     epoch_s: int = 0  # what odometry's clock shows at virtual time 0
     session: Path | None = None
+    triangle: str = ""  # behind each line of odometry: the covariance of its velocity
     record: RunRecord = field(init=False)
 
     def run(self) -> "Overloaded":
         drive = self.drive
         self.inbox = VirtualInbox(list(self._events()))
-        odometry = LiveOdometry("the test", ClockLine(origin_ns=-self.epoch_s * NS_PER_S))
+        clock = ClockLine(origin_ns=-self.epoch_s * NS_PER_S)
+        odometry = LiveOdometry("the test", clock, has_covariance=bool(self.triangle))
+        noise_at = odometry.noise_at if self.triangle else None
         config, wheels = load_preset("robust"), wheels_of(drive.scene)
         log, self.heard = LiveLog(), Listener()
         self.live = LiveSource(
@@ -123,7 +127,7 @@ class Overloaded:
         log.log("run", "a line of the set-up", warning=False)
         self.start_ns = self.live.settle()
         self.given = Given(self.inbox)
-        slam = make_slam(config, rig_of(drive.scene), wheels)
+        slam = make_slam(config, rig_of(drive.scene), wheels, noise_at=noise_at)
         info = SessionInfo(
             scene="short",
             preset="robust",
@@ -135,6 +139,7 @@ class Overloaded:
             wheels={name: getattr(wheels, name) for name in type(wheels).__dataclass_fields__},
             time_base="arrival",
             started_unix_ns=self.live.started_unix_ns(),
+            odometry_covariance=bool(self.triangle),
         )
         if self.session is not None:
             log.begin(SessionLog(self.session, info, start_ns=self.start_ns), self.start_ns)
@@ -157,7 +162,8 @@ class Overloaded:
                 continue
             if event[0] == "odometry line":
                 whole, _, rest = event[1].partition(".")
-                event = (event[0], f"{int(whole) + self.epoch_s}.{rest}", event[2])
+                text = f"{int(whole) + self.epoch_s}.{rest}{self.triangle}"
+                event = (event[0], text, event[2])
             yield Timed(row.t_ns, event)
         if end_ns:
             yield Timed(end_ns, ("odometry end", ""))
@@ -295,3 +301,23 @@ def test_a_full_queue_holds_the_readers_back_and_refuses_lines_about_links() -> 
     stopped.set()
     inbox.hand_over(event, stopped)  # returns at once
     assert inbox.qsize() == 2
+
+
+def test_the_covariance_of_odometry_is_used_and_replayed_bit_for_bit(
+    drive: Drive, tmp_path: Path
+) -> None:
+    """A doubted heading makes a larger covariance of the pose; the recorded floats are the same."""
+    path = tmp_path / "session.mcap"
+    numbers = (1e-4 / 3, 2e-6, 1e-5, 2e-5 / 7, -1e-6, 0.01 / 3)
+    triangle = "".join(f" {one!r}" for one in numbers)
+    run = Overloaded(drive, 0.0, duration_s=8.0, session=path, triangle=triangle).run()
+    plain = Overloaded(drive, 0.0, duration_s=8.0).run()
+    turns = [one.record.states.pose_covariances[3, 2, 2] for one in (run, plain)]
+    assert turns[0] > 4.0 * turns[1]
+    session = open_session(path)
+    samples = [record for record in session.records() if isinstance(record, TumSample)]
+    assert {sample.velocity_covariance for sample in samples} == {numbers}
+    comparison = Comparison()
+    execute(recorded_source(session, StopFlag(), comparison), [comparison])
+    n_states = len(run.record.states)
+    assert f"all {n_states} recorded states came again" in comparison.verdict()
