@@ -7,10 +7,9 @@ known, is enough to estimate both: `uwb-slam calibrate` takes its session and wr
 
 Without an argument an emulated robot first drives two laps among six rods; `--truth` then shows
 what its scene planted. With a session of your own: `python 11_calibration.py out/run/session.mcap`.
-It prints the tables of drive and calibration, and then
+It prints
 
 ```text
-...
 wrote rig.toml
 left_rear: range offset +1.9 cm
 left_front: range offset -2.1 cm
@@ -19,18 +18,23 @@ right_front: range offset -0.8 cm
 ```
 """
 
+import subprocess
 import sys
 from pathlib import Path
 
-from slam.app.cli import main as uwb_slam
-from slam.app.rig.rig_files import load_rig
+from slam import load_rig
+
+
+def uwb_slam(*arguments: str) -> None:
+    command = [sys.executable, "-m", "slam.app.cli", *arguments]
+    if subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0:
+        sys.exit(1)  # it has said why
 
 
 def main(session: str, *options: str) -> None:
-    if uwb_slam(["calibrate", session, "--rig", "rig.toml", *options]) != 0:
-        sys.exit(1)  # it has said why
+    uwb_slam("calibrate", session, "--rig", "rig.toml", *options)
     print("wrote rig.toml")
-    for mount in load_rig(Path("rig.toml")).rig.mounts:
+    for mount in load_rig("rig.toml").rig.mounts:
         print(f"{mount.name}: range offset {100 * mount.range_offset_m:+.1f} cm")
 
 
@@ -39,5 +43,5 @@ if __name__ == "__main__":
         main(sys.argv[1])
     else:
         scene = str(Path(__file__).with_name("short_drive.toml"))
-        uwb_slam(["demo", "--scene", scene, "--preset", "paper", "--out", "drive", "--lean"])
+        uwb_slam("demo", "--scene", scene, "--preset", "paper", "--out", "drive", "--lean")
         main("drive/session.mcap", "--truth", scene)
