@@ -6,7 +6,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,12 +26,8 @@ from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
 
 Array = NDArray[np.float64]
-Range: TypeAlias = "tuple[int, float, float] | tuple[int, float, float, int | None]"
-"""(radar, range_m, sigma_m[, landmark_id]); see `Slam.step`."""
-Point: TypeAlias = (
-    "tuple[int, float, float, float, float] | tuple[int, float, float, float, float, int | None]"
-)
-"""(radar, range_m, bearing_rad, sigma_m, bearing_sigma_rad[, landmark_id]); see `Slam.step`."""
+Row: TypeAlias = Sequence[float | None]
+"""One range or point, numbers and perhaps an id; see `Slam.step`."""
 
 _MOST_AHEAD_NS = 100_000_000
 _KEPT_NS = 2_000_000_000
@@ -166,8 +162,8 @@ class Slam:
         odometry_pose: ArrayLike | Callable[[int], ArrayLike] | None = None,
         *,
         frames: Iterable[RadarFrame] = (),
-        ranges: Iterable[Range] = (),
-        points: Iterable[Point] = (),
+        ranges: Iterable[Row] = (),
+        points: Iterable[Row] = (),
     ) -> SlamState:
         """Take what was seen around one time; return where the robot is.
 
@@ -265,48 +261,45 @@ class Slam:
         )
 
     def _scans(
-        self, frames: Sequence[RadarFrame], ranges: Sequence[Range], points: Sequence[Point]
+        self, frames: Sequence[RadarFrame], ranges: Sequence[Row], points: Sequence[Row]
     ) -> list[RangeScan]:
         """Check all that was seen; return ranges and points as one scan of each mount."""
-        seen: dict[int, str] = {}
+        kinds: dict[int, str] = {}
         for frame in frames:
             if not isinstance(frame, RadarFrame):
                 raise StepInputError(f"frames: a {type(frame).__name__} is no RadarFrame")
+            which = f"frame {frame.counter} of radar {frame.radar}"
+            if frame.radar in kinds:
+                raise StepInputError(f"{which}: a step takes one frame of each radar")
             if np.isinf(frame.samples).any():
-                raise StepInputError(f"frame {frame.counter} of radar {frame.radar} is not finite")
+                raise StepInputError(f"{which}: its samples are not finite")
             if self._newest.get(frame.radar) == (frame.stream, frame.counter):
-                raise StepInputError(f"frame {frame.counter} of radar {frame.radar} came before")
-            if frame.radar in seen:
-                raise StepInputError(f"two frames of radar {frame.radar}; a step takes one of each")
-            self._note(seen, frame.radar, "frame")
-        of_radar: dict[int, list[_Measured]] = {}
+                raise StepInputError(f"{which}: it came before")
+            kinds[frame.radar] = "frame"
+        measured: dict[int, list[_Measured]] = {}
         for kind, rows in (("range", ranges), ("point", points)):
             for row in rows:
                 one = _measured(row, kind)
-                self._note(seen, one.radar, kind)
-                of_radar.setdefault(one.radar, []).append(one)
+                if kinds.setdefault(one.radar, kind) != kind:
+                    raise StepInputError(
+                        f"radar {one.radar} gave a {kinds[one.radar]} and a {kind}; a step takes "
+                        "one kind of each"
+                    )
+                measured.setdefault(one.radar, []).append(one)
+        if unknown := [radar for radar in kinds if not 0 <= radar < len(self.rig.mounts)]:
+            raise StepInputError(
+                f"radar {unknown[0]}: the rig has {len(self.rig.mounts)}, numbered from 0 in the "
+                "order of its mounts"
+            )
         if self.config.back_end is BackEnd.PAPER:
-            has_ids = any(one.label is not None for many in of_radar.values() for one in many)
+            has_ids = any(one.label is not None for many in measured.values() for one in many)
             if points or has_ids or (frames and ranges):
                 what = "points" if points else "ids of landmarks" if has_ids else "both kinds"
                 raise StepInputError(
                     f"{what}: the back end of preset paper takes frames, or ranges without ids; "
                     "preset robust takes all of them"
                 )
-        return [_scan_of(radar, many, seen[radar]) for radar, many in of_radar.items()]
-
-    def _note(self, seen: dict[int, str], radar: int, kind: str) -> None:
-        """Note what a mount gave; raise StepInputError if there is no such, or it gave others."""
-        if not 0 <= radar < len(self.rig.mounts):
-            raise StepInputError(
-                f"{kind} of radar {radar}: the rig has {len(self.rig.mounts)}, numbered from 0 in "
-                "the order of its mounts"
-            )
-        if seen.setdefault(radar, kind) != kind:
-            raise StepInputError(
-                f"radar {radar} gave a {seen[radar]} and a {kind}; a step takes one frame of a "
-                "mount, or its ranges, or its points"
-            )
+        return [_scan_of(radar, many, kinds[radar]) for radar, many in measured.items()]
 
     def _pose_at(
         self,

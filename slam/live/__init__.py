@@ -3,49 +3,31 @@
 Of what lies below the application only these know the driver.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from slam import loader
+
 if TYPE_CHECKING:
-    from slam.live.errors import AppError, OdometryError, RadarSilentError
-    from slam.live.frame_sources import radar_frame
-    from slam.live.odometry_track import OdometryTrack, read_odometry_socket
-    from slam.live.rig import LiveRig, open_rig
-    from slam.live.session.reader import RecordedSession, open_session
-    from slam.live.session_records import Scan
+    from slam.live.errors import AppError as AppError
+    from slam.live.errors import OdometryError as OdometryError
+    from slam.live.errors import RadarSilentError as RadarSilentError
+    from slam.live.frame_sources import radar_frame as radar_frame
+    from slam.live.odometry_track import OdometryTrack as OdometryTrack
+    from slam.live.odometry_track import read_odometry_socket as read_odometry_socket
+    from slam.live.rig import LiveRig as LiveRig
+    from slam.live.rig import open_rig as open_rig
+    from slam.live.session.reader import RecordedSession as RecordedSession
+    from slam.live.session.reader import open_session as open_session
+    from slam.live.session_records import Scan as Scan
 
-_HOMES = {
-    "AppError": "errors",
-    "LiveRig": "rig",
-    "OdometryError": "errors",
-    "OdometryTrack": "odometry_track",
-    "RadarSilentError": "errors",
-    "RecordedSession": "session.reader",
-    "Scan": "session_records",
-    "open_rig": "rig",
-    "open_session": "session.reader",
-    "radar_frame": "frame_sources",
-    "read_odometry_socket": "odometry_track",
+_NAMES = {
+    "slam.live.errors": ("AppError", "OdometryError", "RadarSilentError"),
+    "slam.live.frame_sources": ("radar_frame",),
+    "slam.live.odometry_track": ("OdometryTrack", "read_odometry_socket"),
+    "slam.live.rig": ("LiveRig", "open_rig"),
+    "slam.live.session.reader": ("RecordedSession", "open_session"),
+    "slam.live.session_records": ("Scan",),
 }
-"""Where each name is defined; a name is loaded when it is first used."""
 
-__all__ = [
-    "AppError",
-    "LiveRig",
-    "OdometryError",
-    "OdometryTrack",
-    "RadarSilentError",
-    "RecordedSession",
-    "Scan",
-    "open_rig",
-    "open_session",
-    "radar_frame",
-    "read_odometry_socket",
-]
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = found = getattr(import_module(f"slam.live.{_HOMES[name]}"), name)
-    return found
+__all__ = sorted(name for names in _NAMES.values() for name in names)
+__getattr__ = loader(_NAMES)

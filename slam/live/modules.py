@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from slam.geometry import Rig
 from slam.library.rig_files import RigFile, RigRadar
 from slam.live.errors import AppError
 from slam.live.frame_sources import RadarLink, RecordObserver
@@ -126,6 +127,20 @@ def open_modules(
                 module.driver.close()
         unless_it_works.pop_all()
     return links
+
+
+def open_ports(rig: Rig, ports: Sequence[str], observer: RecordObserver) -> tuple[RadarLink, ...]:
+    """Open the module at each port for the mount in its place; AppError if one does not answer."""
+    links = []
+    with ExitStack() as unless_it_works:
+        for mount, port in zip(rig.mounts, ports, strict=True):
+            module = _OpenModule(port, observer, unless_it_works)
+            module.name(mount.name)
+            links.append(
+                RadarLink(mount=mount, port=port, serial=module.serial, driver=module.driver)
+            )
+        unless_it_works.pop_all()
+    return tuple(links)
 
 
 def _are_beside(port: str, other: str) -> bool:

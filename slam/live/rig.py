@@ -15,7 +15,7 @@ from typing import Literal, Self
 from slam.geometry import Mount, Rig
 from slam.library.rig_files import RigFile, load_rig
 from slam.live.arrival_clock import ArrivalClock
-from slam.live.errors import AppError, RadarSilentError
+from slam.live.errors import RadarSilentError
 from slam.live.frame_sources import (
     RadarLink,
     RigSource,
@@ -23,19 +23,16 @@ from slam.live.frame_sources import (
     radar_frame,
     sampler_limits,
 )
-from slam.live.modules import open_modules
+from slam.live.modules import open_modules, open_ports
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import RadarInfo, Scan
 from slam.live.ticks import Inbox, SourceEvent, TickAssembler, reading
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.matching import ProtocolRecord
-from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.operating_system import StopFlag
-from xethru_protocol.wire.errors import XeThruError
 
 SETTLE_S = 2.0
 """How long frames are read before the first scan, so that clocks are known."""
-START_LIMIT_S = 15.0
 SILENT_RIG_S = 10.0
 _POLL_S = 0.05
 _MOST_TICKS = 2**62
@@ -136,14 +133,14 @@ class _Arrivals:
         self._clocks = [ArrivalClock(radar.rate_hz) for radar in radars]
         period_ns = round(NS_PER_S / radars[0].rate_hz)
         self._ticks = TickAssembler(len(radars), period_ns, _NoOdometry())
-        self._unheard = {radar.name for radar in radars}
-        self._began_ns = self._alive_ns = now_ns
+        self._heard = set[int]()
+        self._alive_ns = now_ns
         self._ready_ns: int | None = None
 
     def take(self, event: SourceEvent) -> None:
         match event:
             case "frame", radar, frame:
-                self._unheard.discard(self._radars[radar].name)
+                self._heard.add(radar)
                 t_ns = self._clocks[radar].stamp_ns(frame.counter, frame.arrival_ns, frame.stream)
                 made = radar_frame(radar, frame, t_ns, limits=self._limits)
                 self._ticks.take(made, frame.arrival_ns, frame.arrival_ns)
@@ -161,10 +158,7 @@ class _Arrivals:
         elif now_ns - self._alive_ns > SILENT_RIG_S * NS_PER_S:
             raise RadarSilentError(f"no radar for {SILENT_RIG_S:g} s")
         if self._ticks.start_ns is None:
-            if self._unheard and now_ns - self._began_ns > START_LIMIT_S * NS_PER_S:
-                names = ", ".join(sorted(self._unheard))
-                raise RadarSilentError(f"radar {names}: no frame in {START_LIMIT_S:g} s")
-            if self._ready_ns is None and not self._unheard:
+            if self._ready_ns is None and self._ticks.alive <= self._heard:
                 self._ready_ns = now_ns
             if self._ready_ns is None or now_ns - self._ready_ns < SETTLE_S * NS_PER_S:
                 return None
@@ -219,23 +213,8 @@ def open_rig(
         rig = rig or Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0) for _ in ports])
         if len(rig.mounts) != len(ports):
             raise ValueError(f"{len(ports)} ports for {len(rig.mounts)} mounts; give one for each")
-        links = _open_each(rig, ports)
+        links = open_ports(rig, ports, _log_faults)
     return LiveRig(links, rig, RawConfig(frame_area_m=frame_area_m), fps, time_base)
-
-
-def _open_each(rig: Rig, ports: Sequence[str]) -> tuple[RadarLink, ...]:
-    links = []
-    with ExitStack() as unless_it_works:
-        for mount, port in zip(rig.mounts, ports, strict=True):
-            try:
-                driver = X4M300.open(port)
-                unless_it_works.callback(driver.close)
-                serial = driver.info().serial_number or ""
-            except XeThruError as error:
-                raise AppError(f"{port}: {error}") from error
-            links.append(RadarLink(mount=mount, port=port, serial=serial, driver=driver))
-        unless_it_works.pop_all()
-    return tuple(links)
 
 
 def _log_faults(radar: str, record: ProtocolRecord) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +20,7 @@ from hil_tests.unit.slam.app.run.virtual_rig import delays, drifting, radar_even
 from slam import ConfigError, Mount, Rig, Slam
 from slam.app.rig.rig_files import rig_file_of, write_rig
 from slam.live import AppError, RadarSilentError, Scan, open_rig
-from slam.live.rig import START_LIMIT_S, _Arrivals
+from slam.live.rig import _Arrivals
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.errors import PortUnavailable
 from xethru_protocol.wire.x4 import frame_time_ns, real_frame_rate
@@ -143,15 +142,19 @@ def test_a_rig_goes_on_without_a_radar_and_ends_without_all(
         arrivals.next_scan(row.t_ns + 11 * NS_PER_S)
 
 
-def test_a_radar_that_never_sends_is_named() -> None:
-    infos, events = radar_events(LAB, 0, 1.0, lambda: 0)
+def test_a_radar_that_never_sends_is_not_waited_for_once_it_is_lost() -> None:
+    infos, events = radar_events(LAB, 0, 6.0, lambda: 0)
     arrivals = _Arrivals(infos, None, 0)
-    for row in events:
+    sizes = []
+    for row in sorted(events, key=lambda row: row.t_ns):
         if row.event[1] != 2:
             arrivals.take(row.event)
-    assert arrivals.next_scan(NS_PER_S) is None
-    with pytest.raises(RadarSilentError, match=infos[2].name):
-        arrivals.next_scan(math.ceil((START_LIMIT_S + 1) * NS_PER_S))
+        if row.t_ns > 3 * NS_PER_S:
+            arrivals.take(("lost", 2, "no frame for 3 s"))
+        while (scan := arrivals.next_scan(row.t_ns)) is not None:
+            assert row.t_ns > 3 * NS_PER_S
+            sizes.append(len(scan.frames))
+    assert set(sizes[:-1]) == {3}
 
 
 @pytest.mark.slow
