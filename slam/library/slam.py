@@ -6,7 +6,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -406,10 +406,8 @@ def _measured(row: Sequence[Any], kind: str) -> _Measured:
     try:
         if len(values) not in (n, n + 1):
             raise ValueError
-        radar, numbers = (
-            operator.index(values[0]),
-            dict(zip(names[1:], map(float, values[1:n]), strict=True)),
-        )
+        radar = operator.index(values[0])
+        numbers = dict(zip(names[1:], map(float, values[1:n]), strict=True))
         label = None if values[n:] in ((), (None,)) else operator.index(values[n])
     except (TypeError, ValueError):
         text = f"({', '.join(names)}), numbers, and perhaps the id of a landmark, a whole number"
