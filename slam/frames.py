@@ -22,23 +22,37 @@ class StepInputError(ValueError):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarFrame:
-    """One raw RF frame of one radar, with everything a front end needs to turn bins into metres."""
+    """One raw RF frame of one radar, with everything a front end needs to turn bins into metres.
 
-    radar: int  # index of the radar's mount in the rig
-    # Session time at which this radar really took the frame, int64 nanoseconds; radars are not
-    # synchronised, so those of one scan differ
+    Attributes
+    ----------
+    radar
+        Index of the radar's mount in the rig.
+    t_ns
+        Session time at which this radar really took the frame, int64 nanoseconds; radars are not
+        synchronised, so those of one scan differ.
+    counter
+        Frame counter of the module; gaps show lost frames.
+    samples
+        Shape (n_bins,), float32, signed normalised RF amplitude.
+    range_start_m, bin_length_m
+        Range label of sample 0, before the mount's own ``range_offset_m`` is removed, and spacing
+        of the samples: *true* metres (light at 299 792 458 m/s).
+    limits
+        Smallest and largest value the module's sampler can give; a sample at one of them was cut
+        off there. None if unknown.
+    stream
+        Counters follow on each other within a stream only; a new one begins wherever the module's
+        counter may have begun anew.
+    """
+
+    radar: int
     t_ns: int
-    counter: int  # frame counter of the module; gaps show lost frames
-    samples: NDArray[np.float32]  # shape (n_bins,), float32, signed normalised RF amplitude
-    # Range label of sample 0 in *true* metres (light at 299 792 458 m/s), before the mount's own
-    # ``range_offset_m`` is removed
+    counter: int
+    samples: NDArray[np.float32]
     range_start_m: float
-    bin_length_m: float  # spacing of the samples in true metres
-    # Smallest and largest value the module's sampler can give, normalised RF amplitude; a sample at
-    # one of them was cut off there. None if unknown.
+    bin_length_m: float
     limits: tuple[float, float] | None = None
-    # Counters follow on each other within a stream only; a new one begins wherever the module's
-    # counter may have begun anew
     stream: int = 0
 
     def __post_init__(self) -> None:

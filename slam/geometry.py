@@ -150,19 +150,31 @@ class ReceivedPulse:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
-    """Where one radar sits on the robot and how its range zero is off."""
+    """Where one radar sits on the robot and how its range zero is off.
 
-    name: str = ""  # the radar's name in messages; without one the rig numbers it
-    # Antenna position in the body frame
+    Attributes
+    ----------
+    name
+        In messages; without one the rig numbers it.
+    x_m, y_m
+        Antenna position in the body frame.
+    yaw_rad
+        Boresight in the body frame, counter-clockwise from forward.
+    range_offset_m
+        What this module measures too long; the front end subtracts it from every range.
+    phase_offset_rad
+        What this module and its antennas add to an echo's carrier phase. Rig files and sessions
+        keep it; SLAM does not use it.
+    pulse
+        What the front end begins with; None: the pulse of the data sheet.
+    """
+
+    name: str = ""
     x_m: float
     y_m: float
-    yaw_rad: float  # boresight in the body frame, counter-clockwise from forward
-    # What this module measures too long; the front end subtracts it from every range
+    yaw_rad: float
     range_offset_m: float = 0.0
-    # What this module and its antennas add to an echo's carrier phase. Rig files and sessions keep
-    # it; SLAM does not use it.
     phase_offset_rad: float = 0.0
-    # What the front end begins with; None: the pulse of the data sheet
     pulse: ReceivedPulse | None = None
 
 

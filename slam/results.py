@@ -207,14 +207,23 @@ class SmoothedRun:
     """The solution over all states of a run: each has seen all measurements, later ones, too.
 
     Map frame, errors additive; the landmarks are those of the newest belief.
+
+    Attributes
+    ----------
+    t_ns
+        Shape (n,): session times of the states.
+    poses, pose_covariances
+        Shape (n, 3), [x m, y m, heading rad], the heading in [-pi, pi); and (n, 3, 3).
+    landmark_ids, landmarks_m, landmark_covariances_m2
+        m ids, shape (m, 2) and (m, 2, 2).
     """
 
-    t_ns: NDArray[np.int64]  # shape (n,): session times of the states
-    poses: Array  # shape (n, 3): [x m, y m, heading rad], the heading in [-pi, pi)
-    pose_covariances: Array  # shape (n, 3, 3)
+    t_ns: NDArray[np.int64]
+    poses: Array
+    pose_covariances: Array
     landmark_ids: tuple[int, ...]
-    landmarks_m: Array  # shape (m, 2)
-    landmark_covariances_m2: Array  # shape (m, 2, 2)
+    landmarks_m: Array
+    landmark_covariances_m2: Array
 
 
 class InputCheck:

@@ -62,27 +62,47 @@ class SlamState:
 
     Between the states of the pipeline, which makes one when the robot has moved (preset ``paper``
     14 states later), the pose is that of the newest one and odometry since then.
+
+    Attributes
+    ----------
+    t_ns
+        Time of the step; None before the first one.
+    pose
+        Shape (3,): x [m], y [m], heading [rad] in [-pi, pi).
+    covariance
+        Shape (3, 3), of the pose, errors additive, [m, m, rad].
+    is_lost
+        Whether the place on the map is unknown: the robot was carried. The pose is then that before
+        it and odometry since, and the covariance covers the map.
+    results
+        The states that the pipeline made in this step, in its own map frame, which begins at the
+        first pose: what was seen, and what it was taken for.
     """
 
-    t_ns: int | None  # time of the step; None before the first one
-    pose: Array  # shape (3,): x [m], y [m], heading [rad] in [-pi, pi)
-    covariance: Array  # shape (3, 3), of the pose, errors additive, [m, m, rad]
-    # Whether the place on the map is unknown: the robot was carried. The pose is then that before
-    # it and odometry since, and the covariance covers the map.
+    t_ns: int | None
+    pose: Array
+    covariance: Array
     is_lost: bool = False
-    # The states that the pipeline made in this step, in its own map frame, which begins at the
-    # first pose: what was seen, and what it was taken for
     results: tuple[StepResult, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Landmarks:
-    """The reported landmarks, map frame; those of preset ``robust`` keep their ids."""
+    """The n landmarks that are reported, map frame; each keeps its id.
+
+    Attributes
+    ----------
+    ids
+        Numbers of their own, in the order of the rows.
+    positions_m, covariances_m2
+        Shape (n, 2) and (n, 2, 2), errors additive.
+    given_ids
+        The ``landmark_id`` of the ranges or points that each was made of, None where they had none.
+    """
 
     ids: tuple[int, ...]
-    positions_m: Array  # shape (n, 2)
-    covariances_m2: Array  # shape (n, 2, 2), errors additive
-    # The ``landmark_id`` that ranges or points gave it, None where they gave none
+    positions_m: Array
+    covariances_m2: Array
     given_ids: tuple[int | None, ...]
 
     def __len__(self) -> int:
@@ -167,6 +187,9 @@ class Slam:
     ) -> SlamState:
         """Take what was seen around one time; return where the robot is.
 
+        Preset ``paper`` takes either frames or ranges without ids; ``robust`` takes all, but of one
+        mount only one kind in a step.
+
         Parameters
         ----------
         t_ns
@@ -187,9 +210,6 @@ class Slam:
         points
             (radar, range_m, bearing_rad, sigma_m, bearing_sigma_rad), and an id in the same way:
             the bearing is counted from the mount's ``yaw_rad``.
-
-        Preset ``paper`` takes either frames or ranges without ids; ``robust`` takes all, but of one
-        mount only one kind in a step.
 
         Raises
         ------
@@ -223,6 +243,7 @@ class Slam:
 
     @property
     def landmarks(self) -> Landmarks:
+        """Return the map after the newest state."""
         belief = self._belief
         n, given = len(belief.landmark_ids), dict[int, int]()
         if isinstance(self._pipeline, RobustSlam):

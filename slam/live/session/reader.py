@@ -274,7 +274,7 @@ _TopicPart: TypeAlias = Literal["frame", "stream", "detections", "rx", "tx", ""]
 
 
 class RecordedSession:
-    """One session file.
+    """One session file; iterating yields the scans that SLAM was stepped with, with odometry.
 
     Attributes
     ----------
@@ -311,11 +311,12 @@ class RecordedSession:
 
     @property
     def rig(self) -> Rig:
+        """Return the mounts that SLAM used."""
         return Rig(mounts=tuple(radar.mount for radar in self.info.radars))
 
     @property
     def config(self) -> SlamConfig:
-        """The settings that SLAM had; AppError if the file has none, or those of another version.
+        """Return the settings that SLAM had; AppError if the file has none, or those of another version.
 
         `Slam` with these, `rig` and `wheels` makes the recorded states again.
         """
@@ -338,7 +339,7 @@ class RecordedSession:
 
     @property
     def wheels(self) -> WheelNoise:
-        """The wheel errors that SLAM assumed; AppError if they are unknown here."""
+        """Return the wheel errors that SLAM assumed; AppError if they are unknown here."""
         self._need(self.info.wheels)
         try:
             return WheelNoise(**self.info.wheels)
