@@ -164,8 +164,11 @@ for (const width of [1100, 400]) {{
 
 @pytest.mark.skipif(find_browser() is None, reason="no Chromium is installed")
 def test_nothing_is_wider_than_a_screen_or_a_telephone(reported: Reported, tmp_path: Path) -> None:
+    long_port = f"/dev/{'long/' * 40}ttyACM0"
+    text, n_ports = re.subn('(?<=data-name="port">)[^<]*', long_port, reported.text)
+    assert n_ports > 0
     (tmp_path / "frames.html").write_text(
-        _FRAMES.format(page=json.dumps(reported.text).replace("</", "<\\/")), encoding="utf-8"
+        _FRAMES.format(page=json.dumps(text).replace("</", "<\\/")), encoding="utf-8"
     )
     dumped = contents_of(tmp_path / "frames.html")
     wide, narrow = json.loads(html.unescape(re.findall("<title>(.*?)</title>", dumped)[0]))
@@ -175,6 +178,13 @@ def test_nothing_is_wider_than_a_screen_or_a_telephone(reported: Reported, tmp_p
     assert all(width > 900 for width in wide[2:])
     assert all(400 < width < 440 for width in narrow[2:])
     assert len(wide) == len(narrow) == 7
+
+
+def test_only_tables_of_many_columns_repeat_their_names_on_a_telephone(reported: Reported) -> None:
+    tables = re.findall('<div class="(wide[^"]*)"><table><tr>(.*?)</tr>', reported.text)
+    assert len(tables) == 3  # landmarks, links, parameters
+    for kind, head in tables:
+        assert ("cards" in kind) == (head.count("<th>") > 5)
 
 
 def test_the_smoothed_path_has_its_number_and_is_on_the_map(tmp_path: Path) -> None:

@@ -179,6 +179,9 @@ def _seconds(record: RunRecord, t_ns: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(np.maximum(np.asarray(t_ns) - record.start_ns, 0) / NS_PER_S)
 
 
+_MOST_COLUMNS = 5
+"""Of a table that is one on narrow screens, too; others become a block per row."""
+
 _STYLE = """\
 :root { color-scheme: light; }
 body { font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #20242a; background: #fff;
@@ -195,6 +198,7 @@ th, td { text-align: left; padding: .25rem .9rem .25rem 0; vertical-align: top; 
 th { color: #6a707a; font-weight: 500; border-bottom: 1px solid #dfe3e8; }
 td.value { font-weight: 600; }
 div.wide td, div.wide th, td.value { white-space: nowrap; }
+div.wide td:last-child { white-space: normal; overflow-wrap: anywhere; }
 img { max-width: 100%; height: auto; display: block; margin: .6rem 0; }
 pre { background: #f6f7f9; padding: .8rem; overflow-x: auto; font-size: .82rem; line-height: 1.35; }
 details { margin: .5rem 0; }
@@ -203,13 +207,14 @@ summary { cursor: pointer; }
   body { margin: 1rem auto; padding: 0 .9rem; }
   th, td { padding-right: .6rem; }
   h1, p { overflow-wrap: anywhere; }
-  div.wide table, div.wide tbody { display: block; }
-  div.wide tr { display: grid; grid-template-columns: repeat(var(--columns), 1fr);
-                padding: .25rem 0; border-bottom: 1px solid #dfe3e8; }
-  div.wide tr:first-child { display: none; }
-  div.wide td { padding: 0 .4rem .1rem 0; white-space: normal; overflow-wrap: anywhere; }
-  div.wide td:last-child { grid-column-end: -1; }
-  div.wide td::before { content: attr(data-name); display: block; font-size: .75rem;
+  div.wide th { white-space: normal; }
+  div.cards table, div.cards tbody { display: block; }
+  div.cards tr { display: grid; grid-template-columns: repeat(3, 1fr);
+                 padding: .25rem 0; border-bottom: 1px solid #dfe3e8; }
+  div.cards tr:first-child { display: none; }
+  div.cards td { padding: 0 .4rem .1rem 0; white-space: normal; overflow-wrap: anywhere; }
+  div.cards td:last-child { grid-column-end: -1; }
+  div.cards td::before { content: attr(data-name); display: block; font-size: .75rem;
                         line-height: 1.2; color: #6a707a; }
 }
 """
@@ -269,7 +274,7 @@ class _Page:
             for row in rows
         ]
         self._parts.append(
-            f'<div class="wide" style="--columns: {len(names) if len(names) < 6 else 3}">'
+            f'<div class="wide{" cards" * (len(names) > _MOST_COLUMNS)}">'
             f"<table><tr>{head}</tr>"
             f"{''.join(f'<tr>{line}</tr>' for line in lines)}</table></div>"
         )

@@ -72,7 +72,7 @@ def picture(
         if title:
             figure.suptitle(title, fontsize=11, color=INK, x=0.01, ha="left")
         yield figure
-        _make_printable(figure)
+        _make_ready(figure)
         drawn = io.BytesIO()
         figure.savefig(drawn, format="png")
         with Image.open(drawn) as colours:
@@ -95,18 +95,23 @@ def svg_of(
         figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
         FigureCanvasSVG(figure)
         draw(figure, *arguments)
-        _make_printable(figure)
+        _make_ready(figure)
         drawn = io.StringIO()
         figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
     return drawn.getvalue()
 
 
-def _make_printable(figure: Figure) -> None:
-    """Write out control characters in names from a file: no font has them."""
+def _make_ready(figure: Figure) -> None:
+    """Write out control characters in names from a file, and lay the axes out.
+
+    No font has those characters. Axes of equal scale get their last tick labels when they have been
+    laid out once, for which `savefig`, which does it again, leaves room.
+    """
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         if not text.get_text().isprintable():
             text.set_text(each_line(text.get_text()))
+    figure.draw_without_rendering()
 
 
 def label(
@@ -313,7 +318,7 @@ def _draw_distances(
     On the map they lie on each other. Paths have shape (n, 2), world frame.
     """
     states, smoothed = record.states, record.whole_smoothed
-    minutes = (states.t_ns - record.start_ns) / (60 * NS_PER_S)
+    times_s = (states.t_ns - record.start_ns) / NS_PER_S
     paths = [(ODOMETRY, odometry)]
     if has_truth:
         paths.append((ESTIMATE, estimate))
@@ -325,12 +330,12 @@ def _draw_distances(
         distances_mm = 1e3 * np.linalg.norm(path - reference, axis=1)
         known_mm = distances_mm[np.isfinite(distances_mm)]
         tops.append(float(np.percentile(known_mm, 99)) if len(known_mm) else 0.0)
-        axes.plot(minutes, distances_mm, color=colour, linewidth=0.9)
+        axes.plot(times_s, distances_mm, color=colour, linewidth=0.9)
     what = "error" if has_truth else "from radar SLAM"
-    label(axes, f"{what} [mm]", "time [min]", "", fontsize=8.5)
+    label(axes, f"{what} [mm]", "time [s]", "", fontsize=8.5)
     axes.tick_params(labelsize=8)
     axes.xaxis.label.set_fontsize(8.5)
-    axes.set_xlim(0.0, max(float(minutes[-1]), 1e-3))
+    axes.set_xlim(0.0, max(float(times_s[-1]), 1e-3))
     # beside the truth the wheels leave the panel, where the others would be lines at its bottom
     axes.set_ylim(0.0, max(1.3 * max(tops[1:] if has_truth else tops), 1.0))
 

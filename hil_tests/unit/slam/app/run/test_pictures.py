@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
@@ -24,8 +25,10 @@ from slam.app.run.pictures import (
     draw_map,
     ellipse_95,
     enlargement,
+    label,
     picture,
     rotate_covariances,
+    svg_of,
 )
 from slam.app.run.runner import RunRecord, States
 from slam.app.run.summary import Summary
@@ -222,3 +225,19 @@ def test_a_picture_is_the_same_file_each_time(tmp_path: Path) -> None:
         with picture(tmp_path / name, width_in=2, height_in=2) as figure:
             figure.subplots().plot([0, 1, 2], [1, 0, 1], color="#1f6fd0")
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_the_names_of_equal_axes_lie_inside_of_the_picture() -> None:
+    """Equal axes get more tick labels, "-1.0" for "-1", when they have been laid out."""
+    drawn: list[Axes] = []
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot(figure.add_gridspec(2, 2, width_ratios=(2.6, 1.0))[:, 0])
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.plot([-1.1, 3.2], [-1.0, 2.9])
+        label(axes, "a map", "x [m]", "y [m]", pad=36)
+        drawn.append(axes)
+
+    svg_of(draw, height_in=6.6)
+    (axes,) = drawn
+    assert axes.yaxis.label.get_window_extent().x0 >= 0.0
