@@ -316,7 +316,7 @@ class RecordedSession:
 
     @property
     def config(self) -> SlamConfig:
-        """Return the settings that SLAM had; AppError if the file has none, or those of another version.
+        """Return the settings that SLAM had; AppError if they cannot be read.
 
         `Slam` with these, `rig` and `wheels` makes the recorded states again.
         """
