@@ -75,11 +75,11 @@ def run_demo(
     """
     loaded, config = scene_and_config(scene, preset)
     with ExitStack() as held:
+        hold_folder(out, held)
         publishing = held.enter_context(Publishing(publish))
         live = None
         if rerun is not None:  # before an earlier run's files are removed
             live = held.enter_context(LiveView(rerun, stop))
-        hold_folder(out, held)
         kept = f"; what was recorded is in {out}"
         with ExitStack() as stack:
             emulator = stack.enter_context(EmulatorProcess(scene, seed))

@@ -100,13 +100,13 @@ def run_rig(
     )
     inbox = Inbox()
     with ExitStack() as held:
-        publishing = held.enter_context(Publishing(publish))
         if (out / SESSION).exists():
             raise AppError(
                 f"{out}: holds the session of an earlier drive, which cannot be repeated; "
                 "choose another --out, or move it away"
             )
         hold_folder(out, held)
+        publishing = held.enter_context(Publishing(publish))
         requests = held.enter_context(SmoothingRequests(out))
         view = held.enter_context(LiveView(rerun, stop)) if rerun is not None else None
         links = open_modules(

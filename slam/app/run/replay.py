@@ -220,13 +220,13 @@ def run_replay(
     `rate` is how many times as fast as it was driven; None: at full speed.
     """
     with ExitStack() as held:
+        hold_folder(out, held)
         publishing = held.enter_context(Publishing(publish))
         recorded = open_session(session, stop)
         comparison = Comparison(different_constants(recorded.info.constants))
         source = recorded_source(recorded, stop, comparison)
         if rate is not None:
             source = replace(source, scans=paced(source.scans, rate, stop))
-        hold_folder(out, held)
         progress = RunProgress(source.info, source.lost_frames, end_ns=recorded.end_ns)
         publishing.begin(source.info, source.link_log.log)
         record = execute(source, [publishing, comparison, progress])
