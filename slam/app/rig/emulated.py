@@ -184,17 +184,23 @@ def scene_and_config(scene: str, preset: str) -> tuple[Scene, SlamConfig]:
     Raises
     ------
     UsageError
-        One of the names is not known; one line with those that are.
+        One of the names is not known; one line with those that are. Or the robot stands still.
     AppError
         The scene file cannot be read or is refused; one line with file, key and remedy.
     """
     try:
         loaded = load_scene(scene)
-        return loaded, load_preset(preset, loaded.environment)
+        config = load_preset(preset, loaded.environment)
     except (UnknownSceneError, ConfigError) as error:
         raise UsageError(str(error)) from None
     except SceneError as error:
         raise AppError(str(error)) from None
+    if not loaded.trajectory().duration_ns:
+        raise UsageError(
+            f"{scene}: its robot stands still, so there is no way to map; take a scene in which it "
+            "drives, such as lab"
+        )
+    return loaded, config
 
 
 def rig_of(scene: Scene) -> Rig:

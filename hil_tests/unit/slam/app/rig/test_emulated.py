@@ -12,7 +12,7 @@ from hil_tests.patience import wait_until
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
-from slam.app.errors import EmulatorError
+from slam.app.errors import EmulatorError, UsageError
 from slam.app.rig import emulated as emulator_process
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
@@ -121,3 +121,10 @@ def test_the_bytes_of_every_port_hold_its_frames(
         # the host spoke first: what was said before the log began is there, too
         assert ways[0] == "tx"
         assert read_note(out)["radar"] == radar.name
+
+
+@pytest.mark.parametrize("name", ["visitor", "sleeper", "desk", "two_people"])
+def test_a_scene_whose_robot_stands_is_not_for_slam(name: str) -> None:
+    """It would be recorded for minutes, and no state would come of it."""
+    with pytest.raises(UsageError, match=name):
+        scene_and_config(name, "robust")
