@@ -44,6 +44,7 @@ recording split into directories has a meta file in each; behind the list of fil
 name of the next one, ``../<directory>/xethru_recording_meta.dat``.
 """
 
+import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -586,3 +587,8 @@ def _name_at(data: bytes, position: int) -> tuple[str, int]:
     except (struct.error, UnicodeDecodeError):
         return "", position
     return (name, end) if end <= len(data) and "\0" not in name else ("", position)
+
+
+def id_in_names(session_id: str) -> str:
+    """Return a session id as names of directories have it."""
+    return re.sub(r"[^\w.+-]", "_", session_id)

@@ -60,6 +60,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     Entry,
     Meta,
     TextKind,
+    id_in_names,
     kind_of_file,
     parse_meta,
 )
@@ -73,6 +74,7 @@ _LONGEST_USER_HEADER = 4096  # bytes; searched where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16
 _LAST_CONTENT_ID = 14  # Protocol reference 6.1
 _FURTHEST = 1 << 48  # byte of a recording; sums of such numbers stay within 64 bits
+_NUMBERED_DIRECTORY = re.compile(r"xethru_recording_[0-9]{8}_[0-9]{6}_(.+)_[0-9]+")
 _MOST_NAMED = 4
 _MOST_LOOKED_AT = 100  # files of a directory
 _DIRECTORY_PREFIX = "xethru_recording_"
@@ -265,13 +267,24 @@ def _split_directories(path: Path) -> list[_RecordingDirectory]:
         inner = sorted(child.glob(f"{_DIRECTORY_PREFIX}*/"), key=_by_number)
         parts += [part] if part.files else map(_part, inner)
     parts = [part for part in parts if part.files]
+    known = {part.meta.session_id for part in parts if part.meta}
+    ids = {id_in_names(one.decode(errors="replace")): one for one in known}
     # Without a session id, two directories cannot be assigned to one radar.
-    sessions = {(part.meta.session_id if part.meta else b"") or part.directory for part in parts}
+    sessions = {
+        (part.meta.session_id if part.meta else ids.get(_id_in_name(part))) or part.directory
+        for part in parts
+    }
     if len(sessions) > 1:
         raise RecordingError(
             f"{path} holds {len(parts)} recordings of {len(sessions)} sessions; name one of them"
         )
     return parts
+
+
+def _id_in_name(part: _RecordingDirectory) -> str:
+    """Return the session id as the name of one of several directories has it, else the name."""
+    found = _NUMBERED_DIRECTORY.fullmatch(part.directory.name)
+    return part.directory.name if found is None else found[1]
 
 
 def _by_number(path: Path) -> list[str | int]:

@@ -34,6 +34,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     Entry,
     Meta,
     closing_order,
+    id_in_names,
 )
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.table import Response
@@ -436,8 +437,7 @@ def session_directory(
     'recordings/xethru_recording_19700101_000000_my_session_1'
     """
     stamp = _local_time(t_ns // MS_NS, timezone)
-    safe_id = re.sub(r"[^\w.+-]", "_", session_id)
-    return Path(folder) / f"xethru_recording_{stamp:%Y%m%d_%H%M%S}_{safe_id}"
+    return Path(folder) / f"xethru_recording_{stamp:%Y%m%d_%H%M%S}_{id_in_names(session_id)}"
 
 
 def _local_time(time_ms: int, zone: tzinfo | None) -> datetime:

@@ -12,12 +12,14 @@ from hil_tests.paths import real_recording, shared_data
 from hil_tests.unit.xethru_protocol.recordings.messages import META, MS, RECORDINGS, frame, presence
 from xethru_protocol.recordings import (
     RecordingError,
+    RecordingFault,
     RecordingWriter,
     Split,
     describe_recording,
     read_recording,
     recording_facts,
 )
+from xethru_protocol.recordings.vendor.writer import session_directory
 from xethru_protocol.wire import messages as m
 
 
@@ -214,6 +216,34 @@ def test_a_recording_split_by_directory_is_read_as_one(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "xethru_recording_2_other", session_id="other") as writer:
         writer.write(frame(2), 0)
     with pytest.raises(RecordingError, match="holds 3 recordings of 2 sessions"):
+        list(read_recording(tmp_path))
+
+
+@pytest.mark.parametrize("n_lost", [0, 1, 2])
+def test_a_directory_whose_meta_file_is_lost_is_known_by_its_name(
+    n_lost: int, tmp_path: Path
+) -> None:
+    split = Split(records=1)
+    with RecordingWriter(tmp_path, session_id="a b", split_directories=split) as writer:
+        for counter in range(3):
+            writer.write(frame(counter), 1000 * counter * MS)
+    folders = sorted(tmp_path.iterdir())
+    for folder in folders[:n_lost]:
+        (folder / META).unlink()
+    faults: list[RecordingFault] = []
+    found = [message for message, _ in read_recording(tmp_path, faults.append)]
+    assert found == [frame(0), frame(1), frame(2)]
+    assert len(faults) == n_lost
+
+
+def test_sessions_whose_names_differ_in_a_number_are_not_joined(tmp_path: Path) -> None:
+    for name in ("lab_1", "lab_2"):
+        folder = session_directory(tmp_path, name, 0, UTC)
+        with RecordingWriter(folder, session_id=name) as writer:
+            writer.write(frame(1), 0)
+        if name == "lab_1":
+            (folder / META).unlink()
+    with pytest.raises(RecordingError, match="of 2 sessions"):
         list(read_recording(tmp_path))
 
 
