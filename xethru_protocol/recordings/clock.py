@@ -1,7 +1,8 @@
-"""Times of a recording that never fall, whatever the recorder's clock did.
+"""Times of a recording that do not fall, whatever the recorder's clock did.
 
 Clocks of recorders restart, are set back and are stored in damaged bytes, while the frame counter
-goes on. A time that falls is put right, and reported:
+goes on. A time that falls is put right, and reported, unless it is only that of another kind of
+message, which was stored less than a second too late:
 
 * one time that lies outside of its neighbours' is taken from between them, by the counter;
 * else the clock was set back. What passed meanwhile is the counter's step times the usual time of
@@ -32,6 +33,7 @@ from xethru_protocol.wire.table import Response
 Item = TypeVar("Item")
 _REMEMBERED = 64  # times that show how long a step of the counter lasts
 _COUNTERS = 2**32
+_LATE_NS = 1_000_000_000
 _MOST_NS = 2**63 - 1
 
 
@@ -57,6 +59,7 @@ class _Clock(Generic[Item]):
     def right(self, rows: Iterable[tuple[Item, int | None]]) -> Iterator[tuple[Item, int | None]]:
         """Yield the rows; an error of theirs comes behind what they gave before it."""
         held: list[_Row[Item]] = []  # what the next time may put right: if two, the second fell
+        newest_ns: dict[type, int] = {}  # of each kind of item
         numbered = enumerate(rows, start=1)
         while True:
             try:
@@ -78,6 +81,11 @@ class _Clock(Generic[Item]):
                 yield from self._released(held[:1])
                 del held[0]
             last = held[-1] if held else self._recent[-1] if self._recent else row
+            own_ns = newest_ns.get(type(item), row.t_ns)
+            newest_ns[type(item)] = row.t_ns
+            if own_ns <= row.t_ns < last.t_ns < row.t_ns + _LATE_NS:
+                yield item, row.t_ns
+                continue
             if row.t_ns >= last.t_ns:
                 yield from self._released(held)
                 held = [row]

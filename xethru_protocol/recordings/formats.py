@@ -122,9 +122,9 @@ def read_recording(
 ) -> TimedMessages:
     """Yield the messages of a recording with their times [ns since 1970], None where unknown.
 
-    Times of vendor directories have a resolution of 1 ms. Times do not fall: where the recorder's
-    clock was set back, the frame counter tells how much later they are. RecordingError if there is
-    nothing to read, or messages are lost and ``on_fault`` is None.
+    Times of vendor directories have a resolution of 1 ms. Those of one kind of message do not
+    fall: where the recorder's clock was set back, the frame counter tells how much later they are.
+    RecordingError if there is nothing to read, or messages are lost and ``on_fault`` is None.
 
     Parameters
     ----------

@@ -196,3 +196,22 @@ def test_an_error_comes_behind_all_messages_before_it() -> None:
     assert list(itertools.islice(read, len(timed))) == timed
     with pytest.raises(RecordingError):
         next(iter(read))
+
+
+@pytest.mark.parametrize("late_ms", [50, 250])
+def test_a_message_that_was_stored_late_keeps_its_time_and_moves_no_other(
+    late_ms: int, tmp_path: Path
+) -> None:
+    rows: list[tuple[m.Response, int | None]] = []
+    for counter in range(12):
+        rows.append((frame(counter, 3), (START_MS + counter * PERIOD_MS) * MS))
+        if counter % 4 == 3:
+            late = m.DataString(text=str(counter))
+            rows.append((late, (START_MS + counter * PERIOD_MS - late_ms) * MS))
+    write_mcap(tmp_path / "x.mcap", iter(rows), RecordingFacts())
+    found, faults = read_with_faults(tmp_path / "x.mcap")
+    assert faults == []
+    for kind in (m.DataFloat, m.DataString):
+        assert [row for row in found if isinstance(row[0], kind)] == [
+            row for row in rows if isinstance(row[0], kind)
+        ]
