@@ -126,8 +126,8 @@ class Ros2Domain:
 
     def writer(
         self, name: str, message_type: str, *, latched: bool = False
-    ) -> Callable[[bytes], bool]:
-        """Return what publishes messages in CDR on a topic, and returns whether there was room.
+    ) -> Callable[[bytes], None]:
+        """Return what publishes messages in CDR on a topic; AppError if a subscriber blocks it.
 
         It is reliable; of a latched topic who comes later gets the last message.
         """
@@ -141,12 +141,9 @@ class Ros2Domain:
         with _naming(f"cannot publish {name}"):
             writer = pub.DataWriter(self._participant, self._topic(name, kind), qos=qos)
 
-        def write(data: bytes) -> bool:
-            try:
+        def write(data: bytes) -> None:
+            with _naming(f"cannot publish {name}; is a subscriber too slow?"):
                 writer.write(kind.deserialize(data))
-            except DDSException as error:
-                return bool(error.code != DDSException.DDS_RETCODE_TIMEOUT)
-            return True
 
         return write
 

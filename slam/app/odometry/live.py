@@ -331,8 +331,8 @@ def parse_source(text: str) -> LineSource:
 
 def _topic_source(text: str) -> LineSource:
     topic, *frames = text.split(":")
-    is_pair = len(frames) in (0, 2) and all(re.fullmatch(r"[\w/]+", frame) for frame in frames)
-    if not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", topic) or not is_pair:
+    is_pair = len(frames) in (0, 2) and all(re.fullmatch(r"[\w/.-]+", frame) for frame in frames)
+    if not re.fullmatch(r"(?a)/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", topic) or not is_pair:
         raise UsageError(
             f"odometry ros2:{text}: must be ros2:TOPIC, or ros2:TOPIC:PARENT:CHILD where the "
             "frames are not odom and base_link or base_footprint"

@@ -1,21 +1,8 @@
 """The sink that publishes a run in ROS 2, without an installation of it.
 
-NAMESPACE is the namespace of a node `uwb_slam`. Its topics, where not stated otherwise every state
-and volatile:
-
-`/NAMESPACE/tf` (`/tf` without one): tf2_msgs/TFMessage
-    `map` -> `odom`, for every scan, so that it stays known while the robot stands. `odom` ->
-    `base_link` is the robot's own, see REP 105.
-`uwb_slam/odometry`: nav_msgs/Odometry, `uwb_slam/pose`: geometry_msgs/PoseWithCovarianceStamped
-    The causal pose of `base_link` in `map` with covariances, and the velocity by the wheels.
-`uwb_slam/path`, `uwb_slam/smoothed_path`: nav_msgs/Path
-    The causal path every two seconds; the smoothed one whenever there is one. Latched.
-`uwb_slam/landmarks`: visualization_msgs/MarkerArray
-    Landmarks, their 95 % ellipses, 10 times as large, and walls, every two seconds. Latched.
-`uwb_slam/frames/RADAR`: std_msgs/Float32MultiArray
-    The samples of every frame, if `,frames` is asked for.
-
-Stamps are the odometry's where it counts from 1970; else the time of day by this machine.
+It is a node `uwb_slam` in a namespace; docs/robot.md has its topics, frames and QoS. `odom` to
+`base_link` is the robot's own (REP 105), so tf has `map` to `odom` only. Stamps are the odometry's
+where that counts from 1970; else the time of day by this machine.
 """
 
 from __future__ import annotations
@@ -30,10 +17,9 @@ from slam.app.odometry.dds import Ros2Domain, domain_number
 from slam.app.publish.sinks import Sink
 from slam.app.session.viewer_topics import GrowingPath, WheelMotion, landmark_markers
 from slam.geometry import between, compose
-from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session import cdr
-from slam.live.session_records import Scan, SessionInfo, Snapshot
+from slam.live.session_records import RadarInfo, Scan, SessionInfo, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, pack_array
 
@@ -52,19 +38,18 @@ class Ros2Sink(Sink):
     def __init__(self, text: str) -> None:
         namespace, comma, option = text.partition(",")
         words = namespace.strip("/")
-        is_name = not words or re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", words)
+        is_name = not words or re.fullmatch(r"(?a)[A-Za-z_]\w*(/[A-Za-z_]\w*)*", words)
         if not is_name or (comma and option != "frames"):
             raise UsageError("must be ros2[:[NAMESPACE][,frames]], as ros2:robot1 or ros2:,frames")
         self._namespace = f"/{words}" if words else ""
         self._has_frames = bool(comma)
         domain_number()
-        self._writers: dict[str, Callable[[bytes], bool]] = {}
+        self._writers: dict[str, Callable[[bytes], None]] = {}
         self._path = GrowingPath("map")
         self._last: Snapshot | None = None
         self._drawn_ns: int | None = None
         self._offset_ns: int | None = None
         self._newest_ns = self._tf_ns = 0  # of scans, of the newest transform: time of ROS
-        self._has_room = True
 
     def open(self) -> None:
         """Enter the domain; others see the topics from now on."""
@@ -78,17 +63,15 @@ class Ros2Sink(Sink):
     def begin(self, info: SessionInfo, start_ns: int, map_id: str) -> None:
         self._info, self._wheels = info, WheelMotion(info.wheels)
         for radar in info.radars if self._has_frames else ():
-            name = f"frames/{radar.name}"
-            self._add(name, self._private(name), FLOAT_ARRAY)
+            self._add(radar_topic(radar), self._private(radar_topic(radar)), FLOAT_ARRAY)
 
     def on_scan(self, scan: Scan) -> None:
         if self._newest_ns > self._tf_ns:  # the scan before led to no state: the robot stands
             self._write_transform(self._newest_ns)
         self._newest_ns = self._ros_ns(scan.t_ns)
         for frame in scan.frames if self._has_frames else ():
-            name = self._info.radars[frame.radar].name
-            self._write(f"frames/{name}", pack_array(FLOAT_ARRAY, frame.samples))
-        self._report_room()
+            name = radar_topic(self._info.radars[frame.radar])
+            self._write(name, pack_array(FLOAT_ARRAY, frame.samples))
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         last, self._last = self._last, snapshot
@@ -105,14 +88,12 @@ class Ros2Sink(Sink):
         self._path.add(t_ns, snapshot.estimate)
         if self._drawn_ns is None or not 0 <= t_ns - self._drawn_ns < _EVERY_NS:
             self._draw()
-        self._report_room()
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         path = GrowingPath("map")
         for t_ns, pose in zip(smoothed.t_ns.tolist(), smoothed.poses, strict=True):
             path.add(self._ros_ns(t_ns), pose)
         self._write_path("smoothed_path", path)
-        self._report_room()
 
     def close(self) -> None:
         """Publish the map and the path once more, and leave the domain."""
@@ -152,10 +133,9 @@ class Ros2Sink(Sink):
         self._writers[name] = self._domain.writer(topic, message_type, latched=latched)
 
     def _write(self, name: str, data: bytes) -> None:
-        self._has_room &= self._writers[name](data)
+        self._writers[name](data)
 
-    def _report_room(self) -> None:
-        """Raise AppError if messages of the event were dropped."""
-        if not self._has_room:
-            self._has_room = True
-            raise AppError("a subscriber takes messages too slowly; some are dropped")
+
+def radar_topic(radar: RadarInfo) -> str:
+    """Return the topic of a radar's frames in letters, digits and underscores, as ROS has them."""
+    return f"frames/radar_{re.sub('[^A-Za-z0-9]', '_', radar.name)}"

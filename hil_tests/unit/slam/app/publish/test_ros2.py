@@ -117,6 +117,20 @@ def test_the_transform_is_repeated_while_the_robot_stands_and_no_stamp_comes_twi
     sink.close()
 
 
+def test_stamps_of_transforms_rise_when_session_time_falls(space: str) -> None:
+    """As where a clock was set while a session was recorded that is replayed."""
+    sink = sink_in(space)
+    transforms = Subscriber(f"/{space}/tf", TFMessage)
+    transforms.wait_for_publisher()
+    for counter in (50, 51, 3, 4, 5, 53):
+        sink.on_scan(scan(counter))
+        sink.on_snapshot(snapshot(counter))
+    stamps = [t_ns_of(one.transforms[0].header) for one in transforms.take(6)]
+    assert stamps == sorted(set(stamps))
+    assert (stamps[0], stamps[-1]) == (50 * FRAME_NS, 53 * FRAME_NS)
+    sink.close()
+
+
 def test_who_comes_later_gets_paths_and_map(space: str) -> None:
     sink = sink_in(space)
     for counter in range(30):
@@ -142,8 +156,10 @@ def test_who_comes_later_gets_paths_and_map(space: str) -> None:
 
 
 def test_with_frames_their_samples_are_published(space: str) -> None:
-    sink = sink_in(space, option=",frames")
-    topic = f"/{space}/uwb_slam/frames/radar1"
+    info = session_info()
+    names = (replace(info.radars[0], name="right"), replace(info.radars[1], name="left 2"))
+    sink = sink_in(space, replace(info, radars=names), ",frames")
+    topic = f"/{space}/uwb_slam/frames/radar_left_2"
     frames = Subscriber(topic, idl_type(FLOAT_ARRAY))
     frames.wait_for_publisher()
     sink.on_scan(scan(4))
@@ -309,7 +325,7 @@ def test_ros_from_iron_on_finds_the_hash_of_a_type(space: str) -> None:
     sink.close()
 
 
-@pytest.mark.parametrize("text", ["9", "a b", "a//b", "a,b", ",", "a:b"])
+@pytest.mark.parametrize("text", ["9", "a b", "a//b", "a,b", ",", "a:b", "\u00e4"])
 def test_what_is_no_namespace_is_wrong_usage(text: str) -> None:
     with pytest.raises(UsageError):
         Ros2Sink(text)
