@@ -266,8 +266,8 @@ class Slam:
     def smoothed(self) -> SmoothedRun | None:
         """Return the solution over all states until now, map frame; None if there is none.
 
-        It takes up to a second after an hour; later steps return the same as without it. Preset
-        ``paper`` has none.
+        It is solved for at every call; later steps return the same as without it. Preset ``paper``
+        has none.
         """
         with self._threads.limit(limits=1):
             run = self._pipeline.smoothed()

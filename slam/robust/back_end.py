@@ -316,9 +316,9 @@ class RobustBackEnd:
             likelihoods, predicted = [*likelihoods, *evidence], [*predicted, *more]
         dof = len(continued)
         for scan in with_bearings:
-            points, nis_of_points, evidence = self._take_points(scan, added_m)
+            points, nis_of_points, evidence, more = self._take_points(scan, added_m)
             continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
-            likelihoods = [*likelihoods, *evidence]
+            likelihoods, predicted = [*likelihoods, *evidence], [*predicted, *more]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         of_tracklets = self._initialise_landmarks()
         self._delete_vanished(solve=solve)
@@ -525,11 +525,14 @@ class RobustBackEnd:
 
     def _take_points(
         self, scan: RangeScan, added_m: float
-    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
+    ) -> tuple[
+        tuple[tuple[int, int, int], ...], float, list[tuple[int, float]], list[PredictedRange]
+    ]:
         """Correct the state with a scan with bearings; log it; make landmarks of what is new.
 
-        Returns what `_correct` does. What is certain corrects the pose first, and is followed by
-        what is certain then. A labelled detection that is too far off is logged all the same.
+        Returns what `_correct` does, and what was predicted. What is certain corrects the pose
+        first, and is followed by what is certain then. A labelled detection that is too far off is
+        logged all the same.
         """
         assert scan.bearings_rad is not None
         state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
@@ -547,6 +550,7 @@ class RobustBackEnd:
         miss = math.log(1.0 - noise.detection_probability)
         evidence: list[tuple[int, float]] = []
         pairs: list[tuple[int, int]] = []
+        predicted: list[PredictedRange] = []
         nis = 0.0
         while True:
             seen = view(state, antennas)
@@ -558,8 +562,11 @@ class RobustBackEnd:
             for (_, row), nats in zip(found.pairs, found.evidence, strict=True):
                 if self._log.is_new_passage(ids[row]):
                     self.evidence += nats
-            nis_of_pairs, likelihoods = self._correct_points(scan, seen, found.pairs, antennas)
+            nis_of_pairs, likelihoods, of_pairs = self._correct_points(
+                scan, seen, found.pairs, antennas
+            )
             nis, evidence = nis + nis_of_pairs, evidence + likelihoods
+            predicted += of_pairs
             used = {index for index, _ in found.pairs}
             free = [index for index in free if index not in used]
         continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
@@ -588,7 +595,7 @@ class RobustBackEnd:
         self._antennas, self._settled = antennas, hit_ids | missed
         if detections:
             self._place_points()
-        return continued, nis, evidence
+        return continued, nis, evidence, predicted
 
     def _correct_points(
         self,
@@ -596,12 +603,16 @@ class RobustBackEnd:
         seen: View,
         pairs: Sequence[tuple[int, int]],
         antennas: Antennas,
-    ) -> tuple[float, list[tuple[int, float]]]:
+    ) -> tuple[float, list[tuple[int, float]], list[PredictedRange]]:
         """Correct the state with detections of landmarks, index and row each; log them."""
         assert scan.bearings_rad is not None
         state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
         indices, rows = [index for index, _ in pairs], [row for _, row in pairs]
         view_of = point_view(state, seen, scan.radar, np.array(rows, dtype=np.intp))
+        H = view_of.H[:, 0]
+        of_ranges = np.sum((H @ state.P.block(view_of.at)) * H, axis=1).tolist()
+        which = [(scan.radar, row, value) for row, value in zip(rows, of_ranges, strict=True)]
+        predicted = ranges_predicted(state, seen, antennas, which)
         measured = [(scan.ranges_m[index], scan.bearings_rad[index]) for index in indices]
         innovations = np.array(measured) - view_of.predicted
         innovations[:, 1] = wrap_angles(innovations[:, 1])
@@ -627,7 +638,7 @@ class RobustBackEnd:
         ):
             self._log_detections(ids[row], [detection])
         state.apply(gain, weighted)
-        return float(white @ white), likelihoods
+        return float(white @ white), likelihoods, predicted
 
     def _log_detections(self, landmark_id: int, seen: Sequence[PointDetection]) -> None:
         for one in seen:

@@ -306,6 +306,33 @@ def test_points_are_landmarks_at_once() -> None:
         assert found[id_] == pytest.approx(at, abs=0.06)
 
 
+@pytest.mark.parametrize("has_bearings", [False, True])
+def test_after_a_stop_what_has_ids_makes_the_pose_sure_again(has_bearings: bool) -> None:
+    """While the wheels stand the robot may be carried; what it hears then shows that it was not."""
+    config = override(
+        load_preset("robust"), {"detection.max_range_m": 8.0, "robust.field_of_view_deg": 170}
+    )
+    slam = Slam(Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0)]), config)
+    step, pose, sigmas = np.array([0.08, 0.0, 0.08 / 1.5]), np.zeros(3), list[float]()
+    for number in range(330):
+        ranges, points = [], []
+        for id_, at in ANCHORS.items():
+            ranges.append((0, math.dist(at, pose[:2]), 0.02, id_))
+            away = between(pose, np.array([*at, 0.0]))
+            points.append((0, ranges[-1][1], math.atan2(away[1], away[0]), 0.02, 0.02, id_))
+        if has_bearings:
+            state = slam.step(number * TICK_NS, pose, points=points)
+        else:
+            state = slam.step(number * TICK_NS, pose, ranges=ranges)
+        sigmas.append(math.sqrt(state.covariance[0, 0]))
+        if not 100 <= number < 115:
+            pose = compose(pose, step)
+    assert not state.is_lost
+    assert sigmas[99] < 0.1
+    assert max(sigmas[115:125]) > 0.3
+    assert sigmas[-1] < 0.1
+
+
 def test_a_rig_takes_a_list_and_names_its_mounts() -> None:
     assert [mount.name for mount in RIG.mounts] == ["radar0", "radar1"]
     with pytest.raises(ValueError, match="finite"):
