@@ -126,6 +126,10 @@ class Slam:
         ``paper`` has numbers of its own.
     start
         Where the map has the first pose: x [m], y [m], heading [rad].
+    odometry_noise
+        Returns the covariance (3, 3) of the noise that odometry has gathered until a time [ns], in
+        the order and frame of its poses; preset ``robust`` takes its growth in place of the white
+        noise of ``wheels``.
     front_end
         Finds ranges in frames, in place of the preset's; see `Detector`.
 
@@ -142,6 +146,7 @@ class Slam:
         *,
         wheels: WheelNoise | None = None,
         start: ArrayLike = (0.0, 0.0, 0.0),
+        odometry_noise: NoiseAt | None = None,
         front_end: Detector | None = None,
     ) -> None:
         if isinstance(rig, RigFile):
@@ -153,7 +158,9 @@ class Slam:
         self.config = load_preset(preset) if isinstance(preset, str) else preset
         self._wheels = wheels or WheelNoise()
         self._start = _pose(start, "start")
-        self._pipeline = make_slam(self.config, rig, self._wheels, front_end)
+        self._noise_at, self._noise = odometry_noise, np.zeros((3, 3))
+        noise_at = None if odometry_noise is None else lambda _: self._noise
+        self._pipeline = make_slam(self.config, rig, self._wheels, front_end, noise_at=noise_at)
         self._threads = ThreadpoolController()
         self._odometry = PoseTrack()
         self._newest: dict[int, tuple[int, int]] = {}  # stream and counter, by radar
@@ -228,6 +235,10 @@ class Slam:
         poses = {stamp: _pose(pose_at(stamp), f"odometry at {stamp} ns") for stamp in stamps_ns}
         if not len(track) or t_ns > track.last_ns:
             track.add(t_ns, poses[t_ns].tolist())
+        if self._noise_at is not None:
+            self._noise = np.array(self._noise_at(t_ns), dtype=np.float64)
+            if self._noise.shape != (3, 3) or not np.isfinite(self._noise).all():
+                raise StepInputError(f"odometry_noise at {t_ns} ns is no finite matrix (3, 3)")
         with self._threads.limit(limits=1):  # the same bits on every machine
             results = self._stepped(taken, scans, poses.__getitem__, t_ns)
         track.forget_before(t_ns - _KEPT_NS)

@@ -39,7 +39,7 @@ from slam.live.session.description import (
 from slam.live.session.lost_messages import read_gap
 from slam.live.session.state_rows import smoothed_of, snapshot_of, with_step
 from slam.live.session_records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
-from slam.results import SmoothedRun
+from slam.results import NoiseAt, SmoothedRun
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.formats import recording_format
@@ -318,7 +318,7 @@ class RecordedSession:
     def config(self) -> SlamConfig:
         """Return the settings that SLAM had; AppError if they cannot be read.
 
-        `Slam` with these, `rig` and `wheels` makes the recorded states again.
+        `Slam` with these, `rig`, `wheels` and `odometry_noise` makes the recorded states again.
         """
         self._need(self.info.config_json)
         try:
@@ -440,6 +440,11 @@ class RecordedSession:
                 with _naming(self.path, entry):
                     data = unpack_array(BYTE_ARRAY, entry.data).tobytes()
                 yield self.info.radars[radar].name, part, data, entry.publish_ns
+
+    @property
+    def odometry_noise(self) -> NoiseAt | None:
+        """Return the noise of odometry by time, where SLAM took it from its covariances."""
+        return self.odometry().noise_at if self.info.odometry_covariance else None
 
     def odometry(self) -> OdometryTrack:
         samples = [record for record in self.records() if isinstance(record, TumSample)]

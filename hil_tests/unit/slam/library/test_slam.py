@@ -306,6 +306,22 @@ def test_points_are_landmarks_at_once() -> None:
         assert found[id_] == pytest.approx(at, abs=0.06)
 
 
+def test_the_noise_of_odometry_is_what_it_says() -> None:
+    """Before any landmark the pose is as uncertain as odometry since the start."""
+    still = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
+    per_step = np.diag([4e-6, 9e-6, 1e-6])
+    slam = Slam(RIG, wheels=still, odometry_noise=lambda t_ns: per_step * (t_ns / TICK_NS))
+    for number in range(4):
+        state = slam.step(number * TICK_NS, drive(number * TICK_NS))
+    assert state.covariance[0, 0] == pytest.approx(3 * 4e-6, rel=0.01)
+    assert state.covariance[2, 2] == pytest.approx(3 * 1e-6, rel=0.01)
+    for noise in (np.zeros(3), np.full((3, 3), math.nan)):
+        wrong = Slam(RIG, odometry_noise=lambda _, noise=noise: noise)  # type: ignore[misc]
+        with pytest.raises(StepInputError):
+            wrong.step(0, P)
+        assert wrong.state.t_ns is None
+
+
 @pytest.mark.parametrize("has_bearings", [False, True])
 def test_after_a_stop_what_has_ids_makes_the_pose_sure_again(has_bearings: bool) -> None:
     """While the wheels stand the robot may be carried; what it hears then shows that it was not."""

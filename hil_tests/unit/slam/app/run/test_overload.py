@@ -21,6 +21,7 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
     drive_through,
 )
 from hil_tests.unit.slam.app.sessions import Listener
+from slam import Slam
 from slam.app.odometry.live import LiveOdometry
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.run.live_source import LiveLog, LiveSource
@@ -321,3 +322,8 @@ def test_the_covariance_of_odometry_is_used_and_replayed_bit_for_bit(
     execute(recorded_source(session, StopFlag(), comparison), [comparison])
     n_states = len(run.record.states)
     assert f"all {n_states} recorded states came again" in comparison.verdict()
+    noise = session.odometry_noise
+    slam = Slam(session.rig, session.config, wheels=session.wheels, odometry_noise=noise)
+    states = [slam.step(scan.t_ns, scan.odometry, frames=scan) for scan in session]
+    poses = [result.belief.pose for state in states for result in state.results]
+    assert np.array_equal(poses, run.record.states.estimate)
