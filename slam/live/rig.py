@@ -26,14 +26,11 @@ from slam.live.frame_sources import (
 from slam.live.modules import open_modules, open_ports
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import RadarInfo, Scan
-from slam.live.ticks import Inbox, SourceEvent, TickAssembler, reading
+from slam.live.ticks import SETTLE_S, SILENT_RIG_S, Inbox, SourceEvent, TickAssembler, reading
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.operating_system import StopFlag
 
-SETTLE_S = 2.0
-"""How long frames are read before the first scan, so that clocks are known."""
-SILENT_RIG_S = 10.0
 _POLL_S = 0.05
 _MOST_TICKS = 2**62
 _LOG = logging.getLogger("slam.live")

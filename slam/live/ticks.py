@@ -84,6 +84,10 @@ class Inbox(Queue[SourceEvent]):
 Reader: TypeAlias = Callable[[Inbox, threading.Event], None]
 """Puts what it reads into the inbox until the event is set."""
 
+SETTLE_S = 2.0
+"""How long frames are read before the first scan, so that clocks are known."""
+SILENT_RIG_S = 10.0
+"""Without any radar for so long, a run ends."""
 SILENCE_S = 3.0
 """Many frame periods; a module that sends nothing for so long has stopped streaming."""
 _POLL_S = 0.2

@@ -26,7 +26,16 @@ from slam.live.errors import AppError
 from slam.live.frame_sources import radar_frame
 from slam.live.odometry_track import NS_PER_S, TumSample
 from slam.live.session_records import LogLine, RadarInfo, Scan, Snapshot
-from slam.live.ticks import GRACE_NS, MOST_EVENTS, MOST_WAIT_NS, Inbox, SourceEvent, TickAssembler
+from slam.live.ticks import (
+    GRACE_NS,
+    MOST_EVENTS,
+    MOST_WAIT_NS,
+    SETTLE_S,
+    SILENT_RIG_S,
+    Inbox,
+    SourceEvent,
+    TickAssembler,
+)
 from slam.results import SmoothedRun
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
@@ -47,10 +56,7 @@ def read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) ->
     inbox.hand_over(("odometry end", trouble), stopped)
 
 
-SETTLE_S = 2.0
-"""How long frames and odometry are read before the first scan, so that clocks are known."""
 START_LIMIT_S = 15.0
-SILENT_RIG_S = 10.0
 UNUSED_S = 5.0
 END_NS = GRACE_NS
 """How long SLAM gets the last scans of a run whose duration or odometry is over."""
