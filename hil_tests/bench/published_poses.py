@@ -1,12 +1,13 @@
 """How late poses are at the sinks of `uwb-slam run --publish`, and what each sink costs.
 
 `python -m hil_tests.bench.published_poses` serves scenes in real time through pseudo-terminals,
-maps them with `uwb-slam run`, and receives what it publishes by UDP, standard output and Foxglove's
-WebSocket, all in one run. A row of its table is a scene, a rate of frames and a sink: the time from
-the arrival of a scan's last frame to its pose at the receiver; and the same from the arrival of the
-last thing that the scan waited for, which may be a line of odometry: poses are interpolated.
-Odometry is sent 50 times a second. Then come the processor share of the sink's threads, those of
-Foxglove's library, too; that of the whole process; and the load of the machine over one minute.
+maps them with `uwb-slam run`, and receives what it publishes by UDP, standard output, Foxglove's
+WebSocket and ROS 2, all in one run, on loopback. A row of its table is a scene, a rate of frames
+and a sink: the time from the arrival of a scan's last frame to its pose at the receiver; and the
+same from the arrival of the last thing that the scan waited for, which may be a line of odometry,
+as poses are interpolated. Odometry is sent 50 times a second. Then come the processor share of the
+sink's threads, those of its library, too; that of the whole process; and the load of the machine
+over one minute.
 """
 
 from __future__ import annotations
@@ -31,17 +32,20 @@ import numpy as np
 
 from emulator import running
 from hil_tests.paths import FIXTURES
+from hil_tests.unit.slam.app.ros2_robot import LOOPBACK
 from slam.app.cli import main as uwb_slam
 from slam.app.odometry.live import LiveOdometry
 from slam.live.odometry_track import TumSample
-from slam.live.session.reader import open_session
+from slam.live.session import cdr
+from slam.live.session.reader import RecordedSession, open_session
 
 ODOMETRY_HZ = 50.0
 NS_PER_S = 1_000_000_000
 SETTLED_NS = 5 * NS_PER_S
 """Session time at the beginning of a run that is not counted: kernels are loaded then."""
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-_LIBRARY_THREADS = "tokio"
+_LIBRARY_THREADS = {"tokio": "foxglove", "recv": "ros2", "tev": "ros2", "dq.": "ros2"}
+"""Beginnings of the names that libraries give to threads of their own."""
 
 Received = dict[int, int]
 """Time of day [ns] at which the pose of a session time [ns] came."""
@@ -91,6 +95,17 @@ async def receive_foxglove(port: int, received: Received) -> None:
                 received.setdefault(t_ns, now_ns)
 
 
+def receive_ros2(received: Received) -> None:
+    from slam.app.odometry.dds import Ros2Domain
+
+    take = Ros2Domain().reader("/uwb_slam/pose", cdr.POSE_WITH_COVARIANCE, reliable=True)
+    while True:
+        for message in take(1.0):
+            now_ns = time.time_ns()
+            seconds, rest_ns = struct.unpack("<iI", message[4:12])
+            received.setdefault(seconds * NS_PER_S + rest_ns, now_ns)
+
+
 def in_thread(function: Callable[..., object], *arguments: object) -> threading.Thread:
     thread = threading.Thread(target=function, args=arguments, daemon=True)
     thread.start()
@@ -120,13 +135,14 @@ def served(scene: str, folder: Path) -> Iterator[Mapping[str, Any]]:
 
 def measure(scene: str, fps: int, seconds: int) -> None:
     """Map a scene for some seconds, and print a row for each sink."""
-    received: dict[str, Received] = {"udp": {}, "jsonl": {}, "foxglove": {}}
+    received: dict[str, Received] = {"udp": {}, "jsonl": {}, "foxglove": {}, "ros2": {}}
     udp, web = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
     with tempfile.TemporaryDirectory() as name, served(scene, Path(name)) as ready:
         folder = Path(name)
         in_thread(receive_udp, udp, received["udp"])
         in_thread(lambda: asyncio.run(receive_foxglove(web, received["foxglove"])))
-        sinks = (f"udp://127.0.0.1:{udp}", "jsonl:-", f"foxglove:{web}")
+        in_thread(receive_ros2, received["ros2"])
+        sinks = (f"udp://127.0.0.1:{udp}", "jsonl:-", f"foxglove:{web}", "ros2")
         command = [sys.executable, "-m", "hil_tests.bench.published_poses", "--child", name]
         command += ["run", "--rig", scene, "--odometry", ready["odometry"], "--fps", str(fps)]
         command += ["--ports", *(device["path"] for device in ready["devices"])]
@@ -143,7 +159,11 @@ def measure(scene: str, fps: int, seconds: int) -> None:
                 note_line(line, received["jsonl"])
         assert run.returncode == 0, (folder / "err").read_text()
         notes = json.loads((folder / "notes.json").read_text())
-        needed = _inputs(folder / "out" / "session.mcap", notes["odometry"])
+        session = open_session(folder / "out" / "session.mcap")
+        needed = _inputs(session, notes["odometry"])
+        # stamps of ROS are the time of day
+        zero_ns = session.info.started_unix_ns or 0
+        received["ros2"] = {t_ns - zero_ns: came for t_ns, came in received["ros2"].items()}
     load = os.getloadavg()[0]
     for kind, poses in received.items():
         known = [(poses[t_ns], *needed[t_ns]) for t_ns in poses if t_ns in needed]
@@ -160,12 +180,14 @@ def _milliseconds(spans_ns: np.ndarray) -> str:
     return f"{p50:5.1f} {p99:6.1f} {most:6.1f}"
 
 
-def _inputs(session: Path, odometry: Sequence[tuple[int, int]]) -> dict[int, tuple[int, int]]:
+def _inputs(
+    session: RecordedSession, odometry: Sequence[tuple[int, int]]
+) -> dict[int, tuple[int, int]]:
     """Return when the last frame and the last input of each scan came, time of day [ns]."""
     stamps_ns, came_ns = np.array(odometry, dtype=np.int64).T
     needed: dict[int, tuple[int, int]] = {}
     start_ns = None
-    for record in open_session(session).scans():
+    for record in session.scans():
         scan = record.scan
         start_ns = scan.t_ns if start_ns is None else start_ns
         if not scan.used or not scan.host_ns or scan.t_ns - start_ns < SETTLED_NS:
@@ -190,38 +212,42 @@ def child(folder: Path, command: Sequence[str]) -> int:
         return sample, warning
 
     LiveOdometry.take = noted  # type: ignore[method-assign]
-    used_s: dict[str, dict[int, float]] = {}
-    began_s, ended_s = time.monotonic(), threading.Event()
+    windows: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    ended = threading.Event()
 
     def watch() -> None:
-        while not ended_s.wait(0.5):
-            for name, thread, seconds in _threads():
-                used_s.setdefault(name, {})[thread] = seconds
+        while not ended.wait(0.5):
+            now_s = time.monotonic()
+            for kind, thread, used_s in _threads():
+                windows.setdefault((kind, thread), []).append((now_s, used_s))
 
     in_thread(watch)
     code = uwb_slam(command)
-    ended_s.set()
-    lasted_s = time.monotonic() - began_s
-    share = {name: sum(threads.values()) / lasted_s for name, threads in used_s.items()}
-    share["process"] = time.process_time() / lasted_s
+    ended.set()
+    share: dict[str, float] = {}
+    for (kind, _), seen in windows.items():
+        (first_s, before_s), (last_s, after_s) = seen[0], seen[-1]
+        share[kind] = share.get(kind, 0.0) + (after_s - before_s) / max(last_s - first_s, 0.5)
     (folder / "notes.json").write_text(json.dumps({"odometry": odometry, "share": share}))
     return code
 
 
 def _threads() -> Iterator[tuple[str, int, float]]:
-    """Yield the kind of sink, the id and the processor time of threads that publish [s]."""
+    """Yield kind of sink, id and processor time [s] of threads that publish, and of the process."""
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
+    is_publishing = False
     for path in Path("/proc/self/task").iterdir():
         name, rest = (path / "stat").read_text().partition("(")[2].rsplit(")", 1)
         own = names.get(int(path.name), "")
+        kinds = [kind for begin, kind in _LIBRARY_THREADS.items() if name.startswith(begin)]
         if own.startswith("publish "):
-            kind = own.removeprefix("publish ").partition(":")[0]
-        elif name.startswith(_LIBRARY_THREADS):
-            kind = "foxglove"
-        else:
-            continue
-        user, system = rest.split()[11:13]
-        yield kind, int(path.name), (int(user) + int(system)) / _TICKS_PER_S
+            kinds = [own.removeprefix("publish ").partition(":")[0]]
+            is_publishing = True
+        if kinds:
+            user, system = rest.split()[11:13]
+            yield kinds[0], int(path.name), (int(user) + int(system)) / _TICKS_PER_S
+    if is_publishing:
+        yield "process", 0, time.process_time()
 
 
 COLUMNS = (
@@ -238,6 +264,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--child", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
+    os.environ |= {"ROS_DOMAIN_ID": "77", "CYCLONEDDS_URI": LOOPBACK}
     if arguments.child:
         return child(Path(arguments.child[0]), arguments.child[1:])
     say("  ".join(cell.ljust(width) for cell, width in zip(COLUMNS, WIDTHS, strict=True)))

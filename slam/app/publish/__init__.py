@@ -24,7 +24,7 @@ SINKS: Mapping[str, SinkKind] = {
     "udp": SinkKind("slam.app.publish.udp:UdpSink", "udp://HOST:PORT: the same as datagrams"),
     "foxglove": SinkKind(
         "slam.app.publish.foxglove:FoxgloveSink",
-        "foxglove or foxglove:PORT: a server for Foxglove and Lichtblick",
+        "foxglove or foxglove:[HOST:]PORT: a server for Foxglove and Lichtblick",
     ),
     "ros2": SinkKind(
         "slam.app.publish.ros2:Ros2Sink",
