@@ -98,6 +98,7 @@ PROMISES: dict[str, tuple[Promise, ...]] = {
     "slam": (
         *_SLAM,
         Promise("uwb-slam view demo --out view.rrd", "[view]", 2),
+        Promise("uwb-slam demo --scene {scene} --publish foxglove --out no", "[foxglove]", 2),
     ),
     "view": _VIEW,
     "all": (*_DRIVER, *_EMULATOR, *_VIEW, *_HIL),

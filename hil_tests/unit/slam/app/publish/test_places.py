@@ -4,6 +4,7 @@ import json
 import os
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -286,6 +287,18 @@ def test_a_wrong_spec_is_wrong_usage_before_anything_is_opened(
             capsys, *command, "--out", out, "--publish", f"jsonl:{tmp_path}/l", "--publish", spec
         )
         assert (code, printed) == (2, "")
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_the_extra_that_is_missing_is_named_before_anything_is_opened(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "slam.app.publish.foxglove", raising=False)
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    sinks = ("--publish", f"jsonl:{tmp_path}/lines", "--publish", "foxglove")
+    code, printed, err = run(capsys, "demo", "--out", tmp_path / "out", *sinks)
+    assert (code, printed) == (2, "")
+    assert "[foxglove]" in err
     assert [*tmp_path.iterdir()] == []
 
 
