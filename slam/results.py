@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 
 from slam.config import SlamConfig
 from slam.frames import Detection, RadarFrame, StepInputError
-from slam.geometry import Rig
+from slam.geometry import Mount, Rig
 
 Array = NDArray[np.float64]
 
 POSE_SIZE = 3
 LANDMARK_SIZE = 2
 _NIS_DOF = 2
+# Standard deviations of a start that is given, along each axis and of its heading: that of a robot
+# which somebody has set down by eye
+START_M, START_RAD = 0.1, 0.1
 
 PoseAt = Callable[[int], Array]
 """Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
@@ -226,6 +229,122 @@ class SmoothedRun:
     landmark_covariances_m2: Array
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SavedRadar:
+    """A radar that made a map; [m] and [rad], body frame."""
+
+    name: str
+    # As the rig has it
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    range_offset_m: float
+    # What the run found beyond that: how much longer its ranges are, and where its antenna is
+    offset_m: float
+    moved_m: tuple[float, float]
+
+    def is_of(self, mount: Mount) -> bool:
+        """Return whether a rig has this radar at this place, with this range zero."""
+        return all(getattr(self, key) == getattr(mount, key) for key in OF_MOUNT)
+
+
+OF_MOUNT = ("name", "x_m", "y_m", "yaw_rad", "range_offset_m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SavedLandmark:
+    """A landmark of a map, map frame."""
+
+    id: int
+    x_m: float
+    y_m: float
+    radius_m: float
+    added_sigma_m: float  # added in squares to the noise of its ranges
+    hits: int  # how many frames hit it
+    label: int | None = None  # id of a beacon, where its ranges have one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SavedWall:
+    """A wall of a map: n . x = d with n = [cos phi, sin phi] away from the robot."""
+
+    id: int
+    phi_rad: float
+    d_m: float
+    added_sigma_m: float
+    hits: int
+    cells: tuple[int, ...]  # which stretches along it gave echoes, in cells of `WallRule.cell_m`
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SavedMap:
+    """What a run knows of its surroundings, for another one.
+
+    The map frame is the body frame at the start of the first run that made it. Errors are additive.
+    Radars and landmarks are correlated, and so are landmarks with each other: the covariance is of
+    all of them together.
+    """
+
+    radars: tuple[SavedRadar, ...]
+    landmarks: tuple[SavedLandmark, ...]
+    walls: tuple[SavedWall, ...]
+    # Names of the q unknowns, such as "offset left_rear", "x 3" and "phi 7", and the lower triangle
+    # of their covariance: q rows of 1 to q numbers
+    unknowns: tuple[str, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    start: tuple[float, float, float]  # pose where the newest run that made it began, map frame
+    next_id: int  # ids of landmarks and walls are smaller
+
+    def full_covariance(self) -> Array:
+        """Return the covariance of all unknowns, shape (q, q)."""
+        q = len(self.unknowns)
+        lower = np.zeros((q, q))
+        lower[np.tril_indices(q)] = [value for row in self.covariance for value in row]
+        return np.asarray(lower + np.tril(lower, -1).T)
+
+    @property
+    def features(self) -> tuple[SavedLandmark | SavedWall, ...]:
+        """Return the landmarks, and behind them the walls."""
+        return (*self.landmarks, *self.walls)
+
+    @property
+    def landmarks_m(self) -> Array:
+        """Return the landmarks' places, shape (n, 2), map frame."""
+        return np.array([(one.x_m, one.y_m) for one in self.landmarks]).reshape(-1, 2)
+
+    def landmarks_covariance(self) -> Array:
+        """Return the covariance of the landmarks' places, shape (2 n, 2 n)."""
+        row = {name: place for place, name in enumerate(self.unknowns)}
+        at = [row[f"{axis} {one.id}"] for one in self.landmarks for axis in "xy"]
+        return self.full_covariance()[np.ix_(at, at)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartOnMap:
+    """A map that a run begins with, and how."""
+
+    map: SavedMap
+    # Where the robot is at first, [x m, y m, heading rad], map frame; None: anywhere
+    pose: tuple[float, float, float] | None = None
+    is_fixed: bool = False  # the map stays as it is: what is new in it serves the pose only
+
+    @property
+    def pose_and_sigmas(self) -> tuple[Array, Array] | None:
+        """Return the pose (3,) and its standard deviations (3,), if it is known."""
+        if self.pose is None:
+            return None
+        return np.array(self.pose), np.array([START_M, START_M, START_RAD])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapChanges:
+    """What a run found of the map that it was given; ids of landmarks."""
+
+    seen: tuple[int, ...]  # where they were
+    gone: tuple[int, ...]  # should have been seen, and were not
+    new: tuple[int, ...]  # are not on the map
+
+
 class InputCheck:
     """Checks what a pipeline is stepped with, before it changes anything; raises StepInputError."""
 
@@ -305,4 +424,12 @@ class Pipeline(Protocol):
 
         What later steps return stays the same, to the last bit.
         """
+        ...
+
+    def saved_map(self) -> SavedMap | None:
+        """Return what the pipeline knows of its surroundings; None if it cannot be used again."""
+        ...
+
+    def map_changes(self) -> MapChanges | None:
+        """Return what was found of the map that the pipeline was given; None if it was not."""
         ...

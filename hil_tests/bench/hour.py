@@ -18,6 +18,7 @@ from pathlib import Path
 from emulator.scene.scene import Scene
 from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import rig_of, scene_and_config, wheels_of
+from slam.app.run.maps import MapSaver
 from slam.app.run.result_files import finish
 from slam.app.run.runner import execute
 from slam.app.session.writer import SessionLog
@@ -103,7 +104,8 @@ def curve(
     if views:
         sinks.append(RerunView(folder / "session.rrd", source.info))
     record = execute(source, sinks)
-    finish(folder, source, record, StopFlag(), publishing=Publishing(()))
+    saver = MapSaver(None, slam, source.info)
+    finish(folder, source, record, StopFlag(), publishing=Publishing(()), map_saver=saver)
     return memory.resident_mb
 
 

@@ -43,7 +43,8 @@ _TYPICAL_SEED = 19
 _RUN_DESCRIPTION = """\
 Opens the modules that a rig file names by their serial numbers, follows the robot's odometry, and
 runs SLAM while frames arrive. Ends with the odometry, after --duration, or by Ctrl-C; writes
-session, map, trajectories and numbers. SIGUSR1: writes smoothed.tum, the path smoothed so far.
+session, map, trajectories and numbers. SIGUSR1: writes smoothed.tum, the path smoothed so far, and
+the map of --save-map.
 """
 
 _RUN_EPILOG = """
@@ -157,6 +158,7 @@ _seed, _count = partial(_whole_number, least=0), partial(_whole_number, least=1)
 
 
 _seconds = number(float, lambda value: 0.0 <= value < math.inf, "seconds, 0 or more")
+_coordinate = number(float, math.isfinite, "a number")
 _metres = number(float, lambda value: 0.0 < value < math.inf, "metres, more than 0")
 _rate = number(float, lambda value: 0.0 < value < math.inf, "more than 0")
 
@@ -226,6 +228,36 @@ def _add_publish(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_map_options(parser: argparse.ArgumentParser) -> None:
+    """Add the map that a run begins with, and the file for its own."""
+    parser.add_argument(
+        "--save-map",
+        type=_output(".json", what="a map"),
+        metavar="OUT.json",
+        help="write the map at the end, for later runs",
+    )
+    parser.add_argument(
+        "--map",
+        dest="map_path",
+        type=Path,
+        metavar="MAP.json",
+        help="begin with a map that --save-map has written, somewhere on it",
+    )
+    parser.add_argument(
+        "--start",
+        nargs=3,
+        type=_coordinate,
+        metavar=("X", "Y", "HEADING"),
+        help="where the robot is at first, to about 0.1 m and 6 degrees: metres and degrees on the "
+        "map (default: it finds out)",
+    )
+    parser.add_argument(
+        "--localise",
+        action="store_true",
+        help="leave the map as it is; what is new serves the pose only",
+    )
+
+
 def _rerun_target(text: str) -> str:
     if text in {SPAWN, SERVE_WEB}:
         return text
@@ -251,6 +283,7 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
         "--scene", default="lab", help="name of a scene or a random room (pillars:3), or a file"
     )
     _add_preset(demo)
+    _add_map_options(demo)
     _add_session_options(demo)
     _add_publish(demo)
 
@@ -340,6 +373,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         metavar="S",
         help="end after so many seconds",
     )
+    _add_map_options(run)
     _add_session_options(run)
     _add_publish(run)
 
@@ -354,6 +388,7 @@ def _add_replay(replay: argparse.ArgumentParser) -> None:
         help="so many times as fast as it was driven, 1 is real time (default: at full speed)",
     )
     _add_publish(replay)
+    _add_map_options(replay)
 
 
 def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
@@ -564,6 +599,22 @@ def _add_experiment(experiment: argparse.ArgumentParser) -> None:
         )
 
 
+def _add_map(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
+    for name, text, count, written in (
+        ("show", "print a map as a table, or draw it", 1, _output(".png", what="a picture")),
+        ("convert", "write a map as GeoJSON, in local metres", 1, Path),
+        ("join", "make one map of two", 2, _output(".json", what="a map")),
+    ):
+        action = actions.add_parser(name, help=text, description=text)
+        action.add_argument("files", type=Path, nargs=count, metavar="MAP")
+        if name == "convert":
+            action.add_argument("out", type=written, metavar="OUT.geojson")
+        else:
+            required = name == "join"
+            action.add_argument("--out", type=written, metavar="OUT", required=required)
+
+
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     benchmark.add_argument(
         "name",
@@ -656,6 +707,14 @@ _COMMANDS = (
         "Estimates every radar's range offset, mount position, relative gain and pulse from a "
         "session of `uwb-slam run` or `demo` past reflectors, and says what the drive cannot tell "
         "apart.",
+    ),
+    _Subcommand(
+        "map",
+        "slam.app.commands.map:run_map",
+        "show, convert or join maps that --save-map has written",
+        _add_map,
+        "Shows a map, writes it as GeoJSON, or makes one map of two whose landmarks lie on each "
+        "other in one way only.",
     ),
     _Subcommand(
         "benchmark",

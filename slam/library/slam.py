@@ -20,7 +20,16 @@ from slam.library.pose_track import PoseTrack
 from slam.library.rig_files import RigFile
 from slam.paper.ekf import motion_jacobian
 from slam.paper.pipeline import UwbRadarSlam
-from slam.results import Belief, NoiseAt, Pipeline, PoseAt, SmoothedRun, StepResult
+from slam.results import (
+    Belief,
+    MapChanges,
+    NoiseAt,
+    Pipeline,
+    PoseAt,
+    SmoothedRun,
+    StartOnMap,
+    StepResult,
+)
 from slam.robust.association import LONGEST_M, RangeScan
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
@@ -40,19 +49,22 @@ def make_slam(
     rig: Rig,
     wheels: WheelNoise,
     detector: Detector | None = None,
-    rules: BackEndParameters | None = None,
     *,
+    rules: BackEndParameters | None = None,
     noise_at: NoiseAt | None = None,
+    on_map: StartOnMap | None = None,
 ) -> Pipeline:
     """Return the pipeline that ``config.back_end`` names.
 
     ``wheels`` is the robot's odometry noise; preset ``paper`` has numbers of its own. ``detector``
-    replaces the front end that the configuration names, ``rules`` those of the robust back end, and
-    ``noise_at`` the white noise of ``wheels`` there.
+    replaces the front end that the configuration names, ``rules`` those of the robust back end,
+    which alone begins ``on_map``, and ``noise_at`` the white noise of ``wheels`` there.
     """
     if config.back_end is BackEnd.ROBUST:
         compile_kernels()  # so that the first scans need not wait
-        return RobustSlam(config, rig, wheels, detector, rules, noise_at=noise_at)
+        return RobustSlam(
+            config, rig, wheels, detector, rules=rules, noise_at=noise_at, on_map=on_map
+        )
     return UwbRadarSlam(config, rig, detector)
 
 

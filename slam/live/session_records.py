@@ -93,6 +93,9 @@ class SessionInfo:
     constants
         Every number SLAM ran with beyond its settings, by dotted name, as JSON has them; empty
         where they were not recorded.
+    map_json
+        The map that SLAM began with, and how, by `slam.app.run.maps.MapUse.text`; "" if it began
+        with an empty one.
     """
 
     scene: str
@@ -111,6 +114,7 @@ class SessionInfo:
     odometry_clock: str = ""
     odometry_covariance: bool = False
     constants: Mapping[str, object] = field(default_factory=dict)
+    map_json: str = ""
 
     @property
     def field_of_view(self) -> FieldOfView:

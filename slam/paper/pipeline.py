@@ -68,6 +68,12 @@ class UwbRadarSlam:
         """Return None: the paper filters only."""
         return None
 
+    def saved_map(self) -> None:
+        """Return None: the paper begins with an empty map."""
+
+    def map_changes(self) -> None:
+        """Return None, as `saved_map` does."""
+
     def _take(
         self, detect: Callable[[], tuple[Detection, ...]], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import Rig, wrap_angles
-from slam.results import PredictedRange, SmoothedRun, UpdateReport
+from slam.results import (
+    MapChanges,
+    PredictedRange,
+    SavedLandmark,
+    SavedMap,
+    SmoothedRun,
+    UpdateReport,
+)
 from slam.robust import kernels
 from slam.robust.association import (
     LONGEST_M,
@@ -53,7 +60,15 @@ from slam.robust.initialisation import (
     possible_rows,
     update_with_point,
 )
-from slam.robust.map import MERGE_SIGMA_M, Existence, apply_merge, find_merge, named_pairs
+from slam.robust.map import (
+    MERGE_SIGMA_M,
+    Existence,
+    apply_merge,
+    find_merge,
+    named_pairs,
+    saved_map_of,
+    take_map,
+)
 from slam.robust.parameters import BackEndParameters
 from slam.robust.proposals.slips import Change, Course, judge_change, move_anew
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
@@ -75,6 +90,7 @@ from slam.robust.state import (
     calibrated_motion,
     free_motion,
     predict,
+    rotation,
 )
 from slam.robust.walls import WallKeeper
 
@@ -90,10 +106,17 @@ class RobustBackEnd:
     """Range SLAM with a consistent covariance.
 
     ``predict`` and ``update`` alternate: one motion, then what the radars saw at its end. The map
-    frame is the body frame at the start.
+    frame is the body frame at the start; with a map of an earlier run it is that of the map, and
+    the robot is at a ``start``: pose, and standard deviations of that, (3,) each.
     """
 
-    def __init__(self, rig: Rig, parameters: BackEndParameters) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        parameters: BackEndParameters,
+        saved: SavedMap | None = None,
+        start: tuple[Array, Array] | None = None,
+    ) -> None:
         self.rig = rig
         self.parameters = parameters
         offsets = (parameters.ranges.offset_sigma_m,) * len(rig.mounts)
@@ -122,7 +145,10 @@ class RobustBackEnd:
         self._existence = Existence(
             parameters.map, rule.min_frames, parameters.ranges.detection_probability
         )
-        self._log = RunLog(parameters.wheels, parameters.splits.gap_poses)
+        # Ids of landmarks of the map are smaller.
+        self._first_id = 0 if saved is None else saved.next_id
+        prior = None if saved is None else take_map(self.state, saved, rig, start)
+        self._log = RunLog(parameters.wheels, parameters.splits.gap_poses, prior)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._motion: Motion | None = None  # the last one, if it is known from the wheels
@@ -130,6 +156,12 @@ class RobustBackEnd:
         self.slip_probability = 0.0
         """Probability that the wheels slipped in the newest step."""
         self._landmark_of_label: dict[int, int] = {}
+        if saved is not None:
+            for landmark in saved.landmarks:
+                self._know(landmark.id, landmark)
+            for wall in saved.walls:
+                self._existence.know(wall.id, wall.hits)
+                self._walls.cells.know(wall.id, wall.cells)
         # Beacons, whose ranges have labels: all labels heard, and by label those without a place
         self._heard: set[int] = set()
         self._waiting: dict[int, Waiting] = {}
@@ -162,7 +194,7 @@ class RobustBackEnd:
     def copy(self) -> RobustBackEnd:
         """Return a back end that goes on from here by itself; what never changes is shared."""
         rules = [getattr(self.parameters, rule.name) for rule in fields(self.parameters)]
-        shared = [self.rig, self.parameters, *rules]
+        shared = [self.rig, self.parameters, self._log.prior, *rules]
         return copy.deepcopy(self, {id(one): one for one in shared})
 
     def with_empty_map(self) -> RobustBackEnd:
@@ -170,6 +202,77 @@ class RobustBackEnd:
         other = RobustBackEnd(self.rig, self.parameters)
         other.state.take_calibration(self.state)
         return other
+
+    def saved_map(self) -> SavedMap:
+        """Return the map for another run, as the solution over all poses has it if there is one."""
+        solved = self.copy()
+        if self.state.feature_ids and self._log.n_poses > 1:
+            solved.relinearise()
+        return solved.map_now()
+
+    def map_now(self) -> SavedMap:
+        """Return the map for another run as the filter has it."""
+        labels = {id_: label for label, id_ in self._landmark_of_label.items()}
+        saved = saved_map_of(self.state, self.rig, self._existence, labels, self._log.start)
+        cells = self._walls.cells
+        walls = tuple(replace(wall, cells=cells.of(wall.id)) for wall in saved.walls)
+        return replace(saved, walls=walls)
+
+    def join(self, other: SavedMap, pairs: Sequence[tuple[int, int]]) -> None:
+        """Take in a map that is seen from the pose, in whose body frame it is given.
+
+        ``pairs`` are ids of the own landmarks and of the other's that are one. Walls are taken to
+        be independent of the other's landmarks.
+        """
+        state, R = self.state, rotation(self.state.heading_rad)
+        known, size = other.full_covariance(), state.layout.landmark_size
+        row_of = {name: row for row, name in enumerate(other.unknowns)}
+        turn, at, added = np.eye(3)[:size, :size], np.array([1, 2]), list[tuple[int, list[int]]]()
+        turn[:2, :2] = R
+        for one in other.landmarks:
+            names = [f"{axis} {one.id}" for axis in ("x", "y", "radius")[:size]]
+            mine = [row_of[name] for name in names]
+            cross = np.zeros((state.P.size, size))
+            cross[:, :2] = state.P.columns(at)
+            corner = turn @ known[np.ix_(mine, mine)] @ turn.T
+            corner[:2, :2] += state.P.block(at)
+            for row, its in added:
+                columns = state.layout.columns(np.array([row]))
+                cross[columns] += turn @ known[np.ix_(its, mine)] @ turn.T
+            place = state.position_m + R @ (one.x_m, one.y_m)
+            new_id = state.augment(place, cross, (corner + corner.T) / 2)
+            if state.radius_sigma_m:
+                state.radii_m[-1] = one.radius_m
+            self._know(new_id, one)
+            added.append((state.landmark_ids.index(new_id), mine))
+        rows = {one.id: row for one, (row, _) in zip(other.landmarks, added, strict=True)}
+        same = tuple((state.landmark_ids.index(own), rows[its]) for own, its in pairs)
+        ids = named_pairs(state, same)
+        apply_merge(state, same, MERGE_SIGMA_M)
+        for kept, gone in ids:
+            self._existence.merge(kept, gone)
+        for wall in other.walls:
+            mine = [row_of[f"{axis} {wall.id}"] for axis in ("phi", "d")]
+            wall_id = self._walls.place_saved(wall, known[np.ix_(mine, mine)])
+            if wall_id is not None:
+                self._existence.hit(wall_id, wall.hits)
+
+    def _know(self, landmark_id: int, saved: SavedLandmark) -> None:
+        self._existence.know(landmark_id, saved.hits)
+        self.state.added_sigmas_m[landmark_id] = saved.added_sigma_m
+        if saved.label is not None:
+            self._landmark_of_label.setdefault(saved.label, landmark_id)
+
+    def map_changes(self, saved: SavedMap) -> MapChanges:
+        """Return what has been found of a map that the back end began with."""
+        hits = {one.id: self._existence.hits(one.id) - one.hits for one in saved.landmarks}
+        ids, known = self.state.landmark_ids, set(hits)
+        present = [ids[row] for row in self.reported_rows()]
+        return MapChanges(
+            seen=tuple(id_ for id_ in present if hits.get(id_, 0) > 0),
+            gone=tuple(sorted(known - set(ids))),
+            new=tuple(id_ for id_ in present if id_ not in known),
+        )
 
     def reported_rows(self) -> list[int]:
         """Return the rows of landmarks hit often enough."""
@@ -447,6 +550,11 @@ class RobustBackEnd:
         """Return the rows of landmarks that have labels."""
         labelled = set(self._landmark_of_label.values())
         return [row for row, id_ in enumerate(self.state.landmark_ids) if id_ in labelled]
+
+    def _distinct_rows(self) -> list[int]:
+        """Return the rows of landmarks no two of which are one: they have labels, or are mapped."""
+        ids = enumerate(self.state.landmark_ids)
+        return [*self._labelled_rows(), *(row for row, id_ in ids if id_ < self._first_id)]
 
     def _take_labelled(
         self, scans: Sequence[RangeScan], added_m: float
@@ -878,7 +986,7 @@ class RobustBackEnd:
             return
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
-        merge = find_merge(self.state, rule, self._refused, self._labelled_rows())
+        merge = find_merge(self.state, rule, self._refused, self._distinct_rows())
         if merge is not None and self._are_seen_together(merge.pairs):
             self._refused[named_pairs(self.state, merge.pairs)] = now
         elif merge is not None and self.merge_if_possible(merge.pairs):

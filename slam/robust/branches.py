@@ -31,6 +31,10 @@ Doubt
     Those that a possible motion lays on others of the map confirm nothing
     (`slam.robust.proposals.constellation.stands_out`), nor do they place a carried robot.
 
+A robot that begins somewhere on the map of an earlier run (`SavedMap`) is taken to have been
+carried before the first step; the map of its own that it makes meanwhile stands for the place where
+it has never been.
+
 The robot is reported as lost while the landmarks known before the carry are against its pose by
 more than the price of a carry, and others are seen, or ranges have shown a carry. That ends when
 several of them are seen where they should be, or a place is adopted.
@@ -54,8 +58,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import chdtri, expit
 
-from slam.geometry import Rig, compose, has_moved, transform
-from slam.results import UpdateReport
+from slam.geometry import Rig, between, compose, has_moved, transform
+from slam.results import SavedMap, UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import Question
@@ -306,6 +310,7 @@ class Carry:
     since: int
     opened: int  # the step at which it was asked, or a place adopted
     price_nats: float  # how unlikely that is
+    is_start: bool = False  # the robot has not been on the map in this run
     next_id: int  # landmarks known before it have smaller ids
     map: RobustBackEnd  # the main back end after the step before
     new: Alternative  # with an empty map at first
@@ -320,11 +325,18 @@ class Carry:
 class Branches:
     """The main back end, the question of a carry, and its decision.
 
-    ``predict`` and ``update`` alternate as in ``RobustBackEnd``.
+    ``predict`` and ``update`` alternate as in ``RobustBackEnd``. A robot that begins on a map
+    without a ``start`` has been carried to wherever on the map it is, or beside it.
     """
 
-    def __init__(self, rig: Rig, parameters: BackEndParameters) -> None:
-        self.main = RobustBackEnd(rig, parameters)
+    def __init__(
+        self,
+        rig: Rig,
+        parameters: BackEndParameters,
+        saved: SavedMap | None = None,
+        start: tuple[Array, Array] | None = None,
+    ) -> None:
+        self.main = RobustBackEnd(rig, parameters, saved, start)
         self._rule = parameters.branches
         self._look_every, self._window = parameters.map.look_every, parameters.tracklets.window
         self._fewest = parameters.tracklets.min_frames
@@ -342,11 +354,18 @@ class Branches:
         self._recognised_ids: set[int] = set()  # new landmarks that were searched for
         self._doubts: list[Doubt] = []
         self.is_lost = False
+        if saved is not None and start is None:
+            self._begin_lost(saved)
 
     @property
     def map(self) -> RobustBackEnd:
         """Return the back end whose map is reported: as it was, while the robot is lost."""
         return self._carry.map if self.is_lost and self._carry is not None else self.main
+
+    @property
+    def is_unplaced(self) -> bool:
+        """Return whether the robot began on a map, and has not found its place there yet."""
+        return self.is_lost and self._carry is not None and self._carry.is_start
 
     @property
     def lost_pose(self) -> tuple[Array, Array] | None:
@@ -527,7 +546,7 @@ class Branches:
         """Return a copy of the main back end as it was before a step."""
         begin = max(kept for kept in self._snapshots if kept <= number)
         back_end = self._snapshots[begin].copy()
-        for step in (self._steps[between] for between in range(begin, number)):
+        for step in (self._steps[taken] for taken in range(begin, number)):
             back_end.predict(step.increment, step.covariance)
             back_end.update(step.scans, solve=False)
         return back_end
@@ -645,6 +664,8 @@ class Branches:
         carry.stayed = Alternative(self.main, carry.since)
         carry.stayed.next_step, carry.stayed.evidence = self._now, self._tables(carry.since)
         self._exchange(carry, placed)
+        if carry.is_start:
+            self._doubts = []  # those of before are in the frame of another map
         carry.placed, carry.adopted, carry.opened = [], placed, self._now
 
     def _exchange(self, carry: Carry, other: Alternative) -> None:
@@ -670,7 +691,10 @@ class Branches:
         is_refuted &= stay.misses - place.misses > MARGIN_NATS
         if is_refuted:
             self._exchange(carry, stayed)
-        if is_refuted or self._is_over(carry):
+        if is_refuted and carry.is_start:
+            carry.stayed, carry.adopted, self.is_lost = None, None, True
+            self._begin_again(carry)
+        elif is_refuted or self._is_over(carry):
             self._end(carry)
         return is_refuted
 
@@ -757,8 +781,36 @@ class Branches:
             hidden=Place(hidden, since, math.log(self._rule.steps_per_hidden), merges=True),
         )
 
+    def _begin_lost(self, saved: SavedMap) -> None:
+        """Begin without a place on a map: on a map of its own, until a search finds one."""
+        mapped, self.main = self.main, self.main.with_empty_map()
+        self.main.state.next_id = saved.next_id
+        # Where nothing is known it is about the middle of the map.
+        middle_m = saved.landmarks_m.mean(axis=0) if saved.landmarks else np.zeros(2)
+        self._carry = Carry(
+            since=0,
+            opened=0,
+            price_nats=-self._rule.price_nats,
+            is_start=True,
+            next_id=saved.next_id,
+            map=mapped,
+            new=Alternative(mapped.with_empty_map(), 0),
+            moved=np.append(middle_m, 0.0),
+            hidden=None,
+        )
+        self.is_lost = True
+
     def _begin_again(self, carry: Carry) -> None:
         """Search for a lost robot by what it sees from now on: what it saw has led nowhere."""
+        # The log of the map gets the steps that are left out, so that no pose is missing.
+        pose = compose(carry.map.pose, carry.moved)
+        for number in range(carry.since, self._now):
+            step = self._steps[number]
+            carry.map.predict(step.increment, step.covariance)
+        carry.moved = between(carry.map.pose, pose)
+        if carry.is_start:
+            self.main, next_id = carry.map.with_empty_map(), self.main.state.next_id
+            self.main.state.next_id = next_id
         carry.since = carry.opened = self._now
         carry.hidden = None
         carry.new = Alternative(carry.map.with_empty_map(), self._now)

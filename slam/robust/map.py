@@ -1,4 +1,4 @@
-"""Map management: existence and merging.
+"""Map management: existence, merging, and maps of earlier runs.
 
 The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
 merging after a loop bends the trajectory back, and everything correlated with it. It is proposed
@@ -9,7 +9,7 @@ made, the solution over the whole run decides (`slam.robust.solver.revision.is_o
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -17,12 +17,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
+from slam.geometry import Rig
+from slam.results import OF_MOUNT, SavedLandmark, SavedMap, SavedRadar, SavedWall
 from slam.robust.association import Correspondence, Pairs, certain, correspondence, density_per_m2
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
-from slam.robust.state import Array, Indices, State
+from slam.robust.state import HEAD_SIZE, Array, Indices, State, SymmetricMatrix
 
 # Noise [m] of the statement that two landmarks are one: it is exact.
 MERGE_SIGMA_M = 1e-5
+SURE = 1e-6  # standard deviations of a pose [m, rad] where a run's own map begins
+_LEAST_M2 = 1e-14  # variance of what a map knows for sure
 _FLOOR = 1e-12  # what keeps matrices regular, as a share
 
 
@@ -78,6 +82,10 @@ class Existence:
     def lost(self) -> list[int]:
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
 
+    def know(self, landmark_id: int, hits: int) -> None:
+        """Begin with what frames of an earlier run hit: its score is that of a new landmark."""
+        self._records[landmark_id] = _Record(score=float(self._report_hits), hits=hits)
+
     def is_reported(self, landmark_id: int) -> bool:
         return self._records[landmark_id].hits >= self._report_hits
 
@@ -91,6 +99,169 @@ class Existence:
         into.n_heard += other.n_heard
         into.n_unheard += other.n_unheard
         self.forget(gone)
+
+
+def unknowns_of(state: State, radars: Sequence[str]) -> tuple[str, ...]:
+    """Return names of all that does not move, in the order of the layout behind the calibration."""
+    names, layout = [f"offset {radar}" for radar in radars], state.layout
+    if layout.has_mounts:
+        names += [f"moved_{axis} {radar}" for radar in radars for axis in "xy"]
+    axes = ("x", "y", "radius")[: layout.landmark_size]
+    names += [f"{axis} {id_}" for id_ in state.landmark_ids for axis in axes]
+    return (*names, *(f"{axis} {id_}" for id_ in state.wall_ids for axis in ("phi", "d")))
+
+
+def fixed_values(state: State) -> Array:
+    """Return offsets, mounts and features in the order of the layout, shape (q,)."""
+    layout = state.layout
+    mounts = state.mounts_m.ravel() if layout.has_mounts else np.zeros(0)
+    landmarks = state.landmarks_m
+    if layout.has_radii:
+        landmarks = np.column_stack([landmarks, state.radii_m])
+    return np.concatenate([state.offsets_m, mounts, landmarks.ravel(), state.walls.ravel()])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapPrior:
+    """What is known before a run: its first pose, and the unknowns of a map, by name.
+
+    Errors are additive; those of the pose and of the map are independent of each other.
+    """
+
+    pose: Array  # shape (3,)
+    pose_sigmas: Array  # shape (3,)
+    radars: tuple[str, ...]  # of the rig
+    names: tuple[str, ...]
+    values: Array  # shape (k,)
+    covariance: Array  # shape (k, k)
+
+    def of(self, state: State) -> tuple[Indices, Array, Array]:
+        """Return which columns of the error it is about, with values and information.
+
+        What is not on the map any more is marginalised.
+        """
+        row = {name: place for place, name in enumerate(self.names)}
+        names = unknowns_of(state, self.radars)
+        columns = np.array([at for at, name in enumerate(names) if name in row], dtype=np.intp)
+        rows = np.array([row[names[at]] for at in columns.tolist()], dtype=np.intp)
+        # What was known for sure has information of a finite size, too.
+        covariance = self.covariance[np.ix_(rows, rows)] + _LEAST_M2 * np.eye(len(rows))
+        information = np.linalg.inv(covariance)
+        return HEAD_SIZE + columns, self.values[rows], (information + information.T) / 2
+
+
+def take_map(
+    state: State, saved: SavedMap, rig: Rig, start: tuple[Array, Array] | None
+) -> MapPrior:
+    """Let a new state begin on a map, at a pose (3,) with standard deviations (3,).
+
+    Without a start it is at the origin, for sure.
+
+    Range offsets and antennas are known from the map if the rig is the one that made it; else they
+    are independent of it.
+    """
+    pose, sigmas = start or (np.zeros(3), np.full(3, SURE))
+    state.landmark_ids = [one.id for one in saved.landmarks]
+    state.landmarks_m = saved.landmarks_m
+    if state.radius_sigma_m:
+        state.radii_m = np.array([one.radius_m for one in saved.landmarks])
+    state.wall_ids = [one.id for one in saved.walls]
+    state.walls = np.array([(one.phi_rad, one.d_m) for one in saved.walls]).reshape(-1, 2)
+    state.added_sigmas_m = {one.id: one.added_sigma_m for one in saved.features}
+    state.next_id = saved.next_id
+    n_own, layout = len(saved.radars), state.layout
+    is_same_rig = n_own == len(rig.mounts) and all(map(SavedRadar.is_of, saved.radars, rig.mounts))
+    if is_same_rig:
+        state.offsets_m = np.array([radar.offset_m for radar in saved.radars])
+        if layout.has_mounts:
+            state.mounts_m = np.array([radar.moved_m for radar in saved.radars])
+    of_radars = ("offset ", "moved_x ", "moved_y ")
+    radars = tuple(mount.name for mount in rig.mounts)
+    own = unknowns_of(state, radars)
+    rows = [
+        row
+        for row, name in enumerate(saved.unknowns)
+        if name in own and (is_same_rig or not name.startswith(of_radars))
+    ]
+    names = tuple(saved.unknowns[row] for row in rows)
+    known = saved.full_covariance()[np.ix_(rows, rows)]
+    at = np.array([own.index(name) for name in names], dtype=np.intp)
+    P = np.zeros((layout.size, layout.size))
+    before = state.P.full()
+    P[: len(before), : len(before)] = before
+    P[:3, :3] = np.diag(np.square(np.array([sigmas[2], sigmas[0], sigmas[1]])))
+    if layout.has_radii:
+        radii = np.arange(layout.size)[layout.radii]
+        P[radii, radii] = state.radius_sigma_m**2
+    P[np.ix_(HEAD_SIZE + at, HEAD_SIZE + at)] = known
+    state.position_m, state.heading_rad = np.array(pose[:2]), float(pose[2])
+    state.P = SymmetricMatrix(P)  # of the size that it will have
+    state.set_additive_covariance(P)
+    return MapPrior(
+        pose=pose,
+        pose_sigmas=sigmas,
+        radars=radars,
+        names=names,
+        values=fixed_values(state)[at],
+        covariance=known,
+    )
+
+
+def saved_map_of(
+    state: State, rig: Rig, existence: Existence, labels: Mapping[int, int], start: Array
+) -> SavedMap:
+    """Return the reported landmarks and walls of a state but for where they gave echoes.
+
+    ``labels`` are ids of beacons by landmark, and ``start`` (3,) is the first pose.
+    """
+    layout, n = state.layout, len(state.landmark_ids)
+    rows = [row for row, id_ in enumerate(state.feature_ids) if existence.is_reported(id_)]
+    T = state.additive_transform()
+    columns = [layout.columns(np.array([row])) for row in rows]
+    at = np.concatenate([state.radar_columns, *columns])
+    P = (T @ state.P.full() @ T.T)[np.ix_(at, at)]
+    names = unknowns_of(state, [mount.name for mount in rig.mounts])
+    radii_m = state.feature_radii_m
+    features = [(row, state.feature_ids[row], state.added_sigmas_m) for row in rows]
+    return SavedMap(
+        radars=tuple(
+            SavedRadar(
+                **{key: getattr(mount, key) for key in OF_MOUNT},
+                offset_m=float(state.offsets_m[place]),
+                moved_m=(float(state.mounts_m[place, 0]), float(state.mounts_m[place, 1])),
+            )
+            for place, mount in enumerate(rig.mounts)
+        ),
+        landmarks=tuple(
+            SavedLandmark(
+                id=id_,
+                x_m=float(state.landmarks_m[row, 0]),
+                y_m=float(state.landmarks_m[row, 1]),
+                radius_m=float(radii_m[row]),
+                added_sigma_m=added.get(id_, 0.0),
+                hits=existence.hits(id_),
+                label=labels.get(id_),
+            )
+            for row, id_, added in features
+            if row < n
+        ),
+        walls=tuple(
+            SavedWall(
+                id=id_,
+                phi_rad=float(state.walls[row - n, 0]),
+                d_m=float(state.walls[row - n, 1]),
+                added_sigma_m=added.get(id_, 0.0),
+                hits=existence.hits(id_),
+                cells=(),
+            )
+            for row, id_, added in features
+            if row >= n
+        ),
+        unknowns=tuple(names[column - HEAD_SIZE] for column in at.tolist()),
+        covariance=tuple(tuple(P[row, : row + 1].tolist()) for row in range(len(at))),
+        start=(float(start[0]), float(start[1]), float(start[2])),
+        next_id=state.next_id,
+    )
 
 
 def merge_rows(state: State, pairs: Pairs, sigma_m: float) -> tuple[Indices, Array, Array, Array]:

@@ -14,7 +14,17 @@ from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.geometry import Rig, between, has_moved
-from slam.results import Belief, InputCheck, NoiseAt, PoseAt, SmoothedRun, StepResult
+from slam.results import (
+    Belief,
+    InputCheck,
+    MapChanges,
+    NoiseAt,
+    PoseAt,
+    SavedMap,
+    SmoothedRun,
+    StartOnMap,
+    StepResult,
+)
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
@@ -33,7 +43,7 @@ class RobustSlam:
 
     The belief's errors are additive, as everywhere outside ``slam.robust``; it holds the reported
     landmarks, and their ids stay. ``noise_at`` replaces the white noise of the wheels, not their
-    calibration errors.
+    calibration errors. With a map of an earlier run (`StartOnMap`) all is in its frame.
     """
 
     def __init__(
@@ -42,13 +52,24 @@ class RobustSlam:
         rig: Rig,
         wheels: WheelNoise,
         detector: Detector | None = None,
-        rules: BackEndParameters | None = None,
         *,
+        rules: BackEndParameters | None = None,
         noise_at: NoiseAt | None = None,
+        on_map: StartOnMap | None = None,
     ) -> None:
         self.config = config
         self.rig = rig
-        self._branches = Branches(rig, back_end_parameters(config, wheels, rules))
+        parameters = back_end_parameters(config, wheels, rules)
+        self._on_map = on_map
+        if on_map is None:
+            self._branches = Branches(rig, parameters)
+        else:
+            self._branches = Branches(rig, parameters, on_map.map, on_map.pose_and_sigmas)
+        # What is reported of a map that stays as it is
+        self._fixed: tuple[Belief, Array] | None = None
+        if on_map is not None and on_map.is_fixed:
+            begin = self._branches.map
+            self._fixed = belief_of(begin), begin.wall_spans_m()
         self._detector = detector or make_detector(config, rig)
         self._noise_at, self._noise = noise_at, np.zeros((3, 3))  # the latter at the last state
         self._least_noise = np.diag(np.square([wheels.floor_m, wheels.floor_m, wheels.floor_rad]))
@@ -97,12 +118,40 @@ class RobustSlam:
         return ()
 
     def wall_spans_m(self) -> Array:
-        return self.back_end.wall_spans_m()
+        if self._fixed is not None:
+            return self._fixed[1]
+        branches = self._branches
+        return (branches.map if branches.is_unplaced else branches.main).wall_spans_m()
 
     def smoothed(self) -> SmoothedRun | None:
-        if not len(self._stamps_ns):
+        if not len(self._stamps_ns) or self._branches.is_unplaced:
             return None
-        return self.back_end.smoothed(self._stamps_ns.rows.copy())
+        smoothed = self.back_end.smoothed(self._stamps_ns.rows.copy())
+        if smoothed is None or self._fixed is None:
+            return smoothed
+        fixed = self._fixed[0]
+        return replace(
+            smoothed,
+            landmark_ids=fixed.landmark_ids,
+            landmarks_m=fixed.landmarks,
+            landmark_covariances_m2=np.array(
+                [fixed.landmark_covariance(row) for row in range(len(fixed.landmark_ids))]
+            ).reshape(-1, 2, 2),
+        )
+
+    def saved_map(self) -> SavedMap:
+        """Return the map for another run; one that stays as it is, or has no place yet, as it was.
+
+        It is that of the solution over all poses, which takes as long as `smoothed`.
+        """
+        if self._on_map is not None and (self._fixed is not None or self._branches.is_unplaced):
+            return self._on_map.map
+        return self._branches.map.saved_map()
+
+    def map_changes(self) -> MapChanges | None:
+        if self._on_map is None:
+            return None
+        return self._branches.map.map_changes(self._on_map.map)
 
     def _take(
         self,
@@ -143,7 +192,7 @@ class RobustSlam:
             StepResult(
                 t_ns=t_ns,
                 odometry_pose=pose,
-                belief=belief_of(branches.map, branches.lost_pose, branches.doubted_covariance),
+                belief=self._belief(),
                 detections=detections,
                 report=report,
                 range_sigmas_m=sigmas_m,
@@ -169,6 +218,18 @@ class RobustSlam:
         turned = np.eye(3)
         turned[:2, :2] = rotation(-float(before[2]))
         return np.asarray(turned @ new @ turned.T + self._least_noise)
+
+    def _belief(self) -> Belief:
+        branches = self._branches
+        belief = belief_of(branches.map, branches.lost_pose, branches.doubted_covariance)
+        if self._fixed is None:
+            return belief
+        fixed = self._fixed[0]
+        covariance = fixed.covariance.copy()
+        covariance[:3, :3] = belief.pose_covariance
+        covariance[:3, 3:], covariance[3:, :3] = 0.0, 0.0
+        mean = np.concatenate([belief.pose, fixed.mean[3:]])
+        return replace(fixed, mean=mean, covariance=covariance)
 
     def _sigma_m(self, detection: Detection) -> float:
         """Return the standard deviation of a range; infinite for one to be left out."""

@@ -18,13 +18,14 @@ in cells along the wall.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
 
 from slam.geometry import wrap_angle
+from slam.results import SavedWall
 from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
     FeatureRows,
@@ -96,6 +97,13 @@ class WallCells:
         cells = np.floor(along_m / self._cell_m).astype(np.intp).tolist()
         self._cells.setdefault(wall_id, set()).update(cells)
 
+    def of(self, wall_id: int) -> tuple[int, ...]:
+        """Return the cells of a wall, in order."""
+        return tuple(sorted(self._cells.get(wall_id, ())))
+
+    def know(self, wall_id: int, cells: Collection[int]) -> None:
+        self._cells[wall_id] = set(cells)
+
     def distance_m(self, wall_id: int, along_m: float) -> float:
         cells = self._cells.get(wall_id)
         if not cells:
@@ -115,7 +123,7 @@ class WallCells:
     def spans_m(self, wall_id: int) -> list[tuple[float, float]]:
         """Return the stretches that gave echoes, as (from, to) along the wall."""
         spans: list[tuple[float, float]] = []
-        for cell in sorted(self._cells.get(wall_id, ())):
+        for cell in self.of(wall_id):
             begin, end = cell * self._cell_m, (cell + 1) * self._cell_m
             if spans and begin - spans[-1][1] < 0.5 * self._cell_m:
                 spans[-1] = (spans[-1][0], end)
@@ -277,7 +285,6 @@ class WallKeeper:
 
     def place(self, tracklet: Tracklet) -> int | None:
         """Bring a wall into the map; return its id, or None if it is too near to another one."""
-        state = self._state
         phi, d = tracklet.target
         n = np.array([np.cos(phi), np.sin(phi)])
         antennas = tracklet.seen.antennas_m
@@ -287,6 +294,11 @@ class WallKeeper:
             by_offsets=tracklet.by_offsets,
             feet_m=antennas + np.outer(d - antennas @ n, n),
         )
+        return self.place_seen(seen)
+
+    def place_seen(self, seen: BodyWall) -> int | None:
+        """Do what ``place`` does, with a wall that was seen."""
+        state = self._state
         row = match_wall(state, seen, self.cells, self._parameters)
         if row is None:
             if is_unresolved(state, seen, self.cells, self._rule):
@@ -300,9 +312,32 @@ class WallKeeper:
         self.cells.add(wall_id, along_wall(state, row, seen.in_map(state)))
         return wall_id
 
+    def place_saved(self, wall: SavedWall, covariance: Array) -> int | None:
+        """Do what ``place`` does, with a wall of a map that is given in the body frame."""
+        n = np.array([math.cos(wall.phi_rad), math.sin(wall.phi_rad)])
+        along_m = (np.array(wall.cells) + 0.5) * self._rule.cell_m
+        seen = BodyWall(
+            wall=np.array([wall.phi_rad, wall.d_m]),
+            covariance=covariance,
+            by_offsets=np.zeros((2, len(self._state.radar_columns))),
+            feet_m=wall.d_m * n + np.outer(along_m, (-n[1], n[0])),
+        )
+        return self.place_seen(seen)
+
     def spans_m(self, row: int) -> Array:
         """Return the ends of the known stretches of a wall, shape (k, 2, 2), map frame."""
         phi, d = (float(value) for value in self._state.walls[row])
-        n, t = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
         spans = np.array(self.cells.spans_m(self._state.wall_ids[row])).reshape(-1, 2)
-        return np.asarray(d * n + spans[:, :, None] * t)
+        return _ends_m(phi, d, spans)
+
+
+def wall_spans_m(wall: SavedWall, cell_m: float) -> Array:
+    """Return the ends of the stretches of a saved wall that gave echoes, (k, 2, 2), map frame."""
+    cells = WallCells(cell_m)
+    cells.know(wall.id, wall.cells)
+    return _ends_m(wall.phi_rad, wall.d_m, np.array(cells.spans_m(wall.id)).reshape(-1, 2))
+
+
+def _ends_m(phi: float, d: float, spans: Array) -> Array:
+    n, t = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
+    return np.asarray(d * n + spans[:, :, None] * t)

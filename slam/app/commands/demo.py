@@ -27,6 +27,7 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
+from slam.app.run.maps import MapSaver, map_use
 from slam.app.run.output import RunProgress, note, print_progress
 from slam.app.run.result_files import (
     REPORT,
@@ -67,6 +68,10 @@ def run_demo(
     lean: bool = False,
     rerun: str | None = None,
     publish: Sequence[str] = (),
+    map_path: Path | None = None,
+    start: Sequence[float] | None = None,
+    localise: bool = False,
+    save_map: Path | None = None,
 ) -> None:
     """Run the emulated robot through its scene and write everything into one folder.
 
@@ -74,6 +79,7 @@ def run_demo(
     driven until then is recorded, mapped and summed up.
     """
     loaded, config = scene_and_config(scene, preset)
+    begin = map_use(config, map_path=map_path, start=start, localise=localise, save_map=save_map)
     with ExitStack() as held:
         hold_folder(out, held)
         publishing = held.enter_context(Publishing(publish))
@@ -101,7 +107,6 @@ def run_demo(
             rig_source.start(RAW_CONFIG, FRAME_RATE_HZ)
             trajectory = loaded.trajectory()
             scans = _Scans(rig_source, end_tick(trajectory.duration_ns), emulator, stop)
-            wheels = wheels_of(loaded)
             info = SessionInfo(
                 scene=loaded.name,
                 preset=preset,
@@ -111,28 +116,33 @@ def run_demo(
                 versions=versions(),
                 config_json=settings_text(config),
                 constants=slam_constants(),
-                wheels=asdict(wheels),
+                wheels=asdict(wheels_of(loaded)),
                 outlines_m=outlines_m(loaded),
                 started_unix_ns=time.time_ns(),
+                map_json=begin.text,
             )
             source = RunSource(
                 info=info,
                 rig=rig,
-                slam=make_slam(config, rig, wheels),
+                slam=make_slam(config, rig, wheels_of(loaded), on_map=begin.on_map),
                 scans=scans,
                 odometry=odometry,
                 truth_at=trajectory.poses,
                 lost_frames=lambda: rig_source.lost_frames,
                 link_log=link_log,
                 close=rig_source.close,
+                map_file=begin.file,
             )
+            map_saver = MapSaver(save_map, source.slam, info)
             stop.check()
             remove_earlier(out, _OUTPUTS)
-            path = out / SESSION
-            log = SessionLog(path, info, odometry, truth_at=trajectory.poses, drawn=not lean)
+            log = SessionLog(
+                out / SESSION, info, odometry, truth_at=trajectory.poses, drawn=not lean
+            )
             stack.callback(log.close)
             sinks: list[SessionObserver] = [
                 RunProgress(info, source.lost_frames, end_ns=trajectory.duration_ns),
+                map_saver,
                 log,  # closed before the views: the record must not wait for them
                 publishing,
                 *([live.observer(info)] if live is not None else []),
@@ -146,7 +156,7 @@ def run_demo(
             record = execute(source, sinks)
         if record.last is not None:
             # without the flag: the signal that ended the drive does not end the writing
-            finish(out, source, record, StopFlag(), publishing=publishing)
+            finish(out, source, record, StopFlag(), publishing=publishing, map_saver=map_saver)
         if stop.received is not None:
             raise StopRequestedError(stop.received, kept)
         if scans.failure is not None:

@@ -24,6 +24,7 @@ from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.live_source import LiveLog, LiveSource, drift_text, read_odometry
+from slam.app.run.maps import MapSaver, map_use
 from slam.app.run.output import ResultRow, RunProgress, note
 from slam.app.run.result_files import (
     REPORT,
@@ -75,6 +76,10 @@ def run_rig(
     lean: bool = False,
     rerun: str | None = None,
     publish: Sequence[str] = (),
+    map_path: Path | None = None,
+    start: Sequence[float] | None = None,
+    localise: bool = False,
+    save_map: Path | None = None,
 ) -> None:
     """Run SLAM on a rig until odometry ends, the time is over, or a signal comes.
 
@@ -94,6 +99,7 @@ def run_rig(
         raise UsageError(str(error)) from None
     if covariance and config.back_end is not BackEnd.ROBUST:
         raise UsageError("--odometry-covariance: preset paper has a noise of its own; use robust")
+    begin = map_use(config, map_path=map_path, start=start, localise=localise, save_map=save_map)
     line_source = parse_source(odometry)
     live_odometry = LiveOdometry(
         line_source.name, parse_clock(clock, line_source), has_covariance=covariance
@@ -125,10 +131,14 @@ def run_rig(
         stop.check()
         rig_source.start(RAW_CONFIG, fps)
         wheels = rig_file.wheels.noise
-        noise_at = live_odometry.noise_at if covariance else None
-        slam = held.enter_context(
-            PromptSlam(make_slam(config, rig_file.rig, wheels, noise_at=noise_at), stop)
+        pipeline = make_slam(
+            config,
+            rig_file.rig,
+            wheels,
+            noise_at=live_odometry.noise_at if covariance else None,
+            on_map=begin.on_map,
         )
+        slam = held.enter_context(PromptSlam(pipeline, stop))
         log = LiveLog()
         live = LiveSource(
             rig_source.radars,
@@ -162,6 +172,7 @@ def run_rig(
                 ),
                 odometry_clock=clock,
                 odometry_covariance=covariance,
+                map_json=begin.text,
             )
             source = RunSource(
                 info=info,
@@ -172,7 +183,9 @@ def run_rig(
                 lost_frames=lambda: live.lost_frames,
                 link_log=log,
                 smoothing_asked=requests.asked,
+                map_file=begin.file,
             )
+            map_saver = MapSaver(save_map, slam, info)
             remove_earlier(out, (*RESULTS, *_STALE))
             session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)
@@ -181,15 +194,22 @@ def run_rig(
                 publishing,
                 RunProgress(info, source.lost_frames, also=lambda: _dropped_text(live)),
                 requests,
+                map_saver,
+                *([view.observer(info)] if view is not None else []),
             ]
-            if view is not None:
-                sinks.append(view.observer(info))
             publishing.begin(info, log.log, start_ns)
             record = execute(source, sinks)
             end_reading()  # the modules are stopped while the results are written
             # without the flag: the signal that ended the drive does not end the writing
-            rows = _rows(record, live, live_odometry, slam)
-            finish(out, source, record, StopFlag(), rows, publishing=publishing)
+            finish(
+                out,
+                source,
+                record,
+                StopFlag(),
+                _rows(record, live, live_odometry, slam),
+                publishing=publishing,
+                map_saver=map_saver,
+            )
         rig_source.close()  # while a page is served, others may have the modules
         _report_end(live, log, out)
         if view is not None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from slam.app.errors import UsageError
 from slam.app.publish.sinks import Publishing
+from slam.app.run.maps import MapSaver, MapUse, map_use, recorded_use
 from slam.app.run.output import RunProgress, note
 from slam.app.run.result_files import SESSION, VIEW, finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import (
@@ -214,35 +215,49 @@ def run_replay(
     out: Path,
     rate: float | None = None,
     publish: Sequence[str] = (),
+    map_path: Path | None = None,
+    start: Sequence[float] | None = None,
+    localise: bool = False,
+    save_map: Path | None = None,
 ) -> None:
     """Replay a session, write its results into a folder and print its table.
 
-    `rate` is how many times as fast as it was driven; None: at full speed.
+    `rate` is how many times as fast as it was driven; None: at full speed. With a map it is another
+    run of the same frames, which is not compared with the recorded one.
     """
     with ExitStack() as held:
         hold_folder(out, held)
         publishing = held.enter_context(Publishing(publish))
         recorded = open_session(session, stop)
         comparison = Comparison(different_constants(recorded.info.constants))
-        source = recorded_source(recorded, stop, comparison)
+        begin = map_use(
+            recorded.config, map_path=map_path, start=start, localise=localise, save_map=save_map
+        )
+        source = recorded_source(recorded, stop, comparison, begin)
         if rate is not None:
             source = replace(source, scans=paced(source.scans, rate, stop))
         progress = RunProgress(source.info, source.lost_frames, end_ns=recorded.end_ns)
+        map_saver = MapSaver(save_map, source.slam, source.info)
         publishing.begin(source.info, source.link_log.log)
-        record = execute(source, [publishing, comparison, progress])
+        record = execute(source, [publishing, comparison, progress, map_saver])
         if recorded.cut_at_byte is not None:
             note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")
-        note(comparison.verdict())
+        if map_path is None:
+            note(comparison.verdict())
         with saying_what_is_left(f"; {out} is not complete"):
-            finish(out, source, record, stop, publishing=publishing)
+            finish(out, source, record, stop, publishing=publishing, map_saver=map_saver)
 
 
 def recorded_source(
-    session: RecordedSession, stop: StopFlag, comparison: Comparison | None = None
+    session: RecordedSession,
+    stop: StopFlag,
+    comparison: Comparison | None = None,
+    begin: MapUse | None = None,
 ) -> RunSource:
     """Return a session as the source of a run that steps SLAM as the recorded one did.
 
-    `comparison` gets every recorded state and smoothed run, before the replay begins.
+    `comparison` gets every recorded state and smoothed run, before the replay begins; a map to
+    `begin` with replaces the one that the run began with.
 
     Raises
     ------
@@ -256,7 +271,11 @@ def recorded_source(
         raise AppError(f"{session.path}: {error}") from None
     rules = recorded_rules(session.info.constants)
     noise_at = odometry.noise_at if session.info.odometry_covariance else None
-    slam = make_slam(config, session.rig, wheels, rules=rules, noise_at=noise_at)
+    if begin is None or begin.file is None:
+        begin = recorded_use(session.info, session.path)
+    slam = make_slam(
+        config, session.rig, wheels, rules=rules, noise_at=noise_at, on_map=begin.on_map
+    )
     scans = RecordedScans(session, stop)
     return RunSource(
         info=session.info,
@@ -267,6 +286,7 @@ def recorded_source(
         truth_at=scans.truth_at,
         lost_frames=lambda: scans.lost.n_lost,
         link_log=scans.link_log,
+        map_file=begin.file,
     )
 
 

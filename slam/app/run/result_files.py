@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from slam.app.errors import naming
 from slam.app.publish.sinks import Publishing
+from slam.app.run.maps import MapSaver, MapSummary, map_rows, map_summary
 from slam.app.run.output import ResultRow, print_result
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, summarise
@@ -44,32 +45,46 @@ def finish(
     also: Sequence[ResultRow] = (),
     *,
     publishing: Publishing,
+    map_saver: MapSaver,
 ) -> None:
     """Write a run's results into an existing folder, then print its table; `also` are more rows.
 
     The files of an earlier run are removed first, and each new one has its name once it is whole.
     If one cannot be written, the table is printed nevertheless. Where a sink of `publishing` has
-    standard output, it is printed on standard error.
+    standard output, it is printed on standard error. AppError, too, if its map was not saved.
     """
     stop.check()
     also = [*also, *publishing.rows()]
     outlet = STDERR if publishing.takes_stdout else STDOUT
     summary = summarise(record, source.info, source.rig)
+    on_map, changes = None, source.slam.map_changes()
+    if source.map_file is not None and changes is not None:
+        on_map = map_summary(source.map_file, changes, record)
+        also = [*map_rows(on_map), *also]
     try:
         remove_earlier(out, RESULTS)
-        _write(out, source.info, record, summary, stop)
+        _write(out, source.info, record, summary, stop, on_map=on_map)
     except AppError:
         print_result(source, record, summary, also, outlet)
         raise
     with stop.at_once():  # a stream may block
         print_result(source, record, summary, also, outlet)
+    map_saver.check()
 
 
 def _write(
-    out: Path, info: SessionInfo, record: RunRecord, summary: Summary | None, stop: StopFlag
+    out: Path,
+    info: SessionInfo,
+    record: RunRecord,
+    summary: Summary | None,
+    stop: StopFlag,
+    *,
+    on_map: MapSummary | None,
 ) -> None:
     stop.check()
     text = summary.to_json() if summary else _summary_without_truth(info, record)
+    if on_map is not None:
+        text = json.dumps(json.loads(text) | {"map": asdict(on_map)}, indent=2, allow_nan=False)
     with naming(path := out / "summary.json"), written_whole(path) as fresh:
         fresh.write_text(text + "\n", encoding="ascii")
     write_trajectories(out, record)

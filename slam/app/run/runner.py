@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from slam.evaluation import TrueAssociationNis, true_range_nis
 from slam.frames import RadarFrame, StepInputError
 from slam.geometry import Rig
+from slam.library.saved_map import MapFile
 from slam.live.errors import AppError
 from slam.live.frame_sources import less_gain
 from slam.live.session_records import (
@@ -47,6 +48,7 @@ class WrappedSlam:
         self.config = slam.config
         self.step_detections, self.flush = slam.step_detections, slam.flush
         self.wall_spans_m, self.smoothed = slam.wall_spans_m, slam.smoothed
+        self.saved_map, self.map_changes = slam.saved_map, slam.map_changes
 
 
 def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -122,6 +124,8 @@ class RunSource:
         Called before sinks are closed: what it logs is still recorded.
     smoothing_asked
         Called after every scan: whether sinks shall get the smoothed run so far.
+    map_file
+        The map that SLAM began with, None if it began with an empty one.
     """
 
     info: SessionInfo
@@ -134,6 +138,7 @@ class RunSource:
     link_log: LinkLog = field(default_factory=LinkLog)
     close: Callable[[], None] = lambda: None
     smoothing_asked: Callable[[], bool] = lambda: False
+    map_file: MapFile | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,6 +156,8 @@ class States:
     nis, nis_dof
         Shape (n,): summed NIS of the measurements of what they are truly of, before gates, and its
         degrees of freedom; 0 of a state without truth or without such measurements.
+    lost
+        Shape (n,): whether SLAM reported the robot as lost.
     """
 
     t_ns: NDArray[np.int64]
@@ -160,6 +167,7 @@ class States:
     pose_covariances: NDArray[np.float64]
     nis: NDArray[np.float64]
     nis_dof: NDArray[np.int32]
+    lost: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -230,6 +238,7 @@ class RunRecorder(SessionObserver):
         self._truth, self._odometry, self._estimate = (PackedRows(_FLOAT, 3) for _ in range(3))
         self._covariances = PackedRows(_FLOAT, 3, 3)
         self._nis, self._nis_dof = PackedRows(_FLOAT), PackedRows(np.dtype(np.int32))
+        self._lost = PackedRows(np.dtype(np.bool_))
         self._last: Snapshot | None = None
         self._smoothed: SmoothedRun | None = None
         self._start_ns: int | None = None
@@ -251,6 +260,8 @@ class RunRecorder(SessionObserver):
         nis, dof = self._true_nis(snapshot)
         self._nis.append(nis)
         self._nis_dof.append(dof)
+        report = None if snapshot.step is None else snapshot.step.report
+        self._lost.append(report is not None and report.lost)
         self._last = snapshot
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
@@ -267,6 +278,7 @@ class RunRecorder(SessionObserver):
                 pose_covariances=self._covariances.rows,
                 nis=self._nis.rows,
                 nis_dof=self._nis_dof.rows,
+                lost=self._lost.rows,
             ),
             last=self._last,
             n_frames=self._n_frames,
@@ -310,6 +322,9 @@ def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunReco
             gains_db=[radar.gain_db for radar in source.info.radars],
             true_landmarks_m=source.info.true_landmarks_m,
             smoothing_asked=source.smoothing_asked,
+            world_from_map=None
+            if source.map_file is None or source.map_file.world_from_map is None
+            else np.array(source.map_file.world_from_map),
         )
 
 
@@ -323,6 +338,7 @@ def run_slam(
     gains_db: Sequence[float] = (),
     true_landmarks_m: NDArray[np.float64] = _NO_LANDMARKS_M,
     smoothing_asked: Callable[[], bool] = lambda: False,
+    world_from_map: NDArray[np.float64] | None = None,
 ) -> RunRecord:
     """Feed scans to SLAM as they come, and scans and states to the observers.
 
@@ -331,7 +347,8 @@ def run_slam(
     the smoothed run at the end, and after a scan when `smoothing_asked` returns True. BLAS runs on
     one thread, as everywhere else, so that results are the same bits. Observers get frames as
     received, SLAM gets them without each radar's gain, if `gains_db` has any. `true_landmarks_m`,
-    shape (m, 2), world frame, is for the record only.
+    shape (m, 2), world frame, is for the record only; `world_from_map` is the pose of the map frame
+    if that does not begin with the truth's first pose.
 
     Raises
     ------
@@ -343,7 +360,6 @@ def run_slam(
     recorder = RunRecorder(true_landmarks_m)
     observers = [recorder, *observers]
     counters = RowsByTime(np.dtype(np.int64))
-    world_from_map: NDArray[np.float64] | None = None
 
     def take(new: Iterable[StepResult]) -> None:
         for result in new:

@@ -15,7 +15,7 @@ from slam.app.run.runner import RunRecord
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import Rig, between, transform, wrap_angles
 from slam.live.odometry_track import NS_PER_S
-from slam.live.session_records import SessionInfo, SessionObserver, Snapshot
+from slam.live.session_records import SessionInfo, Snapshot
 
 LANDMARKS_TO_FIND = 3
 """Landmarks in view that determine a pose on a map of points: two leave its mirror image."""
@@ -52,28 +52,13 @@ class CarryOutcome:
         return self.found_s is not None and self.found_s - self.three_seen_s <= FOUND_WITHIN_S
 
 
-class LostStates(SessionObserver):
-    """Keeps of every state whether SLAM reported the robot as lost."""
-
-    def __init__(self) -> None:
-        self.of_states: list[bool] = []
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        report = None if snapshot.step is None else snapshot.step.report
-        self.of_states.append(report is not None and report.lost)
-
-
 def carry_of(
     record: RunRecord,
-    lost: NDArray[np.bool_],
     down_ns: int,
     info: SessionInfo,
     rig: Rig,
 ) -> CarryOutcome | None:
-    """Return what became of a robot set down at a session time; None if no state follows.
-
-    ``lost`` is that of every state, shape (n,).
-    """
+    """Return what became of a robot set down at a session time; None if no state follows."""
     states = record.states
     after = np.flatnonzero(states.t_ns >= down_ns)
     if not len(after):
@@ -94,7 +79,7 @@ def carry_of(
         [between(record.world_from_map, pose) for pose in truth]
     )
     right = (
-        ~lost[after]
+        ~states.lost[after]
         & (np.hypot(errors[:, 0], errors[:, 1]) <= FOUND_M)
         & (np.abs(wrap_angles(errors[:, 2])) <= FOUND_RAD)
     )
@@ -103,7 +88,6 @@ def carry_of(
 
 def confidently_wrong(
     record: RunRecord,
-    lost: NDArray[np.bool_],
     carried_ns: tuple[int, int] | None,
     carry: CarryOutcome | None,
 ) -> float:
@@ -126,7 +110,7 @@ def confidently_wrong(
         from_ns = np.inf if seen_s is None else down_ns + (seen_s + FOUND_WITHIN_S) * NS_PER_S
         counted = (states.t_ns < begin_ns) | (states.t_ns >= from_ns)
     is_wrong = (np.hypot(errors[:, 0], errors[:, 1]) > WRONG_M) & (squares > chdtri(2, WRONG_TAIL))
-    return float((is_wrong & ~lost & counted).mean())
+    return float((is_wrong & ~states.lost & counted).mean())
 
 
 def _begin_s(since_s: NDArray[np.float64], right: NDArray[np.bool_]) -> float | None:

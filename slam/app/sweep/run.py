@@ -41,7 +41,6 @@ from slam.app.sweep import CLEAN, STRESSES, SceneKeys, Stress
 from slam.app.sweep.bound import BoundSummary, StateRanges, bound_of
 from slam.app.sweep.outcomes import (
     CarryOutcome,
-    LostStates,
     carry_of,
     confidently_wrong,
     false_landmarks,
@@ -401,19 +400,19 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
             "install the same on both"
         )
     source = source_of(case, stop)
-    ranges, lost_states = StateRanges(), LostStates()
-    record = execute(source, [lost_states, ranges] if case.bound else [lost_states])
+    ranges = StateRanges()
+    record = execute(source, [ranges] if case.bound else [])
     summary = summarise(record, source.info, source.rig)
     if summary is None or record.last is None:
         raise AppError(f"{case.scene.name}: too short for SLAM, no state was estimated")
     false, confident = false_landmarks(record.last, case.scene)
-    lost = np.array(lost_states.of_states)
+    lost = record.states.lost
     carried_ns = (
         stressed_scene(case.scene, STRESSES[case.stress], case.seed).trajectory().carried_ns
     )
     carry = None
     if carried_ns is not None:
-        carry = carry_of(record, lost, carried_ns[1], source.info, source.rig)
+        carry = carry_of(record, carried_ns[1], source.info, source.rig)
     run = SweepRun(
         **{row.name: getattr(summary, row.name) for row in fields(summary)},
         settings=dict(case.settings),
@@ -421,7 +420,7 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
         family="" if case.room is None else case.room[0],
         lost_share=float(lost.mean()),
         lost_at_end=bool(lost[-1]),
-        confidently_wrong_share=confidently_wrong(record, lost, carried_ns, carry),
+        confidently_wrong_share=confidently_wrong(record, carried_ns, carry),
         carry=carry,
         false=false,
         confident_false=confident,

@@ -50,6 +50,7 @@ def session_table(info: SessionInfo) -> dict[str, str]:
         "wheels": json.dumps(dict(info.wheels)),
         "versions": json.dumps(dict(info.versions)),
         "constants": json.dumps(dict(info.constants)),
+        **({"map": info.map_json} if info.map_json else {}),
     }
 
 
@@ -110,6 +111,7 @@ def read_session_table(
             started_unix_ns=int(started) if started else None,
             odometry_clock=table.get("odometry_clock", ""),
             odometry_covariance=bool(json.loads(table.get("odometry_covariance", "false"))),
+            map_json=table.get("map", ""),
         )
     except (KeyError, ValueError, TypeError) as error:
         raise AppError(

@@ -116,8 +116,9 @@ def is_one(log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameter
     # The cost of a range is bounded: few of them could lie anywhere.
     residual = measurement_residuals(merged, together.estimate).residual[: len(merged.ranges_m)]
     fits = np.abs(residual) <= parameters.relinearisation.outlier_sigmas
-    rows = [row for pair in pairs for row in pair]
-    return all(np.mean(fits[problem.range_landmarks == row]) > 0.5 for row in rows)
+    of_rows = [fits[problem.range_landmarks == row] for pair in pairs for row in pair]
+    # Those of a map may have none in this run.
+    return all(np.mean(of_row) > 0.5 for of_row in of_rows if len(of_row))
 
 
 def noisier(state: State, same: Mapping[int, int]) -> dict[int, float]:

@@ -16,13 +16,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import WheelNoise
-from slam.geometry import wrap_angle, wrap_angles
+from slam.geometry import between, compose, wrap_angle, wrap_angles
+from slam.robust.map import SURE, MapPrior, fixed_values
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import HEAD_SIZE, Array, Indices, Layout, Motion, State, quarter_turn
@@ -30,9 +31,8 @@ from slam.robust.state import HEAD_SIZE, Array, Indices, Layout, Motion, State, 
 # Standard deviations of calibration and offsets below this are taken as this, so that information
 # stays finite.
 _LEAST_SIGMA = 1e-7
-# Of the first pose [m, rad], where a run's own map begins
-_POSE_SIGMA = 1e-6
 _LEAST_WAY_M = 1e-9
+_NONE = np.zeros(0, dtype=np.intp)
 # Of a feature's place [m], and of a wall's direction [rad]
 _ANYWHERE_M = 30.0
 
@@ -78,6 +78,9 @@ class Problem:
     # see `RangeErrors`
     variance_share: float = 1.0
     radius_price: float = 1.0
+    # The unknowns (k,) whose prior is that of a map, and their information; these have no sigmas
+    known_at: Indices = field(default_factory=lambda: _NONE)
+    known_information: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def is_walking(self) -> bool:
@@ -97,7 +100,7 @@ def prior_sigmas(layout: Layout, parameters: BackEndParameters) -> Array:
     noise = parameters.ranges
     calibration = np.maximum(parameters.wheels.calibration_sigmas, _LEAST_SIGMA)
     sigmas = np.full(layout.size, _ANYWHERE_M)
-    sigmas[:3], sigmas[3:HEAD_SIZE] = _POSE_SIGMA, calibration
+    sigmas[:3], sigmas[3:HEAD_SIZE] = SURE, calibration
     sigmas[layout.offsets] = max(noise.offset_sigma_m, _LEAST_SIGMA)
     sigmas[layout.mounts] = noise.mount_sigma_m
     if layout.has_radii:
@@ -195,19 +198,22 @@ def motion_covariances(chain: Chain, step_covariances: Array) -> Array:
 class RunLog:
     """Steps and used detections of a whole run, with the trajectory last solved for.
 
+    ``prior`` is what is known of a map; without it the run starts at the origin of its own.
+
     Landmarks are named by id; merges rename, deletions drop what belonged to the landmark. One that
     has not been seen for more than ``gap_poses`` is in another passage when it is seen again.
     """
 
-    def __init__(self, wheels: WheelNoise, gap_poses: int) -> None:
-        self._wheels, self._gap_poses = wheels, gap_poses
+    def __init__(self, wheels: WheelNoise, gap_poses: int, prior: MapPrior | None = None) -> None:
+        self._wheels, self._gap_poses, self.prior = wheels, gap_poses, prior
+        start = np.zeros(3) if prior is None else prior.pose
         self._steps = PackedRows(np.dtype(np.float64), 3)
         self._covariances = PackedRows(np.dtype(np.float64), 3, 3)
         self._walks = PackedRows(np.dtype(np.float64))
         self._is_key = PackedRows(np.dtype(np.bool_))  # poses that must be keyframes
         self._is_key.append(True)
         self._causal = PackedRows(np.dtype(np.float64), 3)
-        self._causal.append(np.zeros(3))
+        self._causal.append(start)
         whose = [("pose", np.int32), ("landmark", np.int32), ("passage", np.int32)]
         where = [("radar", np.int16), ("antenna", np.float64, 2), ("turn_rad", np.float32)]
         measured = [("range_m", np.float64), ("sigma_m", np.float32)]
@@ -219,11 +225,16 @@ class RunLog:
         self._n_passages = 0
         self.since_solved = 0
         """How many steps ago the trajectory was last solved for, or that was tried."""
-        self._stored_pose: Array = np.zeros(3)
+        self._stored_pose: Array = start
 
     @property
     def n_poses(self) -> int:
         return len(self._causal)
+
+    @property
+    def start(self) -> Array:
+        """Return the first pose, (3,), as last solved for."""
+        return np.array(self._causal.rows[0])
 
     def add_motion(self, increment: Array, motion: Motion, *, is_loose: bool = False) -> None:
         """Append a step as reported; ``motion`` is the step as the calibration corrects it.
@@ -395,10 +406,17 @@ class RunLog:
         of_landmark = prior_mean[layout.landmarks].reshape(-1, layout.landmark_size)
         of_landmark[:, :2] = state.landmarks_m
         prior_mean[layout.walls] = state.walls.ravel()
+        sigmas, at, information = prior_sigmas(layout, parameters), _NONE, np.zeros((0, 0))
+        if self.prior is not None:
+            prior_mean[:3], sigmas[:3] = self.prior.pose, self.prior.pose_sigmas
+            at, prior_mean[at], information = self.prior.of(state)
+            sigmas[at] = math.inf
         return Problem(
+            known_at=at,
+            known_information=information,
             layout=layout,
             prior_mean=prior_mean,
-            prior_sigmas=prior_sigmas(layout, parameters),
+            prior_sigmas=sigmas,
             steps=steps,
             step_covariances=self._covariances.rows.copy(),
             walks=self._walks.rows[:, None] * np.square(self._wheels.calibration_sigmas),
@@ -428,6 +446,9 @@ class RunLog:
         whole = np.array([0, len(problem.steps)])
         chain = chain_of(problem.steps, whole, state.calibration[None, :])
         chained = np.vstack([np.zeros(3), np.column_stack([chain.after, np.cumsum(chain.turns)])])
+        if self.prior is not None:  # the start is not known: it is the end that has been corrected
+            first = compose(state.pose, between(chained[-1], np.zeros(3)))
+            chained = np.array([compose(first, pose) for pose in chained])
         poses[-1] = state.pose
         causal = Estimate(
             poses=poses,
@@ -456,16 +477,6 @@ def _rows_of(
             name = names[name]
         final[id_] = -1 if name is None else rows.get(name, -1)
     return final[ids]
-
-
-def fixed_values(state: State) -> Array:
-    """Return offsets, mounts and features in the order of the layout, shape (q,)."""
-    layout = state.layout
-    mounts = state.mounts_m.ravel() if layout.has_mounts else np.zeros(0)
-    landmarks = state.landmarks_m
-    if layout.has_radii:
-        landmarks = np.column_stack([landmarks, state.radii_m])
-    return np.concatenate([state.offsets_m, mounts, landmarks.ravel(), state.walls.ravel()])
 
 
 def _from_keyframes(chain: Chain, keys: Indices) -> tuple[Indices, Array, Array]:

@@ -290,6 +290,11 @@ class NormalEquations:
         self.C[rest, rest] += information[self.size :]
         self.h[rest] += gradient[self.size :]
 
+    def add_known(self, at: Indices, away: Array, information: Array) -> None:
+        """Add what a map says of the columns ``at``, given how far they are from its values."""
+        self.C[np.ix_(at, at)] += information
+        self.h[at] += information @ away[at]
+
     def closed(self) -> tuple[Array, Array, Array, Array, Array]:
         """Return band, B, C, g and h with the last pose moved to the border."""
         size, k = self.size, self.n_chain
@@ -405,7 +410,9 @@ class Smoother:
     def __init__(self, problem: Problem, rule: RelinearisationRule) -> None:
         self._problem, self._rule = problem, rule
         first, layout = problem.keys[:-1], problem.layout
-        self._radii = layout.radii if layout.has_radii else slice(0, 0)
+        radii = layout.radii if layout.has_radii else slice(0, 0)
+        # Those of a map have its prior.
+        self._radii = np.setdiff1d(np.arange(layout.size)[radii], problem.known_at)
         chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))
         covariances = motion_covariances(chain, problem.step_covariances)
         # W with W C W^T = I, shape (k, 3, 3)
@@ -486,6 +493,8 @@ class Smoother:
         costs[self._radii] = price * thin**2 / (2.0 * tau * tau)
         costs[self._radii] += price * 2.0 * np.log((tau + radii) / (2.0 * tau))
         below = np.minimum(away[self._radii], 0.0)
+        away = away[problem.known_at]
+        total += float(away @ problem.known_information @ away)
         return total + float(np.sum(costs) + np.sum((below / tau) ** 2))
 
     def start_cost(self, estimate: Estimate) -> float:
@@ -594,7 +603,10 @@ class Smoother:
             equations.add_steps(steps)
         rows = measurement_residuals(problem, estimate)
         equations.add_rows(rows, self.weights(rows.residual, limit))
-        equations.add_prior(*self._from_prior(estimate))
+        away, sigmas = self._from_prior(estimate)
+        equations.add_prior(away, sigmas)
+        if len(problem.known_at):
+            equations.add_known(problem.known_at, away, problem.known_information)
         return equations
 
 

@@ -176,6 +176,12 @@ class NoSlam:
     def wall_spans_m(self) -> NDArray[np.float64]:
         return np.empty((0, 2, 2))
 
+    def saved_map(self) -> None:
+        """Return no map."""
+
+    def map_changes(self) -> None:
+        """Return no changes."""
+
 
 def feed(observer: SessionObserver, n_scans: int) -> None:
     """Give an observer a whole session of two radars, without closing it."""

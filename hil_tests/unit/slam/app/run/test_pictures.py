@@ -102,6 +102,7 @@ def short_run() -> RunRecord:
         pose_covariances=np.zeros((3, 3, 3)),
         nis=np.zeros(3),
         nis_dof=np.zeros(3, dtype=np.int32),
+        lost=np.zeros(3, dtype=bool),
     )
     return RunRecord(states=states, last=last, n_frames=6, duration_ns=1, wall_s=1.0)
 

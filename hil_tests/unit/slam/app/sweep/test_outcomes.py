@@ -27,7 +27,11 @@ S = 1_000_000_000
 DOWN_NS = 10 * S
 
 
-def record_of(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> RunRecord:
+def record_of(
+    estimate: NDArray[np.float64],
+    truth: NDArray[np.float64],
+    lost: NDArray[np.bool_] | None = None,
+) -> RunRecord:
     """Return a run of a state per second; the map frame is the world's."""
     n = len(truth)
     states = States(
@@ -38,6 +42,7 @@ def record_of(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> RunR
         pose_covariances=np.repeat(np.eye(3)[np.newaxis], n, axis=0),
         nis=np.zeros(n),
         nis_dof=np.zeros(n, dtype=np.int32),
+        lost=np.zeros(n, dtype=bool) if lost is None else lost,
     )
     return RunRecord(states=states, last=None, n_frames=n, duration_ns=n * S, wall_s=1.0)
 
@@ -67,7 +72,7 @@ def found(
     estimate = TRUTH.copy()
     estimate[:wrong_until, 1] += 1.0
     lost = np.arange(60) < lost_until
-    carry = carry_of(record_of(estimate, TRUTH), lost, DOWN_NS, info_of(landmarks), paper_rig())
+    carry = carry_of(record_of(estimate, TRUTH, lost), DOWN_NS, info_of(landmarks), paper_rig())
     assert carry is not None
     return carry
 
@@ -88,8 +93,7 @@ def test_a_place_that_is_right_for_a_moment_is_not_found() -> None:
     estimate = TRUTH.copy()
     estimate[:, 0] += 0.5
     estimate[20:24, 0] -= 0.5
-    lost = np.zeros(60, dtype=bool)
-    carry = carry_of(record_of(estimate, TRUTH), lost, DOWN_NS, info_of(LANDMARKS), paper_rig())
+    carry = carry_of(record_of(estimate, TRUTH), DOWN_NS, info_of(LANDMARKS), paper_rig())
     assert carry is not None
     assert carry.found_s is None
     assert carry.in_time is False
@@ -98,19 +102,17 @@ def test_a_place_that_is_right_for_a_moment_is_not_found() -> None:
 def test_fewer_than_three_landmarks_in_view_give_no_result() -> None:
     assert found(25, 0, LANDMARKS[:2]).in_time is None
     empty = record_of(TRUTH[:5], TRUTH[:5])
-    assert (
-        carry_of(empty, np.zeros(5, dtype=bool), DOWN_NS, info_of(LANDMARKS), paper_rig()) is None
-    )
+    assert carry_of(empty, DOWN_NS, info_of(LANDMARKS), paper_rig()) is None
 
 
 def wrong_share(errors_m: Sequence[float], sigma_m: float, lost: Sequence[int] = ()) -> float:
     """Return the share of ten states, each off by an error across the way, that count as wrong."""
     truth = TRUTH[: len(errors_m)]
     estimate = truth + np.column_stack([np.zeros(len(errors_m)), errors_m, np.zeros(len(errors_m))])
-    record = record_of(estimate, truth)
-    record.states.pose_covariances[:, :2, :2] = sigma_m**2 * np.eye(2)
     is_lost = np.isin(np.arange(len(errors_m)), lost)
-    return confidently_wrong(record, is_lost, None, None)
+    record = record_of(estimate, truth, is_lost)
+    record.states.pose_covariances[:, :2, :2] = sigma_m**2 * np.eye(2)
+    return confidently_wrong(record, None, None)
 
 
 def test_a_position_is_wrong_beyond_15_cm_and_999_of_1000_errors() -> None:
@@ -127,13 +129,13 @@ def test_after_a_carry_states_count_from_20_s_after_the_third_landmark() -> None
     estimate = TRUTH + np.array([0.0, 1.0, 0.0])
     record = record_of(estimate, TRUTH)
     record.states.pose_covariances[:] = 1e-4 * np.eye(3)
-    lost, carried_ns = np.zeros(60, dtype=bool), (8 * S, DOWN_NS)
+    carried_ns = (8 * S, DOWN_NS)
     seen = CarryOutcome(three_seen_s=16.0, found_s=None)
     # eight states before, those from 10 + 16 + 20 = 46 s on
-    share = confidently_wrong(record, lost, carried_ns, seen)
+    share = confidently_wrong(record, carried_ns, seen)
     assert share == pytest.approx((8 + 14) / 60)
     never = CarryOutcome(three_seen_s=None, found_s=None)
-    assert confidently_wrong(record, lost, carried_ns, never) == pytest.approx(8 / 60)
+    assert confidently_wrong(record, carried_ns, never) == pytest.approx(8 / 60)
 
 
 RUN: SweepRun = replace(run_of(make_case("lab", "paper", 0)), ate_rmse_m=0.01)
