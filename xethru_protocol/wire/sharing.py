@@ -7,6 +7,7 @@ DATA STRING with the reason, then ERROR (4.1).
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from xethru_protocol.wire import messages as m
@@ -31,7 +32,7 @@ SETTINGS_CHANGE = "another program changes the settings"
 MOST_UNSENT = 1 << 20
 """Bytes that wait for one host; messages that would make it more are lost for that host."""
 _ANSWER_NS = 10_000_000_000  # longer than a mode change or a restart of the chip takes
-_MOST_QUESTIONS = 64  # of one host that wait
+_MOST_QUESTIONS, _MOST_HELD = 64, 1024  # asked and not answered; of all hosts, not asked yet
 _READINGS = {m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString, m.ParameterFile}
 _NOT_FOR_ALL = (m.X4DriverRead, m.X4DriverReadI2c)  # reading a FIFO empties it
 _CHANGES = (
@@ -46,15 +47,18 @@ class Host:
 
     Attributes
     ----------
+    send
+        Called with every message for it, as bytes.
     unsent
-        What it should get next.
+        Returns how many bytes of them wait.
     messages, lost
         Messages that it was given, and those that it was too slow for.
     """
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.unsent = bytearray()
+    def __init__(
+        self, name: str, send: Callable[[bytes], object], unsent: Callable[[], int]
+    ) -> None:
+        self.name, self.send, self.unsent = name, send, unsent
         self.messages = 0
         self.lost = 0
         self.reader = PacketReader(Direction.FROM_HOST)
@@ -72,48 +76,47 @@ class _Question:
 class SharedModule:
     """A module and its hosts.
 
+    Parameters
+    ----------
+    write
+        Called with what the module should get.
+
     Attributes
     ----------
     hosts
         Those that have not left.
     commander
         Whose changes are carried out; None: of the first that wants one.
-    to_module
-        Bytes that the module should get next.
     statistics
         What the module's line carried. Damaged bytes are not passed on.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, write: Callable[[bytes], object]) -> None:
+        self._write = write
         self.hosts: list[Host] = []
         self.commander: Host | None = None
-        self.to_module = bytearray()
         self.statistics = LinkStatistics()
         self.line_lost()
 
     def line_lost(self) -> None:
         """Begin anew with a line that was just opened; the hosts are left to the caller."""
-        self.to_module.clear()
         self._reader = PacketReader(Direction.FROM_MODULE, self.statistics)
         self._asked: deque[_Question] = deque(maxlen=_MOST_QUESTIONS)  # all by one host
-        self._waiting: list[_Question] = []
+        self._waiting: deque[_Question] = deque(maxlen=_MOST_HELD)
         self._answer_by_ns = 0
 
-    def join(self, name: str) -> Host:
-        self.hosts.append(Host(name))
+    def join(self, name: str, send: Callable[[bytes], object], unsent: Callable[[], int]) -> Host:
+        """Add a host; arguments as of its attributes."""
+        self.hosts.append(Host(name, send, unsent))
         return self.hosts[-1]
 
     def leave(self, host: Host) -> None:
         """Forget a host; the answers to what it asked are nobody's, and others may command."""
         self.hosts.remove(host)
-        self._waiting = [one for one in self._waiting if one.host is not host]
+        for question in [one for one in self._waiting if one.host is host]:
+            self._waiting.remove(question)
         if self.commander is host:
             self.commander = None
-
-    def wants_data(self, host: Host) -> bool:
-        """Whether more may be read from a host; not while it takes no answers."""
-        asked = sum(one.host is host for one in self._waiting)
-        return asked < _MOST_QUESTIONS and len(host.unsent) < MOST_UNSENT
 
     def receive_from_host(self, host: Host, data: bytes, now_ns: int) -> None:
         host.reader.receive_data(data)
@@ -129,12 +132,8 @@ class SharedModule:
                 self._pass_on(found)
         self.advance(now_ns)
 
-    def wake_ns(self) -> int | None:
-        """Return when `advance` should be called next; None: not before bytes come."""
-        return self._answer_by_ns if self._asked and self._waiting else None
-
     def advance(self, now_ns: int) -> None:
-        """Ask the module what waits, as far as it can be asked now."""
+        """Ask the module what waits, as far as it can be asked now; to be called now and then."""
         if self._waiting and now_ns >= self._answer_by_ns:
             self._asked.clear()  # the answers do not come any more
         while True:
@@ -146,9 +145,9 @@ class SharedModule:
             self._waiting.remove(question)
             self._asked.append(question)
             self._answer_by_ns = now_ns + _ANSWER_NS
-            self.to_module += encode_normal(question.payload)
             if isinstance(question.command, _CHANGES):
                 self._announce_change(question.host)
+            self._write(encode_normal(question.payload))
 
     def _take_command(self, host: Host, payload: bytes) -> None:
         command = decode_command(payload)
@@ -190,7 +189,7 @@ class SharedModule:
         if message == _BOOTING:  # what was asked before will not be answered
             self._asked.clear()
         for host in self.hosts:
-            if len(host.unsent) + len(data) > MOST_UNSENT:
+            if host.unsent() + len(data) > MOST_UNSENT:
                 host.lost += 1
             else:
                 self._add(host, data)
@@ -218,7 +217,7 @@ class SharedModule:
 
     @staticmethod
     def _add(host: Host, data: bytes) -> None:
-        host.unsent += data
+        host.send(data)
         host.messages += 1
 
 
