@@ -276,7 +276,7 @@ def test_a_terminal_is_drawn_in_place(at_rest: Path) -> None:
     ("options", "part"),
     [
         ([], "name a recording, or the --port of a module"),
-        (["rec", "--port", "p"], "name a recording, or the --port of a module"),
+        (["rec", "--port", "p"], "not both"),
         (["rec", "--web", "--terminal"], "not allowed with argument"),
         (["rec", "--memory", "1000"], '"1000" must be like 500MB or 2GB'),
         (["rec", "--rate", "-1"], '"-1" must be a number from 0 on'),
