@@ -261,11 +261,7 @@ class SocketTransport(LineTransport):
             raise PortUnavailable(_why_unreachable(url, host, error)) from None
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # a server that lost its power says nothing: without this the line would seem quiet
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in _KEEP_ALIVE.items():
-            if hasattr(socket, option):  # Linux
-                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+        keep_alive(self._socket)
         super().__init__(url, self._socket.fileno())
 
     def close(self) -> None:
@@ -516,6 +512,14 @@ def listening_socket(host: str, port: int, backlog: int) -> socket.socket:
         raise PortUnavailable(f"{host}:{port}: cannot listen: {reason}") from error
     listener.setblocking(False)
     return listener
+
+
+def keep_alive(connection: socket.socket) -> None:
+    """Find out in half a minute that the other machine lost its power, of which it says nothing."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in _KEEP_ALIVE.items():
+        if hasattr(socket, option):  # Linux
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
 
 def _why_unreachable(url: str, host: str, error: Exception) -> str:

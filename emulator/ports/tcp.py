@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from emulator.ports.pty import LARGEST_READ, LinkError
 from emulator.ports.sockets import Listener
-from xethru_protocol.transport import listening_socket
+from xethru_protocol.transport import keep_alive, listening_socket
 from xethru_protocol.wire.errors import PortUnavailable
 
 BACKLOG = 16
@@ -93,5 +93,5 @@ class TcpLink(Listener):
             connection.close()
             return
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        keep_alive(connection)
         self._client = connection

@@ -10,7 +10,13 @@ from contextlib import suppress
 
 from xethru_protocol.cli.output import CommandFailed, counted, print_json, print_line, warn
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
-from xethru_protocol.transport import LineTransport, is_loopback, listening_socket, open_line
+from xethru_protocol.transport import (
+    LineTransport,
+    is_loopback,
+    keep_alive,
+    listening_socket,
+    open_line,
+)
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 from xethru_protocol.wire.sharing import Host, SharedModule
 
@@ -117,7 +123,7 @@ class _Sharing:
             writer.transport.abort()
             return
         connection = writer.get_extra_info("socket")
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        keep_alive(connection)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
         name = f"{peer[0]}:{peer[1]}"
         host = self._module.join(name, writer.write, writer.transport.get_write_buffer_size)

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from hil_tests.patience import seconds
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
-from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
 from xethru_protocol.cli import main
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
@@ -68,10 +68,9 @@ def share(module: PtyModule) -> Iterator[Share]:
         yield share
 
 
-def test_frames_that_do_not_come_cannot_be_taken() -> None:
+def test_frames_that_do_not_come_cannot_be_taken(driver_on: DriverOn) -> None:
     module = EmulatedModule()
-    lines = ScriptedTransport(module), ScriptedTransport(module)
-    commander, listener = (X4M300(line, clock=line.clock) for line in lines)
+    (commander, _), (listener, _) = driver_on(module), driver_on(module)
     with pytest.raises(LocalProtocolError):  # mode STOP
         listener.attach()
     geometry = commander.configure_raw()
