@@ -183,4 +183,4 @@ def _naming(problem: str) -> Iterator[None]:
     try:
         yield
     except DDSException as error:
-        raise AppError(f"ROS 2, domain {domain_number()}: {problem}: {error.msg}") from None
+        raise AppError(f"ROS 2, domain {domain_number()}: {problem} ({error.code})") from None
