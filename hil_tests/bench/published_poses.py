@@ -2,12 +2,12 @@
 
 `python -m hil_tests.bench.published_poses` serves scenes in real time through pseudo-terminals,
 maps them with `uwb-slam run`, and receives what it publishes by UDP, standard output, Foxglove's
-WebSocket and ROS 2, all in one run, on loopback. A row of its table is a scene, a rate of frames
-and a sink: the time from the arrival of a scan's last frame to its pose at the receiver; and the
-same from the arrival of the last thing that the scan waited for, which may be a line of odometry,
-as poses are interpolated. Odometry is sent 50 times a second. Then come the processor share of the
-sink's threads, those of its library, too; that of the whole process; and the load of the machine
-over one minute.
+WebSocket and ROS 2 on loopback, all in one run. A row of its table is a scene, a rate of frames and
+a sink: the time from the arrival of a scan's last frame to its pose at the receiver; and the same
+from the arrival of the last thing that the scan waited for, which may be a line of odometry: poses
+are interpolated. Odometry is sent 50 times a second. Then come the processor share of the sink's
+threads, those of the libraries of Foxglove and DDS, too; that of the whole process; and the load of
+the machine over one minute.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import numpy as np
 
 from emulator import running
 from hil_tests.paths import FIXTURES
-from hil_tests.unit.slam.app.ros2_robot import LOOPBACK
+from hil_tests.system.installation import LOOPBACK
 from slam.app.cli import main as uwb_slam
 from slam.app.odometry.live import LiveOdometry
 from slam.live.odometry_track import TumSample
@@ -44,8 +44,11 @@ NS_PER_S = 1_000_000_000
 SETTLED_NS = 5 * NS_PER_S
 """Session time at the beginning of a run that is not counted: kernels are loaded then."""
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-_LIBRARY_THREADS = {"tokio": "foxglove", "recv": "ros2", "tev": "ros2", "dq.": "ros2"}
-"""Beginnings of the names that libraries give to threads of their own."""
+_LIBRARY_THREADS = {
+    "tokio": "foxglove",
+    **dict.fromkeys(("recv", "tev", "gc", "dq.", "fsm", "lease"), "ros2"),
+}
+"""Beginnings of the names of threads, by the sink that they belong to."""
 
 Received = dict[int, int]
 """Time of day [ns] at which the pose of a session time [ns] came."""
@@ -96,14 +99,15 @@ async def receive_foxglove(port: int, received: Received) -> None:
 
 
 def receive_ros2(received: Received) -> None:
+    """Note when poses came, by the time of ROS."""
     from slam.app.odometry.dds import Ros2Domain
 
     take = Ros2Domain().reader("/uwb_slam/pose", cdr.POSE_WITH_COVARIANCE, reliable=True)
     while True:
-        for message in take(1.0):
+        for data in take(1.0):
             now_ns = time.time_ns()
-            seconds, rest_ns = struct.unpack("<iI", message[4:12])
-            received.setdefault(seconds * NS_PER_S + rest_ns, now_ns)
+            pose = cdr.pose_sample(cdr.deserialise(data, cdr.POSE_WITH_COVARIANCE))
+            received.setdefault(pose.t_ns, now_ns)
 
 
 def in_thread(function: Callable[..., object], *arguments: object) -> threading.Thread:
@@ -161,9 +165,8 @@ def measure(scene: str, fps: int, seconds: int) -> None:
         notes = json.loads((folder / "notes.json").read_text())
         session = open_session(folder / "out" / "session.mcap")
         needed = _inputs(session, notes["odometry"])
-        # stamps of ROS are the time of day
-        zero_ns = session.info.started_unix_ns or 0
-        received["ros2"] = {t_ns - zero_ns: came for t_ns, came in received["ros2"].items()}
+    offset_ns = session.info.started_unix_ns or 0
+    received["ros2"] = {t_ns - offset_ns: came_ns for t_ns, came_ns in received["ros2"].items()}
     load = os.getloadavg()[0]
     for kind, poses in received.items():
         known = [(poses[t_ns], *needed[t_ns]) for t_ns in poses if t_ns in needed]
@@ -241,13 +244,14 @@ def _threads() -> Iterator[tuple[str, int, float]]:
         own = names.get(int(path.name), "")
         kinds = [kind for begin, kind in _LIBRARY_THREADS.items() if name.startswith(begin)]
         if own.startswith("publish "):
-            kinds = [own.removeprefix("publish ").partition(":")[0]]
-            is_publishing = True
-        if kinds:
-            user, system = rest.split()[11:13]
-            yield kinds[0], int(path.name), (int(user) + int(system)) / _TICKS_PER_S
-    if is_publishing:
-        yield "process", 0, time.process_time()
+            kind = own.removeprefix("publish ").partition(":")[0]
+        else:
+            known = (sink for begin, sink in _LIBRARY_THREADS.items() if name.startswith(begin))
+            kind = next(known, "")
+        if not kind:
+            continue
+        user, system = rest.split()[11:13]
+        yield kind, int(path.name), (int(user) + int(system)) / _TICKS_PER_S
 
 
 COLUMNS = (
@@ -264,7 +268,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--child", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
-    os.environ |= {"ROS_DOMAIN_ID": "77", "CYCLONEDDS_URI": LOOPBACK}
+    os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "ROS_DOMAIN_ID": "99"}
     if arguments.child:
         return child(Path(arguments.child[0]), arguments.child[1:])
     say("  ".join(cell.ljust(width) for cell, width in zip(COLUMNS, WIDTHS, strict=True)))

@@ -106,9 +106,7 @@ PROMISES: dict[str, tuple[Promise, ...]] = {
     "foxglove": (
         Promise("uwb-slam demo --scene {scene} --publish foxglove --out demo", "events sent"),
     ),
-    "ros2": (
-        Promise("uwb-slam demo --scene {scene} --publish ros2 --out demo", "0 failed: ros2"),
-    ),
+    "ros2": (Promise("uwb-slam demo --scene {scene} --publish ros2 --out demo", "0 failed: ros2"),),
     "dask": (
         Promise("python sweep.py sweep --scene {scene} --seeds 1 --json sweep.json", "short"),
     ),
