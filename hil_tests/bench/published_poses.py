@@ -215,34 +215,30 @@ def child(folder: Path, command: Sequence[str]) -> int:
         return sample, warning
 
     LiveOdometry.take = noted  # type: ignore[method-assign]
-    windows: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    ended = threading.Event()
+    used_s: dict[str, dict[int, float]] = {}
+    began_s, ended_s = time.monotonic(), threading.Event()
 
     def watch() -> None:
-        while not ended.wait(0.5):
-            now_s = time.monotonic()
-            for kind, thread, used_s in _threads():
-                windows.setdefault((kind, thread), []).append((now_s, used_s))
+        while not ended_s.wait(0.5):
+            for name, thread, seconds in _threads():
+                used_s.setdefault(name, {})[thread] = seconds
 
     in_thread(watch)
     code = uwb_slam(command)
-    ended.set()
-    share: dict[str, float] = {}
-    for (kind, _), seen in windows.items():
-        (first_s, before_s), (last_s, after_s) = seen[0], seen[-1]
-        share[kind] = share.get(kind, 0.0) + (after_s - before_s) / max(last_s - first_s, 0.5)
+    ended_s.set()
+    lasted_s = time.monotonic() - began_s
+    share = {name: sum(threads.values()) / lasted_s for name, threads in used_s.items()}
+    share["process"] = time.process_time() / lasted_s
     (folder / "notes.json").write_text(json.dumps({"odometry": odometry, "share": share}))
     return code
 
 
 def _threads() -> Iterator[tuple[str, int, float]]:
-    """Yield kind of sink, id and processor time [s] of threads that publish, and of the process."""
+    """Yield the kind of sink, the id and the processor time of threads that publish [s]."""
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
-    is_publishing = False
     for path in Path("/proc/self/task").iterdir():
         name, rest = (path / "stat").read_text().partition("(")[2].rsplit(")", 1)
         own = names.get(int(path.name), "")
-        kinds = [kind for begin, kind in _LIBRARY_THREADS.items() if name.startswith(begin)]
         if own.startswith("publish "):
             kind = own.removeprefix("publish ").partition(":")[0]
         else:

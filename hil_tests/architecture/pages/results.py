@@ -73,8 +73,8 @@ SWEEPS = {
         "Rig, speed and course are drawn with the room. `make harm FIRST_SEED=40` runs "
         "them. The picture shows a room of each family with the version before carries were "
         "judged by all ranges, and with the first of these four. That version was also run under "
-        "the stresses, in rooms 40 to 44 of the six families and room 40 of the others: of 111 runs "
-        "66 were confidently wrong and 20 harmed, of the same runs today 1 and 4.",
+        "the stresses, in rooms 40 to 44 of the six families and room 40 of the others: of 111 "
+        "runs 66 were confidently wrong and 20 harmed, of the same runs today 1 and 4.",
         "harm.png",
         "Paths in a room of each family that deceives, before and after",
     ),
