@@ -39,6 +39,7 @@ Row: TypeAlias = Sequence[float | None]
 
 _MOST_AHEAD_NS = 100_000_000
 _KEPT_NS = 2_000_000_000
+_SAME = 1e-9  # [m] and [rad]: two poses of one time that differ by less are one
 _MOST_M = 1e8  # farther than once around the Earth; the filter squares positions
 _MOST_STAMP_NS = 2**63 - 1
 
@@ -244,8 +245,6 @@ class Slam:
         is_first = self._belief_at is None  # frames at the first pose are not looked at
         stamps_ns = {t_ns} if is_first else {t_ns, *(frame.t_ns for frame in taken)}
         poses = {stamp: _pose(pose_at(stamp), f"odometry at {stamp} ns") for stamp in stamps_ns}
-        if not len(track) or t_ns > track.last_ns:
-            track.add(t_ns, poses[t_ns].tolist())
         if self._noise_at is not None:
             self._noise = np.array(self._noise_at(t_ns), dtype=np.float64)
             if self._noise.shape != (3, 3) or not np.isfinite(self._noise).all():
@@ -356,7 +355,8 @@ class Slam:
         if odometry_pose is not None:
             pose = _pose(odometry_pose, f"odometry at {t_ns} ns")
             if len(track) and t_ns <= track.last_ns:
-                if t_ns < track.last_ns or not np.array_equal(track.pose_at(t_ns), pose):
+                apart = between(track.pose_at(t_ns), pose)
+                if t_ns < track.last_ns or np.abs(apart).max() > _SAME:
                     raise StepInputError(
                         f"odometry_pose at {t_ns} ns: poses until {track.last_ns} ns were given "
                         "before; leave it out, and the pose comes from them"
@@ -368,8 +368,8 @@ class Slam:
             if not len(track) or not track.first_ns <= stamp_ns <= track.last_ns + _MOST_AHEAD_NS:
                 known = f"{track.first_ns} to {track.last_ns} ns" if len(track) else "none so far"
                 raise StepInputError(
-                    f"no odometry at {stamp_ns} ns: known {known}; give poses until then first "
-                    "(add_odometry), or frames of that time in a later step"
+                    f"no odometry at {stamp_ns} ns: known {known}; give poses until then first, by "
+                    "add_odometry or as a function of time, or frames of that time in a later step"
                 )
             if stamp_ns > track.last_ns:
                 return track.extrapolated(stamp_ns)

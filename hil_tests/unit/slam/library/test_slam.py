@@ -206,6 +206,19 @@ def test_a_frame_just_behind_the_newest_pose_is_where_the_robot_goes_on_to() -> 
         assert one.pose == pytest.approx(other.pose, abs=1e-9)
 
 
+def test_odometry_may_come_after_the_step_of_its_time() -> None:
+    """A step a little ahead of odometry goes on at its velocity; late poses are taken, too."""
+    slam, millisecond_ns = Slam(RIG), 1_000_000
+    for stamp_ms in range(0, 1000, 20):
+        slam.add_odometry(stamp_ms * millisecond_ns, drive(stamp_ms * millisecond_ns))
+        if stamp_ms % 200 == 40:
+            t_ns = (stamp_ms + 30) * millisecond_ns
+            since_first = drive(t_ns) - drive(70 * millisecond_ns)
+            assert slam.step(t_ns).pose == pytest.approx(since_first, abs=1e-9)
+    for heading_rad in (7.0, 7.0 - 2 * math.tau):  # one pose
+        assert slam.step(2 * 10**9, (0.3, 0.0, heading_rad)).t_ns == 2 * 10**9
+
+
 def test_headings_need_not_be_unwrapped() -> None:
     """A frame half way between two poses on both sides of pi looks the way between them."""
     slam = Slam(RIG, front_end=Rod())
