@@ -31,7 +31,9 @@ SETTINGS_CHANGE = "another program changes the settings"
 """Text for the other hosts, before frames of other settings can come."""
 MOST_UNSENT = 1 << 20
 """Bytes that wait for one host; messages that would make it more are lost for that host."""
-_ANSWER_NS = 10_000_000_000  # longer than a mode change or a restart of the chip takes
+# How long others wait for an answer: longer than a mode change or a restart of the chip takes, and
+# for a mere question, which a module may leave unanswered (4.4), shorter than hosts have patience.
+_COMMAND_NS, _QUESTION_NS = 10_000_000_000, 1_000_000_000
 _MOST_QUESTIONS, _MOST_HELD = 64, 1024  # asked and not answered; of all hosts, not asked yet
 _READINGS = {m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString, m.ParameterFile}
 _NOT_FOR_ALL = (m.X4DriverRead, m.X4DriverReadI2c)  # reading a FIFO empties it
@@ -71,6 +73,7 @@ class _Question:
     command: Command[Response]
     payload: bytes
     replies: tuple[type[Response], ...]  # that answer it besides ERROR; empty: any
+    limit_ns: int
 
 
 class SharedModule:
@@ -144,7 +147,7 @@ class SharedModule:
                 return
             self._waiting.remove(question)
             self._asked.append(question)
-            self._answer_by_ns = now_ns + _ANSWER_NS
+            self._answer_by_ns = now_ns + question.limit_ns
             if isinstance(question.command, _CHANGES):
                 self._announce_change(question.host)
             self._write(encode_normal(question.payload))
@@ -174,7 +177,8 @@ class SharedModule:
             self._give(host, m.Error(code=code))
             return
         replies = () if row is None or Response in row.replies else row.replies
-        self._waiting.append(_Question(host, command, payload, replies))
+        limit_ns = _QUESTION_NS if is_question else _COMMAND_NS
+        self._waiting.append(_Question(host, command, payload, replies, limit_ns))
 
     def _pass_on(self, packet: Packet) -> None:
         message = decode_response(packet.payload)
