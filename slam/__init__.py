@@ -32,9 +32,12 @@ if TYPE_CHECKING:
     from slam.geometry import Rig as Rig
     from slam.library.rig_files import RigFile as RigFile
     from slam.library.rig_files import load_rig as load_rig
+    from slam.library.saved_map import MapFile as MapFile
+    from slam.library.saved_map import load_map as load_map
     from slam.library.slam import Landmarks as Landmarks
     from slam.library.slam import Slam as Slam
     from slam.library.slam import SlamState as SlamState
+    from slam.results import MapChanges as MapChanges
     from slam.results import SmoothedRun as SmoothedRun
 
 _NAMES = {
@@ -43,8 +46,9 @@ _NAMES = {
     "slam.frames": ("Detection", "Detector", "RadarFrame", "StepInputError"),
     "slam.geometry": ("Mount", "Rig"),
     "slam.library.rig_files": ("RigFile", "load_rig"),
+    "slam.library.saved_map": ("MapFile", "load_map"),
     "slam.library.slam": ("Landmarks", "Slam", "SlamState"),
-    "slam.results": ("SmoothedRun",),
+    "slam.results": ("MapChanges", "SmoothedRun"),
 }
 
 

@@ -6,6 +6,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,6 +19,7 @@ from slam.front_end.numba_compilation import compile_kernels
 from slam.geometry import Rig, between, compose, transform
 from slam.library.pose_track import PoseTrack
 from slam.library.rig_files import RigFile
+from slam.library.saved_map import MapFile, load_map, save_map
 from slam.paper.ekf import motion_jacobian
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import (
@@ -137,13 +139,19 @@ class Slam:
         How odometry errs; None: as the rig file says, or the defaults of `WheelNoise`. Preset
         ``paper`` has numbers of its own.
     start
-        Where the map has the first pose: x [m], y [m], heading [rad].
+        Where the map has the first pose: x [m], y [m], heading [rad]; None: at the origin, or with
+        a ``map`` anywhere on it. On a map it is taken to be right to 0.1 m and 0.1 rad.
     odometry_noise
         Returns the covariance (3, 3) of the noise that odometry has gathered until a time [ns], in
         the order and frame of its poses; preset ``robust`` takes its growth in place of the white
         noise of ``wheels``.
     front_end
         Finds ranges in frames, in place of the preset's; see `Detector`.
+    map
+        A map to begin with: a file that `save_map` has written, or what `load_map` returns of it.
+        Until the place on it is found, ``state.is_lost`` is true. Preset ``robust`` only.
+    localise
+        Leave that map as it is: what is new in it serves the pose only.
 
     Attributes
     ----------
@@ -157,9 +165,11 @@ class Slam:
         preset: str | SlamConfig = "robust",
         *,
         wheels: WheelNoise | None = None,
-        start: ArrayLike = (0.0, 0.0, 0.0),
+        start: ArrayLike | None = None,
         odometry_noise: NoiseAt | None = None,
         front_end: Detector | None = None,
+        map: str | Path | MapFile | None = None,
+        localise: bool = False,
     ) -> None:
         if isinstance(rig, RigFile):
             wheels = wheels or rig.wheels.noise
@@ -169,18 +179,34 @@ class Slam:
         self.rig = rig
         self.config = load_preset(preset) if isinstance(preset, str) else preset
         self._wheels = wheels or WheelNoise()
-        self._start = _pose(start, "start")
+        given = None if start is None else _pose(start, "start")
+        on_map = None if map is None else _on_map(map, given, is_fixed=localise)
+        if (map is not None or localise) and self.config.back_end is not BackEnd.ROBUST:
+            raise ValueError("map, localise: preset paper begins with an empty map; use robust")
+        if localise and map is None:
+            raise ValueError("localise: in which map? Give map, too")
+        # Where the pipeline's map, if it is not an earlier one, lies on the map
+        self._start = np.zeros(3) if given is None or on_map is not None else given
         self._noise_at, self._noise = odometry_noise, np.zeros((3, 3))
         noise_at = None if odometry_noise is None else lambda _: self._noise
-        self._pipeline = make_slam(self.config, rig, self._wheels, front_end, noise_at=noise_at)
+        self._pipeline = make_slam(
+            self.config, rig, self._wheels, front_end, noise_at=noise_at, on_map=on_map
+        )
         self._threads = ThreadpoolController()
         self._odometry = PoseTrack()
         self._newest: dict[int, tuple[int, int]] = {}  # stream and counter, by radar
-        self._is_lost = False
+        self._is_lost = on_map is not None and on_map.pose is None
         # The newest belief, and odometry at it
         self._belief = Belief(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+        if on_map is not None and isinstance(self._pipeline, RobustSlam):
+            self._belief = self._pipeline.belief()
         self._belief_at: Array | None = None
-        self.state = SlamState(t_ns=None, pose=self._start, covariance=np.zeros((3, 3)))
+        self.state = SlamState(
+            t_ns=None,
+            pose=compose(self._start, self._belief.pose),
+            covariance=self._belief.pose_covariance,
+            is_lost=self._is_lost,
+        )
 
     def add_odometry(self, t_ns: int, pose: ArrayLike) -> None:
         """Take a pose of the wheels between steps: frames get their poses from it.
@@ -302,6 +328,30 @@ class Slam:
             landmark_covariances_m2=self._turned(run.landmark_covariances_m2),
         )
 
+    def save_map(self, path: str | Path) -> None:
+        """Write the map for later runs, as the solution over all states has it.
+
+        It takes as long as `smoothed`. Of a fixed map the file is written that was given.
+
+        Raises
+        ------
+        ValueError
+            The preset is ``paper``, or ``start`` is another place than the origin of a map: then
+            leave it out, and the map begins at the first pose.
+        OSError
+            The file cannot be written.
+        """
+        with self._threads.limit(limits=1):
+            saved = self._pipeline.saved_map()
+        if saved is None or self._start.any():
+            raise ValueError("save_map: it takes preset robust, and a map that begins at (0, 0, 0)")
+        save_map(path, MapFile(map=saved))
+
+    @property
+    def map_changes(self) -> MapChanges | None:
+        """Return which landmarks of the given map were seen, are gone, or are new; None without."""
+        return self._pipeline.map_changes()
+
     def _scans(
         self, frames: Sequence[RadarFrame], ranges: Sequence[Row], points: Sequence[Row]
     ) -> list[RangeScan]:
@@ -422,6 +472,12 @@ class Slam:
         cosine, sine = math.cos(self._start[2]), math.sin(self._start[2])
         R[:2, :2] = [[cosine, -sine], [sine, cosine]]
         return np.asarray(R @ covariances @ R.T)
+
+
+def _on_map(given: str | Path | MapFile, start: Array | None, *, is_fixed: bool) -> StartOnMap:
+    file = given if isinstance(given, MapFile) else load_map(given)
+    pose = None if start is None else (float(start[0]), float(start[1]), float(start[2]))
+    return StartOnMap(map=file.map, pose=pose, is_fixed=is_fixed)
 
 
 class _Measured(NamedTuple):

@@ -192,7 +192,7 @@ class RobustSlam:
             StepResult(
                 t_ns=t_ns,
                 odometry_pose=pose,
-                belief=self._belief(),
+                belief=self.belief(),
                 detections=detections,
                 report=report,
                 range_sigmas_m=sigmas_m,
@@ -219,7 +219,8 @@ class RobustSlam:
         turned[:2, :2] = rotation(-float(before[2]))
         return np.asarray(turned @ new @ turned.T + self._least_noise)
 
-    def _belief(self) -> Belief:
+    def belief(self) -> Belief:
+        """Return pose and map as they are reported now."""
         branches = self._branches
         belief = belief_of(branches.map, branches.lost_pose, branches.doubted_covariance)
         if self._fixed is None:

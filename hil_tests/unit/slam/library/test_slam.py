@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import slam as library
 from slam import (
+    ConfigError,
     Detection,
     Mount,
     RadarFrame,
@@ -26,6 +27,7 @@ from slam import (
     SlamState,
     StepInputError,
     WheelNoise,
+    load_map,
     load_preset,
     load_rig,
     override,
@@ -297,6 +299,81 @@ def test_ranges_of_anchors_with_ids_place_robot_and_anchors() -> None:
         away = at - ANCHORS[id_]
         assert math.hypot(*away) < 0.1
         assert away @ np.linalg.solve(covariance, away) < 13.8  # 2 dof
+
+
+def circled(slam: Slam, n: int) -> tuple[Pose, SlamState]:
+    """Drive a circle of 3 m among the anchors; return the true pose and the state at its end."""
+    rng = np.random.default_rng(2)
+    step, pose = np.array([0.08, 0.0, 0.08 / 1.5]), np.zeros(3)
+    for number in range(n):
+        ranges = [
+            (0, math.dist(at, pose[:2]) + rng.normal(0.0, 0.02), 0.02, id_)
+            for id_, at in ANCHORS.items()
+        ]
+        state = slam.step(number * TICK_NS, pose, ranges=ranges)
+        pose = compose(pose, step) if number < n - 1 else pose
+    return pose, state
+
+
+def test_the_next_run_begins_on_the_saved_map_with_its_ids(tmp_path: Path) -> None:
+    """Anchors keep their ids, so a robot put down 10 cm off is right after a few ranges."""
+    path, rig = tmp_path / "map.json", Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0)])
+    first = Slam(rig)
+    circled(first, 150)
+    assert first.map_changes is None
+    first.save_map(path)
+    second = Slam(rig, map=path, start=(0.08, -0.06, 0.05))
+    assert second.state.pose == pytest.approx([0.08, -0.06, 0.05])
+    assert second.state.covariance == pytest.approx(np.diag([0.01, 0.01, 0.01]))
+    pose, state = circled(second, 40)
+    assert not state.is_lost
+    assert math.dist(state.pose[:2], pose[:2]) < 0.05
+    assert set(second.landmarks.given_ids) == set(ANCHORS)
+    changes = second.map_changes
+    assert changes is not None
+    assert set(changes.seen) == set(first.landmarks.ids)
+    assert changes.gone == changes.new == ()
+
+
+def test_a_fixed_map_is_reported_and_saved_as_it_was(tmp_path: Path) -> None:
+    path, again = tmp_path / "map.json", tmp_path / "again.json"
+    rig = Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0)])
+    first = Slam(rig)
+    circled(first, 150)
+    first.save_map(path)
+    file = load_map(path)
+    fixed = Slam(rig, map=file, start=(0.0, 0.0, 0.0), localise=True)
+    _, state = circled(fixed, 40)
+    assert state.covariance[0, 0] < 0.05**2
+    assert fixed.landmarks.positions_m.tolist() == file.map.landmarks_m.tolist()
+    fixed.save_map(again)
+    assert load_map(again).map == file.map
+
+
+def test_on_a_map_the_robot_is_lost_until_it_has_found_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    slam = made()
+    for number in range(30):
+        stepped(slam, number)
+    slam.save_map(path)
+    placed = Slam(RIG, map=path, front_end=Rod())
+    assert placed.state.is_lost
+    assert stepped(placed, 0).is_lost
+    assert stepped(placed, 1).is_lost
+
+
+def test_what_cannot_begin_on_a_map_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    made().save_map(path)
+    for options in ({"map": path, "preset": "paper"}, {"localise": True}):
+        with pytest.raises(ValueError, match="map"):
+            Slam(RIG, **options)
+    with pytest.raises(ConfigError, match="none"):
+        Slam(RIG, map=tmp_path / "none.json")
+    for slam in (made("paper"), made(start=(1.0, 0.0, 0.0))):
+        with pytest.raises(ValueError, match="save_map"):
+            slam.save_map(tmp_path / "other.json")
+    assert not (tmp_path / "other.json").exists()
 
 
 def test_points_are_landmarks_at_once() -> None:

@@ -224,7 +224,7 @@ def test_a_fixed_map_is_reported_as_it_was() -> None:
     ):
         pass
     assert len(back_end.reported_rows()) > len(saved.landmarks)
-    belief = slam._belief()
+    belief = slam.belief()
     assert belief.landmark_ids == tuple(one.id for one in saved.landmarks)
     np.testing.assert_array_equal(belief.landmarks, saved.landmarks_m)
     np.testing.assert_allclose(belief.covariance[3:, 3:], saved.landmarks_covariance(), atol=1e-15)
