@@ -19,9 +19,6 @@ Array = NDArray[np.float64]
 POSE_SIZE = 3
 LANDMARK_SIZE = 2
 _NIS_DOF = 2
-# Standard deviations of a start that is given, along each axis and of its heading: that of a robot
-# which somebody has set down by eye
-START_M, START_RAD = 0.1, 0.1
 
 PoseAt = Callable[[int], Array]
 """Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
@@ -327,13 +324,6 @@ class StartOnMap:
     # Where the robot is at first, [x m, y m, heading rad], map frame; None: anywhere
     pose: tuple[float, float, float] | None = None
     is_fixed: bool = False  # the map stays as it is: what is new in it serves the pose only
-
-    @property
-    def pose_and_sigmas(self) -> tuple[Array, Array] | None:
-        """Return the pose (3,) and its standard deviations (3,), if it is known."""
-        if self.pose is None:
-            return None
-        return np.array(self.pose), np.array([START_M, START_M, START_RAD])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -607,12 +607,14 @@ def _add_map(parser: argparse.ArgumentParser) -> None:
         ("join", "make one map of two", 2, _output(".json", what="a map")),
     ):
         action = actions.add_parser(name, help=text, description=text)
-        action.add_argument("files", type=Path, nargs=count, metavar="MAP")
+        action.add_argument("files", type=Path, nargs=count, metavar="MAP", help="from --save-map")
         if name == "convert":
-            action.add_argument("out", type=written, metavar="OUT.geojson")
+            action.add_argument("out", type=written, metavar="OUT.geojson", help="to write")
         else:
             required = name == "join"
-            action.add_argument("--out", type=written, metavar="OUT", required=required)
+            action.add_argument(
+                "--out", type=written, metavar="OUT", required=required, help="file to write"
+            )
 
 
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:

@@ -390,6 +390,11 @@ class BranchRule:
     weakened: Annotated[float, Origin.CHOSEN] = 4.0
     """Factor on the covariance of the points by which the robot is set down, as their ranges are
     used once more."""
+    start_m: Annotated[float, Origin.CHOSEN] = 0.1
+    """Standard deviation of a start on a map that is given, along each axis: that of a robot which
+    somebody has put down by eye."""
+    start_rad: Annotated[float, Origin.CHOSEN] = 0.1
+    """The same of its heading."""
     lost_position_m: Annotated[float, Origin.CHOSEN] = 5.0
     """Standard deviation that is reported for the position while the robot is lost."""
 

@@ -64,7 +64,13 @@ class RobustSlam:
         if on_map is None:
             self._branches = Branches(rig, parameters)
         else:
-            self._branches = Branches(rig, parameters, on_map.map, on_map.pose_and_sigmas)
+            rule, start = parameters.branches, None
+            if on_map.pose is not None:
+                start = (
+                    np.array(on_map.pose),
+                    np.array([rule.start_m, rule.start_m, rule.start_rad]),
+                )
+            self._branches = Branches(rig, parameters, on_map.map, start)
         # What is reported of a map that stays as it is
         self._fixed: tuple[Belief, Array] | None = None
         if on_map is not None and on_map.is_fixed:

@@ -16,9 +16,11 @@ from scipy.io import savemat
 
 from hil_tests.unit.slam.app.convert.authors_bag import authors_bag
 from hil_tests.unit.slam.app.sessions import session_info, write_session
+from hil_tests.unit.slam.library.test_saved_map import FILE
 from hil_tests.unit.transcripts.test_transcripts import check_transcript
 from slam.app.session.writer import SessionLog
 from slam.app.view.rerun_recording import rr
+from slam.library.saved_map import map_text
 from slam.live.odometry_track import OdometryTrack, TumSample
 from slam.live.session.description import METADATA_NAME, session_table
 
@@ -154,6 +156,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "link.rrd").symlink_to("session.mcap")
     (place / "loop.mcap").symlink_to("loop.mcap")
     (place / "empty").mkdir()
+    (place / "room.json").write_text(map_text(FILE))
+    (place / "newer.json").write_text(map_text(FILE).replace('"version": 1', '"version": 2'))
+    (place / "damaged.json").write_text(map_text(FILE)[:300])
     for name, text in DATA_SETS.items():
         (place / name).parent.mkdir(exist_ok=True)
         (place / name).write_text(text, encoding="ascii")

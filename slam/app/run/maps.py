@@ -60,7 +60,7 @@ def map_use(
         raise UsageError("--map, --save-map: preset paper begins and ends without; use robust")
     if map_path is None:
         if start is not None or localise:
-            raise UsageError("--start, --localise: where in which map? Name it with --map MAP.json")
+            raise UsageError("--start and --localise are about a map: name it with --map MAP.json")
         return MapUse()
     try:
         file = load_map(map_path)
