@@ -111,6 +111,11 @@ class Belief:
         block = landmark_slice(row)
         return self.covariance[block, block]
 
+    def landmark_covariances(self) -> Array:
+        """Return the covariance of each landmark, shape (n, 2, 2)."""
+        n = len(self.landmark_ids)
+        return np.array([self.landmark_covariance(row) for row in range(n)]).reshape(-1, 2, 2)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Association:

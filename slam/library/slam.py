@@ -292,15 +292,14 @@ class Slam:
     def landmarks(self) -> Landmarks:
         """Return the map after the newest state."""
         belief = self._belief
-        n, given = len(belief.landmark_ids), dict[int, int]()
+        given = dict[int, int]()
         if isinstance(self._pipeline, RobustSlam):
             of_label = self._pipeline.back_end.landmark_of_label
             given = {landmark: label for label, landmark in of_label.items()}
-        covariances = np.array([belief.landmark_covariance(row) for row in range(n)])
         return Landmarks(
             ids=belief.landmark_ids,
             positions_m=self._placed(belief.landmarks),
-            covariances_m2=self._turned(covariances.reshape(-1, 2, 2)),
+            covariances_m2=self._turned(belief.landmark_covariances()),
             given_ids=tuple(given.get(id_) for id_ in belief.landmark_ids),
         )
 

@@ -213,10 +213,14 @@ class RobustBackEnd:
     def map_now(self) -> SavedMap:
         """Return the map for another run as the filter has it."""
         labels = {id_: label for label, id_ in self._landmark_of_label.items()}
-        saved = saved_map_of(self.state, self.rig, self._existence, labels, self._log.start)
-        cells = self._walls.cells
-        walls = tuple(replace(wall, cells=cells.of(wall.id)) for wall in saved.walls)
-        return replace(saved, walls=walls)
+        return saved_map_of(
+            self.state,
+            self.rig,
+            self._existence,
+            self._log.start,
+            labels=labels,
+            cells_of=self._walls.cells.of,
+        )
 
     def join(self, other: SavedMap, pairs: Sequence[tuple[int, int]]) -> None:
         """Take in a map that is seen from the pose, in whose body frame it is given.

@@ -9,7 +9,7 @@ made, the solution over the whole run decides (`slam.robust.solver.revision.is_o
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -208,11 +208,17 @@ def take_map(
 
 
 def saved_map_of(
-    state: State, rig: Rig, existence: Existence, labels: Mapping[int, int], start: Array
+    state: State,
+    rig: Rig,
+    existence: Existence,
+    start: Array,
+    *,
+    labels: Mapping[int, int],
+    cells_of: Callable[[int], tuple[int, ...]],
 ) -> SavedMap:
-    """Return the reported landmarks and walls of a state but for where they gave echoes.
+    """Return the reported landmarks and walls of a state; ``start`` (3,) is the first pose.
 
-    ``labels`` are ids of beacons by landmark, and ``start`` (3,) is the first pose.
+    ``labels`` are ids of beacons by landmark, ``cells_of`` gives where a wall answered.
     """
     layout, n = state.layout, len(state.landmark_ids)
     rows = [row for row, id_ in enumerate(state.feature_ids) if existence.is_reported(id_)]
@@ -252,7 +258,7 @@ def saved_map_of(
                 d_m=float(state.walls[row - n, 1]),
                 added_sigma_m=added.get(id_, 0.0),
                 hits=existence.hits(id_),
-                cells=(),
+                cells=cells_of(id_),
             )
             for row, id_, added in features
             if row >= n

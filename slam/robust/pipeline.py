@@ -140,9 +140,7 @@ class RobustSlam:
             smoothed,
             landmark_ids=fixed.landmark_ids,
             landmarks_m=fixed.landmarks,
-            landmark_covariances_m2=np.array(
-                [fixed.landmark_covariance(row) for row in range(len(fixed.landmark_ids))]
-            ).reshape(-1, 2, 2),
+            landmark_covariances_m2=fixed.landmark_covariances(),
         )
 
     def saved_map(self) -> SavedMap:

@@ -1,4 +1,4 @@
-"""A second day in emulated rooms: on the map of the first within 10 mm, or lost, never both wrong."""
+"""A second day in emulated rooms: on the map within 10 mm, or lost, and never sure and wrong."""
 
 import pytest
 

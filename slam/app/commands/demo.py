@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
-from typing import Literal
+from typing import Literal, Unpack
 
 from slam.app.errors import EmulatorError
 from slam.app.publish.sinks import Publishing
@@ -27,7 +27,7 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.maps import MapSaver, map_use
+from slam.app.run.maps import MapOptions, MapSaver, map_use
 from slam.app.run.output import RunProgress, note, print_progress
 from slam.app.run.result_files import (
     REPORT,
@@ -68,10 +68,7 @@ def run_demo(
     lean: bool = False,
     rerun: str | None = None,
     publish: Sequence[str] = (),
-    map_path: Path | None = None,
-    start: Sequence[float] | None = None,
-    localise: bool = False,
-    save_map: Path | None = None,
+    **maps: Unpack[MapOptions],
 ) -> None:
     """Run the emulated robot through its scene and write everything into one folder.
 
@@ -79,7 +76,7 @@ def run_demo(
     driven until then is recorded, mapped and summed up.
     """
     loaded, config = scene_and_config(scene, preset)
-    begin = map_use(config, map_path=map_path, start=start, localise=localise, save_map=save_map)
+    begin = map_use(config, maps)
     with ExitStack() as held:
         hold_folder(out, held)
         publishing = held.enter_context(Publishing(publish))
@@ -133,7 +130,7 @@ def run_demo(
                 close=rig_source.close,
                 map_file=begin.file,
             )
-            map_saver = MapSaver(save_map, source.slam, info)
+            map_saver = MapSaver(begin.out, source.slam, info)
             stop.check()
             remove_earlier(out, _OUTPUTS)
             log = SessionLog(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,34 +91,25 @@ def _convert(saved: SavedMap, out: Path) -> None:
         )
     if out.suffix != ".geojson":
         raise UsageError(f"{out}: give a name that ends in .geojson")
-    covariance = saved.landmarks_covariance()
-    features = [
-        {
-            "type": "Feature",
-            "id": one.id,
-            "geometry": {"type": "Point", "coordinates": [one.x_m, one.y_m]},
-            "properties": {
-                "kind": "landmark",
-                "radius_m": one.radius_m,
-                "covariance_m2": covariance[2 * row : 2 * row + 2, 2 * row : 2 * row + 2].tolist(),
-            },
-        }
-        for row, one in enumerate(saved.landmarks)
-    ]
-    features += [
-        {
-            "type": "Feature",
-            "id": wall.id,
-            "geometry": {
-                "type": "MultiLineString",
-                "coordinates": wall_spans_m(wall, WallRule().cell_m).tolist(),
-            },
-            "properties": {"kind": "wall"},
-        }
-        for wall in saved.walls
-    ]
+    blocks, cell_m = saved.landmarks_covariance(), WallRule().cell_m
+    features = []
+    for row, one in enumerate(saved.landmarks):
+        at = slice(2 * row, 2 * row + 2)
+        known = {"radius_m": one.radius_m, "covariance_m2": blocks[at, at].tolist()}
+        features.append(_feature(one.id, "landmark", "Point", [one.x_m, one.y_m], **known))
+    for wall in saved.walls:
+        spans = wall_spans_m(wall, cell_m).tolist()
+        features.append(_feature(wall.id, "wall", "MultiLineString", spans))
     write_json(out, {"type": "FeatureCollection", "coordinates_are": _FRAME, "features": features})
     note(f"{out} has {len(features)} features in {_FRAME}")
+
+
+def _feature(
+    id_: int, kind: str, shape: str, coordinates: list[Any], **known: object
+) -> dict[str, object]:
+    geometry = {"type": shape, "coordinates": coordinates}
+    properties = {"kind": kind, **known}
+    return {"type": "Feature", "id": id_, "geometry": geometry, "properties": properties}
 
 
 def _join(files: list[Path], maps: list[MapFile], out: Path) -> None:

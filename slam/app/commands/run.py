@@ -14,7 +14,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import Self
+from typing import Self, Unpack
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.live_source import LiveLog, LiveSource, drift_text, read_odometry
-from slam.app.run.maps import MapSaver, map_use
+from slam.app.run.maps import MapOptions, MapSaver, map_use
 from slam.app.run.output import ResultRow, RunProgress, note
 from slam.app.run.result_files import (
     REPORT,
@@ -76,10 +76,7 @@ def run_rig(
     lean: bool = False,
     rerun: str | None = None,
     publish: Sequence[str] = (),
-    map_path: Path | None = None,
-    start: Sequence[float] | None = None,
-    localise: bool = False,
-    save_map: Path | None = None,
+    **maps: Unpack[MapOptions],
 ) -> None:
     """Run SLAM on a rig until odometry ends, the time is over, or a signal comes.
 
@@ -99,7 +96,7 @@ def run_rig(
         raise UsageError(str(error)) from None
     if covariance and config.back_end is not BackEnd.ROBUST:
         raise UsageError("--odometry-covariance: preset paper has a noise of its own; use robust")
-    begin = map_use(config, map_path=map_path, start=start, localise=localise, save_map=save_map)
+    begin = map_use(config, maps)
     line_source = parse_source(odometry)
     live_odometry = LiveOdometry(
         line_source.name, parse_clock(clock, line_source), has_covariance=covariance
@@ -185,7 +182,7 @@ def run_rig(
                 smoothing_asked=requests.asked,
                 map_file=begin.file,
             )
-            map_saver = MapSaver(save_map, slam, info)
+            map_saver = MapSaver(begin.out, slam, info)
             remove_earlier(out, (*RESULTS, *_STALE))
             session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)

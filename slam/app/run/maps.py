@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 
@@ -25,12 +26,22 @@ from slam.live.session_records import SessionInfo, SessionObserver, Snapshot
 from slam.results import MapChanges, Pipeline, SmoothedRun, StartOnMap
 
 
+class MapOptions(TypedDict, total=False):
+    """The options, as they are given."""
+
+    map_path: Path | None
+    start: Sequence[float] | None  # x, y [m] and heading [degrees], map frame
+    localise: bool
+    save_map: Path | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapUse:
-    """The map that a run begins with, and how; None of both where it begins with an empty one."""
+    """The map that a run begins with, if there is one, how, and where it saves its own."""
 
     file: MapFile | None = None
     on_map: StartOnMap | None = None
+    out: Path | None = None
 
     @property
     def text(self) -> str:
@@ -41,33 +52,29 @@ class MapUse:
         return json.dumps({"file": map_text(self.file), **how})
 
 
-def map_use(
-    config: SlamConfig,
-    *,
-    map_path: Path | None,
-    start: Sequence[float] | None,
-    localise: bool,
-    save_map: Path | None,
-) -> MapUse:
-    """Return what options ask for; `start` is x, y [m] and heading [degrees], map frame.
+def map_use(config: SlamConfig, options: MapOptions) -> MapUse:
+    """Return what the options ask for.
 
     Raises
     ------
     UsageError
         The map cannot be used, the preset has none, or an option lacks `--map`.
     """
-    if (map_path or save_map) and config.back_end is not BackEnd.ROBUST:
+    path, out = options.get("map_path"), options.get("save_map")
+    start, is_fixed = options.get("start"), options.get("localise", False)
+    if (path or out) and config.back_end is not BackEnd.ROBUST:
         raise UsageError("--map, --save-map: preset paper begins and ends without; use robust")
-    if map_path is None:
-        if start is not None or localise:
+    if path is None:
+        if start is not None or is_fixed:
             raise UsageError("--start and --localise are about a map: name it with --map MAP.json")
-        return MapUse()
+        return MapUse(out=out)
     try:
-        file = load_map(map_path)
+        file = load_map(path)
     except ConfigError as error:
         raise UsageError(str(error)) from None
     pose = None if start is None else (start[0], start[1], math.radians(start[2]))
-    return MapUse(file=file, on_map=StartOnMap(map=file.map, pose=pose, is_fixed=localise))
+    on_map = StartOnMap(map=file.map, pose=pose, is_fixed=is_fixed)
+    return MapUse(file=file, on_map=on_map, out=out)
 
 
 def recorded_use(info: SessionInfo, source: Path) -> MapUse:
@@ -95,7 +102,7 @@ class MapSaver(SessionObserver):
     def __init__(self, path: Path | None, slam: Pipeline, info: SessionInfo) -> None:
         self._path, self._slam, self._info = path, slam, info
         self._world_from_map: tuple[float, float, float] | None = None
-        self._failure = "no map was saved: SLAM has none, or the run was ended within a step"
+        self._failure = "no map was saved: the robot is lost, or the run ended within a step"
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         if np.isfinite(snapshot.truth).all():

@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import UsageError
 from slam.app.publish.sinks import Publishing
-from slam.app.run.maps import MapSaver, MapUse, map_use, recorded_use
+from slam.app.run.maps import MapOptions, MapSaver, MapUse, map_use, recorded_use
 from slam.app.run.output import RunProgress, note
 from slam.app.run.result_files import SESSION, VIEW, finish, hold_folder, saying_what_is_left
 from slam.app.run.runner import (
@@ -215,10 +216,7 @@ def run_replay(
     out: Path,
     rate: float | None = None,
     publish: Sequence[str] = (),
-    map_path: Path | None = None,
-    start: Sequence[float] | None = None,
-    localise: bool = False,
-    save_map: Path | None = None,
+    **maps: Unpack[MapOptions],
 ) -> None:
     """Replay a session, write its results into a folder and print its table.
 
@@ -230,19 +228,17 @@ def run_replay(
         publishing = held.enter_context(Publishing(publish))
         recorded = open_session(session, stop)
         comparison = Comparison(different_constants(recorded.info.constants))
-        begin = map_use(
-            recorded.config, map_path=map_path, start=start, localise=localise, save_map=save_map
-        )
+        begin = map_use(recorded.config, maps)
         source = recorded_source(recorded, stop, comparison, begin)
         if rate is not None:
             source = replace(source, scans=paced(source.scans, rate, stop))
         progress = RunProgress(source.info, source.lost_frames, end_ns=recorded.end_ns)
-        map_saver = MapSaver(save_map, source.slam, source.info)
+        map_saver = MapSaver(begin.out, source.slam, source.info)
         publishing.begin(source.info, source.link_log.log)
         record = execute(source, [publishing, comparison, progress, map_saver])
         if recorded.cut_at_byte is not None:
             note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")
-        if map_path is None:
+        if begin.file is None:
             note(comparison.verdict())
         with saying_what_is_left(f"; {out} is not complete"):
             finish(out, source, record, stop, publishing=publishing, map_saver=map_saver)

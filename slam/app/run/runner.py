@@ -419,7 +419,6 @@ def snapshot_of_step(
 ) -> Snapshot:
     """Return the state that a step of SLAM led to; see `Snapshot`."""
     belief = result.belief
-    rows = range(len(belief.landmark_ids))
     return Snapshot(
         counter=counter,
         t_ns=result.t_ns,
@@ -430,9 +429,7 @@ def snapshot_of_step(
         pose_covariance=belief.pose_covariance,
         landmark_ids=np.array(belief.landmark_ids, dtype=np.int64),
         landmarks_m=belief.landmarks,
-        landmark_covariances_m2=np.array([belief.landmark_covariance(row) for row in rows]).reshape(
-            -1, 2, 2
-        ),
+        landmark_covariances_m2=belief.landmark_covariances(),
         nis_per_dof=result.nis_per_dof,
         wall_spans_m=wall_spans_m,
         step=result,
