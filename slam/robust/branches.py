@@ -58,7 +58,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import chdtri, expit
 
-from slam.geometry import Rig, between, compose, has_moved, transform
+from slam.geometry import Rig, compose, has_moved, transform
 from slam.results import SavedMap, UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
@@ -314,6 +314,7 @@ class Carry:
     next_id: int  # landmarks known before it have smaller ids
     map: RobustBackEnd  # the main back end after the step before
     new: Alternative  # with an empty map at first
+    pose: Array  # shape (3,), before it: [m, m, rad], map frame
     moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
     hidden: Place | None  # a motion that the wheels did not report, and no carry
     placed: list[Place] = field(default_factory=list)  # where the robot may be on the map
@@ -375,7 +376,7 @@ class Branches:
         """
         if not self.is_lost or self._carry is None:
             return None
-        moved = compose(self._carry.map.pose, self._carry.moved)
+        moved = compose(self._carry.pose, self._carry.moved)
         return moved, np.diag(self._rule.lost_variances)
 
     @property
@@ -777,6 +778,7 @@ class Branches:
             next_id=step.next_id,
             map=before,
             new=Alternative(before.with_empty_map(), since),
+            pose=before.pose,
             moved=moved,
             hidden=Place(hidden, since, math.log(self._rule.steps_per_hidden), merges=True),
         )
@@ -795,7 +797,8 @@ class Branches:
             next_id=saved.next_id,
             map=mapped,
             new=Alternative(mapped.with_empty_map(), 0),
-            moved=np.append(middle_m, 0.0),
+            pose=np.append(middle_m, 0.0),
+            moved=np.zeros(3),
             hidden=None,
         )
         self.is_lost = True
@@ -803,11 +806,9 @@ class Branches:
     def _begin_again(self, carry: Carry) -> None:
         """Search for a lost robot by what it sees from now on: what it saw has led nowhere."""
         # The log of the map gets the steps that are left out, so that no pose is missing.
-        pose = compose(carry.map.pose, carry.moved)
         for number in range(carry.since, self._now):
             step = self._steps[number]
             carry.map.predict(step.increment, step.covariance)
-        carry.moved = between(carry.map.pose, pose)
         if carry.is_start:
             self.main, next_id = carry.map.with_empty_map(), self.main.state.next_id
             self.main.state.next_id = next_id
