@@ -24,6 +24,7 @@ from slam.paper.ekf import motion_jacobian
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import (
     Belief,
+    MapChanges,
     NoiseAt,
     Pipeline,
     PoseAt,
