@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
+from rosbags.serde import SerdeError
+
 from slam.app.odometry.dds import Ros2Domain, domain_number
 from slam.live.errors import OdometryError
 from slam.live.odometry_track import NS_PER_S, TumSample, format_sample
@@ -49,8 +51,11 @@ def topic_lines(
             look_s = now_s + (_LOOK_EVERY_S if offered[0] else _WAIT_S)
         for data in take(_WAIT_S):
             arrival_ns = time.monotonic_ns()
-            for sample in _READERS[offered[0]](poses, data):
-                yield format_sample(sample), arrival_ns
+            try:
+                for sample in _READERS[offered[0]](poses, data):
+                    yield format_sample(sample), arrival_ns
+            except SerdeError as error:  # the line is refused, and the user gets a warning
+                yield str(error), arrival_ns
         if now_s - began_s > UNFOUND_S and not poses.is_found:
             poses.check(domain, is_published=bool(offered[0]))
 

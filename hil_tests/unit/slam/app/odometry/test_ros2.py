@@ -28,8 +28,11 @@ from hil_tests.unit.slam.app.ros2_robot import (
 )
 from slam.app.errors import UsageError
 from slam.app.odometry import ros2
+from slam.app.odometry.dds import Ros2Domain
 from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_source, read_lines
 from slam.live.errors import AppError, OdometryError
+from slam.live.odometry_track import TumSample
+from slam.live.session import cdr
 
 NS_PER_S = 1_000_000_000
 
@@ -197,6 +200,27 @@ def test_a_clock_that_jumps_costs_the_poses_before_it_catches_up() -> None:
             live.take(*reading.next())
     assert live.n_refused == 1
     assert live.last_ns == 5_200_000_000
+
+
+def test_a_message_that_cannot_be_read_is_refused_and_the_next_one_is_read() -> None:
+    """Its frame is no UTF-8, which Cyclone passes on."""
+    topic, live = f"/{unique_name()}", LiveOdometry("a test")
+    message = bytearray(cdr.wheel_odometry(TumSample(t_ns=5, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0)))
+    at = message.index(b"odom")
+    write = Ros2Domain().writer(topic, cdr.ODOMETRY)
+    robot = Robot(topic, Odometry)  # tells when the reader is there
+    with Reading(f"ros2:{topic}") as reading:
+        robot.wait_for_listener()
+        robot.publish(odometry(4))
+        live.take(*reading.next())
+        message[at] = 0xFF
+        write(bytes(message))
+        live.take(*reading.next())
+        assert live.n_refused == 1
+        message[at] = ord("o")
+        write(bytes(message))
+        live.take(*reading.next())
+    assert (live.n_refused, live.last_ns) == (1, 5)
 
 
 def test_of_more_messages_than_are_kept_the_newest_are_read() -> None:
