@@ -190,8 +190,7 @@ def _inputs(
     stamps_ns, came_ns = np.array(odometry, dtype=np.int64).T
     needed: dict[int, tuple[int, int]] = {}
     start_ns = None
-    for record in session.scans():
-        scan = record.scan
+    for scan in session.scans():
         start_ns = scan.t_ns if start_ns is None else start_ns
         if not scan.used or not scan.host_ns or scan.t_ns - start_ns < SETTLED_NS:
             continue

@@ -166,7 +166,7 @@ class Scan:
     host_ns: tuple[int, ...] = ()
     used: bool = True
     odometry: PoseAt | None = None
-    truth: NDArray[np.float64] | None = None
+    truth: NDArray[np.float64] | None = field(default=None, compare=False)
 
     def __iter__(self) -> Iterator[RadarFrame]:
         return iter(self.frames)

@@ -156,7 +156,7 @@ def test_damage_in_the_middle_loses_the_chunk_it_is_in(
     assert count_by_rosbags(path) == len(found)
     kept = iter(everything)
     assert all(row in kept for row in found)  # in order, and nothing that was not there
-    for one, _ in open_session(path).scans():  # whole ones, whatever is lost between them
+    for one in open_session(path).scans():  # whole ones, whatever is lost between them
         frames = [(frame.radar, frame.counter) for frame in one.frames]
         assert frames == [(0, one.counter), (1, one.counter)]
     # 40 bytes touch two chunks at most, with eight messages each at most

@@ -192,9 +192,7 @@ def test_a_client_of_foxglove_gets_frames_pose_and_landmarks(session: Path, tmp_
     )
     scans = open_session(session).scans()
     t_ns = int(found["/radar/front_left/frame"]["t_ns"])
-    (samples,) = (
-        frame.samples for one in scans for frame in one.scan.frames[:1] if frame.t_ns == t_ns
-    )
+    (samples,) = (frame.samples for one in scans for frame in one.frames[:1] if frame.t_ns == t_ns)
     assert found["/radar/front_left/frame"]["message"]["data"] == samples.tolist()
     assert found["/landmarks"]["type"] == "sensor_msgs/msg/PointCloud2"
     assert found["/landmarks"]["message"]["width"] > 0

@@ -145,7 +145,7 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
             out / f"{name}.tum"
         ).read_bytes()
     session = open_session(out / "session.mcap")
-    used = [scan for scan, _ in session.scans() if scan.used]
+    used = [scan for scan in session.scans() if scan.used]
     assert summary["frames"] == sum(len(scan.frames) for scan in used) > 0
     assert session.info.time_base == "arrival"
     assert session.info.odometry_clock == "arrival"
@@ -232,7 +232,7 @@ def test_a_run_whose_slam_is_too_slow_ends_at_once_with_all_results(
     ) as process:
         session = out / "session.mcap"
         wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
-        wait_until(lambda: not all(s.used for s, _ in open_session(session).scans()), process)
+        wait_until(lambda: not all(s.used for s in open_session(session).scans()), process)
         began_s = time.monotonic()
         process.send_signal(signal.SIGINT)
         printed, said = process.communicate(timeout=seconds(30))
@@ -244,7 +244,7 @@ def test_a_run_whose_slam_is_too_slow_ends_at_once_with_all_results(
     # no smoothed path where the last step was given up
     assert {path.name for path in out.iterdir()} - {"smoothed.tum"} == names
     rows = {line.split("  ")[0]: line.split() for line in printed.splitlines()}
-    scans = [scan for scan, _ in open_session(session).scans()]
+    scans = [scan for scan in open_session(session).scans()]
     unused = sum(not scan.used for scan in scans)
     assert int(rows["dropped"][1]) + int(rows["left out"][2]) == unused > 0
     assert "recorded states came again, to the last bit" in replayed(

@@ -70,7 +70,7 @@ def texts(path: Path, entity: str, component: str) -> list[str]:
 
 def test_the_file_holds_every_frame_and_state(viewed: Viewed) -> None:
     rows = count_rows(viewed.rrd)
-    n_frames = sum(len(scan.frames) for scan, _ in open_session(viewed.session).scans())
+    n_frames = sum(len(scan.frames) for scan in open_session(viewed.session).scans())
     assert sum(rows[f"/radar/{name}/frame"] for name in RADARS) == n_frames
     assert rows["/radar/rear_left/frame"] == rows["/radar/front_left/frame"] - 1
     assert rows["/map/robot"] == rows["/error/slam"] == viewed.n_states
@@ -161,7 +161,7 @@ def test_a_run_goes_on_when_its_viewer_is_killed(
     session = open_session(viewed.session)
     with LiveView("serve-web", StopFlag()) as live:
         watcher = live.observer(session.info)
-        for number, (scan, _) in enumerate(session.scans()):
+        for number, scan in enumerate(session.scans()):
             if number == 20:
                 kill_viewer()
             watcher.on_scan(scan)

@@ -16,8 +16,8 @@ from slam.evaluation import associate_times, ate_rmse_m, ate_rotation_rmse_rad, 
 from slam.geometry import align_se2, transform
 from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S, Trajectory, read_tum
-from slam.live.session.reader import RecordedScan, begins_with, open_session
-from slam.live.session_records import Snapshot
+from slam.live.session.reader import begins_with, open_session
+from slam.live.session_records import Scan, Snapshot
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.validation import recording_at
@@ -53,8 +53,8 @@ def trajectory_at(
     for record in open_session(source, stop).played():
         if isinstance(record, Snapshot) and wanted == "estimate":
             rows[record.t_ns] = record.estimate
-        elif isinstance(record, RecordedScan) and wanted == "truth" and record.truth is not None:
-            rows[record.scan.t_ns] = record.truth
+        elif isinstance(record, Scan) and wanted == "truth" and record.truth is not None:
+            rows[record.t_ns] = record.truth
     known = {t_ns: pose for t_ns, pose in sorted(rows.items()) if np.isfinite(pose).all()}
     if not known:
         remedy = "`uwb-slam replay` makes one" if wanted == "estimate" else "give a TUM file of it"

@@ -290,7 +290,7 @@ def write_detections(
     stamps_s: list[float] = []
     fixes: tuple[list[Array], list[Array]] = ([], [])
     frames: dict[int, list[NDArray[np.float32]]] = {number: [] for number in _RADARS}
-    for scan, _ in session.scans():
+    for scan in session.scans():
         stop.check()
         # in the order of counters, whether the state is collected or not: a front end may learn
         offsets = [rig.mounts[frame.radar].range_offset_m for frame in scan.frames]

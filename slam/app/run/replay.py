@@ -38,7 +38,7 @@ from slam.frames import Detection, RadarFrame
 from slam.library.slam import make_slam
 from slam.live.errors import AppError, OdometryError
 from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
-from slam.live.session.reader import RecordedScan, RecordedSession, begins_with, open_session
+from slam.live.session.reader import RecordedSession, begins_with, open_session
 from slam.live.session.state_rows import smoothed_row, state_row
 from slam.live.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
@@ -95,11 +95,11 @@ class RecordedScans:
             self._stop.check()
             if isinstance(record, LogLine):
                 self.link_log.pass_on(record)
-            elif isinstance(record, RecordedScan):
-                scan, truth = record.scan, record.truth
-                self._truth.put(scan.t_ns, np.full(3, np.nan) if truth is None else truth)
-                self.lost.on_scan(scan)
-                yield scan
+            elif isinstance(record, Scan):
+                truth = record.truth
+                self._truth.put(record.t_ns, np.full(3, np.nan) if truth is None else truth)
+                self.lost.on_scan(record)
+                yield record
 
 
 def play_states(
@@ -122,8 +122,8 @@ def play_states(
         for record in session.played():
             stop.check()
             for sink in (recorder, *sinks):
-                if isinstance(record, RecordedScan):
-                    sink.on_scan(record.scan)
+                if isinstance(record, Scan):
+                    sink.on_scan(record)
                 elif isinstance(record, Snapshot):
                     sink.on_snapshot(record)
                 elif isinstance(record, SmoothedRun):

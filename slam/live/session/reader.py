@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import BinaryIO, Literal, NamedTuple, Self, TypeAlias
+from typing import BinaryIO, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -219,13 +219,6 @@ class ScanEnd:
     truth: NDArray[np.float64] | None
 
 
-class RecordedScan(NamedTuple):
-    """A scan as the run took it, and the true pose at it, shape (3,), world frame, if known."""
-
-    scan: Scan
-    truth: NDArray[np.float64] | None
-
-
 SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot | SmoothedRun | Gap
 """What `RecordedSession.records` yields; a TumSample is odometry."""
 
@@ -368,10 +361,10 @@ class RecordedSession:
         if self.info.has_detections:
             raise AppError(f"{self.path}: holds ranges in place of frames: see `detections`")
         gains_db, odometry = [radar.gain_db for radar in self.info.radars], self.odometry()
-        for scan, truth in self.scans():
+        for scan in self.scans():
             if scan.used:
                 frames = tuple(less_gain(frame, gains_db[frame.radar]) for frame in scan.frames)
-                yield replace(scan, frames=frames, odometry=odometry.pose_at, truth=truth)
+                yield replace(scan, frames=frames, odometry=odometry.pose_at)
 
     def records(self) -> Iterator[SessionRecord]:
         """Yield what was recorded, in the order of the file; may be called again.
@@ -384,11 +377,11 @@ class RecordedSession:
         for _, record in self._records():
             yield record
 
-    def scans(self) -> Iterator[RecordedScan]:
+    def scans(self) -> Iterator[Scan]:
         """Yield every scan but those that damage or the end of a cut file left incomplete."""
-        return (record for record in self.played() if isinstance(record, RecordedScan))
+        return (record for record in self.played() if isinstance(record, Scan))
 
-    def played(self) -> Iterator[RecordedScan | TumSample | LogLine | Snapshot | SmoothedRun | Gap]:
+    def played(self) -> Iterator[Scan | TumSample | LogLine | Snapshot | SmoothedRun | Gap]:
         """Yield what `records` does, with the frames put together into scans as in `scans`."""
         held: list[tuple[RadarFrame, int]] = []
         for message, record in self._records():
@@ -402,14 +395,14 @@ class RecordedSession:
                 arrivals = tuple(host_ns for frame, host_ns in held if host_ns != frame.t_ns)
                 held = []
                 if tuple((frame.radar, frame.counter) for frame in frames) == record.members:
-                    scan = Scan(
+                    yield Scan(
                         counter=record.counter,
                         t_ns=record.t_ns,
                         frames=frames,
                         host_ns=arrivals if len(arrivals) == len(frames) else (),
                         used=record.used,
+                        truth=record.truth,
                     )
-                    yield RecordedScan(scan=scan, truth=record.truth)
             else:
                 yield record
 

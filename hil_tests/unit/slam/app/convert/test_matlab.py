@@ -87,7 +87,7 @@ def test_a_session_gets_the_ranges_that_the_fixes_are_made_of(
     assert set(of_radar) == set(expected)
     for radar, ranges in expected.items():
         np.testing.assert_allclose(of_radar[radar], ranges, atol=1e-12)
-    frames = [frame for one, _ in session.scans() for frame in one.frames]
+    frames = [frame for one in session.scans() for frame in one.frames]
     assert [(frame.radar, frame.counter, len(frame.samples)) for frame in frames] == [(2, 4, 500)]
 
 

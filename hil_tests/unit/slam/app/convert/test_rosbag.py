@@ -48,7 +48,7 @@ def facts(session: RecordedSession) -> list[tuple[object, ...]]:
             one.used,
             [(f.radar, f.counter, f.t_ns, f.samples.tobytes()) for f in one.frames],
         )
-        for one, _ in session.scans()
+        for one in session.scans()
     ]
 
 
@@ -79,10 +79,10 @@ def test_a_session_comes_back_from_a_bag(
     first, second = open_session(recorded), open_session(again)
     assert facts(second) == facts(first)
     assert list(second.odometry()) == list(first.odometry())
-    for (_, one), (_, other) in zip(first.scans(), second.scans(), strict=True):
-        assert one is not None
-        assert other is not None
-        np.testing.assert_allclose(other, one, rtol=0, atol=1e-12)
+    for one, other in zip(first.scans(), second.scans(), strict=True):
+        assert one.truth is not None
+        assert other.truth is not None
+        np.testing.assert_allclose(other.truth, one.truth, rtol=0, atol=1e-12)
     assert second.info.radars == first.info.radars
     assert second.info.seed == 7
     assert second.info.config_json == '{"a": 1}'
@@ -131,16 +131,16 @@ def test_the_authors_layout_becomes_a_session(
     assert radar.range_start_m + 1431 * radar.bin_length_m == pytest.approx(9.40067863, abs=1e-6)
     assert radar.rate_hz == pytest.approx(5.0, rel=0.1)
     assert (session.info.seed, session.info.simulated) == (None, False)
-    for number, (one, truth) in enumerate(session.scans()):
+    for number, one in enumerate(session.scans()):
         assert [(f.radar, f.counter, f.t_ns) for f in one.frames] == [
             (radar, number, jittered_ns(radar, number)) for radar in range(4)
         ]
         for frame in one.frames:
             np.testing.assert_array_equal(frame.samples, samples(frame.radar, number))
         assert one.used
-        assert truth is not None
+        assert one.truth is not None
         passed_s = (one.t_ns - START_NS + 300_000_000) / 1e9
-        np.testing.assert_allclose(truth, [2.0 + passed_s / 4, -0.5, 0.2], atol=1e-9)
+        np.testing.assert_allclose(one.truth, [2.0 + passed_s / 4, -0.5, 0.2], atol=1e-9)
     # stamps are those of the headers, not of the recording 3 ms later
     assert session.odometry().first_ns == START_NS - 300_000_000
 
@@ -175,7 +175,7 @@ def test_what_is_odd_is_said_and_left_out(
         f"uwb-slam: {bag}: poses that went back in time and are left out: 1",
         f"uwb-slam: {bag}: no truth on /slam_out_pose: numbers that need it will be null",
     ]
-    assert [truth for _, truth in open_session(tmp_path / "s.mcap").scans()] == [None] * N_SCANS
+    assert [one.truth for one in open_session(tmp_path / "s.mcap").scans()] == [None] * N_SCANS
 
 
 def test_scans_that_odometry_does_not_reach_are_not_used(
@@ -188,7 +188,7 @@ def test_scans_that_odometry_does_not_reach_are_not_used(
     code, _, err = run(capsys, "convert", tmp_path / "bag", tmp_path / "again.mcap")
     assert code == 0
     assert "5 scans lie outside the odometry" in err
-    used = [one.used for one, _ in open_session(tmp_path / "again.mcap").scans()]
+    used = [one.used for one in open_session(tmp_path / "again.mcap").scans()]
     assert used == [False, False, True, True, True, False, False, False]
 
 
@@ -211,7 +211,7 @@ def test_scans_in_a_hole_of_odometry_are_kept_and_not_used(
     code, _, err = run(capsys, "convert", bag.path, out)
     assert code == 0
     assert "15 scans lie outside the odometry, or in a hole of it longer than 1 s" in err
-    used = [one.used for one, _ in open_session(out).scans()]
+    used = [one.used for one in open_session(out).scans()]
     # scan 20 begins at 4.0 s, where the last pose is, and ends at 4.09 s; scan 35 begins at 7.0 s
     assert [number for number, is_used in enumerate(used) if not is_used] == list(range(20, 35))
     assert len(used) == 50
@@ -325,7 +325,7 @@ def test_frames_of_one_period_are_one_scan_even_if_one_is_lost(
     write_scans(path, scans, OdometryTrack.from_lines(poses))
     run(capsys, "convert", path, tmp_path / "bag")
     run(capsys, "convert", tmp_path / "bag", tmp_path / "again.mcap")
-    taken = [one for one, _ in open_session(tmp_path / "again.mcap").scans()]
+    taken = [one for one in open_session(tmp_path / "again.mcap").scans()]
     assert [[f.radar for f in one.frames] for one in taken] == [
         [1] if counter == 3 else [0, 1] for counter in range(8)
     ]

@@ -254,7 +254,7 @@ def test_the_session_of_an_overloaded_run_replays_to_the_last_bit(
     path = tmp_path / "session.mcap"
     run = Overloaded(drive, 0.5, signal_s=20.0, session=path).run()
     session = open_session(path)
-    recorded = [(scan.counter, scan.used) for scan, _ in session.scans()]
+    recorded = [(scan.counter, scan.used) for scan in session.scans()]
     assert recorded == [(scan.counter, scan.used) for _, scan in run.given.scans]
     assert {used for _, used in recorded} == {True, False}
     # an independent reader: marks by topic

@@ -89,7 +89,7 @@ def test_scans_group_by_tick_also_where_a_radar_started_whole_periods_late(tmp_p
         frames = (first,) if tick == 0 else (first, replace(second, counter=tick - 1))
         scans.append(replace(scan(tick), frames=frames))
     write_scans(path, scans, odometry(80), info)
-    grouped = [one for one, _ in open_session(path).scans()]
+    grouped = [one for one in open_session(path).scans()]
     assert [(s.counter, [f.counter for f in s.frames]) for s in grouped] == [
         (0, [0]),
         *((tick, [tick, tick - 1]) for tick in range(1, 5)),
@@ -117,10 +117,10 @@ def test_scans_come_back_as_the_run_took_them(tmp_path: Path) -> None:
         log.on_scan(one)
     log.close()
     taken = list(open_session(path).scans())
-    assert [facts(one) for one, _ in taken] == [facts(one) for one in sent]
-    for one, truth in taken:
-        assert truth is not None
-        assert truth.tolist() == (one.t_ns * np.array([1e-9, 1 / 3, 0.1])).tolist()
+    assert [facts(one) for one in taken] == [facts(one) for one in sent]
+    for one in taken:
+        assert one.truth is not None
+        assert one.truth.tolist() == (one.t_ns * np.array([1e-9, 1 / 3, 0.1])).tolist()
 
 
 def test_what_is_unknown_stays_unknown(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_what_is_unknown_stays_unknown(tmp_path: Path) -> None:
     session = open_session(path)
     assert (session.info.seed, session.info.simulated) == (None, False)
     assert session.info.time_base == "arrival"
-    assert [truth for _, truth in session.scans()] == [None]
+    assert [one.truth for one in session.scans()] == [None]
     (state,) = [record for record in session.records() if isinstance(record, Snapshot)]
     assert np.isnan(state.truth).all()
 

@@ -244,7 +244,7 @@ def test_the_stream_of_every_frame_comes_back(tmp_path: Path) -> None:
         frames = tuple(replace(frame, stream=number) for frame, number in pairs)
         log.on_scan(replace(one, frames=frames))
     log.close()
-    found = [tuple(f.stream for f in one.frames) for one, _ in open_session(path).scans()]
+    found = [tuple(f.stream for f in one.frames) for one in open_session(path).scans()]
     assert found == streams
     with path.open("rb") as stream:
         rows = [
