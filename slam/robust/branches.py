@@ -317,6 +317,7 @@ class Carry:
     pose: Array  # shape (3,), before it: [m, m, rad], map frame
     moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
     hidden: Place | None  # a motion that the wheels did not report, and no carry
+    skipped: list[Step] = field(default_factory=list)  # steps before ``since`` that led nowhere
     placed: list[Place] = field(default_factory=list)  # where the robot may be on the map
     until: int = 0  # step at which these are dropped; 0 until they have caught up
     adopted: Place | None = None
@@ -805,10 +806,7 @@ class Branches:
 
     def _begin_again(self, carry: Carry) -> None:
         """Search for a lost robot by what it sees from now on: what it saw has led nowhere."""
-        # The log of the map gets the steps that are left out, so that no pose is missing.
-        for number in range(carry.since, self._now):
-            step = self._steps[number]
-            carry.map.predict(step.increment, step.covariance)
+        carry.skipped += [self._steps[number] for number in range(carry.since, self._now)]
         if carry.is_start:
             self.main, next_id = carry.map.with_empty_map(), self.main.state.next_id
             self.main.state.next_id = next_id
@@ -847,6 +845,8 @@ class Branches:
             covariance = self._rule.weakened * here.covariance_m2[block, block]
             points.append((there.ids[row], here.points_m[own], covariance))
         back_end = carry.map.copy()
+        for step in carry.skipped:  # no pose of the run is missing
+            back_end.predict(step.increment, step.covariance)
         back_end.set_down(placement.motion, points)
         back_end.state.next_id = self.main.state.next_id + _IDS_APART
         return Place(back_end, carry.since, price_nats)
