@@ -2,12 +2,13 @@
 
 `python -m hil_tests.bench.published_poses` serves scenes in real time through pseudo-terminals,
 maps them with `uwb-slam run`, and receives what it publishes by UDP, standard output, Foxglove's
-WebSocket and ROS 2 on loopback, all in one run. A row of its table is a scene, a rate of frames and
-a sink: the time from the arrival of a scan's last frame to its pose at the receiver; and the same
-from the arrival of the last thing that the scan waited for, which may be a line of odometry: poses
-are interpolated. Odometry is sent 50 times a second. Then come the processor share of the sink's
-threads, those of the libraries of Foxglove and DDS, too; that of the whole process; and the load of
-the machine over one minute.
+WebSocket and ROS 2, all in one run, on loopback. A row of its table is a scene, a rate of frames
+and a sink: the time from the arrival of a scan's last frame to its pose at the receiver; and the
+same from the arrival of the last thing that the scan waited for, which may be a line of odometry,
+as poses are interpolated. Odometry is sent 50 times a second. Then come the processor share of the
+sink's threads, those of its library, too; that of the whole process; and the load of the machine
+over one minute. Some poses come 40 ms later by WebSocket: the server's library leaves small
+messages to Nagle's algorithm, and they wait for the acknowledgement of the one before.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ async def receive_foxglove(port: int, received: Received) -> None:
         if isinstance(message, str):
             channels = json.loads(message).get("channels", ())
             ids = [{"id": one["id"], "channelId": one["id"]} for one in channels]
-            poses = next((one["id"] for one in channels if one["topic"] == "/estimate/pose"), poses)
+            poses = next((one["id"] for one in channels if one["topic"] == "/estimate"), poses)
             if ids:  # to all topics, as a viewer does
                 await client.write_message(json.dumps({"op": "subscribe", "subscriptions": ids}))
         elif message[0] == 1:
