@@ -32,9 +32,16 @@ from slam.robust.state import HEAD_SIZE, Array, Indices, Layout, Motion, State, 
 # stays finite.
 _LEAST_SIGMA = 1e-7
 _LEAST_WAY_M = 1e-9
-_NONE = np.zeros(0, dtype=np.intp)
 # Of a feature's place [m], and of a wall's direction [rad]
 _ANYWHERE_M = 30.0
+
+
+def _no_unknowns() -> Indices:
+    return np.zeros(0, dtype=np.intp)
+
+
+def _no_information() -> Array:
+    return np.zeros((0, 0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,8 +86,8 @@ class Problem:
     variance_share: float = 1.0
     radius_price: float = 1.0
     # The unknowns (k,) whose prior is that of a map, and their information; these have no sigmas
-    known_at: Indices = field(default_factory=lambda: _NONE)
-    known_information: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    known_at: Indices = field(default_factory=_no_unknowns)
+    known_information: Array = field(default_factory=_no_information)
 
     @property
     def is_walking(self) -> bool:
@@ -406,7 +413,8 @@ class RunLog:
         of_landmark = prior_mean[layout.landmarks].reshape(-1, layout.landmark_size)
         of_landmark[:, :2] = state.landmarks_m
         prior_mean[layout.walls] = state.walls.ravel()
-        sigmas, at, information = prior_sigmas(layout, parameters), _NONE, np.zeros((0, 0))
+        sigmas = prior_sigmas(layout, parameters)
+        at, information = _no_unknowns(), _no_information()
         if self.prior is not None:
             prior_mean[:3], sigmas[:3] = self.prior.pose, self.prior.pose_sigmas
             at, prior_mean[at], information = self.prior.of(state)
