@@ -195,6 +195,11 @@ class StepResult:
     range_sigmas_m: tuple[float, ...] = ()
 
     @property
+    def is_lost(self) -> bool:
+        """Whether the robust back end reports the robot as lost."""
+        return self.report is not None and self.report.lost
+
+    @property
     def nis(self) -> tuple[float, ...]:
         """Return the normalised innovation squared (2 dof) of each landmark seen again."""
         return tuple(a.nis for a in self.associations if a.nis is not None)

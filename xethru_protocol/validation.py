@@ -92,21 +92,14 @@ def load_toml(
 
     Raises ``error`` with one line that begins with ``source`` and calls the file ``what``.
     """
+    import tomllib  # commands that read no such file start without it
+
     try:
-        content = read_bounded(path).decode()
+        return model.model_validate(tomllib.loads(read_bounded(path).decode()))
     except OSError as problem:
         raise error(f"{source}: cannot read the {what} file: {problem.strerror}") from problem
     except UnicodeDecodeError as problem:
         raise error(f"{source}: not UTF-8 text at byte {problem.start}") from problem
-    return parse_toml(model, content, source=source, error=error)
-
-
-def parse_toml(model: type[ModelT], text: str, *, source: str, error: type[Exception]) -> ModelT:
-    """Return the model in TOML text; raise ``error`` naming the source otherwise."""
-    import tomllib  # commands that read no such file start without it
-
-    try:
-        return model.model_validate(tomllib.loads(text))
     except RecursionError as problem:
         raise error(f"{source}: brackets are nested too deep") from problem
     except ValueError as problem:

@@ -285,7 +285,7 @@ class Slam:
             self._belief_at = poses[t_ns]
         for result in results:
             self._belief, self._belief_at = result.belief, result.odometry_pose
-            self._is_lost = result.report is not None and result.report.lost
+            self._is_lost = result.is_lost
         self.state = self._state(t_ns, poses[t_ns], results)
         return self.state
 

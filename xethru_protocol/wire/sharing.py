@@ -17,7 +17,6 @@ from xethru_protocol.wire.framing import (
     Direction,
     Framing,
     FramingFault,
-    LinkStatistics,
     NeedData,
     Packet,
     PacketReader,
@@ -77,7 +76,7 @@ class _Question:
 
 
 class SharedModule:
-    """A module and its hosts.
+    """A module and its hosts; damaged bytes are not passed on.
 
     Parameters
     ----------
@@ -90,20 +89,17 @@ class SharedModule:
         Those that have not left.
     commander
         Whose changes are carried out; None: of the first that wants one.
-    statistics
-        What the module's line carried. Damaged bytes are not passed on.
     """
 
     def __init__(self, write: Callable[[bytes], object]) -> None:
         self._write = write
         self.hosts: list[Host] = []
         self.commander: Host | None = None
-        self.statistics = LinkStatistics()
         self.line_lost()
 
     def line_lost(self) -> None:
         """Begin anew with a line that was just opened; the hosts are left to the caller."""
-        self._reader = PacketReader(Direction.FROM_MODULE, self.statistics)
+        self._reader = PacketReader(Direction.FROM_MODULE)
         self._asked: deque[_Question] = deque(maxlen=_MOST_QUESTIONS)  # all by one host
         self._waiting: deque[_Question] = deque(maxlen=_MOST_HELD)
         self._answer_by_ns = 0

@@ -56,14 +56,13 @@ class LineMaker:
             if before.get(id_) != self._given[id_]:
                 numbers = {"position": _numbers(row[:2]), "covariance": _numbers(row[2:])}
                 changed.append(_json({"id": id_} | numbers))
-        report = None if snapshot.step is None else snapshot.step.report
         head = {
             "kind": "state",
             "map": self._map_id,
             "t_ns": snapshot.t_ns,
             "pose": _numbers(snapshot.estimate),
             "covariance": _numbers(snapshot.pose_covariance),
-            "lost": report is not None and report.lost,
+            "lost": snapshot.step is not None and snapshot.step.is_lost,
         }
         once = {"removed": [id_ for id_ in before if id_ not in self._given], "reset": is_whole}
         for first, part in self._parts(head | once, changed):

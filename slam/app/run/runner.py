@@ -260,8 +260,7 @@ class RunRecorder(SessionObserver):
         nis, dof = self._true_nis(snapshot)
         self._nis.append(nis)
         self._nis_dof.append(dof)
-        report = None if snapshot.step is None else snapshot.step.report
-        self._lost.append(report is not None and report.lost)
+        self._lost.append(snapshot.step is not None and snapshot.step.is_lost)
         self._last = snapshot
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:

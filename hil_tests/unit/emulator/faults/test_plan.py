@@ -7,7 +7,6 @@ import pytest
 from emulator.faults.kind import Target
 from emulator.faults.kinds import KINDS
 from emulator.faults.plan import (
-    FaultPlan,
     FaultPlanError,
     described,
     example,
@@ -15,7 +14,6 @@ from emulator.faults.plan import (
     load_plan,
 )
 from emulator.scene.toml_files import shipped_names
-from xethru_protocol.validation import parse_toml
 
 
 def test_shipped_scenarios_load() -> None:
@@ -25,10 +23,10 @@ def test_shipped_scenarios_load() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_example_of_every_kind_is_a_scenario(kind: str) -> None:
-    (spec,) = parse_toml(
-        FaultPlan, example(KINDS[kind]), source="scenario", error=FaultPlanError
-    ).fault
+def test_the_example_of_every_kind_is_a_scenario(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "scenario.toml"
+    path.write_text(example(KINDS[kind]))
+    (spec,) = load_plan(path).fault
     assert spec.kind == kind
     assert spec.kind_parameters() == KINDS[kind].parameters()
 
@@ -65,12 +63,14 @@ def test_every_parameter_has_a_meaning_and_a_limit(kind: str) -> None:
         ("[[fault]]\nkind = 'stall'\nat_s = 2\nuntil_s = 2", "fault[0]: until_s: "),
     ],
 )
-def test_a_mistake_is_one_line_that_names_the_place(text: str, place: str) -> None:
+def test_a_mistake_is_one_line_that_names_the_place(text: str, place: str, tmp_path: Path) -> None:
+    path = tmp_path / "scenario.toml"
+    path.write_text(text)
     with pytest.raises(FaultPlanError) as caught:
-        parse_toml(FaultPlan, text, source="scenario", error=FaultPlanError)
+        load_plan(path)
     assert place in str(caught.value)
     assert "\n" not in str(caught.value).replace(text, "")
-    assert str(caught.value).startswith("scenario: ")
+    assert str(caught.value).startswith(f"{path}: ")
 
 
 @pytest.mark.parametrize(
