@@ -475,11 +475,22 @@ def _address(url: str) -> tuple[str, int]:
             f"{url}: {scheme}:// is not a kind of port; there are tcp://HOST:PORT, "
             "rfc2217://HOST:PORT, and serial ports such as /dev/ttyACM0"
         )
-    found = re.fullmatch(r"(\[[^\]]+\]|[^:/?#\[\]]+):([0-9]{1,5})/?", rest, re.ASCII)
-    if found is None or not 0 < int(found[2]) < 65536:
+    if (address := host_and_port(rest.removesuffix("/"))) is None:
         raise PortUnavailable(
             f"{url}: must be {scheme}://HOST:PORT with a port of 1...65535, and nothing behind it"
         )
+    return address
+
+
+def host_and_port(text: str) -> tuple[str, int] | None:
+    """Return the two parts of ``HOST:PORT``; None if it is something else.
+
+    >>> host_and_port("[::1]:8765"), host_and_port("lab-pc:0"), host_and_port("lab-pc")
+    (('::1', 8765), None, None)
+    """
+    found = re.fullmatch(r"(\[[^\]]+\]|[^:/?#\[\]]+):([0-9]{1,5})", text, re.ASCII)
+    if found is None or not 0 < int(found[2]) < 65536:
+        return None
     return found[1].strip("[]"), int(found[2])
 
 

@@ -59,7 +59,7 @@ import numpy as np
 from scipy.special import chdtri, expit
 
 from slam.geometry import Rig, compose, has_moved, transform
-from slam.results import SavedMap, UpdateReport
+from slam.results import SavedMap, StartOnMap, UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import Question
@@ -328,18 +328,18 @@ class Branches:
     """The main back end, the question of a carry, and its decision.
 
     ``predict`` and ``update`` alternate as in ``RobustBackEnd``. A robot that begins on a map
-    without a ``start`` has been carried to wherever on the map it is, or beside it.
+    without a pose has been carried to wherever on the map it is, or beside it.
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        parameters: BackEndParameters,
-        saved: SavedMap | None = None,
-        start: tuple[Array, Array] | None = None,
+        self, rig: Rig, parameters: BackEndParameters, on_map: StartOnMap | None = None
     ) -> None:
+        self._rule = rule = parameters.branches
+        saved, start = None if on_map is None else on_map.map, None
+        if on_map is not None and on_map.pose is not None:
+            sigmas = np.array([rule.start_m, rule.start_m, rule.start_rad])
+            start = np.array(on_map.pose), sigmas
         self.main = RobustBackEnd(rig, parameters, saved, start)
-        self._rule = parameters.branches
         self._look_every, self._window = parameters.map.look_every, parameters.tracklets.window
         self._fewest = parameters.tracklets.min_frames
         self._steps: dict[int, Step] = {}  # by number, those that are needed still

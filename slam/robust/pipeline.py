@@ -61,16 +61,7 @@ class RobustSlam:
         self.rig = rig
         parameters = back_end_parameters(config, wheels, rules)
         self._on_map = on_map
-        if on_map is None:
-            self._branches = Branches(rig, parameters)
-        else:
-            rule, start = parameters.branches, None
-            if on_map.pose is not None:
-                start = (
-                    np.array(on_map.pose),
-                    np.array([rule.start_m, rule.start_m, rule.start_rad]),
-                )
-            self._branches = Branches(rig, parameters, on_map.map, start)
+        self._branches = Branches(rig, parameters, on_map)
         # What is reported of a map that stays as it is
         self._fixed: tuple[Belief, Array] | None = None
         if on_map is not None and on_map.is_fixed:

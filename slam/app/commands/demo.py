@@ -130,7 +130,7 @@ def run_demo(
                 close=rig_source.close,
                 map_file=begin.file,
             )
-            map_saver = MapSaver(begin.out, source.slam, info)
+            map_saver = MapSaver(maps.get("save_map"), source.slam, info)
             stop.check()
             remove_earlier(out, _OUTPUTS)
             log = SessionLog(

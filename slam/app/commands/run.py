@@ -182,7 +182,7 @@ def run_rig(
                 smoothing_asked=requests.asked,
                 map_file=begin.file,
             )
-            map_saver = MapSaver(begin.out, slam, info)
+            map_saver = MapSaver(maps.get("save_map"), slam, info)
             remove_earlier(out, (*RESULTS, *_STALE))
             session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from contextlib import ExitStack
 
 from foxglove import Channel, Context, Schema, start_server
@@ -17,11 +16,11 @@ from slam.live.odometry_track import TumSample
 from slam.live.session import cdr
 from slam.live.session_records import LogLine, Scan, SessionInfo, Snapshot
 from slam.results import SmoothedRun
+from xethru_protocol.transport import host_and_port
 
 DEFAULT_PORT = 8765
 """Where Foxglove and Lichtblick look for a server by default."""
 _HOST = "127.0.0.1"
-_LARGEST_PORT = 65_535
 
 
 class _ServedTopics(Topics, ServerListener):
@@ -70,10 +69,10 @@ class FoxgloveSink(Sink):
     """
 
     def __init__(self, text: str) -> None:
-        host, _, port = text.rpartition(":")
-        if text and not (re.fullmatch("[0-9]{1,5}", port) and 0 < int(port) <= _LARGEST_PORT):
+        address = host_and_port(text if ":" in text else f"{_HOST}:{text or DEFAULT_PORT}")
+        if address is None:
             raise UsageError("must be foxglove, foxglove:PORT or foxglove:HOST:PORT")
-        self._host, self._port = host or _HOST, int(port or DEFAULT_PORT)
+        self._host, self._port = address
         self._ending = ExitStack()
 
     def open(self) -> None:
@@ -94,6 +93,7 @@ class FoxgloveSink(Sink):
                 f"--publish foxglove: port {self._port} of {self._host} cannot be opened: {error}; "
                 "if another run is published there, choose another port with foxglove:PORT"
             ) from None
+        self._ending.callback(self._server.stop)
 
     def begin(self, info: SessionInfo, start_ns: int, map_id: str) -> None:
         self._log = self._ending.enter_context(SessionLog(self._topics, info, start_ns=start_ns))
@@ -116,4 +116,3 @@ class FoxgloveSink(Sink):
     def close(self) -> None:
         """Send what is drawn at the end, and end the connections."""
         self._ending.close()
-        self._server.stop()

@@ -71,7 +71,7 @@ class Ros2Sink(Sink):
         self._newest_ns = self._ros_ns(scan.t_ns)
         for frame in scan.frames if self._has_frames else ():
             name = radar_topic(self._info.radars[frame.radar])
-            self._write(name, pack_array(FLOAT_ARRAY, frame.samples))
+            self._writers[name](pack_array(FLOAT_ARRAY, frame.samples))
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         last, self._last = self._last, snapshot
@@ -83,8 +83,8 @@ class Ros2Sink(Sink):
         # that of a state which lags the newest scan is as good for that
         self._write_transform(max(self._newest_ns, self._tf_ns + 1))
         placed = cdr.planar(snapshot.estimate)
-        self._write("odometry", cdr.odometry(t_ns, "map", placed, covariance, twist))
-        self._write("pose", cdr.pose_with_covariance(t_ns, "map", snapshot.estimate, covariance))
+        self._writers["odometry"](cdr.odometry(t_ns, "map", placed, covariance, twist))
+        self._writers["pose"](cdr.pose_with_covariance(t_ns, "map", snapshot.estimate, covariance))
         self._path.add(t_ns, snapshot.estimate)
         if self._drawn_ns is None or not 0 <= t_ns - self._drawn_ns < _EVERY_NS:
             self._draw()
@@ -105,19 +105,19 @@ class Ros2Sink(Sink):
     def _draw(self) -> None:
         assert self._last is not None
         self._drawn_ns = t_ns = self._ros_ns(self._last.t_ns)
-        self._write("landmarks", cdr.markers(t_ns, "map", landmark_markers(self._last)))
+        self._writers["landmarks"](cdr.markers(t_ns, "map", landmark_markers(self._last)))
         self._write_path("path", self._path)
 
     def _write_path(self, name: str, path: GrowingPath) -> None:
         stamps_ns, poses = path.thinned(_SHOWN_POSES)
-        self._write(name, cdr.path(int(stamps_ns[-1]), path.frame, stamps_ns, poses))
+        self._writers[name](cdr.path(int(stamps_ns[-1]), path.frame, stamps_ns, poses))
 
     def _write_transform(self, t_ns: int) -> None:
         if self._last is None:
             return
         self._tf_ns = t_ns
         map_from_odom = compose(self._last.estimate, between(self._last.odometry, np.zeros(3)))
-        self._write("tf", cdr.transforms(t_ns, {("map", "odom"): map_from_odom}))
+        self._writers["tf"](cdr.transforms(t_ns, {("map", "odom"): map_from_odom}))
 
     def _ros_ns(self, t_ns: int) -> int:
         """Return the time of ROS at a session time."""
@@ -131,9 +131,6 @@ class Ros2Sink(Sink):
 
     def _add(self, name: str, topic: str, message_type: str, *, latched: bool = False) -> None:
         self._writers[name] = self._domain.writer(topic, message_type, latched=latched)
-
-    def _write(self, name: str, data: bytes) -> None:
-        self._writers[name](data)
 
 
 def radar_topic(radar: RadarInfo) -> str:

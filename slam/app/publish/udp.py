@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 import socket
 
 from slam.app.errors import UsageError
 from slam.app.publish.json_lines import LinesSink
 from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S
+from xethru_protocol.transport import host_and_port
 
 MOST_BYTES = 65_507
 """What a datagram can hold over IPv4: 65 535 bytes less the headers of IP and UDP."""
-
-_LARGEST_PORT = 65_535
 
 
 class UdpSink(LinesSink):
@@ -22,10 +20,10 @@ class UdpSink(LinesSink):
     limits = MOST_BYTES, 5 * NS_PER_S
 
     def __init__(self, text: str) -> None:
-        found = re.fullmatch(r"//(?:\[(.+)\]|([^:/\[\]]+)):([0-9]{1,5})", text)
-        if found is None or not 0 < int(found[3]) <= _LARGEST_PORT:
+        address = host_and_port(text.removeprefix("//"))
+        if address is None or not text.startswith("//"):
             raise UsageError("must be udp://HOST:PORT, such as udp://192.168.0.7:5006")
-        self._host, self._port = found[1] or found[2], int(found[3])
+        self._host, self._port = address
 
     def open(self) -> None:
         """Look the host up; nobody need listen there yet."""

@@ -37,11 +37,10 @@ class MapOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapUse:
-    """The map that a run begins with, if there is one, how, and where it saves its own."""
+    """The map that a run begins with, if there is one, and how."""
 
     file: MapFile | None = None
     on_map: StartOnMap | None = None
-    out: Path | None = None
 
     @property
     def text(self) -> str:
@@ -60,21 +59,21 @@ def map_use(config: SlamConfig, options: MapOptions) -> MapUse:
     UsageError
         The map cannot be used, the preset has none, or an option lacks `--map`.
     """
-    path, out = options.get("map_path"), options.get("save_map")
+    path = options.get("map_path")
     start, is_fixed = options.get("start"), options.get("localise", False)
-    if (path or out) and config.back_end is not BackEnd.ROBUST:
+    if (path or options.get("save_map")) and config.back_end is not BackEnd.ROBUST:
         raise UsageError("--map, --save-map: preset paper begins and ends without; use robust")
     if path is None:
         if start is not None or is_fixed:
             raise UsageError("--start and --localise are about a map: name it with --map MAP.json")
-        return MapUse(out=out)
+        return MapUse()
     try:
         file = load_map(path)
     except ConfigError as error:
         raise UsageError(str(error)) from None
     pose = None if start is None else (start[0], start[1], math.radians(start[2]))
     on_map = StartOnMap(map=file.map, pose=pose, is_fixed=is_fixed)
-    return MapUse(file=file, on_map=on_map, out=out)
+    return MapUse(file=file, on_map=on_map)
 
 
 def recorded_use(info: SessionInfo, source: Path) -> MapUse:

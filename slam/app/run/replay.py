@@ -233,7 +233,7 @@ def run_replay(
         if rate is not None:
             source = replace(source, scans=paced(source.scans, rate, stop))
         progress = RunProgress(source.info, source.lost_frames, end_ns=recorded.end_ns)
-        map_saver = MapSaver(begin.out, source.slam, source.info)
+        map_saver = MapSaver(maps.get("save_map"), source.slam, source.info)
         publishing.begin(source.info, source.link_log.log)
         record = execute(source, [publishing, comparison, progress, map_saver])
         if recorded.cut_at_byte is not None:

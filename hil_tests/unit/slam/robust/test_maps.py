@@ -60,12 +60,12 @@ def driven(
     places: Array,
     seed: int,
     saved: SavedMap | None = None,
-    start: Array | None = None,
+    start: tuple[float, float, float] | None = None,
 ) -> tuple[Branches, list[bool], Array]:
     """Return the back end, whether it was lost, and its error, after each step; map frame."""
     rng = np.random.default_rng(seed)
-    known = None if start is None else (start, np.full(3, 0.1))
-    branches = Branches(paper_rig(), PARAMETERS, saved, known)
+    on_map = None if saved is None else StartOnMap(map=saved, pose=start)
+    branches = Branches(paper_rig(), PARAMETERS, on_map)
     lost, errors = list[bool](), []
     scans = scans_of(poses, places, rng, SIGMA_M)
     for report, pose in zip(
@@ -139,7 +139,7 @@ def test_a_solution_fuses_a_map_with_ranges_by_information() -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_a_robot_that_is_set_down_by_eye_joins_the_map(seed: int) -> None:
     poses = there_and_back()
-    start = np.array([0.07, -0.06, 0.08])
+    start = (0.07, -0.06, 0.08)
     branches, lost, errors = driven(poses, PLACES, 10 + seed, day_one(), start)
     assert not any(lost)
     assert np.sqrt(np.mean(errors[100:] ** 2)) < 0.01
