@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+MOST_M = 1e8
+"""Farther than once around the Earth, as positions on a map may be; filters square them."""
 # Where two range circles cross at a smaller angle, an error of range moves their intersection by
 # more than 80 times as much.
 _MIN_CROSSING_RAD = math.radians(1.0)

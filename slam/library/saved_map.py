@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from slam.config import ConfigError
+from slam.geometry import MOST_M
 from slam.results import SavedMap
 from xethru_protocol.operating_system import read_bounded, written_whole
 
@@ -91,7 +91,7 @@ def parse_map(text: str, source: str) -> MapFile:
         )
     try:
         file = _FILE.validate_python({**tables, "map": tables})
-        _check(file.map)
+        _check(file)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"][1:])) or "map"
@@ -101,8 +101,11 @@ def parse_map(text: str, source: str) -> MapFile:
     return file
 
 
-def _check(saved: SavedMap) -> None:
-    """Raise ValueError if the parts of a map do not fit together."""
+def _check(file: MapFile) -> None:
+    """Raise ValueError if a number is none of a map, or its parts do not fit together."""
+    if not all(abs(number) <= MOST_M for number in _numbers(asdict(file))):
+        raise ValueError(f"all numbers must be finite, and at most {MOST_M:g}")
+    saved = file.map
     ids = [one.id for one in saved.features]
     if len(set(ids)) < len(ids) or max(ids, default=-1) >= saved.next_id:
         raise ValueError("ids of landmarks and walls must differ, and be less than next_id")
@@ -113,14 +116,18 @@ def _check(saved: SavedMap) -> None:
         raise ValueError("unknowns must name x and y of each landmark and phi and d of each wall")
     if [len(row) for row in saved.covariance] != list(range(1, len(saved.unknowns) + 1)):
         raise ValueError("covariance must have as many rows as unknowns, of 1, 2, 3 ... numbers")
-    numbers = [value for row in saved.covariance for value in row]
-    numbers += [value for one in saved.landmarks for value in (one.x_m, one.y_m, one.radius_m)]
-    numbers += [value for one in saved.walls for value in (one.phi_rad, one.d_m)]
-    if not math.isfinite(sum(map(abs, numbers))):
-        raise ValueError("all numbers must be finite")
-    values = np.linalg.eigvalsh(saved.full_covariance()) if numbers else np.ones(1)
-    if values[0] < -_ROUNDING * values[-1]:
+    values = np.linalg.eigvalsh(saved.full_covariance())
+    if len(values) and values[0] < -_ROUNDING * values[-1]:
         raise ValueError("covariance has a negative variance")
+
+
+def _numbers(part: object) -> Iterator[float]:
+    """Yield the numbers with a decimal point; ids and counts may be of any size."""
+    if isinstance(part, float):
+        yield part
+    elif isinstance(part, Mapping | tuple):
+        for one in part.values() if isinstance(part, Mapping) else part:
+            yield from _numbers(one)
 
 
 def load_map(path: str | Path) -> MapFile:

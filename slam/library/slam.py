@@ -16,7 +16,7 @@ from threadpoolctl import ThreadpoolController
 from slam.config import BackEnd, SlamConfig, WheelNoise, load_preset
 from slam.frames import Detection, Detector, RadarFrame, StepInputError
 from slam.front_end.numba_compilation import compile_kernels
-from slam.geometry import Rig, between, compose, transform
+from slam.geometry import MOST_M, Rig, between, compose, transform
 from slam.library.pose_track import PoseTrack
 from slam.library.rig_files import RigFile
 from slam.library.saved_map import MapFile, load_map, save_map
@@ -43,7 +43,6 @@ Row: TypeAlias = Sequence[float | None]
 _MOST_AHEAD_NS = 100_000_000
 _KEPT_NS = 2_000_000_000
 _SAME = 1e-9  # [m] and [rad]: two poses of one time that differ by less are one
-_MOST_M = 1e8  # farther than once around the Earth; the filter squares positions
 _MOST_STAMP_NS = 2**63 - 1
 
 
@@ -548,7 +547,7 @@ def _pose(given: ArrayLike, what: str) -> Array:
         pose = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         pose = np.empty(0)
-    if pose.shape != (3,) or not np.isfinite(pose).all() or np.abs(pose).max() > _MOST_M:
+    if pose.shape != (3,) or not np.isfinite(pose).all() or np.abs(pose).max() > MOST_M:
         raise StepInputError(
             f"{what} is {given!r}; a pose is three finite numbers, x [m], y [m] and heading [rad]"
         )

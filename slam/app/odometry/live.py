@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import UsageError
+from slam.geometry import MOST_M
 from slam.live.arrival_clock import ClockLine, LowerEnvelope
 from slam.live.errors import OdometryError
 from slam.live.odometry_track import (
@@ -46,8 +47,6 @@ AHEAD_NS = 60 * NS_PER_S
 """A file may begin so much later than a run, and a clock be so far off."""
 MOST_STAMP_NS = (2**31 - 1_000_000) * NS_PER_S
 """The seconds of a ROS message end at 2**31; days before, for a drive that begins there goes on."""
-MOST_M = 1e8
-"""Farther than once around the Earth, as positions on a map may be; the filter squares them."""
 _MOST_WARNINGS = 5
 _ROUNDED = 1e-9  # of the largest eigenvalue, for covariances without full rank
 

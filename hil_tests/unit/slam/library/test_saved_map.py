@@ -107,6 +107,9 @@ DAMAGED = {
     "id": TEXT.replace('"id": 4', '"id": 3'),
     "next_id": TEXT.replace('"next_id": 7', '"next_id": 4'),
     "nan": TEXT.replace('"x_m": 1.0', '"x_m": NaN'),
+    "nan of a radar": TEXT.replace('"x_m": 0.1,', '"x_m": NaN,'),
+    "beyond all numbers": TEXT.replace('"world_from_map": [1.0', '"world_from_map": [1e999'),
+    "too far": TEXT.replace('"x_m": 1.0', '"x_m": 1e9'),
     "rows": TEXT.replace('"radius 3", ', ""),
     "negative": json.dumps(json.loads(TEXT) | {"covariance": [[-1.0], *FILE.map.covariance[1:]]}),
 }
