@@ -193,7 +193,7 @@ def request_of(words: Sequence[str]) -> dict[str, Any]:  # noqa: PLR0911 - one r
     """Return the request of a command line's words; ValueError if there is no such request.
 
     >>> request_of(["fault", "add", "stall", "seconds=2", "count=3"])["fault"]
-    {'kind': 'stall', 'count': 3, 'parameters': {'seconds': 2}}
+    {'kind': 'stall', 'parameters': {'seconds': 2}, 'count': 3}
     >>> request_of(["seek", "1.5"])
     {'verb': 'seek', 'seconds': 1.5}
     """

@@ -85,8 +85,9 @@ def parse_tum_line(line: str) -> TumSample:
         Not 8 or 14 numbers, one that is not a finite decimal in ASCII, a stamp that
         cannot be seconds, a quaternion without length.
 
-    >>> parse_tum_line("12.000000005 1.5 -2 0 0 0 0 1")
-    TumSample(t_ns=12000000005, x_m=1.5, y_m=-2.0, qz=0.0, qw=1.0)
+    >>> sample = parse_tum_line("12.000000005 1.5 -2 0 0 0 0 1")
+    >>> sample.t_ns, sample.x_m, sample.y_m
+    (12000000005, 1.5, -2.0)
     """
     fields = _BLANKS.split(line.strip(" \t\r\n"))
     if len(fields) not in (_FIELDS, _WITH_COVARIANCE):

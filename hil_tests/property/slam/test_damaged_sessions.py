@@ -89,6 +89,7 @@ def test_a_damaged_byte_in_the_head_loses_nothing(
         assert left == ALL_FRAMES, at
 
 
+@pytest.mark.rare
 def test_a_head_with_damage_needs_no_repair(whole: bytes, tmp_path: Path) -> None:
     """The second copy follows the first at once, so what lies before it is not lost."""
     chance = random.Random(9)
@@ -100,7 +101,10 @@ def test_a_head_with_damage_needs_no_repair(whole: bytes, tmp_path: Path) -> Non
         assert frames_in(path) == ALL_FRAMES, at
 
 
-@pytest.mark.parametrize("n_places", [25, pytest.param(60, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "n_places",
+    [8, pytest.param(25, marks=pytest.mark.rare), pytest.param(60, marks=pytest.mark.thorough)],
+)
 def test_a_damaged_byte_anywhere_costs_one_chunk_at_most(
     whole: bytes, tmp_path: Path, n_places: int
 ) -> None:

@@ -23,6 +23,7 @@ START_NS = 1_690_000_000_000_000_000
 AUTHORS_NAMES = {"front_right": 1, "rear_left": 2, "rear_right": 3, "front_left": 4}
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize("name", ["lab.bag", pytest.param("lab", marks=pytest.mark.thorough)])
 def test_whoever_downloads_it_can_run_it(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

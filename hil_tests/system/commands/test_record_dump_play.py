@@ -88,6 +88,7 @@ def test_wire_capture_holds_the_same_messages(tmp_path: Path, capsys: Capture) -
     )
 
 
+@pytest.mark.rare
 def test_outputs_of_a_profile(tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "recording"
     outputs = "iq,ap,single,movinglist,pulsedoppler,noisemap"
@@ -107,6 +108,7 @@ def test_outputs_of_a_profile(tmp_path: Path, capsys: Capture) -> None:
     }
 
 
+@pytest.mark.rare
 def test_respiration_of_an_x4m200(tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "recording"
     setup = ["--profile", "respiration", "--output", "status,movinglist", "--zone", "0.4", "2"]
@@ -127,6 +129,7 @@ def test_respiration_of_an_x4m200(tmp_path: Path, capsys: Capture) -> None:
     assert facts.parameter_file
 
 
+@pytest.mark.rare
 def test_unplugging_keeps_what_came(tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "recording"
     with emulator(*SERVED) as served:

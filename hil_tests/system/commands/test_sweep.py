@@ -60,6 +60,7 @@ def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
     assert group["anees_band_95"] == pytest.approx([2.700 / 3, 19.023 / 3], rel=1e-3)
 
 
+@pytest.mark.rare
 def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
     script = tmp_path / "main.py"
     script.write_text(
@@ -82,6 +83,7 @@ def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [script]
 
 
+@pytest.mark.rare
 def test_a_stressed_run_loses_frames_and_has_a_bound_on_what_is_left(tmp_path: Path) -> None:
     pytest.importorskip("gtsam")
     case = make_case(str(write_short_scene(tmp_path)), "paper", 0, stress="all", bound=True)

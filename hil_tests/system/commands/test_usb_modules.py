@@ -205,6 +205,7 @@ def ports(bed: Bed) -> list[dict[str, Any]]:
     return found
 
 
+@pytest.mark.rare
 def test_modules_are_listed_examined_and_gone(bed: Bed, tmp_path: Path) -> None:
     bed.plug("ttyACM0", "100000000007")
     bed.plug("ttyACM1", "?", "03eb:2404")

@@ -79,6 +79,7 @@ def domain() -> Iterator[int]:
         yield number
 
 
+@pytest.mark.rare
 def test_fast_dds_drives_slam_and_gets_its_poses_to_the_last_bit(
     witness: Path, domain: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,9 +32,9 @@ def run_of(room: str, stress: str = "clean") -> SweepRun:
 @pytest.mark.parametrize(
     "room",
     [
-        "doors:5",
+        pytest.param("doors:5", marks=pytest.mark.rare),
         "columns:1",
-        "yard:3",
+        pytest.param("yard:3", marks=pytest.mark.rare),
         pytest.param("rack:3", marks=_LONG),
         pytest.param("rack:2", marks=_LONG),
         pytest.param("rack:5", marks=_LONG),
@@ -60,7 +60,9 @@ def test_ranges_that_err_four_times_as_much_as_stated_do_no_harm() -> None:
     assert run.confidently_wrong_share == 0.0
 
 
-@pytest.mark.parametrize("room", ["legs:2", pytest.param("rack:0", marks=_LONG)])
+@pytest.mark.parametrize(
+    "room", [pytest.param("legs:2", marks=pytest.mark.rare), pytest.param("rack:0", marks=_LONG)]
+)
 def test_a_robot_carried_where_all_looks_alike_is_lost_and_not_elsewhere(room: str) -> None:
     run = run_of(room, "carried")
     assert run.lost_at_end
@@ -119,6 +121,7 @@ def scan_of(
     return RangeScan(radar=radar, ranges_m=tuple(seen), sigmas_m=(3e-3,) * len(seen))
 
 
+@pytest.mark.rare
 def test_perfect_wheels_on_a_circle_stay_perfect() -> None:
     """Offsets, radii and the scale of the wheels are nearly alike there."""
     errors = [on_a_circle(seed) for seed in range(5)]

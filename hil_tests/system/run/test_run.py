@@ -161,7 +161,10 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
     assert not topics & {"/estimate/path", "/landmarks/markers", "/radar/front_left/bscan"}
 
 
-@pytest.mark.parametrize(("which", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(
+    ("which", "code"),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.rare)],
+)
 def test_a_signal_leaves_a_session_that_replays(
     which: signal.Signals,
     code: int,

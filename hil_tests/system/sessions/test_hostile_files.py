@@ -182,6 +182,7 @@ def end_of(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, 
     return code, printed
 
 
+@pytest.mark.rare
 def test_text_of_a_session_reaches_no_terminal_with_control_characters(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

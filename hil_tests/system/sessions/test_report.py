@@ -123,6 +123,7 @@ def test_settings_are_shown_as_json_has_them(reported: Reported) -> None:
         json.loads(html.unescape(line))
 
 
+@pytest.mark.rare
 def test_the_same_session_gives_the_same_page(reported: Reported, tmp_path: Path) -> None:
     again = tmp_path / "again.html"
     assert main(["report", str(reported.session), "--out", str(again)]) == 0
@@ -232,6 +233,7 @@ def test_no_text_is_cut_and_no_legend_lies_over_data(
     assert n_drawn == 10
 
 
+@pytest.mark.rare
 def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
     record_session(tmp_path / "session.mcap", "robust", has_truth=False)
     assert main(["report", str(tmp_path)]) == 0

@@ -71,6 +71,7 @@ def test_what_was_recorded_is_shown_without_slam(session: Path, tmp_path: Path) 
     assert rows["/radar/front_left/detections"] == n_states
 
 
+@pytest.mark.rare
 @pytest.mark.usefixtures("no_slam")
 def test_a_session_of_an_older_version_shows_what_it_has(session: Path, tmp_path: Path) -> None:
     older = without(session, tmp_path, "/slam/step")

@@ -291,7 +291,7 @@ def test_of_a_killed_run_the_session_is_shown_not_its_unfinished_view(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
-@pytest.mark.parametrize("command", ["view", "report"])
+@pytest.mark.parametrize("command", ["view", pytest.param("report", marks=pytest.mark.rare)])
 def test_a_full_disk_is_one_line(
     viewed: Viewed, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

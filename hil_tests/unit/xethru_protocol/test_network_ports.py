@@ -230,6 +230,7 @@ def test_the_baud_rate_is_set_on_the_server_too() -> None:
         assert redirector.baudrates[-1] == 921600
 
 
+@pytest.mark.rare
 @pytest.mark.slow
 def test_the_baud_rate_is_set_while_another_thread_reads() -> None:
     with (

@@ -302,7 +302,7 @@ def parse_source(text: str) -> LineSource:
     """Return the source that a text means; UsageError if it means none.
 
     >>> parse_source("tcp://127.0.0.1:5005")
-    LineSource(kind=<SourceKind.TCP: 'TCP socket'>, place='127.0.0.1', number=5005)
+    LineSource(kind=<SourceKind.TCP: 'TCP socket'>, place='127.0.0.1', number=5005, frames=())
     >>> parse_source("serial:/dev/ttyUSB0@57600").name
     'serial port /dev/ttyUSB0'
     """

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported
@@ -128,6 +129,7 @@ def test_mounts_that_are_off_are_found_too() -> None:
     np.testing.assert_allclose(found.mount_shifts_m, errors, atol=1e-6)
 
 
+@pytest.mark.rare
 def test_errors_are_as_large_as_the_stated_deviations() -> None:
     """Twelve drives: the mean square of error by deviation, four offsets each."""
     priors = CalibrationPriors(mount_m=1e-5)  # the mounts are exact here

@@ -412,7 +412,7 @@ def test_the_noise_of_odometry_is_what_it_says() -> None:
         assert wrong.state.t_ns is None
 
 
-@pytest.mark.parametrize("has_bearings", [False, True])
+@pytest.mark.parametrize("has_bearings", [False, pytest.param(True, marks=pytest.mark.rare)])
 def test_after_a_stop_what_has_ids_makes_the_pose_sure_again(has_bearings: bool) -> None:
     """While the wheels stand the robot may be carried; what it hears then shows that it was not."""
     config = override(

@@ -348,6 +348,7 @@ def test_ids_after_a_carry_are_of_no_other_landmark() -> None:
     assert branches.main.state.next_id > max(ever)
 
 
+@pytest.mark.rare
 def test_a_carried_robot_that_hears_nothing_stays_lost_until_it_finds_itself() -> None:
     """Radars are silent for 150 scans after the robot is noticed to be lost."""
     run, cut = carried_run(0, n_ways=4)
@@ -452,6 +453,7 @@ def test_a_place_that_misses_more_than_staying_is_taken_back() -> None:
     assert branches.main is stayed.back_end
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize("stops", [pytest.param(True, marks=pytest.mark.thorough), False])
 def test_a_robot_that_stays_lost_needs_bounded_memory(*, stops: bool) -> None:
     """It is carried to where it has never been, and drives to and fro there for 1300 scans.

@@ -106,7 +106,7 @@ def world(seed: int, *, labelled: bool) -> tuple[Array, Iterator[Step]]:
     return marks, drive()
 
 
-@pytest.mark.parametrize("labelled", [True, False])
+@pytest.mark.parametrize("labelled", [True, pytest.param(False, marks=pytest.mark.rare)])
 def test_the_map_is_found_and_the_pose_is_as_sure_as_it_says(*, labelled: bool) -> None:
     """Of the mean NEES of several runs, the band holds 99.9 %."""
     nees: list[float] = []

@@ -227,6 +227,7 @@ def test_a_module_at_another_baud_rate(capsys: Capture, monkeypatch: pytest.Monk
     assert "--baudrate 460800" in finding["remedy"]
 
 
+@pytest.mark.rare
 @pytest.mark.usefixtures("hurried")
 def test_only_uarts_are_tried_at_other_rates(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch

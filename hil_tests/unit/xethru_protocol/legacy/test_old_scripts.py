@@ -109,6 +109,7 @@ def test_files_and_registers(port: str, tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.rare
 def test_respiration(runtime: Path, tmp_path: Path) -> None:
     with emulated_port(None, "--model", "x4m200") as port:
         code, lines, errors = run("respiration.py", tmp_path, port)
@@ -116,6 +117,7 @@ def test_respiration(runtime: Path, tmp_path: Path) -> None:
     assert lines == ["state True 0", "lists True"]
 
 
+@pytest.mark.rare
 def test_output_after_run(runtime: Path, tmp_path: Path) -> None:
     with emulated_port(None, "--model", "x4m200", "--pace", "asap") as port:
         code, lines, errors = run("output_after_run.py", tmp_path, port)

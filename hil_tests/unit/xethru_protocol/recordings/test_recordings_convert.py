@@ -182,6 +182,7 @@ def test_frames_of_several_sizes_survive(tmp_path: Path) -> None:
     assert list(read_recording(tmp_path / "a.mcap")) == expected
 
 
+@pytest.mark.rare
 def test_samples_are_not_held_in_memory(tmp_path: Path) -> None:
     n_frames, n_bins = 2000, 1000
     with RecordingWriter(tmp_path / "long") as writer:

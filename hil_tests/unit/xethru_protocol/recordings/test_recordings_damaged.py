@@ -169,6 +169,7 @@ def test_a_damaged_head_of_the_meta_file_costs_no_message(
     assert reason in faults[0].reason
 
 
+@pytest.mark.rare
 def test_a_long_index_stays_packed_in_memory(tmp_path: Path) -> None:
     n_messages = 20_000
     with RecordingWriter(tmp_path / "long") as writer:

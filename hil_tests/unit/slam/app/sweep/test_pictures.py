@@ -131,7 +131,10 @@ def damaged(value: Any) -> Iterator[Any]:  # noqa: ANN401 - JSON
         yield from ([*value[:-1], wrong] for wrong in damaged(value[-1]))
 
 
-@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
+@pytest.mark.parametrize(
+    "name",
+    ["stress", *(pytest.param(name, marks=pytest.mark.rare) for name in ("consistency", "scenes"))],
+)
 def test_a_file_that_is_no_whole_sweep_is_refused_or_shown(name: str, tmp_path: Path) -> None:
     """Whatever is missing or null in it; what is drawn goes by what is let through."""
     sweep = Path(written(tmp_path, runs()))

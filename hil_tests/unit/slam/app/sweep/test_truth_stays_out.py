@@ -114,7 +114,7 @@ def bits_of(record: RunRecord) -> list[bytes]:
     return [array.tobytes() for array in arrays]
 
 
-@pytest.mark.parametrize("preset", ["robust", "paper"])
+@pytest.mark.parametrize("preset", ["robust", pytest.param("paper", marks=pytest.mark.rare)])
 def test_a_planted_truth_changes_no_bit_of_the_estimate(preset: str) -> None:
     scene = load_scene("lab")
     source = source_of(make_case("lab", preset, 3))
