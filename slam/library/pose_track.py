@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from array import array
 from bisect import bisect_right
@@ -57,9 +56,6 @@ class PoseTrack:
         self._y_m.append(y_m)
         self._heading_rad.append(heading_rad + self._turns_rad)
         self._last_heading_rad = heading_rad
-
-    def copy(self) -> PoseTrack:
-        return copy.deepcopy(self)
 
     def forget_before(self, t_ns: int) -> int:
         """Forget what no pose from a time on depends on, now or later; return how many poses."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -266,7 +267,7 @@ class Slam:
         if self.state.t_ns is not None and t_ns < self.state.t_ns:
             raise StepInputError(f"t_ns is {t_ns}, before that of the last step, {self.state.t_ns}")
         scans = self._scans(taken, tuple(ranges), tuple(points))
-        track = self._odometry.copy()
+        track = deepcopy(self._odometry)
         pose_at = self._pose_at(track, t_ns, odometry_pose)
         is_first = self._belief_at is None  # frames at the first pose are not looked at
         stamps_ns = {t_ns} if is_first else {t_ns, *(frame.t_ns for frame in taken)}

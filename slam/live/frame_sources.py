@@ -7,7 +7,7 @@ Here, and nowhere else, module metres become true metres: the module computes wi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -266,7 +266,7 @@ class RigSource:
         self.radars = tuple(radars)
         self._limits = sampler_limits(config)
 
-    def scans(self, end_tick: int, stop: StopFlag) -> Iterator[Scan]:
+    def scans(self, end_tick: int, stop: StopFlag) -> Generator[Scan]:
         """Yield the frames of ticks below `end_tick`, one scan per tick; see `Scan`.
 
         Raises RadarSilentError if a radar sends no frame for 5 s, or its port is gone.

@@ -81,7 +81,10 @@ class LiveRig:
             self._source.start(config, fps)
             unless_it_works.pop_all()
         self.radars = self._source.radars
-        self._scans = self._counted() if time_base == "counter" else self._arriving()
+        if time_base == "counter":
+            self._scans = self._source.scans(_MOST_TICKS, StopFlag())
+        else:
+            self._scans = self._arriving()
 
     def __enter__(self) -> Self:
         return self
@@ -100,9 +103,6 @@ class LiveRig:
             last_ns = max(last_ns, *(frame.t_ns for frame in scan.frames))
             frames = tuple(less_gain(one, self._links[one.radar].gain_db) for one in scan.frames)
             yield replace(scan, t_ns=int(last_ns), frames=frames)
-
-    def _counted(self) -> Generator[Scan]:
-        yield from self._source.scans(_MOST_TICKS, StopFlag())
 
     def _arriving(self) -> Generator[Scan]:
         inbox = Inbox()

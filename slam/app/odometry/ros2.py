@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NoReturn
 
 from rosbags.serde import SerdeError
@@ -95,9 +96,10 @@ class _TopicPoses:
         message = cdr.deserialise(data, cdr.ODOMETRY)
         if not self._is_asked(message.header.frame_id, message.child_frame_id):
             self._fail_by_frames()
-        covariance = cdr.pose_sample(message, with_covariance=True).velocity_covariance
+        sample = cdr.pose_sample(message, with_covariance=True)
+        covariance = sample.velocity_covariance
         is_known = any(covariance) and all(map(math.isfinite, covariance))
-        yield cdr.pose_sample(message, with_covariance=is_known)
+        yield sample if is_known else replace(sample, velocity_covariance=())
 
     def of_transforms(self, data: bytes) -> Iterator[TumSample]:
         for one in cdr.deserialise(data, cdr.TRANSFORMS).transforms:
