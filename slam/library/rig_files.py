@@ -141,7 +141,7 @@ def load_rig(path: str | Path) -> RigFile:
     Raises
     ------
     ConfigError
-        It cannot be read, or is no rig file; one line with file, key and what is allowed.
+        It cannot be read, or is not a rig file; one line with file, key and what is allowed.
     """
     found = load_toml(RigFile, Path(path), source=str(path), what="rig", error=ConfigError)
     for key in ("name", "serial"):

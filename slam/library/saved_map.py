@@ -73,7 +73,7 @@ def parse_map(text: str, source: str) -> MapFile:
     Raises
     ------
     ConfigError
-        It is no map, is damaged, or a newer version wrote it; one line.
+        It is not a map, is damaged, or a newer version wrote it; one line.
     """
     try:
         tables = json.loads(text)
@@ -102,7 +102,7 @@ def parse_map(text: str, source: str) -> MapFile:
 
 
 def _check(file: MapFile) -> None:
-    """Raise ValueError if a number is none of a map, or its parts do not fit together."""
+    """Raise ValueError for a number that is not finite, and parts that do not fit together."""
     if not all(abs(number) <= MOST_M for number in _numbers(asdict(file))):
         raise ValueError(f"all numbers must be finite, and at most {MOST_M:g}")
     saved = file.map

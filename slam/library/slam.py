@@ -275,7 +275,7 @@ class Slam:
         if self._noise_at is not None:
             self._noise = np.array(self._noise_at(t_ns), dtype=np.float64)
             if self._noise.shape != (3, 3) or not np.isfinite(self._noise).all():
-                raise StepInputError(f"odometry_noise at {t_ns} ns is no finite matrix (3, 3)")
+                raise StepInputError(f"odometry_noise at {t_ns} ns is not a finite matrix (3, 3)")
         with self._threads.limit(limits=1):  # the same bits on every machine
             results = self._stepped(taken, scans, poses.__getitem__, t_ns)
         track.forget_before(t_ns - _KEPT_NS)
@@ -359,7 +359,7 @@ class Slam:
         kinds: dict[int, str] = {}
         for frame in frames:
             if not isinstance(frame, RadarFrame):
-                raise StepInputError(f"frames: a {type(frame).__name__} is no RadarFrame")
+                raise StepInputError(f"frames: a {type(frame).__name__} is not a RadarFrame")
             which = f"frame {frame.counter} of radar {frame.radar}"
             if frame.radar in kinds:
                 raise StepInputError(f"{which}: a step takes one frame of each radar")

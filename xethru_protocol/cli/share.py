@@ -139,7 +139,7 @@ class _Sharing:
             self._module.leave(host)
             writer.transport.abort()
             if self._as_json:
-                with suppress(BrokenPipeError, CommandFailed):  # nobody reads it any more
+                with suppress(BrokenPipeError, CommandFailed):  # its reader has gone
                     print_json({"left": name, "messages": host.messages, "lost": host.lost})
             else:
                 taken = counted(host.messages, "message")

@@ -88,7 +88,7 @@ class SharedModule:
     hosts
         Those that have not left.
     commander
-        Whose changes are carried out; None: of the first that wants one.
+        Whose changes are carried out; None: of the first that asks for one.
     """
 
     def __init__(self, write: Callable[[bytes], object]) -> None:
@@ -110,7 +110,7 @@ class SharedModule:
         return self.hosts[-1]
 
     def leave(self, host: Host) -> None:
-        """Forget a host; the answers to what it asked are nobody's, and others may command."""
+        """Forget a host; answers to what it asked are dropped, and others may command."""
         self.hosts.remove(host)
         for question in [one for one in self._waiting if one.host is host]:
             self._waiting.remove(question)

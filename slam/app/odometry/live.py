@@ -237,7 +237,7 @@ def _rejection(sample: TumSample) -> str:
 
 
 def _covariance_rejection(triangle: tuple[float, ...]) -> str:
-    """Return why an upper triangle is no covariance of a velocity; "" if it is."""
+    """Return why an upper triangle cannot be the covariance of a velocity; "" if it can."""
     if not any(triangle):  # which in ROS means unknown
         return "it does not say how its velocity errs, as --odometry-covariance needs"
     least, _, most = np.linalg.eigvalsh(symmetric(triangle)).tolist()

@@ -81,7 +81,7 @@ class _TopicPoses:
         self.is_found = False
 
     def offered(self, domain: Ros2Domain) -> tuple[str, bool]:
-        """Return the topic's type, "" if nobody publishes it, and whether all do it reliably."""
+        """Return the topic's type, "" without a publisher, and whether all are reliable."""
         reliable: dict[str, list[bool]] = {}
         for offer in domain.offers():
             if offer.topic == self._topic:
@@ -109,13 +109,13 @@ class _TopicPoses:
                 yield TumSample(t_ns=t_ns, x_m=place.x, y_m=place.y, qz=turn.z, qw=turn.w)
 
     def check(self, domain: Ros2Domain, *, is_published: bool) -> None:
-        """Raise OdometryError if nobody publishes the topic, or other frames on it."""
+        """Raise OdometryError if the topic has no publisher, or other frames."""
         if self._others:
             self._fail_by_frames()
         if not is_published:
             there = _named({offer.topic for offer in domain.offers()})
             self._fail(
-                f"nobody publishes it in domain {domain_number()} (ROS_DOMAIN_ID); topics there: "
+                f"it has no publisher in domain {domain_number()} (ROS_DOMAIN_ID); topics there: "
                 f"{there or 'none; does multicast reach the robot?'}"
             )
 

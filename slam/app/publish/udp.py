@@ -26,7 +26,7 @@ class UdpSink(LinesSink):
         self._host, self._port = address
 
     def open(self) -> None:
-        """Look the host up; nobody need listen there yet."""
+        """Look the host up; a listener is not needed yet."""
         try:
             (family, kind, *_, address), *_ = socket.getaddrinfo(
                 self._host, self._port, type=socket.SOCK_DGRAM
