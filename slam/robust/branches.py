@@ -313,11 +313,11 @@ class Carry:
     is_start: bool = False  # the robot has not been on the map in this run
     next_id: int  # landmarks known before it have smaller ids
     map: RobustBackEnd  # the main back end after the step before
+    base: RobustBackEnd  # that, moved by the steps before ``since`` that led nowhere
     new: Alternative  # with an empty map at first
     pose: Array  # shape (3,), before it: [m, m, rad], map frame
     moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
     hidden: Place | None  # a motion that the wheels did not report, and no carry
-    skipped: list[Step] = field(default_factory=list)  # steps before ``since`` that led nowhere
     placed: list[Place] = field(default_factory=list)  # where the robot may be on the map
     until: int = 0  # step at which these are dropped; 0 until they have caught up
     adopted: Place | None = None
@@ -778,6 +778,7 @@ class Branches:
             price_nats=step.carry_nats,
             next_id=step.next_id,
             map=before,
+            base=before,
             new=Alternative(before.with_empty_map(), since),
             pose=before.pose,
             moved=moved,
@@ -797,6 +798,7 @@ class Branches:
             is_start=True,
             next_id=saved.next_id,
             map=mapped,
+            base=mapped,
             new=Alternative(mapped.with_empty_map(), 0),
             pose=np.append(middle_m, 0.0),
             moved=np.zeros(3),
@@ -806,7 +808,10 @@ class Branches:
 
     def _begin_again(self, carry: Carry) -> None:
         """Search for a lost robot by what it sees from now on: what it saw has led nowhere."""
-        carry.skipped += [self._steps[number] for number in range(carry.since, self._now)]
+        if carry.base is carry.map:
+            carry.base = carry.map.copy()
+        for number in range(carry.since, self._now):  # no pose of the run is missing
+            carry.base.predict(self._steps[number].increment, self._steps[number].covariance)
         if carry.is_start:
             self.main, next_id = carry.map.with_empty_map(), self.main.state.next_id
             self.main.state.next_id = next_id
@@ -844,9 +849,7 @@ class Branches:
             # The same ranges are taken once more, so this use of them must hardly count.
             covariance = self._rule.weakened * here.covariance_m2[block, block]
             points.append((there.ids[row], here.points_m[own], covariance))
-        back_end = carry.map.copy()
-        for step in carry.skipped:  # no pose of the run is missing
-            back_end.predict(step.increment, step.covariance)
+        back_end = carry.base.copy()
         back_end.set_down(placement.motion, points)
         back_end.state.next_id = self.main.state.next_id + _IDS_APART
         return Place(back_end, carry.since, price_nats)

@@ -1,5 +1,6 @@
 """A run on the map of another: what it knows at first, where it finds itself, what it reports."""
 
+import gc
 import math
 from dataclasses import replace
 from functools import cache
@@ -23,7 +24,7 @@ from slam.library.joining import find_place, join
 from slam.results import SavedMap, StartOnMap
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.branches import Branches
+from slam.robust.branches import Branches, Step
 from slam.robust.parameters import BranchRule
 from slam.robust.pipeline import RobustSlam
 
@@ -185,6 +186,27 @@ def test_a_robot_in_another_room_never_says_that_it_knows() -> None:
     assert branches.lost_pose is not None
     covariance = branches.lost_pose[1]
     assert covariance[0, 0] >= np.ptp(PLACES[:, 0]) ** 2
+
+
+def n_steps() -> int:
+    """Return how many steps are in memory."""
+    gc.collect()
+    return sum(isinstance(one, Step) for one in gc.get_objects())
+
+
+def test_a_robot_that_is_lost_for_long_forgets_what_it_did_long_ago() -> None:
+    """A search that takes all steps since the beginning once more gets slower with every one."""
+    rule = replace(PARAMETERS.branches, carry_steps=30)
+    branches = Branches(
+        paper_rig(), replace(PARAMETERS, branches=rule), StartOnMap(map=day_one(), pose=None)
+    )
+    rng, poses = np.random.default_rng(5), np.vstack([there_and_back()] * 2)
+    others = np.column_stack([rng.uniform(-0.2, 2.0, 8), np.tile([0.85, -0.75], 4)])
+    scans, n_before = scans_of(poses, others, rng, SIGMA_M), n_steps()
+    for _ in follow(branches, reported(poses, LAB, rng, 0.0), scans):
+        pass
+    assert branches.is_unplaced
+    assert n_steps() - n_before <= rule.carry_steps + (rule.snapshots + 2) * rule.snapshot_every
 
 
 def test_two_equal_rooms_on_one_map_are_not_told_apart() -> None:
