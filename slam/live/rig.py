@@ -10,7 +10,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty
-from typing import Literal, Self
+from typing import Literal, Self, TypeAlias, get_args
 
 from slam.geometry import Mount, Rig
 from slam.library.rig_files import RigFile, load_rig
@@ -30,6 +30,8 @@ from slam.live.ticks import SETTLE_S, SILENT_RIG_S, Inbox, SourceEvent, TickAsse
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.operating_system import StopFlag
+
+TimeBase: TypeAlias = Literal["arrival", "counter"]
 
 _POLL_S = 0.05
 _MOST_TICKS = 2**62
@@ -70,7 +72,7 @@ class LiveRig:
         rig: Rig | RigFile,
         config: RawConfig,
         fps: int,
-        time_base: Literal["arrival", "counter"],
+        time_base: TimeBase,
     ) -> None:
         self.rig = rig
         self._links = tuple(links)
@@ -116,8 +118,6 @@ class LiveRig:
                 while (scan := arrivals.next_scan(time.monotonic_ns())) is not None:
                     if scan.used:
                         yield scan
-                    else:
-                        _LOG.warning("a scan came too late, or waited too long for this program")
 
 
 class _Arrivals:
@@ -133,6 +133,7 @@ class _Arrivals:
         self._heard = set[int]()
         self._alive_ns = now_ns
         self._ready_ns: int | None = None
+        self._warned = 0  # scans that were not used when that was last logged
 
     def take(self, event: SourceEvent) -> None:
         match event:
@@ -160,7 +161,15 @@ class _Arrivals:
             if self._ready_ns is None or now_ns - self._ready_ns < SETTLE_S * NS_PER_S:
                 return None
             self._ticks.begin(now_ns)
-        return self._ticks.next_scan(now_ns)
+        scan = self._ticks.next_scan(now_ns)
+        if self._ticks.n_unused >= max(2 * self._warned, 1):
+            self._warned = self._ticks.n_unused
+            _LOG.warning(
+                "%d scans came too late, or waited too long for this program; an emulator that "
+                "does not keep time needs time_base='counter'",
+                self._warned,
+            )
+        return scan
 
 
 def open_rig(
@@ -169,7 +178,7 @@ def open_rig(
     *,
     fps: int = 5,
     frame_area_m: tuple[float, float] = (0.2, 9.4),
-    time_base: Literal["arrival", "counter"] = "arrival",
+    time_base: TimeBase = "arrival",
 ) -> LiveRig:
     """Open the modules of a robot, set them up for raw frames and start them.
 
@@ -198,6 +207,10 @@ def open_rig(
         A module is missing, not in the rig, found twice, or does not answer; one line with the
         remedy.
     """
+    if time_base not in get_args(TimeBase):
+        raise ValueError(f"time_base is {time_base!r}; there are {', '.join(get_args(TimeBase))}")
+    if isinstance(ports, str):
+        raise ValueError(f"ports is a text; give a list, as [{ports!r}]")
     if isinstance(rig, str | Path):
         path, rig = rig, load_rig(rig)
     else:

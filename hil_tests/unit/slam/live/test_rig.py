@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -85,7 +86,9 @@ def test_what_cannot_be_opened_is_named(lab: Scene, tmp_path: Path) -> None:
         open_rig(ports=["left_front", "nowhere"])
     with pytest.raises(ConfigError, match=r"robot.toml: cannot read"):
         open_rig(tmp_path / "robot.toml")
-    for ports in (None, [], ["left_front"]):
+    with pytest.raises(ValueError, match="time_base"):
+        open_rig(ports=["left_front"], time_base="counters")  # type: ignore[arg-type]
+    for ports in (None, [], ["left_front"], "left_front"):
         with pytest.raises(ValueError, match="ports"):
             open_rig(Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0)] * 2), ports)
 
@@ -155,6 +158,22 @@ def test_a_radar_that_never_sends_is_not_waited_for_once_it_is_lost() -> None:
             assert row.t_ns > 3 * NS_PER_S
             sizes.append(len(scan.frames))
     assert set(sizes[:-1]) == {3}
+
+
+def test_a_program_that_is_too_slow_is_warned_ever_more_rarely(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    infos, events = radar_events(LAB, 0, 60.0, lambda: 1_000_000)
+    arrivals = _Arrivals(infos, None, 0)
+    asked_ns, n_unused = 0, 0
+    for row in sorted(events, key=lambda row: row.t_ns):
+        if row.t_ns - asked_ns > 10 * NS_PER_S or asked_ns < 4 * NS_PER_S:
+            asked_ns = row.t_ns
+            while (scan := arrivals.next_scan(row.t_ns)) is not None:
+                n_unused += not scan.used
+        arrivals.take(row.event)
+    assert n_unused > 100
+    assert 4 <= len(caplog.messages) <= 1 + math.log2(n_unused)
 
 
 @pytest.mark.slow
