@@ -130,7 +130,8 @@ class QueuedSink:
         """Wait for the end of the thread until a monotonic time; what still waits is dropped."""
         if self._thread is not None:
             self._thread.join(max(until_s - time.monotonic(), 0.0))
-            self._waiting.clear()
+            with self._changed:  # a sink that blocks does not hold it
+                self._waiting.clear()
             return
         with suppress(Exception):  # there was no run, whose end has an error of its own
             self._sink.close()

@@ -21,7 +21,6 @@ from slam.config import BackEnd, ConfigError, SlamConfig
 from slam.geometry import between
 from slam.library.saved_map import MapFile, load_map, map_text, parse_map, save_map
 from slam.live.errors import AppError
-from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import SessionInfo, SessionObserver, Snapshot
 from slam.results import MapChanges, Pipeline, SmoothedRun, StartOnMap
 
@@ -139,7 +138,6 @@ class MapSummary:
     """
 
     id: str
-    found_after_s: float | None
     found_after_m: float | None
     lost_share: float
     error_rmse_m: float | None
@@ -160,9 +158,6 @@ def map_summary(file: MapFile, changes: MapChanges, record: RunRecord) -> MapSum
         errors_m = np.linalg.norm(states.estimate[:, :2] - truth[:, :2], axis=1)[placed]
     return MapSummary(
         id=file.id,
-        found_after_s=None
-        if first is None
-        else (int(states.t_ns[first]) - record.start_ns) / NS_PER_S,
         found_after_m=None if first is None else float(steps_m[:first].sum()),
         lost_share=float(np.mean(~placed)) if len(placed) else 1.0,
         error_rmse_m=float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else None,
