@@ -319,6 +319,9 @@ def symmetric(triangle: Sequence[float]) -> NDArray[np.float64]:
 def read_odometry_socket(path: str, timeout_s: float = 10.0) -> OdometryTrack:
     """Read every line that an emulator under `--pace asap` serves on its unix socket.
 
+    `pose_at(t_ns)` of what is returned is the pose of the wheels at a time, which `Slam.step`
+    takes; `last_ns` is the time of the last line.
+
     Raises OdometryError if there is no listener, the sender stops before the end, or a line is bad.
     """
     received = bytearray()

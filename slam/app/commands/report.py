@@ -624,11 +624,10 @@ def _write_parameters(page: _Page, info: SessionInfo) -> None:
 
 def _what_was_done(info: SessionInfo, record: RunRecord, data: _ReportData) -> str:
     assert record.last is not None
-    way = np.diff(record.states.estimate[:, :2], axis=0)
     lost = sum(count.lost for count in data.links.counts.values())
     faults = sum(count.faults for count in data.links.counts.values())
     return (
-        f"A robot drove {np.linalg.norm(way, axis=1).sum():.1f} m in "
+        f"A robot drove {record.states.driven_m:.1f} m in "
         f"{record.duration_ns / NS_PER_S:.0f} s; SLAM found {len(record.last.landmark_ids)} "
         f"landmarks in {record.n_frames} frames of {len(info.radars)} radars. "
         f"{lost} frames were lost, and there were {faults} faults on the links."

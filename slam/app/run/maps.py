@@ -173,13 +173,13 @@ def map_rows(found: MapSummary) -> list[ResultRow]:
     if found.found_after_m is not None:
         where = f"{found.found_after_m:.2f} m"
     gone, new = (", ".join(map(str, ids)) or "none" for ids in (found.gone, found.new))
+    error: list[ResultRow] = []
+    if found.error_rmse_m is not None:  # of a real robot no truth is known
+        at_most = f"RMS of positions, not aligned, at most {mm_text(found.error_max_m)}"
+        error = [("error on map", mm_text(found.error_rmse_m), at_most)]
     return [
         ("place on map", where, f"way until it was known; lost in {100 * found.lost_share:.1f} %"),
-        (
-            "error on map",
-            mm_text(found.error_rmse_m),
-            f"RMS of positions, not aligned, at most {mm_text(found.error_max_m)}",
-        ),
+        *error,
         (
             "of the map",
             f"{len(found.seen)} of {found.landmarks}",

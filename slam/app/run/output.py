@@ -268,19 +268,19 @@ def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Res
     states, last = record.states, record.last
     if last is None:
         return [*rows, ("states", "0", "the robot did not move, or no scan could be used")]
-    lengths_m = [
-        float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
-        for path in (states.estimate, states.odometry)
-    ]
+    wheels_m = float(np.linalg.norm(np.diff(states.odometry[:, :2], axis=0), axis=1).sum())
     if (smoothed := record.whole_smoothed) is not None:
         apart_m = np.linalg.norm(smoothed.poses[:, :2] - states.estimate[:, :2], axis=1)
-        rms_m = float(np.sqrt(np.mean(apart_m**2)))
+        placed_m = apart_m[~states.lost]
+        rms_m = float(np.sqrt(np.mean(placed_m**2))) if len(placed_m) else None
         note = "RMS distance of the causal path from the one solved for at the end"
+        if states.lost.any():
+            note += ", where it was not lost"
         rows.append(("smoothed", mm_text(rms_m), note))
     sigma_m = float(np.sqrt(np.trace(last.pose_covariance[:2, :2])))
     spread = [float(np.sqrt(np.trace(each))) for each in last.landmark_covariances_m2]
     rows += [
-        ("driven", f"{lengths_m[0]:.2f} m", f"{lengths_m[1]:.2f} m by the wheels alone"),
+        ("driven", f"{states.driven_m:.2f} m", f"{wheels_m:.2f} m by the wheels alone"),
         (
             "last pose",
             f"+-{1e3 * sigma_m:.1f} mm",

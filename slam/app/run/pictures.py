@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from slam.app.errors import naming
-from slam.app.run.runner import LinkState, RunRecord
+from slam.app.run.runner import LinkState, RunRecord, States
 from slam.app.run.summary import Summary
 from slam.geometry import between, compose, transform
 from slam.live.odometry_track import NS_PER_S
@@ -279,7 +279,7 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     outlined = [transform(place, last.landmarks_m), estimate, info.true_landmarks_m]
     _draw_landmarks(axes, last, extent_m(*outlined, *info.outlines_m))
     axes.margins(0.06)
-    title, remark = _title_and_remark(info, summary, estimate)
+    title, remark = _title_and_remark(info, summary, states)
     if is_narrow:
         title, remark = (
             "\n".join(line for part in text.split("\n") for line in wrap(part, n_letters))
@@ -341,16 +341,18 @@ def _draw_distances(
 
 
 def _title_and_remark(
-    info: SessionInfo, summary: Summary | None, estimate: NDArray[np.float64]
+    info: SessionInfo, summary: Summary | None, states: States
 ) -> tuple[str, str]:
     simulated = " (simulated)" if info.simulated else ""
     if summary is None:
-        length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
         title = (
             f"{info.scene}, preset {info.preset}{simulated}: "
-            f"{length_m:.1f} m driven, no truth to compare with"
+            f"{states.driven_m:.1f} m driven, no truth to compare with"
         )
-        remark = "map frame: the origin is the robot's first pose"
+        origin = (
+            "where the first run on the map began" if info.map_json else "the robot's first pose"
+        )
+        remark = f"map frame: the origin is {origin}"
     else:
         seed = "" if summary.seed is None else f", seed {summary.seed}"
         title = (
@@ -469,9 +471,13 @@ def _draw_landmarks(axes: Axes, last: Snapshot, map_extent_m: float) -> None:
 def _world_from_odom(record: RunRecord) -> NDArray[np.float64]:
     """Return the place of odometry's frame such that it begins where SLAM does, shape (3,).
 
-    A robot's odometry begins anywhere, as it runs before we listen; that of a demo at its start.
+    A robot's odometry begins anywhere, as it runs before we listen; that of a demo at its start. It
+    is laid on the first state whose place on the map was known.
     """
-    return compose(_first_pose(record), between(record.states.odometry[0], np.zeros(3)))
+    states = record.states
+    first = int(np.argmax(~states.lost))
+    pose = compose(record.world_from_map, states.estimate[first])
+    return compose(pose, between(states.odometry[first], np.zeros(3)))
 
 
 def _first_pose(record: RunRecord) -> NDArray[np.float64]:

@@ -177,6 +177,12 @@ class States:
         """Whether the true pose is known at every state, and there is a state."""
         return len(self) > 0 and bool(np.isfinite(self.truth).all())
 
+    @property
+    def driven_m(self) -> float:
+        """The way by the estimate; the jump with which a lost robot is found is none."""
+        steps_m = np.linalg.norm(np.diff(self.estimate[:, :2], axis=0), axis=1)
+        return float(steps_m[~self.lost[:-1] | self.lost[1:]].sum())
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunRecord:

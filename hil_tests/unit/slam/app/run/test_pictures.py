@@ -107,6 +107,17 @@ def short_run() -> RunRecord:
     return RunRecord(states=states, last=last, n_frames=6, duration_ns=1, wall_s=1.0)
 
 
+def test_a_lost_robot_did_not_drive_to_where_it_is_found_and_its_wheels_are_drawn_there() -> None:
+    record = short_run()
+    estimate = np.array([[7.0, 8.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.5, 0.3]])  # found at the second
+    states = replace(record.states, estimate=estimate, lost=np.array([True, False, False]))
+    assert states.driven_m == pytest.approx(math.hypot(1.0, 0.5))
+    figure = Figure(layout="constrained")
+    draw_map(figure, replace(session_info(), map_json="{}"), replace(record, states=states), None)
+    (wheels,) = (each for each in figure.axes[0].lines if each.get_label() == "wheel odometry")
+    np.testing.assert_allclose(np.asarray(wheels.get_xydata()), record.states.odometry[:, :2])
+
+
 @pytest.mark.parametrize("width_in", [9.0, NARROW_IN])
 def test_the_map_says_how_much_its_ellipses_are_enlarged(width_in: float) -> None:
     record = short_run()
