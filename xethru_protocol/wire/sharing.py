@@ -33,7 +33,8 @@ MOST_UNSENT = 1 << 20
 # How long others wait for an answer: longer than a mode change or a restart of the chip takes, and
 # for a mere question, which a module may leave unanswered (4.4), shorter than hosts have patience.
 _COMMAND_NS, _QUESTION_NS = 10_000_000_000, 1_000_000_000
-_MOST_QUESTIONS, _MOST_HELD = 64, 1024  # asked and not answered; of all hosts, not asked yet
+# Of one host: asked one after the other while others wait, and not asked yet.
+_MOST_IN_A_ROW, _MOST_WAITING = 64, 1024
 _READINGS = {m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString, m.ParameterFile}
 _NOT_FOR_ALL = (m.X4DriverRead, m.X4DriverReadI2c)  # reading a FIFO empties it
 _CHANGES = (
@@ -64,6 +65,7 @@ class Host:
         self.lost = 0
         self.reader = PacketReader(Direction.FROM_HOST)
         self.knows_of_change = False  # since it asked, or got a frame
+        self.n_waiting = 0  # questions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,9 +102,13 @@ class SharedModule:
     def line_lost(self) -> None:
         """Begin anew with a line that was just opened; the hosts are left to the caller."""
         self._reader = PacketReader(Direction.FROM_MODULE)
-        self._asked: deque[_Question] = deque(maxlen=_MOST_QUESTIONS)  # all by one host
-        self._waiting: deque[_Question] = deque(maxlen=_MOST_HELD)
+        self._asked: deque[_Question] = deque()  # all by one host
+        self._asking: Host | None = None  # that host
+        self._in_a_row = 0  # by it
+        self._waiting: deque[_Question] = deque()
         self._answer_by_ns = 0
+        for host in self.hosts:
+            host.n_waiting = 0
 
     def join(self, name: str, send: Callable[[bytes], object], unsent: Callable[[], int]) -> Host:
         """Add a host; arguments as of its attributes."""
@@ -136,13 +142,21 @@ class SharedModule:
         if self._waiting and now_ns >= self._answer_by_ns:
             self._asked.clear()  # the answers do not come any more
         while True:
-            asking = self._asked[0].host if self._asked else None
-            fitting = (one for one in self._waiting if asking in {None, one.host})
-            question = next(fitting, None)
-            if question is None:
+            if not self._asked:  # another host's comes first, lest one holds up the others
+                self._in_a_row = 0
+                waiting = sorted(self._waiting, key=lambda one: one.host is self._asking)
+            elif self._in_a_row < _MOST_IN_A_ROW:
+                waiting = [one for one in self._waiting if one.host is self._asking]
+            else:
                 return
+            if not waiting:
+                return
+            question = waiting[0]
             self._waiting.remove(question)
             self._asked.append(question)
+            self._asking = question.host
+            question.host.n_waiting -= 1
+            self._in_a_row += 1
             self._answer_by_ns = now_ns + question.limit_ns
             if isinstance(question.command, _CHANGES):
                 self._announce_change(question.host)
@@ -159,7 +173,9 @@ class SharedModule:
             and not is_misread(payload)
         )
         reason = ""
-        if isinstance(command, m.SetBaudRate):
+        if host.n_waiting >= _MOST_WAITING:
+            reason = f"{_MOST_WAITING} commands of this program wait for the module already"
+        elif isinstance(command, m.SetBaudRate):
             reason = "xethru share keeps the rate of its line; start it with another --baudrate"
         elif not is_question:
             self.commander = self.commander or host
@@ -174,6 +190,7 @@ class SharedModule:
             return
         replies = () if row is None or Response in row.replies else row.replies
         limit_ns = _QUESTION_NS if is_question else _COMMAND_NS
+        host.n_waiting += 1
         self._waiting.append(_Question(host, command, payload, replies, limit_ns))
 
     def _pass_on(self, packet: Packet) -> None:

@@ -208,6 +208,27 @@ def test_a_change_is_announced_before_other_frames_can_come() -> None:
     assert notice not in shared.got(commander)
 
 
+def test_a_host_that_never_stops_asking_holds_up_nobody() -> None:
+    """Answers of another host's flood come to that host only, however many there are."""
+    shared = Shared()
+    one, other = shared.join("one"), shared.join("other")
+    shared.ask(one, *[m.Ping()] * 3000)
+    shared.ask(other, ASK_FPS)
+    refused = [each for each in shared.got(one) if isinstance(each, m.Error)]
+    assert len(refused) > 1500
+    n_asked = 0
+    while ASK_FPS not in (asked := shared.asked()):
+        n_asked += len(asked)
+        assert 0 < asked.count(m.Ping()) == len(asked)
+        assert n_asked <= 100
+        shared.ask(one, m.Ping())
+        shared.say(*[READY] * len(asked))
+        assert shared.got(other) == []
+    shared.say(FPS_IS)
+    assert shared.got(other) == [FPS_IS]
+    assert FPS_IS not in shared.got(one)
+
+
 def test_a_module_that_restarts_answers_nothing_it_was_asked_before() -> None:
     """Protocol reference 3: what is sent after a reset is never answered."""
     shared = Shared()
