@@ -26,7 +26,7 @@ from slam.live.frame_sources import (
 from slam.live.modules import open_modules, open_ports
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import RadarInfo, Scan
-from slam.live.ticks import SETTLE_S, SILENT_RIG_S, Inbox, SourceEvent, TickAssembler, reading
+from slam.live.ticks import SETTLE_S, Inbox, SourceEvent, TickAssembler, reading
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.matching import ProtocolRecord
 from xethru_protocol.operating_system import StopFlag
@@ -108,7 +108,7 @@ class LiveRig:
 
     def _arriving(self) -> Generator[Scan]:
         inbox = Inbox()
-        arrivals = _Arrivals(self.radars, self._limits, time.monotonic_ns())
+        arrivals = _Arrivals(self.radars, self._limits)
         with reading(self._links, inbox):
             while True:
                 with suppress(Empty):
@@ -123,15 +123,12 @@ class LiveRig:
 class _Arrivals:
     """Makes scans of frames by time base `arrival`; it reads no clock."""
 
-    def __init__(
-        self, radars: Sequence[RadarInfo], limits: tuple[float, float] | None, now_ns: int
-    ) -> None:
+    def __init__(self, radars: Sequence[RadarInfo], limits: tuple[float, float] | None) -> None:
         self._radars, self._limits = radars, limits
         self._clocks = [ArrivalClock(radar.rate_hz) for radar in radars]
         period_ns = round(NS_PER_S / radars[0].rate_hz)
         self._ticks = TickAssembler(len(radars), period_ns, _NoOdometry())
         self._heard = set[int]()
-        self._alive_ns = now_ns
         self._ready_ns: int | None = None
         self._warned = 0  # scans that were not used when that was last logged
 
@@ -151,10 +148,8 @@ class _Arrivals:
 
     def next_scan(self, now_ns: int) -> Scan | None:
         """Return the next scan if it is complete; RadarSilentError if none can be expected."""
-        if self._ticks.alive:
-            self._alive_ns = now_ns
-        elif now_ns - self._alive_ns > SILENT_RIG_S * NS_PER_S:
-            raise RadarSilentError(f"no radar for {SILENT_RIG_S:g} s")
+        if text := self._ticks.silence(now_ns):
+            raise RadarSilentError(text)
         if self._ticks.start_ns is None:
             if self._ready_ns is None and self._ticks.alive <= self._heard:
                 self._ready_ns = now_ns

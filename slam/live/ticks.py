@@ -233,6 +233,7 @@ class TickAssembler:
         self._waiting: list[deque[_WaitingFrame]] = [deque() for _ in range(n_radars)]
         self._tick = 0
         self.alive = set(range(n_radars))
+        self._all_lost_ns: int | None = None
         self.start_ns: int | None = None
         self.wait_ns = 0
         self.n_unused = self.n_dropped = self.n_left_out = 0
@@ -251,6 +252,14 @@ class TickAssembler:
         self._waiting[frame.radar].append(_WaitingFrame(frame, host_ns, came_ns))
         if self.start_ns is None:
             self._forget_before(frame.t_ns - EARLY_NS)
+
+    def silence(self, now_ns: int) -> str:
+        """Return why no more frames can be expected, "" if they can; host time, asked often."""
+        if self.alive or self._all_lost_ns is None:
+            self._all_lost_ns = None if self.alive else now_ns
+        elif now_ns - self._all_lost_ns > SILENT_RIG_S * NS_PER_S:
+            return f"no radar for {SILENT_RIG_S:g} s"
+        return ""
 
     def _forget_before(self, t_ns: int) -> None:
         for queue in self._waiting:

@@ -31,7 +31,6 @@ from slam.live.ticks import (
     MOST_EVENTS,
     MOST_WAIT_NS,
     SETTLE_S,
-    SILENT_RIG_S,
     Inbox,
     SourceEvent,
     TickAssembler,
@@ -189,7 +188,6 @@ class LiveSource:
         self._stop, self._duration_s, self._clock_ns = stop, duration_s, clock_ns
         self._unix_ns = time.time_ns() - time.monotonic_ns()
         self._began_ns = clock_ns()
-        self._all_lost_ns: int | None = None
         self._last_frames: list[Frame | None] = [None] * len(radars)
         self._drift_logged_ns = self._began_ns
         self._warned_dropped = self._warned_refused = 0
@@ -393,14 +391,9 @@ class LiveSource:
         elif self.ticks.ended or over_ns >= self._odometry_end_ns:
             trouble = self._odometry.trouble
             self.ended = AppError(trouble) if trouble else "odometry ended"
-        elif text := self._odometry.silence(now_ns, self._began_ns):
-            self.ended = AppError(text)
-        elif self.ticks.alive:
-            self._all_lost_ns = None
-        elif self._all_lost_ns is None:
-            self._all_lost_ns = now_ns
-        elif now_ns - self._all_lost_ns > SILENT_RIG_S * NS_PER_S:
-            self.ended = AppError(f"no radar for {SILENT_RIG_S:g} s")
+        else:
+            text = self._odometry.silence(now_ns, self._began_ns) or self.ticks.silence(now_ns)
+            self.ended = AppError(text) if text else None
 
     def _log_drifts(self) -> None:
         for info, clock in zip(self.radars, self.clocks, strict=True):

@@ -97,7 +97,7 @@ def test_by_arrival_every_frame_comes_once_and_at_its_time() -> None:
     """Clocks 30 ppm apart, starts up to 150 ms apart, lines with jitter, in virtual time."""
     scene = drifting(LAB, (15.0, -15.0, 0.0, 5.0), (0.0, 150.0, 60.0, 30.0))
     infos, events = radar_events(scene, 0, 10.0, delays(1, 16.0))
-    arrivals = _Arrivals(infos, None, 0)
+    arrivals = _Arrivals(infos, None)
     scans: list[Scan] = []
     for row in sorted(events, key=lambda row: row.t_ns):
         arrivals.take(row.event)
@@ -124,7 +124,7 @@ def test_a_rig_goes_on_without_a_radar_and_ends_without_all(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     infos, events = radar_events(LAB, 0, 8.0, lambda: 1_000_000)
-    arrivals = _Arrivals(infos, None, 0)
+    arrivals = _Arrivals(infos, None)
     sizes = []
     for row in sorted(events, key=lambda row: row.t_ns):
         kind, radar, *_ = row.event
@@ -147,7 +147,7 @@ def test_a_rig_goes_on_without_a_radar_and_ends_without_all(
 
 def test_a_radar_that_never_sends_is_not_waited_for_once_it_is_lost() -> None:
     infos, events = radar_events(LAB, 0, 6.0, lambda: 0)
-    arrivals = _Arrivals(infos, None, 0)
+    arrivals = _Arrivals(infos, None)
     sizes = []
     for row in sorted(events, key=lambda row: row.t_ns):
         if row.event[1] != 2:
@@ -164,7 +164,7 @@ def test_a_program_that_is_too_slow_is_warned_ever_more_rarely(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     infos, events = radar_events(LAB, 0, 60.0, lambda: 1_000_000)
-    arrivals = _Arrivals(infos, None, 0)
+    arrivals = _Arrivals(infos, None)
     asked_ns, n_unused = 0, 0
     for row in sorted(events, key=lambda row: row.t_ns):
         if row.t_ns - asked_ns > 10 * NS_PER_S or asked_ns < 4 * NS_PER_S:
