@@ -223,12 +223,14 @@ class Rig:
     mounts: Sequence[Mount]  # kept as a tuple
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a mount that is nowhere."""
+        """Raise ValueError for a mount that is nowhere, or is called as another one."""
         for number, mount in enumerate(self.mounts):
             where = mount.x_m, mount.y_m, mount.yaw_rad, mount.range_offset_m
             if not all(map(math.isfinite, where)):
                 raise ValueError(f"mount {number}, {mount}: its numbers must be finite")
-        named = (m if m.name else replace(m, name=f"radar{k}") for k, m in enumerate(self.mounts))
+        named = [m if m.name else replace(m, name=f"radar{k}") for k, m in enumerate(self.mounts)]
+        if len({mount.name for mount in named}) < len(named):  # maps and sessions go by names
+            raise ValueError(f"mounts are called {', '.join(mount.name for mount in named)}")
         object.__setattr__(self, "mounts", tuple(named))
 
     def pairs(self, field: FieldOfView = PAPERS_FIELD) -> tuple[RadarPair, ...]:

@@ -109,6 +109,8 @@ def _check(file: MapFile) -> None:
     ids = [one.id for one in saved.features]
     if len(set(ids)) < len(ids) or max(ids, default=-1) >= saved.next_id:
         raise ValueError("ids of landmarks and walls must differ, and be less than next_id")
+    if len({radar.name for radar in saved.radars}) < len(saved.radars):
+        raise ValueError("names of radars must differ")
     needed = [f"{axis} {one.id}" for one in saved.landmarks for axis in "xy"]
     needed += [f"{axis} {one.id}" for one in saved.walls for axis in ("phi", "d")]
     names = set(saved.unknowns)

@@ -110,6 +110,7 @@ DAMAGED = {
     "nan of a radar": TEXT.replace('"x_m": 0.1,', '"x_m": NaN,'),
     "beyond all numbers": TEXT.replace('"world_from_map": [1.0', '"world_from_map": [1e999'),
     "too far": TEXT.replace('"x_m": 1.0', '"x_m": 1e9'),
+    "twins": json.dumps(json.loads(TEXT) | {"radars": 2 * json.loads(TEXT)["radars"]}),
     "rows": TEXT.replace('"radius 3", ', ""),
     "negative": json.dumps(json.loads(TEXT) | {"covariance": [[-1.0], *FILE.map.covariance[1:]]}),
 }

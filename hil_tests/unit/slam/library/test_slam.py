@@ -441,6 +441,10 @@ def test_after_a_stop_what_has_ids_makes_the_pose_sure_again(has_bearings: bool)
 
 def test_a_rig_takes_a_list_and_names_its_mounts() -> None:
     assert [mount.name for mount in RIG.mounts] == ["radar0", "radar1"]
+    mount = Mount(name="radar1", x_m=0.0, y_m=0.0, yaw_rad=0.0)
+    for twin in (mount, replace(mount, name="")):  # the latter is called by its number
+        with pytest.raises(ValueError, match="radar1, radar1"):
+            Rig([mount, twin])
     with pytest.raises(ValueError, match="finite"):
         Rig([Mount(x_m=math.nan, y_m=0.0, yaw_rad=0.0)])
     with pytest.raises(ValueError, match="mount"):
