@@ -113,6 +113,11 @@ def _check(file: MapFile) -> None:
         raise ValueError("names of radars must differ")
     needed = [f"{axis} {one.id}" for one in saved.landmarks for axis in "xy"]
     needed += [f"{axis} {one.id}" for one in saved.walls for axis in ("phi", "d")]
+    labels = [one.label for one in saved.landmarks if one.label is not None]
+    if len(set(labels)) < len(labels):
+        raise ValueError("labels of landmarks must differ")
+    if any(one.added_sigma_m < 0.0 or one.hits < 0 for one in saved.features):
+        raise ValueError("added_sigma_m and hits must not be negative")
     names = set(saved.unknowns)
     if len(names) < len(saved.unknowns) or not names.issuperset(needed):
         raise ValueError("unknowns must name x and y of each landmark and phi and d of each wall")

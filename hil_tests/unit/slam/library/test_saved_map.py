@@ -111,6 +111,16 @@ DAMAGED = {
     "beyond all numbers": TEXT.replace('"world_from_map": [1.0', '"world_from_map": [1e999'),
     "too far": TEXT.replace('"x_m": 1.0', '"x_m": 1e9'),
     "twins": json.dumps(json.loads(TEXT) | {"radars": 2 * json.loads(TEXT)["radars"]}),
+    "added": TEXT.replace('"added_sigma_m": 0.003', '"added_sigma_m": -1.0'),
+    "hits": TEXT.replace('"hits": 9', '"hits": -9'),
+    "cells": TEXT.replace("[-2, -1, 5]", f"[{-(2**70)}]"),
+    "label": json.dumps(
+        json.loads(TEXT)
+        | {
+            "landmarks": [json.loads(TEXT)["landmarks"][0] | {"id": id_} for id_ in (2, 3)],
+            "unknowns": ["x 2", "y 2", "x 3", "y 3", "phi 4", "d 4"],
+        }
+    ),
     "rows": TEXT.replace('"radius 3", ', ""),
     "negative": json.dumps(json.loads(TEXT) | {"covariance": [[-1.0], *FILE.map.covariance[1:]]}),
 }
