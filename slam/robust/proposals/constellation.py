@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from slam.geometry import align_se2, compose, transform
@@ -32,6 +33,7 @@ from slam.robust.state import HEADING, Array, Indices, State, quarter_turn, rota
 # Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
 # that keeps the matrix regular
 _STEPS, _LEAST_CHANGE, _VARIANCE_FLOOR_M2 = 5, 1e-9, 1e-10
+_ROOM = 1.0 + 1e-9  # for rounding, where landmarks are searched within reach
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -154,22 +156,32 @@ def _guesses(points: Array, targets: Array, rule: BranchRule, seeds: int) -> lis
     angles = np.arctan2(gaps[..., 1], gaps[..., 0])
     long_enough = lengths >= rule.base_m
     found: list[Pairs] = []
-    first = points[:seeds]
+    first, tree = points[:seeds], cKDTree(targets)
+    least = min(rule.least_landmarks, len(points))
     for a in range(len(first)):
         for b in range(a + 1, len(first)):
             gap = points[b] - points[a]
             length = math.hypot(gap[0], gap[1])
             if length < rule.base_m:
                 continue
-            alike = long_enough & (np.abs(lengths - length) <= rule.reach_m)
-            for i, j in np.argwhere(alike).tolist():
-                turn = float(angles[i, j]) - math.atan2(gap[1], gap[0])
+            direction = math.atan2(gap[1], gap[0])
+            alike = np.argwhere(long_enough & (np.abs(lengths - length) <= rule.reach_m))
+            # Most lay too few on any other, which a tree finds out for all of them together.
+            turns = angles[alike[:, 0], alike[:, 1]] - direction
+            by_turn = points - (points[a] + points[b]) / 2
+            x, y = np.cos(turns)[:, None], np.sin(turns)[:, None]
+            laid = np.stack([x * by_turn[:, 0], y * by_turn[:, 0]], axis=-1)
+            laid += np.stack([-y * by_turn[:, 1], x * by_turn[:, 1]], axis=-1)
+            laid += targets[alike].mean(axis=1)[:, None]
+            near_m, _ = tree.query(laid, distance_upper_bound=rule.reach_m * _ROOM)
+            for i, j in alike[np.isfinite(near_m).sum(axis=1) >= least].tolist():
+                turn = float(angles[i, j]) - direction
                 R = rotation(turn)
                 middle = (targets[i] + targets[j]) / 2 - R @ (points[a] + points[b]) / 2
                 moved = points @ R.T + middle
                 away = np.hypot(*np.moveaxis(targets[:, None] - moved[None, :], -1, 0))
                 pairs = _nearest(away, rule.reach_m)
-                if len(pairs) >= min(rule.least_landmarks, len(points)):
+                if len(pairs) >= least:
                     found.append(pairs)
     found.sort(key=lambda pairs: -len(pairs))
     return found[: rule.most_tried]
