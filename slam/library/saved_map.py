@@ -118,6 +118,8 @@ def _check(file: MapFile) -> None:
         raise ValueError("labels of landmarks must differ")
     if any(one.added_sigma_m < 0.0 or one.hits < 0 for one in saved.features):
         raise ValueError("added_sigma_m and hits must not be negative")
+    if any(abs(cell) > MOST_M for one in saved.walls for cell in one.cells):
+        raise ValueError(f"cells must be at most {MOST_M:g}")
     names = set(saved.unknowns)
     if len(names) < len(saved.unknowns) or not names.issuperset(needed):
         raise ValueError("unknowns must name x and y of each landmark and phi and d of each wall")

@@ -44,6 +44,7 @@ Row: TypeAlias = Sequence[float | None]
 _MOST_AHEAD_NS = 100_000_000
 _KEPT_NS = 2_000_000_000
 _SAME = 1e-9  # [m] and [rad]: two poses of one time that differ by less are one
+_ROUNDED = 1e-9  # of gathered noise, for covariances without full rank
 _MOST_STAMP_NS = 2**63 - 1
 
 
@@ -188,8 +189,10 @@ class Slam:
             raise ValueError("localise: in which map? Give map, too")
         # Where the pipeline's map, if it is not an earlier one, lies on the map
         self._start = np.zeros(3) if given is None or on_map is not None else given
+        # Until the last step, and until that which is being taken
         self._noise_at, self._noise = odometry_noise, np.zeros((3, 3))
-        noise_at = None if odometry_noise is None else lambda _: self._noise
+        self._noise_now = self._noise
+        noise_at = None if odometry_noise is None else lambda _: self._noise_now
         self._pipeline = make_slam(
             self.config, rig, self._wheels, front_end, noise_at=noise_at, on_map=on_map
         )
@@ -263,23 +266,21 @@ class Slam:
             A ValueError: something cannot be taken. Then nothing of the step was: later results are
             the same, to the last bit, as without it.
         """
-        t_ns, taken = _stamp(t_ns), tuple(frames)
+        t_ns, taken = _stamp(t_ns), _items(frames, "frames")
         if self.state.t_ns is not None and t_ns < self.state.t_ns:
             raise StepInputError(f"t_ns is {t_ns}, before that of the last step, {self.state.t_ns}")
-        scans = self._scans(taken, tuple(ranges), tuple(points))
+        scans = self._scans(taken, _items(ranges, "ranges"), _items(points, "points"))
         track = deepcopy(self._odometry)
         pose_at = self._pose_at(track, t_ns, odometry_pose)
         is_first = self._belief_at is None  # frames at the first pose are not looked at
         stamps_ns = {t_ns} if is_first else {t_ns, *(frame.t_ns for frame in taken)}
         poses = {stamp: _pose(pose_at(stamp), f"odometry at {stamp} ns") for stamp in stamps_ns}
         if self._noise_at is not None:
-            self._noise = np.array(self._noise_at(t_ns), dtype=np.float64)
-            if self._noise.shape != (3, 3) or not np.isfinite(self._noise).all():
-                raise StepInputError(f"odometry_noise at {t_ns} ns is not a finite matrix (3, 3)")
+            self._noise_now = _later_noise(self._noise_at(t_ns), self._noise, t_ns)
         with self._threads.limit(limits=1):  # the same bits on every machine
             results = self._stepped(taken, scans, poses.__getitem__, t_ns)
         track.forget_before(t_ns - _KEPT_NS)
-        self._odometry = track
+        self._odometry, self._noise = track, self._noise_now
         self._newest |= {frame.radar: (frame.stream, frame.counter) for frame in taken}
         if self._belief_at is None:
             self._belief_at = poses[t_ns]
@@ -500,7 +501,7 @@ _FIELDS = {
 
 def _measured(row: Sequence[Any], kind: str) -> _Measured:
     """Return what a row of ``ranges`` or ``points`` says; StepInputError if it cannot be."""
-    names, values = _FIELDS[kind], tuple(row)
+    names, values = _FIELDS[kind], _items(row, f"{kind}s: one of them")
     n = len(names)
     try:
         if len(values) not in (n, n + 1):
@@ -508,7 +509,7 @@ def _measured(row: Sequence[Any], kind: str) -> _Measured:
         radar = operator.index(values[0])
         numbers = dict(zip(names[1:], map(float, values[1:n]), strict=True))
         label = None if values[n:] in ((), (None,)) else operator.index(values[n])
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         text = f"({', '.join(names)}), numbers, and perhaps the id of a landmark, a whole number"
         raise StepInputError(f"{kind} {values}: must be {text}") from None
     one = _Measured(radar, label, **numbers)
@@ -532,6 +533,13 @@ def _scan_of(radar: int, many: Sequence[_Measured], kind: str) -> RangeScan:
     )
 
 
+def _items(given: Iterable[Any], what: str) -> tuple[Any, ...]:
+    try:
+        return tuple(given)
+    except TypeError:
+        raise StepInputError(f"{what} must be rows, not {given!r}") from None
+
+
 def _stamp(t_ns: int) -> int:
     try:
         stamp_ns = operator.index(t_ns)
@@ -546,13 +554,27 @@ def _pose(given: ArrayLike, what: str) -> Array:
     """Return a pose as an array (3,); StepInputError if it is not three numbers of the Earth."""
     try:
         pose = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape != (3,) or not np.isfinite(pose).all() or np.abs(pose).max() > MOST_M:
         raise StepInputError(
             f"{what} is {given!r}; a pose is three finite numbers, x [m], y [m] and heading [rad]"
         )
     return pose
+
+
+def _later_noise(given: ArrayLike, before: Array, t_ns: int) -> Array:
+    """Return gathered noise (3, 3); StepInputError if it is none, or less than that before."""
+    noise = np.array(given, dtype=np.float64)
+    if noise.shape != (3, 3) or not np.isfinite(noise).all():
+        raise StepInputError(f"odometry_noise at {t_ns} ns is not a finite matrix (3, 3)")
+    variances = np.linalg.eigvalsh(noise - before)
+    if variances[0] < -_ROUNDED * np.abs(noise).max():
+        raise StepInputError(
+            f"odometry_noise at {t_ns} ns: it is less than before by a variance of "
+            f"{-variances[0]:g}; noise that odometry has gathered never falls"
+        )
+    return noise
 
 
 def _motion_noise(moved: Array, heading_rad: float, wheels: WheelNoise) -> Array:

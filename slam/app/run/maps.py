@@ -18,7 +18,7 @@ from slam.app.errors import UsageError
 from slam.app.run.output import ResultRow, mm_text, note
 from slam.app.run.runner import RunRecord
 from slam.config import BackEnd, ConfigError, SlamConfig
-from slam.geometry import between
+from slam.geometry import MOST_M, between
 from slam.library.saved_map import MapFile, load_map, map_text, parse_map, save_map
 from slam.live.errors import AppError
 from slam.live.session_records import SessionInfo, SessionObserver, Snapshot
@@ -71,6 +71,8 @@ def map_use(config: SlamConfig, options: MapOptions) -> MapUse:
     except ConfigError as error:
         raise UsageError(str(error)) from None
     pose = None if start is None else (start[0], start[1], math.radians(start[2]))
+    if start is not None and max(map(abs, start)) > MOST_M:
+        raise UsageError(f"--start: no number may be more than {MOST_M:g}")
     on_map = StartOnMap(map=file.map, pose=pose, is_fixed=is_fixed)
     return MapUse(file=file, on_map=on_map)
 
@@ -85,6 +87,8 @@ def recorded_use(info: SessionInfo, source: Path) -> MapUse:
         pose, is_fixed = tables["start"], bool(tables["localise"])
         if pose is not None:
             x, y, heading = map(float, pose)
+            if not max(map(abs, (x, y, heading))) <= MOST_M:
+                raise ValueError(f"its start is {pose}")
             pose = (x, y, heading)
     except (KeyError, TypeError, ValueError) as error:
         raise AppError(f"{source}: the map that it began with cannot be read: {error}") from None

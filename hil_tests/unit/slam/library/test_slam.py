@@ -134,6 +134,10 @@ REFUSED: dict[str, Callable[[Slam, int], object]] = {
     "range and point of one": lambda s, t: s.step(
         t, P, ranges=[(0, 1.0, 0.1)], points=[(0, 1.0, 0.0, 0.1, 0.1)]
     ),
+    "no rows": lambda s, t: s.step(t, P, frames=None, ranges=FOREIGN),  # type: ignore[arg-type]
+    "a row that is alone": lambda s, t: s.step(t, P, ranges=(0, 1.0, 0.1)),  # type: ignore[arg-type]
+    "pose beyond floats": lambda s, t: s.step(t, (10**400, 0.0, 0.0)),
+    "range beyond floats": lambda s, t: s.step(t, P, ranges=[(0, 10**400, 0.1)]),
     "bearing without sigma": lambda s, t: s.step(
         t,
         P,
@@ -178,6 +182,26 @@ def test_whatever_is_refused_moves_nothing(preset: str) -> None:
         assert_same(stepped(disturbed, number), stepped(calm, number))
         if number > 1:
             refuse_all(disturbed, number + 1, names)
+
+
+def test_noise_of_odometry_that_falls_is_refused_and_moves_nothing() -> None:
+    """The covariance of the motion would not be one."""
+    falls = [False]
+
+    def noise(t_ns: int) -> np.ndarray:
+        return np.eye(3) * 1e-14 * (-t_ns if falls[0] else t_ns)
+
+    disturbed, calm = (Slam(RIG, front_end=Rod(), odometry_noise=noise) for _ in range(2))
+    for number in range(20):
+        falls[0] = number > 0
+        for late in (0, TICK_NS):
+            if falls[0]:
+                with pytest.raises(StepInputError):
+                    disturbed.step(number * TICK_NS + late, P, frames=frames(number))
+        falls[0] = False
+        with pytest.raises(StepInputError):  # by the pipeline, at a later time than the next step
+            disturbed.step((number + 1) * TICK_NS, (math.nan, 0.0, 0.0))
+        assert_same(stepped(disturbed, number), stepped(calm, number))
 
 
 def test_frames_have_the_poses_between_those_of_the_steps() -> None:
