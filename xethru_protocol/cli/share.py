@@ -125,8 +125,13 @@ class _Sharing:
         connection = writer.get_extra_info("socket")
         keep_alive(connection)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
-        name = f"{peer[0]}:{peer[1]}"
-        host = self._module.join(name, writer.write, writer.transport.get_write_buffer_size)
+        name, transport = f"{peer[0]}:{peer[1]}", writer.transport
+
+        def send(data: bytes) -> None:
+            if not transport.is_closing():  # asyncio logs every message to one that broke off
+                transport.write(data)
+
+        host = self._module.join(name, send, transport.get_write_buffer_size)
         self._writers[host] = writer
         try:
             while data := await reader.read(_CHUNK_BYTES):
@@ -137,7 +142,7 @@ class _Sharing:
         finally:
             del self._writers[host]
             self._module.leave(host)
-            writer.transport.abort()
+            transport.abort()
             if self._as_json:
                 with suppress(BrokenPipeError, CommandFailed):  # its reader has gone
                     print_json({"left": name, "messages": host.messages, "lost": host.lost})

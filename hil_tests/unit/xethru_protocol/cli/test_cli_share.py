@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 from xethru_protocol.wire.errors import (
     DeviceError,
@@ -27,6 +29,7 @@ from xethru_protocol.wire.errors import (
     LocalProtocolError,
     ResponseTimeout,
 )
+from xethru_protocol.wire.framing import encode_normal
 
 XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
 
@@ -176,6 +179,19 @@ def test_a_program_that_goes_in_the_middle_of_a_command(share: Share, module: Pt
         stays.start(17)
         assert count(stays, 3)
     assert not any(isinstance(one, m.UnknownMessage) for one in module.received[n_commands:])
+
+
+def test_a_program_that_asks_much_and_breaks_off_leaves_no_word_on_stderr(share: Share) -> None:
+    host, port = share.url.removeprefix("tcp://").split(":")
+    for _ in range(20):
+        with socket.create_connection((host, int(port))) as goes:
+            goes.sendall(encode_normal(encode(m.Ping())) * 3000)
+            goes.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    with X4M300.open(share.url) as stays:
+        stays.ping()
+    assert share.end() == 0
+    assert share.process.stderr is not None
+    assert share.process.stderr.read() == ""
 
 
 @pytest.mark.slow
