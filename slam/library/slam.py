@@ -129,7 +129,7 @@ class Slam:
     """SLAM step by step, with whatever a robot's own loop has: frames, ranges or points.
 
     Lengths are true metres, angles radians, counter-clockwise. The body frame has x forward and y
-    left; the map frame begins at the first pose.
+    left; the map frame begins at the first pose. One thread at a time may use it.
 
     Parameters
     ----------
