@@ -144,7 +144,8 @@ class _Sharing:
             self._module.leave(host)
             transport.abort()
             if self._as_json:
-                with suppress(BrokenPipeError, CommandFailed):  # its reader has gone
+                # its reader has gone, or all ends
+                with suppress(BrokenPipeError, CommandFailed, StopRequestedError):
                     print_json({"left": name, "messages": host.messages, "lost": host.lost})
             else:
                 taken = counted(host.messages, "message")
