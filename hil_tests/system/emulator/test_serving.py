@@ -89,6 +89,7 @@ def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
         assert radar.statistics.off_lattice_samples == 0
 
 
+@pytest.mark.rare
 def test_bare_modules_have_serial_numbers_of_their_own(tmp_path: Path) -> None:
     """Two emulators on one machine, one that is given numbers, one that keeps them."""
     two = ("serve", "--bare", "--count", "2")
@@ -123,6 +124,7 @@ def test_a_file_survives_the_emulator(tmp_path: Path) -> None:
         assert not radar.files.find(FILE.file_type)
 
 
+@pytest.mark.rare
 def test_without_a_state_dir_nothing_is_kept() -> None:
     for _ in range(2):
         with emulator("serve", "--bare") as served, open_radar(served.paths[0]) as radar:

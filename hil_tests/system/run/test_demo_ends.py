@@ -114,6 +114,7 @@ def test_a_signal_half_way(which: signal.Signals, times: int, code: int, tmp_pat
     assert abs(count_rows(out / "session.rrd")["/radar/left_rear/frame"] - len(counters)) <= 1
 
 
+@pytest.mark.rare
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "slam.app.cli", "demo", "--preset", "paper"]
     command += ["--scene", str(write_short_scene(tmp_path)), "--out", str(tmp_path / "out")]

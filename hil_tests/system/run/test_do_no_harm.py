@@ -54,6 +54,7 @@ def test_a_place_that_deceives_does_no_harm(room: str) -> None:
     assert not run.lost_at_end
 
 
+@pytest.mark.rare
 def test_ranges_that_err_four_times_as_much_as_stated_do_no_harm() -> None:
     run = run_of("doors:3", "noise_stated_low")
     assert run.ate_ratio <= HARMED

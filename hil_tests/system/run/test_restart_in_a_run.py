@@ -24,6 +24,7 @@ from xethru_protocol.operating_system import StopFlag
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.rare
 def test_frames_after_a_restart_are_those_of_their_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,6 +61,7 @@ def test_replay_begins_on_the_recorded_map(
     assert load_map(moved).map == load_map(days / "two.json").map
 
 
+@pytest.mark.rare
 def test_a_session_is_localised_in_a_map_that_stays_as_it_is(days: Path, tmp_path: Path) -> None:
     saved = tmp_path / "same.json"
     options = ["--map", str(days / "one.json"), "--start", "0", "0", "0", "--localise"]

@@ -62,6 +62,7 @@ def test_every_radar_plays_at_a_port_of_its_own(session: Path) -> None:
         assert served.end() == 0
 
 
+@pytest.mark.rare
 def test_from_and_only(session: Path) -> None:
     arguments = ("--from", "27.5", "--rate", "0")
     with emulator("play", session, *arguments, "--only", "data-float") as served:

@@ -188,6 +188,7 @@ def test_only_tables_of_many_columns_repeat_their_names_on_a_telephone(reported:
         assert ("cards" in kind) == (head.count("<th>") > 5)
 
 
+@pytest.mark.rare
 def test_the_smoothed_path_has_its_number_and_is_on_the_map(tmp_path: Path) -> None:
     record = record_session(tmp_path / "session.mcap", "robust")
     assert record.whole_smoothed is not None

@@ -95,6 +95,7 @@ def test_frames_without_states_go_through_slam(session: Path, tmp_path: Path) ->
     assert (tmp_path / "run.html").read_bytes() == (tmp_path / "frames.html").read_bytes()
 
 
+@pytest.mark.rare
 def test_progress_comes_to_the_end_that_it_names(
     session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,6 +152,7 @@ def test_a_signal_leaves_what_was_there(
     assert contents(tmp_path) == before
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize("command", ["view", pytest.param("report", marks=pytest.mark.thorough)])
 def test_a_full_disk_leaves_what_was_there(session: Path, tmp_path: Path, command: str) -> None:
     out = tmp_path / "shown"

@@ -218,6 +218,7 @@ def test_a_viewer_gets_every_row_that_a_file_gets(
     assert sum(expected.values()) > 1000
 
 
+@pytest.mark.rare
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of one that is still written
 def test_a_demo_is_watched_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerun_recording, "_VIEWER_CLOSE_LIMIT_S", seconds(5))

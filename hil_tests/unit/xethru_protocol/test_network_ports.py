@@ -215,6 +215,7 @@ def test_both_drivers_stream_over_every_kind_of_port(url: str, served: Served) -
     assert counters == list(range(counters[0], counters[0] + 20))
 
 
+@pytest.mark.rare
 @pytest.mark.slow
 def test_the_baud_rate_is_set_on_the_server_too() -> None:
     """The emulated UART answers only a host whose own side has the module's rate."""

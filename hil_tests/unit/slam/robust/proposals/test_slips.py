@@ -62,6 +62,7 @@ def n_in_view(run: Run, step: int) -> int:
     return int(found.sum())
 
 
+@pytest.mark.rare
 def test_corners_are_no_slips(run: Run) -> None:
     found = [probability for _, probability in probabilities(run, run.increments)]
     assert sum(probability > 0.0 for probability in found) == N_CHANGES
