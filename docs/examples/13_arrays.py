@@ -8,7 +8,7 @@ first metre, where the antennas hear each other. `xethru convert` writes the sam
 With a recording of your own: `python 13_arrays.py rec`. It prints
 
 ```text
-visitor.mcap: left 34 messages in ... s
+visitor.mcap: left 34 messages, .../s, 0 lost; in ... s
 34 frames of 181 bins, 17.0 per second, ... s long
 the strongest echo lies at 2.08 m
 ```
