@@ -24,11 +24,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from hil_tests.patience import seconds
-
-LOOPBACK = (
-    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>"
-    "</General></Domain></CycloneDDS>"
-)
+from hil_tests.system.installation import LOOPBACK
 
 
 @dataclass
