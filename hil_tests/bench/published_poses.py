@@ -214,7 +214,7 @@ def child(folder: Path, command: Sequence[str]) -> int:
             odometry.append((sample.t_ns, arrival_ns + unix_ns))
         return sample, warning
 
-    LiveOdometry.take = noted  # type: ignore[method-assign]
+    LiveOdometry.take = noted  # type: ignore[method-assign]  # watched
     used_s: dict[str, dict[int, float]] = {}
     began_s, ended_s = time.monotonic(), threading.Event()
 

@@ -98,7 +98,7 @@ def assert_same(one: SlamState, other: SlamState) -> None:
 T, P = TICK_NS, (0.5, 0.0, 0.0)
 FOREIGN: Any = object()
 REFUSED: dict[str, Callable[[Slam, int], object]] = {
-    "stamp in seconds": lambda s, t: s.step(t / 1e9, P),  # type: ignore[arg-type]
+    "stamp in seconds": lambda s, t: s.step(t / 1e9, P),  # type: ignore[arg-type]  # wrong on purpose
     "stamp of 80 bits": lambda s, t: s.step(1 << 80, P),
     "stamp that runs back": lambda s, t: s.step(t - 3 * T, P),
     "NaN heading": lambda s, t: s.step(t, (0.5, 0.0, math.nan)),
@@ -134,8 +134,8 @@ REFUSED: dict[str, Callable[[Slam, int], object]] = {
     "range and point of one": lambda s, t: s.step(
         t, P, ranges=[(0, 1.0, 0.1)], points=[(0, 1.0, 0.0, 0.1, 0.1)]
     ),
-    "no rows": lambda s, t: s.step(t, P, frames=None, ranges=FOREIGN),  # type: ignore[arg-type]
-    "a row that is alone": lambda s, t: s.step(t, P, ranges=(0, 1.0, 0.1)),  # type: ignore[arg-type]
+    "no rows": lambda s, t: s.step(t, P, frames=None, ranges=FOREIGN),  # type: ignore[arg-type]  # wrong on purpose
+    "a row that is alone": lambda s, t: s.step(t, P, ranges=(0, 1.0, 0.1)),  # type: ignore[arg-type]  # wrong on purpose
     "pose beyond floats": lambda s, t: s.step(t, (10**400, 0.0, 0.0)),
     "range beyond floats": lambda s, t: s.step(t, P, ranges=[(0, 10**400, 0.1)]),
     "bearing without sigma": lambda s, t: s.step(
@@ -255,7 +255,7 @@ def test_headings_need_not_be_unwrapped() -> None:
         return ()
 
     slam.step(0, (0.0, 0.0, math.pi - 0.1))
-    slam._stepped = spy  # type: ignore[method-assign]
+    slam._stepped = spy  # type: ignore[method-assign]  # watched
     frame = replace(FRAME, t_ns=TICK_NS // 2)
     slam.step(TICK_NS, (0.0, 0.0, 3 * math.pi + 0.1 - 2 * math.tau), frames=[frame])
     assert abs(seen[0][2]) == pytest.approx(math.pi)
@@ -430,7 +430,7 @@ def test_the_noise_of_odometry_is_what_it_says() -> None:
     assert state.covariance[0, 0] == pytest.approx(3 * 4e-6, rel=0.01)
     assert state.covariance[2, 2] == pytest.approx(3 * 1e-6, rel=0.01)
     for noise in (np.zeros(3), np.full((3, 3), math.nan)):
-        wrong = Slam(RIG, odometry_noise=lambda _, noise=noise: noise)  # type: ignore[misc]
+        wrong = Slam(RIG, odometry_noise=lambda _, noise=noise: noise)  # type: ignore[misc]  # mypy infers no lambda with a default
         with pytest.raises(StepInputError):
             wrong.step(0, P)
         assert wrong.state.t_ns is None

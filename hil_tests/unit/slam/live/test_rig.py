@@ -87,7 +87,7 @@ def test_what_cannot_be_opened_is_named(lab: Scene, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"robot.toml: cannot read"):
         open_rig(tmp_path / "robot.toml")
     with pytest.raises(ValueError, match="time_base"):
-        open_rig(ports=["left_front"], time_base="counters")  # type: ignore[arg-type]
+        open_rig(ports=["left_front"], time_base="counters")  # type: ignore[arg-type]  # wrong on purpose
     for ports in (None, [], ["left_front"], "left_front"):
         with pytest.raises(ValueError, match="ports"):
             open_rig(Rig([Mount(x_m=0.0, y_m=0.0, yaw_rad=0.0)] * 2), ports)

@@ -151,7 +151,7 @@ def publish(spec: str, counters: range) -> tuple[tuple[int, int, int], list[str]
         seen.begin(session_info(), lines)
         (queued,) = seen.queued
         for count, counter in enumerate(counters):
-            wait_until(lambda done=count: queued.n_sent + queued.n_failed == done)  # type: ignore[misc]
+            wait_until(lambda done=count: queued.n_sent + queued.n_failed == done)  # type: ignore[misc]  # mypy infers no lambda with a default
             seen.on_snapshot(snapshot(counter))
     return (queued.n_sent, queued.n_dropped, queued.n_failed), lines
 
@@ -352,7 +352,7 @@ def test_a_viewer_that_never_reads_holds_up_neither_the_run_nor_its_end(
         for counter in range(1, 1201):
             seen.on_scan(scan(counter))
             if counter % 100 == 0:
-                wait_until(lambda sent=counter: queued.n_sent > sent)  # type: ignore[misc]
+                wait_until(lambda sent=counter: queued.n_sent > sent)  # type: ignore[misc]  # mypy infers no lambda with a default
         seen.close()  # the viewer answers no more than it reads
     assert time.monotonic() - began_s < seconds(10)
     assert (queued.n_dropped, queued.n_failed) == (0, 0)
