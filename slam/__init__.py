@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from slam.config import WheelNoise as WheelNoise
     from slam.config import load_preset as load_preset
     from slam.config import override as override
-    from slam.evaluation import ate_rmse_m as ate_rmse_m
     from slam.frames import Detection as Detection
     from slam.frames import Detector as Detector
     from slam.frames import RadarFrame as RadarFrame
     from slam.frames import StepInputError as StepInputError
     from slam.geometry import Mount as Mount
     from slam.geometry import Rig as Rig
+    from slam.library.evaluation import ate_rmse_m as ate_rmse_m
     from slam.library.rig_files import RigFile as RigFile
     from slam.library.rig_files import load_rig as load_rig
     from slam.library.saved_map import MapFile as MapFile
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "slam.config": ("ConfigError", "SlamConfig", "WheelNoise", "load_preset", "override"),
-    "slam.evaluation": ("ate_rmse_m",),
+    "slam.library.evaluation": ("ate_rmse_m",),
     "slam.frames": ("Detection", "Detector", "RadarFrame", "StepInputError"),
     "slam.geometry": ("Mount", "Rig"),
     "slam.library.rig_files": ("RigFile", "load_rig"),

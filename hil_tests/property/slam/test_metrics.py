@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.evaluation import (
+from slam.geometry import between, transform
+from slam.library.evaluation import (
     associate_times,
     ate_rmse_m,
     ate_rotation_rmse_rad,
@@ -21,7 +22,6 @@ from slam.evaluation import (
     relative_pose_errors,
     rmse_m,
 )
-from slam.geometry import between, transform
 
 Array = NDArray[np.float64]
 

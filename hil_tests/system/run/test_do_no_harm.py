@@ -14,8 +14,8 @@ from slam.app.rig.emulated import scene_and_config
 from slam.app.sweep.run import SweepRun, make_case, run_case
 from slam.app.sweep.statistics import HARMED
 from slam.config import WheelNoise
-from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount, Rig, between, compose
+from slam.library.evaluation import ate_rmse_m
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.pipeline import back_end_parameters

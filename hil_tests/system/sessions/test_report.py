@@ -21,7 +21,7 @@ from slam.app.cli import main
 from slam.app.run import pictures
 from slam.app.run.pictures import SMOOTHED
 from slam.app.view.rerun_recording import count_rows
-from slam.evaluation import ate_rmse_m
+from slam.library.evaluation import ate_rmse_m
 
 pytestmark = pytest.mark.slow
 

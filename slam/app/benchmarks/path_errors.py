@@ -12,8 +12,8 @@ from slam.app.benchmarks.back_end import BenchmarkRun, solve
 from slam.app.benchmarks.data_set import Array, DataSet, Positions, Run
 from slam.app.errors import naming
 from slam.app.run.result_files import write_path
-from slam.evaluation import ate_rmse_m
 from slam.geometry import align_se2, transform
+from slam.library.evaluation import ate_rmse_m
 from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S
 from xethru_protocol.operating_system import StopFlag

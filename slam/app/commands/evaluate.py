@@ -12,8 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.run.output import print_table, print_text
-from slam.evaluation import associate_times, ate_rmse_m, ate_rotation_rmse_rad, relative_pose_errors
 from slam.geometry import align_se2, transform
+from slam.library.evaluation import (
+    associate_times,
+    ate_rmse_m,
+    ate_rotation_rmse_rad,
+    relative_pose_errors,
+)
 from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S, Trajectory, read_tum
 from slam.live.session.reader import begins_with, open_session

@@ -45,9 +45,9 @@ from slam.app.run.summary import (
     summarise,
     world_from_odom,
 )
-from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import RadarFrame
 from slam.geometry import transform
+from slam.library.evaluation import LANDMARK_MATCH_M
 from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session.reader import RecordedSession, open_session

@@ -13,8 +13,8 @@ import numpy as np
 from slam.app.errors import naming
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, ratio
-from slam.evaluation import MIN_POSES, LandmarkScore
 from slam.geometry import transform
+from slam.library.evaluation import MIN_POSES, LandmarkScore
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from xethru_protocol.operating_system import (

@@ -17,7 +17,7 @@ from slam.app.run.maps import MapSaver, MapSummary, map_rows, map_summary
 from slam.app.run.output import ResultRow, print_result
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, summarise
-from slam.evaluation import LandmarkScore
+from slam.library.evaluation import LandmarkScore
 from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S, Trajectory, write_tum
 from slam.live.session_records import SessionInfo

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.evaluation import TrueAssociationNis, true_range_nis
 from slam.frames import RadarFrame, StepInputError
 from slam.geometry import Rig
+from slam.library.evaluation import TrueAssociationNis, true_range_nis
 from slam.library.saved_map import MapFile
 from slam.live.errors import AppError
 from slam.live.frame_sources import less_gain

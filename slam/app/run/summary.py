@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from slam.app.run.runner import RunRecord
-from slam.evaluation import (
+from slam.geometry import Rig, align_se2, between, compose, transform
+from slam.library.evaluation import (
     LandmarkScore,
     ate_rmse_m,
     icp_ate_rmse_m,
@@ -22,7 +23,6 @@ from slam.evaluation import (
     nees_pose,
     observable_landmarks,
 )
-from slam.geometry import Rig, align_se2, between, compose, transform
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import SessionInfo, Snapshot
 from slam.results import SmoothedRun

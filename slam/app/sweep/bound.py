@@ -40,9 +40,9 @@ from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
 from slam.app.run.runner import RunRecord, States
 from slam.app.run.summary import nees_at_ten_times
 from slam.config import BackEnd, SlamConfig, WheelNoise
-from slam.evaluation import ate_rmse_m
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
+from slam.library.evaluation import ate_rmse_m
 from slam.live.errors import AppError
 from slam.live.session_records import SessionObserver, Snapshot
 from slam.robust.association import LONGEST_M, crossings

@@ -12,8 +12,8 @@ from scipy.special import chdtri
 from emulator.scene.scene import Scene
 from slam.app.rig.emulated import outlines_m
 from slam.app.run.runner import RunRecord
-from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import Rig, between, transform, wrap_angles
+from slam.library.evaluation import LANDMARK_MATCH_M
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import SessionInfo, Snapshot
 

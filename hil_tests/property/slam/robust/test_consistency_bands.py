@@ -21,8 +21,8 @@ from hil_tests.unit.slam.robust.range_world import (
     scans_of,
     true_path,
 )
-from slam.evaluation import nees_pose
 from slam.geometry import compose, paper_rig
+from slam.library.evaluation import nees_pose
 from slam.paper import ekf as ekf_slam
 from slam.paper.association import mahalanobis_sq
 from slam.results import Belief

@@ -23,10 +23,10 @@ from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, simulate
 from slam.app.run.runner import execute
 from slam.app.sweep.run import make_case, source_of
 from slam.config import WheelNoise, load_preset, override
-from slam.evaluation import ate_rmse_m
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import align_se2, paper_rig, transform
+from slam.library.evaluation import ate_rmse_m
 from slam.library.slam import make_slam
 from slam.results import PoseAt, StepResult
 

@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 
 from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, parameters_for, simulate
 from slam.config import WheelNoise
-from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount, Rig, paper_rig
+from slam.library.evaluation import ate_rmse_m
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd

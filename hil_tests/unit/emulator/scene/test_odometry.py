@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from emulator.scene.motion import drive
 from emulator.scene.scene import CarriedSpec, OdometrySpec, load_scene
 from emulator.scene.wheels import drift, odometry_times_ns, scene_odometry, tum_line
-from slam.evaluation import ate_rmse_m
+from slam.library.evaluation import ate_rmse_m
 
 
 def straight(length_m: float, steps: int) -> NDArray[np.float64]:

@@ -23,9 +23,9 @@ from slam.config import (
     load_preset,
     override,
 )
-from slam.evaluation import ate_rmse_m
 from slam.frames import Detection
 from slam.geometry import paper_rig
+from slam.library.evaluation import ate_rmse_m
 from slam.paper.ekf import motion_noise
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import StepResult

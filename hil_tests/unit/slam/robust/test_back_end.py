@@ -17,8 +17,8 @@ from hil_tests.unit.slam.robust.range_world import (
     parameters_for,
     simulate,
 )
-from slam.evaluation import ate_rmse_m, landmark_metrics, observable_landmarks
 from slam.geometry import PAPERS_FIELD, Mount, Rig, align_se2, paper_rig, transform
+from slam.library.evaluation import ate_rmse_m, landmark_metrics, observable_landmarks
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import BodyPoint, initialise_landmark

@@ -15,8 +15,8 @@ from hil_tests.unit.slam.robust.range_world import (
     reported,
     scans_of,
 )
-from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig
+from slam.library.evaluation import nees_pose
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import (

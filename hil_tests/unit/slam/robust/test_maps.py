@@ -18,8 +18,8 @@ from hil_tests.unit.slam.robust.range_world import (
     scans_of,
 )
 from slam.config import load_preset
-from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig, transform
+from slam.library.evaluation import nees_pose
 from slam.library.joining import find_place, join
 from slam.results import SavedMap, StartOnMap
 from slam.robust.association import RangeScan

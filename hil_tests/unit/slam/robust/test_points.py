@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, multivariate_normal
 
 from slam.config import WheelNoise
-from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount, Rig, compose, wrap_angle
+from slam.library.evaluation import ate_rmse_m
 from slam.robust.association import RangeScan, antennas_of, point_view, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Hypotheses

@@ -11,8 +11,8 @@ from scipy.special import chdtri
 
 from hil_tests.property.robust_oracles import rows_of
 from slam.config import WheelNoise
-from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
+from slam.library.evaluation import nees_pose
 from slam.robust.association import RangeScan, antennas_of, find_known, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import BodyPoint, initialise_landmark, point_rows

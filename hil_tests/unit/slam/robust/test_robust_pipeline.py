@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.rig.emulated import scene_and_config, wheels_of
 from slam.config import RobustConfig, SlamConfig, WheelNoise, load_preset, override
-from slam.evaluation import nees_pose
 from slam.frames import Detection, RadarFrame
 from slam.geometry import between, compose, paper_rig, transform
+from slam.library.evaluation import nees_pose
 from slam.library.slam import make_slam
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Belief, PoseAt

@@ -16,8 +16,8 @@ from hil_tests.unit.slam.robust.range_world import (
     true_path,
 )
 from slam.config import WheelNoise
-from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
+from slam.library.evaluation import nees_pose
 from slam.robust.association import Antennas, RangeScan, antennas_of, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (

@@ -20,8 +20,8 @@ from slam.app.benchmarks.data_set import (
     positions_of,
     step_times,
 )
-from slam.evaluation import ate_rmse_m
 from slam.geometry import between, compose
+from slam.library.evaluation import ate_rmse_m
 from slam.live.errors import AppError
 
 

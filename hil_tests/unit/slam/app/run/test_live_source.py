@@ -30,8 +30,8 @@ from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.run.live_source import LiveSource, read_odometry
 from slam.app.run.runner import RunRecord, run_slam
 from slam.config import load_preset
-from slam.evaluation import ate_rmse_m
 from slam.geometry import Mount
+from slam.library.evaluation import ate_rmse_m
 from slam.library.slam import make_slam
 from slam.live import ticks as run_readers
 from slam.live.arrival_clock import ClockLine

@@ -33,7 +33,7 @@ from slam.app.run.pictures import (
 from slam.app.run.runner import RunRecord, States
 from slam.app.run.summary import Summary
 from slam.app.view import rerun_recording as view
-from slam.evaluation import LandmarkScore
+from slam.library.evaluation import LandmarkScore
 
 
 @given(st.floats(0.01, 2), st.floats(0.01, 2), st.floats(-3, 3))

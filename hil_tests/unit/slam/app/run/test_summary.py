@@ -29,8 +29,8 @@ from slam.app.run.runner import RunRecord
 from slam.app.run.summary import NEES_AT, Summary, summarise
 from slam.app.session.writer import SessionLog
 from slam.config import BackEnd, DetectionConfig, RobustConfig, SlamConfig, TrilaterationConfig
-from slam.evaluation import LandmarkScore, ate_rmse_m
 from slam.geometry import Mount, Rig
+from slam.library.evaluation import LandmarkScore, ate_rmse_m
 from slam.live.errors import AppError
 from slam.live.odometry_track import Trajectory, write_tum
 from slam.live.session.description import settings_text

@@ -2,7 +2,7 @@
 
 from slam.app.sweep.bound import BoundSummary
 from slam.app.sweep.run import Case, SweepRun
-from slam.evaluation import LandmarkScore
+from slam.library.evaluation import LandmarkScore
 
 
 def run_of(case: Case) -> SweepRun:

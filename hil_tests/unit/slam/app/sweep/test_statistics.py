@@ -11,7 +11,7 @@ from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import in_band, summarise_groups
 from slam.app.sweep.sweep import rooms_named
 from slam.app.sweep.table import group_line, stress_table, stress_tables, times_clean
-from slam.evaluation import LandmarkScore
+from slam.library.evaluation import LandmarkScore
 
 RUN = replace(
     run_of(make_case("lab", "paper", 0)),

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.evaluation import ECHO_LENGTH_M, TrueAssociationNis, observable_landmarks, true_range_nis
 from slam.frames import Detection
 from slam.geometry import PAPERS_FIELD, Mount, Rig, paper_rig
+from slam.library.evaluation import (
+    ECHO_LENGTH_M,
+    TrueAssociationNis,
+    observable_landmarks,
+    true_range_nis,
+)
 from slam.paper.ekf import start
 from slam.results import Association, Observation, PredictedRange, StepResult, UpdateReport
 

@@ -1,0 +1,188 @@
+"""Raw frames as complex range profiles, and the part of them that moves with the robot.
+
+An echo A Re{p(r - R) exp(j phi)} at range R, p(x) = exp(-x**2 / (2 s**2)) exp(j k x), has behind a
+filter for its positive frequencies, and with the carrier exp(j k r) removed, the profile
+
+    z(r) = A q(r - R) exp(j (phi - k R)),   k = 4 pi f_c / c
+
+q is real and has its peak 1 at 0. So z changes slowly from bin to bin, and z(R) exp(j k R) is the
+same for every antenna that sees one reflector at its own R: these values are what an image sums.
+
+Filter
+    The matched filter alone would widen an echo by sqrt(2). With P, 0 to 1, the spectrum of the
+    pulse over its largest value, profiles have the spectrum of the echo times
+
+        H = P**_WHITENING / (P**2 + _NOISE_SHARE) P
+
+    which gives back nearly the pulse, and fades where noise is above the pulse (Wiener).
+Static part
+    Leakage from transmitter to receiver and echoes of the robot itself are the same in all frames
+    of a radar; echoes of the room turn their phase with every few millimetres of way. The mean of
+    profiles that were taken at different places keeps the former alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.front_end.pulse import ModulePulse
+
+Array = NDArray[np.float64]
+Profiles = NDArray[np.complex64]
+
+_SPEED_OF_LIGHT_MPS = 299_792_458.0
+_WHITENING = 0.94
+_NOISE_SHARE = 0.01
+# Linear interpolation between bins needs this many of them per envelope sigma.
+_BINS_PER_SIGMA = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RangeProfiles:
+    """Range profiles of one radar, their carrier removed.
+
+    Attributes
+    ----------
+    values
+        Shape (n_frames, n_bins), complex64.
+    range_start_m, bin_length_m
+        Range of bin 0, true metres from the antenna, and spacing of the bins.
+    wave_number_rad_per_m
+        k = 4 pi f_c / c: how fast the phase of an echo turns with its range.
+    """
+
+    values: Profiles
+    range_start_m: float
+    bin_length_m: float
+    wave_number_rad_per_m: float
+
+    @property
+    def ranges_m(self) -> Array:
+        """Return the ranges of the bins, shape (n_bins,)."""
+        return np.asarray(self.range_start_m + self.bin_length_m * np.arange(self.values.shape[1]))
+
+    def times_range(self, power: float) -> RangeProfiles:
+        """Return profiles times range**power: the law by which echoes fall is made up for.
+
+        The power is 2 for points and 1.5 for rods; ranges below 0 count as 0.
+        """
+        law = np.maximum(self.ranges_m, 0.0) ** power
+        return replace(self, values=(self.values * law).astype(np.complex64))
+
+    def less(self, static: NDArray[np.complex128]) -> RangeProfiles:
+        """Return profiles without their static part, shape (n_bins,)."""
+        return replace(self, values=(self.values - static).astype(np.complex64))
+
+
+class ProfileFilter:
+    """Makes range profiles of the RF frames of one module.
+
+    ``pulse`` is the module's, nominal or learnt; ``n_bins`` and ``bin_length_m`` are those of its
+    frames. The bins of profiles are those of the frames.
+    """
+
+    def __init__(self, pulse: ModulePulse, n_bins: int, bin_length_m: float) -> None:
+        model, taps = pulse.model, pulse.equaliser
+        self.n_bins = n_bins
+        self.bin_length_m = bin_length_m
+        self.wave_number_rad_per_m = 4 * math.pi * model.carrier_hz / _SPEED_OF_LIGHT_MPS
+        reach = model.half_length(bin_length_m) + (0 if taps is None else taps.size // 2)
+        self._n_fft = 1 << (n_bins + reach - 1).bit_length()
+        self._half = self._n_fft // 2
+        # Of the pulse: exp(-(kappa - k)**2 s**2 / 2), kappa [rad/m]
+        kappa = math.tau * np.arange(self._half) / (self._n_fft * bin_length_m)
+        p = np.exp(-0.5 * ((kappa - self.wave_number_rad_per_m) * model.sigma_m) ** 2)
+        shape = p ** (1 + _WHITENING) / (p**2 + _NOISE_SHARE)
+        # An echo of amplitude 1 has the peak 1: its spectrum is p times this. The factor 2 makes up
+        # for the negative frequencies.
+        self._spectrum = (2 * shape * p.sum() / (p * shape).sum()).astype(np.complex128)
+        noise = self._spectrum
+        if taps is not None:
+            kernel = np.zeros(self._n_fft)
+            kernel[np.arange(taps.size) - taps.size // 2] = taps
+            noise = self._spectrum * np.fft.rfft(kernel)[: self._half]
+        self._spectrum = noise
+        self.noise_gain = math.sqrt(float(np.sum(np.abs(noise) ** 2)) / (2 * self._n_fft))
+        """Deviation of each quadrature of a profile over that of white noise per RF sample."""
+
+    def apply(self, samples: NDArray[np.floating], range_start_m: float) -> RangeProfiles:
+        """Return the profiles of frames (n_frames, n_bins); samples that are NaN count as 0.
+
+        ``range_start_m`` is the range of bin 0, the module's range offset removed, so it sets the
+        zero of range, and of phase.
+        """
+        rows = np.nan_to_num(np.asarray(samples, dtype=np.float64).reshape(-1, self.n_bins))
+        whole = np.zeros((len(rows), self._n_fft), dtype=np.complex128)
+        whole[:, : self._half] = np.fft.rfft(rows, self._n_fft)[:, : self._half] * self._spectrum
+        values = np.fft.ifft(whole)[:, : self.n_bins]
+        ranges_m = range_start_m + self.bin_length_m * np.arange(self.n_bins)
+        return RangeProfiles(
+            values=(values * np.exp(-1j * self.wave_number_rad_per_m * ranges_m)).astype(
+                np.complex64
+            ),
+            range_start_m=range_start_m,
+            bin_length_m=self.bin_length_m,
+            wave_number_rad_per_m=self.wave_number_rad_per_m,
+        )
+
+
+def baseband_profiles(
+    samples: NDArray[np.complexfloating],
+    range_start_m: float,
+    bin_length_m: float,
+    *,
+    carrier_hz: float,
+    sigma_m: float,
+) -> RangeProfiles:
+    """Return the profiles of I/Q frames (n_frames, n_bins), between whose bins others are put.
+
+    The samples are those of a downconverter that multiplied by exp(-j k (r - r_0)) for any fixed
+    r_0, and whose bins hold the whole band; ``sigma_m`` is the deviation of their envelope. So
+    many bins are put between two of them (by FFT) that there are three per ``sigma_m``.
+    """
+    rows = np.nan_to_num(np.asarray(samples, dtype=np.complex128))
+    n, between = rows.shape[1], max(1, math.ceil(_BINS_PER_SIGMA * bin_length_m / sigma_m))
+    # As many bins of nothing behind the last: the ends of a frame are not each other's neighbours.
+    spectrum = np.fft.fft(rows, 2 * n)
+    padded = np.zeros((len(rows), 2 * n * between), dtype=np.complex128)
+    padded[:, :n], padded[:, -n:] = spectrum[:, :n], spectrum[:, n:]
+    values = between * np.fft.ifft(padded)[:, : (n - 1) * between + 1]
+    return RangeProfiles(
+        values=values.astype(np.complex64),
+        range_start_m=range_start_m,
+        bin_length_m=bin_length_m / between,
+        wave_number_rad_per_m=4 * math.pi * carrier_hz / _SPEED_OF_LIGHT_MPS,
+    )
+
+
+class StaticPart:
+    """The mean of the profiles of one radar that were taken at different places.
+
+    While the robot stands nothing is added, so a start on the spot does not make the room static.
+    Behind ``memory`` profiles, each new one takes the place of a share of all earlier ones. A wall
+    beside a straight path stands still, too, and fades unless the memory is longer than that path.
+    """
+
+    def __init__(self, n_bins: int, *, memory: int = 300, spacing_m: float = 0.005) -> None:
+        self.mean: NDArray[np.complex128] = np.zeros(n_bins, dtype=np.complex128)
+        self.n_places = 0
+        self._memory = memory
+        self._spacing_m = spacing_m
+        self._last_m: Array | None = None
+
+    def add(self, profile: NDArray[np.complexfloating], antenna_m: Array) -> bool:
+        """Take one profile (n_bins,) if its antenna (2,) or (3,) moved since the last; say if so.
+
+        Antennas are given in any frame that does not jump.
+        """
+        last_m = self._last_m
+        if last_m is not None and float(np.linalg.norm(antenna_m - last_m)) < self._spacing_m:
+            return False
+        self._last_m = np.array(antenna_m, dtype=np.float64)
+        self.n_places += 1
+        self.mean += (profile - self.mean) / min(self.n_places, self._memory)
+        return True
