@@ -18,13 +18,14 @@ Filter
 Static part
     Leakage from transmitter to receiver and echoes of the robot itself are the same in all frames
     of a radar; echoes of the room turn their phase with every few millimetres of way. The mean of
-    profiles that were taken at different places keeps the former alone.
+    frames that were taken at different places keeps the former alone.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ from slam.front_end.pulse import ModulePulse
 
 Array = NDArray[np.float64]
 Profiles = NDArray[np.complex64]
+Samples = NDArray[Any]  # RF: float64; I/Q: complex128
 
 _SPEED_OF_LIGHT_MPS = 299_792_458.0
 _WHITENING = 0.94
@@ -72,10 +74,6 @@ class RangeProfiles:
         """
         law = np.maximum(self.ranges_m, 0.0) ** power
         return replace(self, values=(self.values * law).astype(np.complex64))
-
-    def less(self, static: NDArray[np.complex128]) -> RangeProfiles:
-        """Return profiles without their static part, shape (n_bins,)."""
-        return replace(self, values=(self.values - static).astype(np.complex64))
 
 
 class ProfileFilter:
@@ -120,10 +118,9 @@ class ProfileFilter:
         whole[:, : self._half] = np.fft.rfft(rows, self._n_fft)[:, : self._half] * self._spectrum
         values = np.fft.ifft(whole)[:, : self.n_bins]
         ranges_m = range_start_m + self.bin_length_m * np.arange(self.n_bins)
+        values *= np.exp(-1j * self.wave_number_rad_per_m * ranges_m)
         return RangeProfiles(
-            values=(values * np.exp(-1j * self.wave_number_rad_per_m * ranges_m)).astype(
-                np.complex64
-            ),
+            values=values.astype(np.complex64),
             range_start_m=range_start_m,
             bin_length_m=self.bin_length_m,
             wave_number_rad_per_m=self.wave_number_rad_per_m,
@@ -160,22 +157,23 @@ def baseband_profiles(
 
 
 class StaticPart:
-    """The mean of the profiles of one radar that were taken at different places.
+    """The mean of the frames of one radar that were taken at different places.
 
-    While the robot stands nothing is added, so a start on the spot does not make the room static.
-    Behind ``memory`` profiles, each new one takes the place of a share of all earlier ones. A wall
-    beside a straight path stands still, too, and fades unless the memory is longer than that path.
+    Frames are RF or I/Q, before the filter. While the robot stands nothing is added, so a start on
+    the spot does not make the room static. Behind ``memory`` frames, each new one takes the place
+    of a share of all earlier ones. A wall beside a straight path stands still, too, and fades
+    unless the memory is longer than that path.
     """
 
-    def __init__(self, n_bins: int, *, memory: int = 300, spacing_m: float = 0.005) -> None:
-        self.mean: NDArray[np.complex128] = np.zeros(n_bins, dtype=np.complex128)
+    def __init__(self, *, memory: int = 300, spacing_m: float = 0.005) -> None:
+        self.mean: Samples | None = None
         self.n_places = 0
         self._memory = memory
         self._spacing_m = spacing_m
         self._last_m: Array | None = None
 
-    def add(self, profile: NDArray[np.complexfloating], antenna_m: Array) -> bool:
-        """Take one profile (n_bins,) if its antenna (2,) or (3,) moved since the last; say if so.
+    def add(self, samples: Samples, antenna_m: Array) -> bool:
+        """Take a frame (n_bins,) if its antenna (2,) or (3,) has moved; return whether it has.
 
         Antennas are given in any frame that does not jump.
         """
@@ -184,5 +182,9 @@ class StaticPart:
             return False
         self._last_m = np.array(antenna_m, dtype=np.float64)
         self.n_places += 1
-        self.mean += (profile - self.mean) / min(self.n_places, self._memory)
+        known = np.nan_to_num(samples)
+        if self.mean is None:
+            self.mean = known
+        else:
+            self.mean = self.mean + (known - self.mean) / min(self.n_places, self._memory)
         return True

@@ -1,0 +1,187 @@
+"""Patches: the frames that one radar takes along 20 to 30 cm of path, to be imaged together.
+
+Over so short a way odometry is good to a fraction of the 20 mm of range in which the phase of an
+echo turns once; over a whole room it is not. Radars are never summed together: their phases differ.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import RadarFrame
+from slam.front_end.pulse import ModulePulse
+from slam.geometry import FieldOfView, Mount, between, compose
+from slam.imaging.back_projection import Aperture
+from slam.imaging.range_profiles import ProfileFilter, RangeProfiles, StaticPart
+
+Array = NDArray[np.float64]
+
+# How far beyond the end of the field of view bins are kept: the pulse of an echo there
+_MARGIN_M = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PatchRule:
+    """How long patches are, and what goes into them."""
+
+    travel_m: float = 0.25  # way of the antenna in a patch; turning counts by the mount's lever
+    hop_m: float = 0.125  # way from one patch to the next
+    spacing_m: float = 0.0025  # frames that are nearer to the one before are left out
+    # Where the robot stood for longer than this, a new patch begins: it may have been moved.
+    longest_stand_ns: int = 20_000_000_000
+    memory: int = 300  # frames of `StaticPart`
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Patch:
+    """Profiles of one radar along a short way, in the body frame of its middle.
+
+    Attributes
+    ----------
+    radar
+        Index of the mount.
+    t_ns
+        Shape (n,), int64: session times of the profiles.
+    poses
+        Shape (n, 3), body poses at these times, in the frame of the patch: that of the body at
+        profile ``middle``.
+    origin
+        Shape (3,), the patch's frame in the frame of the poses that it was made of, which is that
+        of odometry or a map.
+    """
+
+    radar: int
+    mount: Mount
+    view: FieldOfView
+    t_ns: NDArray[np.int64]
+    poses: Array
+    middle: int
+    origin: Array
+    profiles: RangeProfiles
+
+    @property
+    def aperture(self) -> Aperture:
+        """Return antennas and boresights in the frame of the patch."""
+        return aperture_of(self.mount, self.view, self.poses)
+
+    def with_poses(self, poses: Array) -> Patch:
+        """Return the patch on other poses (n, 3), of any frame, at the same times."""
+        origin = poses[self.middle]
+        inside = np.array([between(origin, pose) for pose in poses])
+        return replace(self, poses=inside, origin=origin)
+
+
+def aperture_of(mount: Mount, view: FieldOfView, poses: Array) -> Aperture:
+    """Return the aperture of one radar at body poses (n, 3), in their frame."""
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = poses[:, 0] + cosine * mount.x_m - sine * mount.y_m
+    y = poses[:, 1] + sine * mount.x_m + cosine * mount.y_m
+    yaw = poses[:, 2] + mount.yaw_rad
+    return Aperture(
+        antennas_m=np.column_stack([x, y]),
+        boresights=np.column_stack([np.cos(yaw), np.sin(yaw)]),
+        half_beam_rad=view.opening_rad / 2,
+        min_range_m=view.min_range_m,
+        max_range_m=view.max_range_m,
+    )
+
+
+@dataclass(slots=True, kw_only=True)
+class _Look:
+    """A frame that waits for its patch."""
+
+    t_ns: int
+    pose: Array
+    samples: Array
+    range_start_m: float
+    way_m: float  # of the antenna since the start
+
+
+class PatchMaker:
+    """Makes the patches of one radar while frames come in.
+
+    ``pulse_of`` returns the module's pulse as it is known now, for a length of bins.
+    """
+
+    def __init__(
+        self,
+        radar: int,
+        mount: Mount,
+        view: FieldOfView,
+        pulse_of: Callable[[float], ModulePulse],
+        rule: PatchRule | None = None,
+    ) -> None:
+        self.radar, self.mount, self.view = radar, mount, view
+        self.rule = rule or PatchRule()
+        self._pulse_of = pulse_of
+        self._looks: list[_Look] = []
+        self._static = StaticPart(memory=self.rule.memory)
+        self._filter: tuple[ModulePulse, ProfileFilter] | None = None
+
+    def add(self, frame: RadarFrame, pose: Array) -> Patch | None:
+        """Take a frame and the body pose (3,) when it was taken; return a patch that is complete.
+
+        Poses come from odometry, or any path without jumps.
+        """
+        start_m = frame.range_start_m - self.mount.range_offset_m
+        reach = (self.view.max_range_m + _MARGIN_M - start_m) / frame.bin_length_m
+        samples = np.nan_to_num(frame.samples[: max(1, math.ceil(reach))].astype(np.float64))
+        antenna = compose(pose, np.array([self.mount.x_m, self.mount.y_m, 0.0]))[:2]
+        if self._looks and not self._continues(self._looks[-1], frame, samples):
+            self._looks.clear()
+        if self._static.mean is not None and self._static.mean.size != samples.size:
+            self._static = StaticPart(memory=self.rule.memory)
+        self._static.add(samples, antenna)
+        way_m = 0.0
+        if self._looks:
+            last = self._looks[-1]
+            before = compose(last.pose, np.array([self.mount.x_m, self.mount.y_m, 0.0]))[:2]
+            step_m = float(np.linalg.norm(antenna - before))
+            if step_m < self.rule.spacing_m:
+                return None
+            way_m = last.way_m + step_m
+        self._looks.append(
+            _Look(t_ns=frame.t_ns, pose=pose, samples=samples, range_start_m=start_m, way_m=way_m)
+        )
+        if way_m - self._looks[0].way_m < self.rule.travel_m:
+            return None
+        patch = self._made(frame.bin_length_m)
+        keep_m = self._looks[0].way_m + self.rule.hop_m
+        self._looks = [look for look in self._looks if look.way_m >= keep_m]
+        return patch
+
+    def _continues(self, last: _Look, frame: RadarFrame, samples: Array) -> bool:
+        is_same = (
+            samples.size == last.samples.size
+            and frame.range_start_m - self.mount.range_offset_m == last.range_start_m
+        )
+        return is_same and 0 <= frame.t_ns - last.t_ns < self.rule.longest_stand_ns
+
+    def _made(self, bin_length_m: float) -> Patch:
+        looks, static = self._looks, self._static.mean
+        pulse = self._pulse_of(bin_length_m)
+        rows = np.array([look.samples for look in looks])
+        if static is not None:
+            rows = rows - static
+        profile_filter = self._filter[1] if self._filter and self._filter[0] is pulse else None
+        if profile_filter is None or profile_filter.n_bins != rows.shape[1]:
+            profile_filter = ProfileFilter(pulse, rows.shape[1], bin_length_m)
+            self._filter = pulse, profile_filter
+        middle_m = 0.5 * (looks[0].way_m + looks[-1].way_m)
+        middle = int(np.argmin([abs(look.way_m - middle_m) for look in looks]))
+        origin = looks[middle].pose
+        return Patch(
+            radar=self.radar,
+            mount=self.mount,
+            view=self.view,
+            t_ns=np.array([look.t_ns for look in looks], dtype=np.int64),
+            poses=np.array([between(origin, look.pose) for look in looks]),
+            middle=middle,
+            origin=origin,
+            profiles=profile_filter.apply(rows, looks[0].range_start_m),
+        )
