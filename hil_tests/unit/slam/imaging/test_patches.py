@@ -1,0 +1,148 @@
+"""Patches: which frames they hold, in which frame of reference, and what is taken out of them."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam.frames import RadarFrame
+from slam.front_end.pulse import ModulePulse, PulseModel
+from slam.geometry import FieldOfView, Mount, compose
+from slam.imaging.back_projection import back_project
+from slam.imaging.patches import Patch, PatchMaker, PatchRule
+
+Array = NDArray[np.float64]
+
+BIN_M = 299_792_458.0 / (2 * 23.328e9)
+MODEL = PulseModel()
+WAVE_NUMBER = math.tau / MODEL.wavelength_m
+MOUNT = Mount(name="left", x_m=0.1, y_m=0.2, yaw_rad=math.pi / 2, range_offset_m=0.03)
+VIEW = FieldOfView()
+PULSE = ModulePulse(model=MODEL, error=0.1)
+START_M, N_BINS = 0.2, 500
+# Half a step shorter than 25 steps of 1 cm, so that rounding of the way decides nothing
+RULE = PatchRule(travel_m=0.245, hop_m=0.125)
+ROD = np.array([0.3, 1.2])
+
+
+def frame_at(pose: Array, index: int, *, leakage: float = 0.0, n_bins: int = N_BINS) -> RadarFrame:
+    """Return what the mount gets of a rod, labelled with its range offset, and of leakage."""
+    antenna = compose(pose, np.array([MOUNT.x_m, MOUNT.y_m, 0.0]))[:2]
+    labels = START_M + BIN_M * np.arange(n_bins)
+    samples = np.zeros(n_bins)
+    for amplitude, range_m in ((0.01, math.dist(ROD, antenna)), (leakage, 0.95)):
+        x = labels - MOUNT.range_offset_m - range_m
+        samples += amplitude * np.exp(-0.5 * (x / MODEL.sigma_m) ** 2) * np.cos(WAVE_NUMBER * x)
+    return RadarFrame(
+        radar=0,
+        t_ns=200_000_000 * index,
+        counter=index + 1,
+        samples=samples.astype(np.float32),
+        range_start_m=START_M,
+        bin_length_m=BIN_M,
+    )
+
+
+def patches_of(poses: Iterable[Array], *, leakage: float = 0.0) -> list[Patch]:
+    maker = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE)
+    made = (
+        maker.add(frame_at(pose, index, leakage=leakage), pose) for index, pose in enumerate(poses)
+    )
+    return [patch for patch in made if patch is not None]
+
+
+def line(length_m: float, step_m: float = 0.01, heading: float = 0.0) -> list[Array]:
+    steps = np.arange(round(length_m / step_m) + 1) * step_m
+    return [np.array([s * math.cos(heading), s * math.sin(heading), heading]) for s in steps]
+
+
+def test_a_patch_is_as_long_as_the_rule_says_and_the_next_begins_a_hop_later() -> None:
+    patches = patches_of(line(1.0))
+    assert all(0.245 <= patch.aperture.length_m < 0.255 for patch in patches)
+    starts = np.array([patch.t_ns[0] for patch in patches]) / 200_000_000 * 0.01
+    assert np.all((np.diff(starts) >= 0.125 - 1e-9) & (np.diff(starts) <= 0.13 + 1e-9))
+    assert starts[-1] + 0.25 + 0.13 > 1.0
+
+
+def test_poses_are_in_the_body_frame_of_the_middle() -> None:
+    path = [compose(np.array([3.0, -2.0, 0.7]), pose) for pose in line(0.3, heading=0.2)]
+    (patch,) = patches_of(path)
+    np.testing.assert_allclose(patch.poses[patch.middle], 0, atol=1e-12)
+    assert patch.middle == pytest.approx(len(patch.poses) / 2, abs=1)
+    back = [compose(patch.origin, pose) for pose in patch.poses]
+    np.testing.assert_allclose(back, path[: len(back)], atol=1e-9)
+
+
+def test_a_rod_comes_to_a_focus_where_it_is_in_the_frame_of_the_patch() -> None:
+    # The rod stands beside the end of the path: of so few frames that see it, the static part,
+    # their mean, keeps little.
+    patch = patches_of([pose - [1.6, 0, 0] for pose in line(2.0)])[-1]
+    rod = ROD - patch.origin[:2]
+    image = back_project(patch.profiles, patch.aperture, rod)
+    assert float(image.count) > 20
+    assert float(image.coherence_factor) > 0.95
+
+
+def test_what_stands_still_with_the_robot_is_taken_out() -> None:
+    # Leakage three times as strong as the rod, 0.95 m away from the antenna in every frame
+    patch = patches_of(line(1.5), leakage=0.03)[-1]
+    bins = np.abs(patch.profiles.ranges_m - 0.95) < 0.02
+    assert np.abs(patch.profiles.values[:, bins]).max() < 0.1 * 0.03
+
+
+def test_turning_on_the_spot_counts_by_the_lever_of_the_mount() -> None:
+    turn = [np.array([0.0, 0.0, angle]) for angle in np.arange(0, 1.3, 0.02)]
+    patches = patches_of(turn)
+    # 0.25 m at a lever of hypot(0.1, 0.2) m is 1.118 rad; the step is 0.02 rad.
+    assert len(patches) == 1
+    assert np.ptp(patches[0].poses[:, 2]) == pytest.approx(0.25 / math.hypot(0.1, 0.2), abs=0.021)
+
+
+def test_a_robot_that_stands_adds_no_frames() -> None:
+    path = [np.zeros(3)] * 80 + line(0.3)
+    (patch,) = patches_of(path)
+    assert len(patch.t_ns) == 26
+
+
+def test_behind_a_long_stand_or_with_other_bins_a_patch_begins_anew() -> None:
+    maker = PatchMaker(
+        0, MOUNT, VIEW, lambda _: PULSE, replace(RULE, longest_stand_ns=5_000_000_000)
+    )
+    path = line(0.6)
+    for index, pose in enumerate(path[:20]):
+        assert maker.add(frame_at(pose, index), pose) is None
+    later = [maker.add(frame_at(pose, 60 + i), pose) for i, pose in enumerate(path[20:46])]
+    assert [patch is not None for patch in later] == [False] * 25 + [True]
+    assert maker.add(frame_at(path[46], 90, n_bins=200), path[46]) is None
+
+
+def test_bins_beyond_the_field_of_view_are_left_out_and_the_range_offset_is_removed() -> None:
+    (patch,) = patches_of(line(0.3))
+    ranges_m = patch.profiles.ranges_m
+    assert ranges_m[0] == pytest.approx(START_M - MOUNT.range_offset_m)
+    assert VIEW.max_range_m + 0.29 < ranges_m[-1] < VIEW.max_range_m + 0.31
+
+
+def test_a_patch_on_other_poses_keeps_its_profiles() -> None:
+    (patch,) = patches_of(line(0.3))
+    other = [compose(np.array([1.0, 2.0, 3.0]), pose) for pose in line(0.25, heading=0.1)]
+    moved = patch.with_poses(np.array(other))
+    assert moved.profiles is patch.profiles
+    np.testing.assert_allclose(moved.origin, other[patch.middle])
+    np.testing.assert_allclose(moved.poses[patch.middle], 0, atol=1e-12)
+    assert moved.aperture.length_m == pytest.approx(patch.aperture.length_m)
+
+
+def test_the_pulse_is_asked_for_with_every_patch() -> None:
+    asked: list[float] = []
+
+    def pulse_of(bin_length_m: float) -> ModulePulse:
+        asked.append(bin_length_m)
+        return PULSE
+
+    maker = PatchMaker(0, MOUNT, VIEW, pulse_of, RULE)
+    made = [maker.add(frame_at(pose, i), pose) for i, pose in enumerate(line(0.6))]
+    assert asked == [BIN_M] * sum(patch is not None for patch in made)
