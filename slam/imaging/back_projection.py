@@ -116,8 +116,8 @@ def back_project(profiles: RangeProfiles, aperture: Aperture, points_m: Array) -
     shape = points_m.shape[:-1]
     points = _in_space(points_m.reshape(-1, points_m.shape[-1]))
     looks_everywhere = aperture.boresights is None
-    total = np.zeros(len(points), dtype=np.complex128)
-    power, count = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
+    total = np.empty(len(points), dtype=np.complex128)
+    power, count = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
     sum_profiles(
         np.ascontiguousarray(profiles.values),
         profiles.range_start_m,

@@ -33,7 +33,7 @@ def sum_profiles(
     power: Array,
     count: NDArray[np.int64],
 ) -> None:
-    """Add what profiles (frames, bins) have at points to their sums; see `back_project`.
+    """Write the sums of profiles (frames, bins) at points; see `back_project`.
 
     Antennas, boresights and points have shape (n, 3); ``turns`` is exp(j x) at equal steps of one
     turn, their number a power of two.
@@ -42,24 +42,27 @@ def sum_profiles(
     per_bin = 1.0 / bin_m
     per_m = wave_number / (2.0 * math.pi) * turns.shape[0]
     mask = turns.shape[0] - 1
-    for f in range(antennas.shape[0]):
-        x, y, z = antennas[f, 0], antennas[f, 1], antennas[f, 2]
-        bx, by, bz = boresights[f, 0], boresights[f, 1], boresights[f, 2]
-        for i in range(points.shape[0]):
-            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-            square = dx * dx + dy * dy + dz * dz
-            if square < min_m * min_m or square > max_m * max_m:
-                continue
-            range_m = math.sqrt(square)
-            if dx * bx + dy * by + dz * bz < cos_half_beam * range_m:
-                continue
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        real, imag, square_sum, seen = 0.0, 0.0, 0.0, 0
+        for f in range(antennas.shape[0]):
+            dx, dy, dz = x - antennas[f, 0], y - antennas[f, 1], z - antennas[f, 2]
+            range_m = math.sqrt(dx * dx + dy * dy + dz * dz)
+            along = dx * boresights[f, 0] + dy * boresights[f, 1] + dz * boresights[f, 2]
             at = (range_m - start_m) * per_bin
-            if at < 0.0 or at >= last:
+            is_seen = min_m <= range_m <= max_m and along >= cos_half_beam * range_m
+            if not (is_seen and 0.0 <= at < last):
                 continue
             low = int(at)
             part = at - low
-            value = (1.0 - part) * values[f, low] + part * values[f, low + 1]
-            value *= turns[int(range_m * per_m + 0.5) & mask]
-            total[i] += value
-            power[i] += value.real * value.real + value.imag * value.imag
-            count[i] += 1
+            near, far = values[f, low], values[f, low + 1]
+            u = near.real + part * (far.real - near.real)
+            v = near.imag + part * (far.imag - near.imag)
+            turn = turns[int(range_m * per_m + 0.5) & mask]
+            real += u * turn.real - v * turn.imag
+            imag += u * turn.imag + v * turn.real
+            square_sum += u * u + v * v
+            seen += 1
+        total[i] = complex(real, imag)
+        power[i] = square_sum
+        count[i] = seen
