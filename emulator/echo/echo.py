@@ -13,7 +13,8 @@ Pulse p
     Gaussian envelope on the carrier (``emulator.echo.paths``). Where a radar of the scene
     has a table ``pulse``, the standard deviation is width (1 - skew) sigma before the peak and
     width (1 + skew) sigma after it, and ringing times the same pulse follows 3.2 sigma later, its
-    carrier 1 rad ahead. All that this radar receives has this pulse, except for its clutter.
+    carrier 1 rad ahead; carrier_offset_hz is added to the carrier. All that this radar receives has
+    this pulse, except for its clutter. Edges of walls take the nominal carrier's wavelength.
     The form is assumed; real pulses of the X4 are a little asymmetric and ring.
 Time t
     Nominal time of the frame, made earlier by the module's fast clock and later by its start
@@ -101,9 +102,10 @@ Phase
 Phase jitter j
     White (by frame) and slow (by time), common to all echoes and the leakage of a frame
     (``emulator.echo.receiver``): figures of the strongest reflector of a real X4 recording. The
-    envelope is not moved; amplitude jitter is left out.
+    envelope is not moved. The amplitude jitters likewise, by frame, where a scene asks for it.
 Leakage
-    The direct pulse at the scene's range and amplitude; antenna ringing is left out.
+    The direct pulse at the scene's range and amplitude, and the antennas' ringing, a resonance at
+    the carrier that dies away behind it (``emulator.echo.paths``); by default there is none.
 Clutter c
     Slow, correlated, inside the transmitted band (``emulator.echo.receiver``): every 8 samples a
     complex Gaussian scatterer that answers with the pulse, of equal strength at all ranges, times
@@ -149,7 +151,7 @@ from emulator.echo.paths import (
     Reflections,
     Viewpoint,
     direct_reflections,
-    reflection_phase_rad,
+    leakage_reflections,
     viewpoint,
 )
 from emulator.echo.people import mover_scatterer, person_scatterer
@@ -185,7 +187,6 @@ class ScenePaths:
         self._targets = Targets(scene.targets, seed)
         self._wander = Wander(scene.targets, seed)
         self._target_pairs = TargetPairs(self._targets.steady, scene.multipath.target_pairs)
-        self._leakage_phase_rad = np.array([reflection_phase_rad("leakage")])
         self._walled = bool(scene.walls or scene.objects)
         self._faces = faces_of(scene.walls, scene.objects)
         self._pairs = corner_pairs(self._faces)
@@ -229,10 +230,8 @@ class ScenePaths:
                 mirrored_reflections(each, view, heights, share)
                 for each, share in zip(scatterers, shares, strict=True)
             ]
-        leakage = Reflections(
-            range_m=np.full((len(t_ns), 1), self._scene.leakage.range_m),
-            amplitude=np.full((len(t_ns), 1), self._scene.leakage.amplitude),
-            phase_rad=self._leakage_phase_rad,
+        leakage = leakage_reflections(
+            self._scene.leakage, len(t_ns), wavelength_m, self._radar.pulse.carrier_offset_hz
         )
         pairs = [self._target_pairs.reflections(direct[0])] if self._target_pairs else []
         # frames are sums in this order, to the last bit
@@ -310,6 +309,7 @@ class SceneEcho:
         times_ns = self._clock.scene_times_ns(taken_ns)
         jitter_rad = self._jitter.phases_rad(indices, times_ns)
         signal = self.echo(capture, taken_ns, jitter_rad)
+        self._jitter.scale(signal, indices)
         self._bursts.add_to(signal, indices, capture, self._gain)
         if self._others:
             view = self._paths.view(times_ns)

@@ -14,7 +14,8 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scene.scene import AntennaSpec, RadarSpec, TargetSpec
+from emulator.echo.pulse import SIGMA_S
+from emulator.scene.scene import AntennaSpec, LeakageSpec, RadarSpec, TargetSpec
 
 BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
 """n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
@@ -22,6 +23,9 @@ NEAREST_M = 0.05
 """Amplitude laws are held from here inwards."""
 RANGE_EXPONENT = {"rod": 1.5, "point": 2.0, "cylinder": 1.0}
 SPEED_OF_LIGHT_MPS = 299_792_458.0
+RINGING_DECAYS = 7
+"""Over how many of its decay lengths the leakage rings; there it is 61 dB down."""
+_RINGING_STEP_M = SIGMA_S * SPEED_OF_LIGHT_MPS / 2  # pulses this close add up without ripple
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,4 +216,27 @@ def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
         range_m=range_m - scatterers.swell_m + view.antenna_m(cos_angle),
         amplitude=strength * surface_m**-scatterers.exponent * beam_gain(cos_angle),
         phase_rad=scatterers.phase_rad,
+    )
+
+
+def leakage_reflections(
+    spec: LeakageSpec, n_frames: int, wavelength_m: float, carrier_offset_hz: float
+) -> Reflections:
+    """Return the direct pulse and the pulses that it rings on with, alike in all frames.
+
+    Ringing is the pulse convolved with exp(-x / ringing_m) and the carrier over x > 0 of range, as
+    of a damped resonance, by the midpoint rule in steps of the nominal pulse's deviation: behind
+    that pulse its envelope is ringing amplitude exp(-x / ringing_m), a little more where the decay
+    is as short as the pulse.
+    """
+    count = math.ceil(RINGING_DECAYS * spec.ringing_m / _RINGING_STEP_M) if spec.ringing else 0
+    behind_m = (np.arange(count) + 0.5) * _RINGING_STEP_M
+    share = spec.ringing / math.sqrt(math.tau) * np.exp(-behind_m / spec.ringing_m)
+    wave_number = 1 / wavelength_m + carrier_offset_hz / SPEED_OF_LIGHT_MPS
+    turned_rad = 2 * math.tau * wave_number * behind_m
+    leaks = np.ones((n_frames, 1))
+    return Reflections(
+        range_m=leaks * (spec.range_m + np.array([0.0, *behind_m])),
+        amplitude=leaks * (spec.amplitude * np.array([1.0, *share])),
+        phase_rad=reflection_phase_rad("leakage") + np.array([0.0, *turned_rad]),
     )

@@ -66,15 +66,17 @@ RINGING_PHASE_RAD = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PulseShape:
-    """The pulse of one module: standard deviations in those of the nominal one, and its ringing.
+    """The pulse of one module: standard deviations in those of the nominal one, ringing, carrier.
 
     The envelope is that of a Gaussian of ``before`` up to its peak and of ``after`` from there on;
-    a copy of the whole, ``ringing`` times as strong, follows by ``RINGING_SIGMAS``.
+    a copy of the whole, ``ringing`` times as strong, follows by ``RINGING_SIGMAS``. The carrier's
+    frequency is ``carrier_offset_hz`` above that of the setting.
     """
 
     before: float = 1.0
     after: float = 1.0
     ringing: float = 0.0
+    carrier_offset_hz: float = 0.0
 
     @classmethod
     def of(cls, spec: PulseSpec) -> PulseShape:
@@ -82,6 +84,7 @@ class PulseShape:
             before=spec.width * (1 - spec.skew),
             after=spec.width * (1 + spec.skew),
             ringing=spec.ringing,
+            carrier_offset_hz=spec.carrier_offset_hz,
         )
 
     @property
@@ -117,11 +120,15 @@ def _offsets(half_window: int) -> NDArray[np.int64]:
 
 @functools.cache
 def _carrier(
-    tx_center_frequency: int, half_window: int
+    tx_center_frequency: int, half_window: int, offset_rad: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return cosine and sine of the carrier at whole samples; the phase is reduced in integers."""
+    """Return cosine and sine of the carrier at whole samples; the phase is reduced in integers.
+
+    ``offset_rad`` is what an offset of its frequency adds from sample to sample.
+    """
     cycles, samples = CARRIER_CYCLES_PER_SAMPLE[tx_center_frequency]
     phase_rad = math.tau * ((cycles * _offsets(half_window)) % samples) / samples
+    phase_rad += offset_rad * _offsets(half_window)
     return np.cos(phase_rad), np.sin(phase_rad)
 
 
@@ -152,6 +159,7 @@ def sum_of_pulses(
     """
     n_frames, n_samples = shape
     half_window = pulse.half_window
+    offset_rad = math.tau * pulse.carrier_offset_hz / SAMPLING_RATE_HZ
     if pulse.ringing:
         frame = np.repeat(frame, 2)
         later = RINGING_SIGMAS * _SIGMA_SAMPLES
@@ -167,7 +175,7 @@ def sum_of_pulses(
     nearest = np.floor(position + 0.5)
     shift = position - nearest
     cycles, samples = CARRIER_CYCLES_PER_SAMPLE[tx_center_frequency]
-    centre_phase = phase_rad - math.tau * cycles / samples * shift
+    centre_phase = phase_rad - (math.tau * cycles / samples + offset_rad) * shift
     in_phase, quadrature = amplitude * np.cos(centre_phase), amplitude * np.sin(centre_phase)
     first = nearest.astype(np.int64) + 2 * half_window
 
@@ -182,7 +190,8 @@ def sum_of_pulses(
         part = slice(begin, end)
         bins = ((frame[part] - done) * width + first[part])[:, np.newaxis] + _offsets(half_window)
         waves = pulse.envelope(shift[part, np.newaxis])
-        waves *= _on_carrier(in_phase[part], quadrature[part], tx_center_frequency, half_window)
+        cosine, sine = _carrier(tx_center_frequency, half_window, offset_rad)
+        waves *= _on_carrier(in_phase[part], quadrature[part], cosine, sine)
         padded = np.bincount(
             bins.ravel(), weights=waves.ravel(), minlength=(n_done - done) * width
         ).reshape(-1, width)
@@ -194,11 +203,10 @@ def sum_of_pulses(
 def _on_carrier(
     in_phase: NDArray[np.float64],
     quadrature: NDArray[np.float64],
-    tx_center_frequency: int,
-    half_window: int,
+    cosine: NDArray[np.float64],
+    sine: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return carriers about the whole samples nearest to pulses, (p, 2 half_window + 1)."""
-    cosine, sine = _carrier(tx_center_frequency, half_window)
     carrier: NDArray[np.float64] = in_phase[:, np.newaxis] * cosine
     carrier -= quadrature[:, np.newaxis] * sine
     return carrier

@@ -27,8 +27,9 @@ Jitter of the carrier phase
 The sampler's clock jitters against the transmitter's: every echo of a frame, and the leakage, are
 turned by the same phase. White jitter is a new normal for every frame; slow jitter is a
 stationary process of scene time that falls to 1/e after ``slow_correlation_s``. At 7.29 GHz one
-radian is 3.3 mm of range; the envelope is not moved, which for 0.03 rad would be 0.1 mm. Amplitude
-jitter, and jitter within a sweep, are left out.
+radian is 3.3 mm of range; the envelope is not moved, which for 0.03 rad would be 0.1 mm. Echoes
+and leakage are also multiplied by 1 + ``amplitude`` times another normal for every frame. Jitter
+within a sweep is left out.
 
 Clutter
 -------
@@ -278,8 +279,8 @@ class CarrierJitter:
 
     def __init__(self, spec: JitterSpec, *, seed: int, serial: int) -> None:
         self._spec = spec
-        self._seed = seed
-        self._white = stream_of(serial, Purpose.JITTER_WHITE)
+        self._white = _FrameNormals(seed, stream_of(serial, Purpose.JITTER_WHITE))
+        self._amplitude = _FrameNormals(seed, stream_of(serial, Purpose.JITTER_AMPLITUDE))
         self._slow = SlowNoise(
             (KnotGrid.falling_in(spec.slow_correlation_s, sigma=spec.slow_rad),),
             1,
@@ -289,8 +290,6 @@ class CarrierJitter:
             purpose=Purpose.JITTER_SLOW,
         )
         self._slow_rad: dict[int, float] = {}
-        self._page = -1
-        self._normals: list[float] = []
 
     def phases_rad(
         self, indices: NDArray[np.int64], scene_times_ns: NDArray[np.int64]
@@ -304,10 +303,9 @@ class CarrierJitter:
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
         """
-        white = [0.0] * len(indices)
+        phases_rad = np.zeros(len(indices))
         if self._spec.white_rad > 0:
-            white = [self._white_at(index) for index in indices.tolist()]
-        phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad
+            phases_rad = self._white.at(indices) * self._spec.white_rad
         if self._spec.slow_rad > 0:
             instants, fractions = self._slow.instants_before(scene_times_ns)
             slow_rad = self._slow_rad = self._slow.at_instants(
@@ -318,12 +316,29 @@ class CarrierJitter:
             phases_rad += before + fractions * (after - before)
         return phases_rad
 
-    def _white_at(self, index: int) -> float:
-        """Return the normal of a frame; made for many at once, since frames come one by one."""
+    def scale(self, signal: NDArray[np.float64], indices: NDArray[np.int64]) -> None:
+        """Multiply frames of shape (n_frames, n_samples), with these indices, in place."""
+        if self._spec.amplitude > 0:
+            signal *= 1 + self._spec.amplitude * self._amplitude.at(indices)[:, np.newaxis]
+
+
+class _FrameNormals:
+    """One normal for each frame of a stream; made for many at once, as frames come one by one."""
+
+    def __init__(self, seed: int, stream: int) -> None:
+        self._seed, self._stream = seed, stream
+        self._page = -1
+        self._normals: list[float] = []
+
+    def at(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the normals of frames, shape (n_frames,)."""
+        return np.array([self._one(index) for index in indices.tolist()], dtype=np.float64)
+
+    def _one(self, index: int) -> float:
         page, place = divmod(index, _COUNTERS_AT_ONCE)
         if page != self._page:
             counters = page * _COUNTERS_AT_ONCE + np.arange(_COUNTERS_AT_ONCE, dtype=np.int64)
-            normals = counter_normals(counters, seed=self._seed, stream=self._white)
+            normals = counter_normals(counters, seed=self._seed, stream=self._stream)
             self._page, self._normals = page, normals.tolist()
         return self._normals[place]
 

@@ -59,6 +59,7 @@ class Purpose(IntEnum):
     BURSTS = 5
     SCINTILLATION = 6
     PERSON = 7
+    JITTER_AMPLITUDE = 8
     WANDER = 4096  # not 7: published results hold these streams
 
 

@@ -11,9 +11,10 @@ line naming file, key and what is allowed.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, StrictBool, StrictInt, field_validator, model_validator
 
@@ -44,18 +45,72 @@ Sigma = Annotated[Number, Field(ge=0, le=1)]
 Seconds = Annotated[Number, Field(gt=0, le=86_400)]
 CorrelationTime = Annotated[Number, Field(ge=1e-3, le=86_400)]
 
+RECORDED: Mapping[str, Mapping[str, Mapping[str, float]]] = {
+    "x4m03_2025": {
+        "noise": {"rf_sigma": 1.8e-5, "iterations": 16, "pulses_per_step": 300},
+        "leakage": {"amplitude": 0.060, "ringing": 0.26, "ringing_m": 0.36},
+        "jitter": {"white_rad": 0.0031, "slow_rad": 0.032, "amplitude": 0.0011},
+        "pulse": {"carrier_offset_hz": -9e7, "width": 1.05, "skew": 0.0, "ringing": 0.0},
+    },
+    "x4_2017": {
+        "noise": {"rf_sigma": 2.4e-5, "iterations": 16, "pulses_per_step": 300},
+        "leakage": {"amplitude": 0.042, "ringing": 0.21, "ringing_m": 0.49},
+        "jitter": {"white_rad": 0.0011, "slow_rad": 0.0002, "amplitude": 0.0006},
+        "pulse": {"carrier_offset_hz": -1e8, "width": 1.0, "skew": 0.0, "ringing": 0.0},
+    },
+    "bare_x4": {
+        "noise": {"rf_sigma": 3.1e-5, "iterations": 16, "pulses_per_step": 300},
+        "leakage": {"amplitude": 0.39, "ringing": 0.76, "ringing_m": 0.24},
+        "jitter": {"white_rad": 0.004, "slow_rad": 0.013, "amplitude": 0.0042},
+        "pulse": {"carrier_offset_hz": -1.9e8, "width": 1.07, "skew": -0.03, "ringing": 0.11},
+    },
+}
+"""Of each recording of a real X4, keys of a scene's tables; ``docs/emulator.md`` has the sources.
 
-class PulseSpec(Table):
+What a recording does not show is not among them, and keeps the value of the scene.
+"""
+
+
+class RecordedTable(Table):
+    """A table that a scene can set to a recording, ``like = "x4m03_2025"``."""
+
+    figures: ClassVar[str]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_like_a_recording(cls, values: Any) -> Any:  # noqa: ANN401 - whatever a file holds
+        if not isinstance(values, Mapping) or "like" not in values:
+            return values
+        own = dict(values)
+        name = own.pop("like")
+        if name not in tuple(RECORDED):
+            raise ValueError(
+                f"like: no such recording: {shown(name)}; {choices(str(name), RECORDED)}"
+            )
+        recorded = RECORDED[name][cls.figures]
+        twice = sorted(own.keys() & recorded)
+        if twice:
+            raise ValueError(f"{twice[0]}: is set by like, too; leave out one of them")
+        return own | dict(recorded)
+
+    def recorded(self, name: str) -> Self:
+        """Return the table with the figures of a recording in place of its own."""
+        return self.model_copy(update=RECORDED[name][self.figures])
+
+
+class PulseSpec(RecordedTable):
     """How a module's pulse differs from the nominal one (``emulator.echo.pulse``).
 
     The envelope's standard deviation is the nominal one times ``width`` (1 - ``skew``) before the
     peak and ``width`` (1 + ``skew``) after it; ``ringing`` is the amplitude of a copy of the pulse
-    that follows.
+    that follows; ``carrier_offset_hz`` is added to the frequency of the carrier.
     """
 
+    figures = "pulse"
     width: Annotated[Number, Field(ge=0.5, le=2)] = 1.0
     skew: Annotated[Number, Field(ge=-0.5, le=0.5)] = 0.0
     ringing: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    carrier_offset_hz: Annotated[Number, Field(ge=-1e9, le=1e9)] = 0.0
 
 
 class BurstSpec(Table):
@@ -322,16 +377,20 @@ class ClutterSpec(Table):
     correlation_s: CorrelationTime = 4.8
 
 
-class JitterSpec(Table):
-    """Jitter of the carrier's phase, common to all echoes of a frame (``emulator.echo.receiver``).
+class JitterSpec(RecordedTable):
+    """Jitter of the carrier, common to all echoes of a frame (``emulator.echo.receiver``).
 
-    ``white_rad`` and ``slow_rad`` are the standard deviations of a part that is new with every
-    frame and of one that falls to 1/e after ``slow_correlation_s``.
+    ``white_rad`` and ``slow_rad`` are the standard deviations of a part of its phase that is new
+    with every frame and of one that falls to 1/e after ``slow_correlation_s``; ``amplitude`` is
+    the relative standard deviation of its amplitude, new with every frame.
     """
+
+    figures = "jitter"
 
     white_rad: Sigma = 0.0
     slow_rad: Sigma = 0.0
     slow_correlation_s: CorrelationTime = 4.0
+    amplitude: Annotated[Number, Field(ge=0, le=0.1)] = 0.0
 
 
 class CarriedSpec(Table):
@@ -405,19 +464,27 @@ class OdometrySpec(Table):
     slip_sigma_deg: Annotated[Number, Field(ge=0, le=90)] = 0.0
 
 
-class NoiseSpec(Table):
+class NoiseSpec(RecordedTable):
     """White receiver noise: ``rf_sigma`` per RF sample at the named working point."""
 
+    figures = "noise"
     rf_sigma: Sigma = 5e-4
     iterations: Annotated[StrictInt, Field(ge=1, le=255)] = 16
     pulses_per_step: Annotated[StrictInt, Field(ge=1, le=65535)] = 300
 
 
-class LeakageSpec(Table):
-    """The direct pulse from transmitter to receiver, at TX power 2."""
+class LeakageSpec(RecordedTable):
+    """The direct pulse from transmitter to receiver, at TX power 2, and how it rings on.
 
+    The antennas ring with the carrier's frequency, from ``ringing`` times the pulse's amplitude at
+    its peak, falling to 1/e over ``ringing_m`` of range (``emulator.echo.paths``).
+    """
+
+    figures = "leakage"
     amplitude: Annotated[Number, Field(ge=0, le=10)] = 0.06
     range_m: Metres = 0.05
+    ringing: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    ringing_m: Annotated[Number, Field(ge=0.01, le=2)] = 0.25
 
 
 class SceneError(ValueError):

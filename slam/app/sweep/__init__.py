@@ -49,6 +49,7 @@ class Stress:
     targets: SceneKeys = field(default_factory=dict)
     multipath: SceneKeys = field(default_factory=dict)
     odometry: SceneKeys = field(default_factory=dict)
+    like: str = ""  # the recording whose noise, leakage, jitter and pulses the modules have
     carried_at: float = 0.0  # part of the drive at which the robot is picked up
     carried_skips: float = 0.0  # part of its course that it misses
 
@@ -63,6 +64,13 @@ _STAMPS: SceneKeys = {"stamp_sigma_ms": 20.0}
 _ROD_ROD: SceneKeys = {"target_pairs": 0.25}
 _SLIP: SceneKeys = {"slips_per_s": 1 / 20, "slip_sigma_m": 0.015, "slip_sigma_deg": 2.0}
 _LARGE_SLIP: SceneKeys = {"slips_per_s": 1 / 60, "slip_sigma_m": 0.06, "slip_sigma_deg": 8.0}
+
+_RECORDED = {
+    "x4m03_2025": "X4M03: noise, leakage, jitter, pulse",
+    "x4_2017": "X4 of 2017",
+    "bare_x4": "X4 without a housing",
+}
+"""`RECORDED` of `emulator.scene.scene`, which is too heavy to load here."""
 
 
 def _wander(range_m: float) -> SceneKeys:
@@ -136,4 +144,8 @@ STRESSES: Mapping[str, Stress] = {
         mount_sigma_deg=_MOUNT_SIGMA_DEG,
         offset_sigma_m=_OFFSET_SIGMA_M,
     ),
+    **{
+        f"like_{name}": Stress(help=f"modules like a recorded {module}", like=name)
+        for name, module in _RECORDED.items()
+    },
 }

@@ -96,6 +96,8 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
             x, y, yaw = mounts[index]
             keys["mount_error_m"] = (stress.mount_sigma_m * x, stress.mount_sigma_m * y)
             keys["mount_error_deg"] = stress.mount_sigma_deg * yaw
+        if stress.like:
+            keys["pulse"] = radar.pulse.recorded(stress.like)
         radars.append(_with(radar, keys))
     duration_s = scene.trajectory().duration_ns / NS_PER_S
     odometry = _with(scene.odometry, stress.odometry)
@@ -108,8 +110,14 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
             at_s=stress.carried_at * duration_s, skips_s=stress.carried_skips * duration_s
         )
         path = path.model_copy(update={"carried": lift})
+    recorded = {
+        key: getattr(scene, key).recorded(stress.like)
+        for key in ("noise", "leakage", "jitter")
+        if stress.like
+    }
     return scene.model_copy(
-        update={
+        update=recorded
+        | {
             "radars": tuple(radars),
             "targets": tuple(_with(target, stress.targets) for target in scene.targets),
             "multipath": _with(scene.multipath, stress.multipath),
