@@ -55,7 +55,7 @@ RECORDED: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "x4_2017": {
         "noise": {"rf_sigma": 2.4e-5, "iterations": 16, "pulses_per_step": 300},
         "leakage": {"amplitude": 0.042, "ringing": 0.21, "ringing_m": 0.49},
-        "jitter": {"white_rad": 0.0011, "slow_rad": 0.0002, "amplitude": 0.0006},
+        "jitter": {"white_rad": 0.0011, "slow_rad": 0.0001, "amplitude": 0.0006},
         "pulse": {"carrier_offset_hz": -1e8, "width": 1.0, "skew": 0.0, "ringing": 0.0},
     },
     "bare_x4": {
