@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from emulator.scene.scene import BurstSpec, PulseSpec, Scene, WanderSpec, load_scene
+from emulator.scene.scene import RECORDED, BurstSpec, PulseSpec, Scene, WanderSpec, load_scene
 from emulator.scene.toml_files import shipped_names
 from emulator.scene.wheels import scene_odometry
 from hil_tests.unit.slam.simulation import frame_of
@@ -213,6 +213,21 @@ def test_model_error_has_the_strengths_of_its_laws() -> None:
     assert {target.wander for target in small.targets} == {
         WanderSpec(range_m=0.003, inside_m=0.02, fading=0.4, phase_rad=1.0)
     }
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_modules_like_recorded_ones_have_their_tables_and_slam_the_same_rig(name: str) -> None:
+    lab = load_scene("lab")
+    scene = stressed_scene(lab, STRESSES[f"like_{name}"], 4)
+    for table, figures in RECORDED[name].items():
+        tables = [getattr(scene, table)] if table != "pulse" else [r.pulse for r in scene.radars]
+        for each in tables:
+            assert each.model_dump().items() >= figures.items()
+    assert scene.leakage.range_m == lab.leakage.range_m
+    assert scene.clutter == lab.clutter
+    assert rig_of(scene) == rig_of(lab)
+    assert wheels_of(scene) == wheels_of(lab)
+    assert stressed_scene(lab, STRESSES[CLEAN], 4) == lab
 
 
 def test_mounts_are_off_by_5_mm_per_axis_and_1_degree() -> None:
