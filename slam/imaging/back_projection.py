@@ -63,7 +63,16 @@ class Aperture:
     @property
     def length_m(self) -> float:
         """Return the way of the antenna from profile to profile."""
-        return float(np.linalg.norm(np.diff(self.antennas_m, axis=0), axis=1).sum())
+        return float(self.metres.sum())
+
+    @property
+    def metres(self) -> Array:
+        """Return the way that each profile stands for, (n,): half of that to either neighbour.
+
+        Profiles times these weights (`RangeProfiles.times`) count by way, not by time.
+        """
+        half_m = np.linalg.norm(np.diff(self.antennas_m, axis=0), axis=1) / 2
+        return np.asarray(np.append(half_m, 0.0) + np.append(0.0, half_m))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -67,6 +67,10 @@ class RangeProfiles:
         """Return the ranges of the bins, shape (n_bins,)."""
         return np.asarray(self.range_start_m + self.bin_length_m * np.arange(self.values.shape[1]))
 
+    def times(self, weights: Array) -> RangeProfiles:
+        """Return each profile times its weight; ``weights`` has shape (n_frames,)."""
+        return replace(self, values=(self.values * weights[:, None]).astype(np.complex64))
+
     def times_range(self, power: float) -> RangeProfiles:
         """Return profiles times range**power: the law by which echoes fall is made up for.
 
