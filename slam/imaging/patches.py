@@ -15,9 +15,15 @@ from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
 from slam.front_end.pulse import ModulePulse
-from slam.geometry import FieldOfView, Mount, between, compose
+from slam.geometry import FieldOfView, Mount, between, transform
 from slam.imaging.back_projection import Aperture
-from slam.imaging.range_profiles import ProfileFilter, RangeProfiles, StaticPart
+from slam.imaging.range_profiles import (
+    ProfileFilter,
+    RangeProfiles,
+    Samples,
+    StaticPart,
+    baseband_profiles,
+)
 
 Array = NDArray[np.float64]
 
@@ -91,13 +97,26 @@ def aperture_of(mount: Mount, view: FieldOfView, poses: Array) -> Aperture:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BasebandFrame:
+    """A frame of a module with downconversion: ``samples`` (n_bins,), complex, I + jQ.
+
+    The rest is as in `RadarFrame`.
+    """
+
+    t_ns: int
+    samples: NDArray[np.complexfloating]
+    range_start_m: float
+    bin_length_m: float
+
+
 @dataclass(slots=True, kw_only=True)
 class _Look:
     """A frame that waits for its patch."""
 
     t_ns: int
     pose: Array
-    samples: Array
+    samples: Samples
     range_start_m: float
     way_m: float  # of the antenna since the start
 
@@ -105,7 +124,9 @@ class _Look:
 class PatchMaker:
     """Makes the patches of one radar while frames come in.
 
-    ``pulse_of`` returns the module's pulse as it is known now, for a length of bins.
+    ``pulse_of`` returns the module's pulse as it is known now, for a length of bins. ``static`` is
+    the part of the samples that stands still with the robot, where it is known beforehand; None:
+    it is learnt from the frames.
     """
 
     def __init__(
@@ -115,33 +136,47 @@ class PatchMaker:
         view: FieldOfView,
         pulse_of: Callable[[float], ModulePulse],
         rule: PatchRule | None = None,
+        *,
+        static: StaticPart | None = None,
     ) -> None:
         self.radar, self.mount, self.view = radar, mount, view
         self.rule = rule or PatchRule()
         self._pulse_of = pulse_of
         self._looks: list[_Look] = []
-        self._static = StaticPart(memory=self.rule.memory)
+        self._is_known = static is not None
+        self._static = static or StaticPart(memory=self.rule.memory)
+        self._n_bins = 0  # that the static part is learnt of
         self._filter: tuple[ModulePulse, ProfileFilter] | None = None
 
-    def add(self, frame: RadarFrame, pose: Array) -> Patch | None:
-        """Take a frame and the body pose (3,) when it was taken; return a patch that is complete.
-
-        Poses come from odometry, or any path without jumps.
-        """
+    def near(self, frame: RadarFrame | BasebandFrame) -> Samples:
+        """Return the samples up to the end of the field of view, those that are NaN as 0."""
         start_m = frame.range_start_m - self.mount.range_offset_m
         reach = (self.view.max_range_m + _MARGIN_M - start_m) / frame.bin_length_m
-        samples = np.nan_to_num(frame.samples[: max(1, math.ceil(reach))].astype(np.float64))
-        antenna = compose(pose, np.array([self.mount.x_m, self.mount.y_m, 0.0]))[:2]
+        samples = frame.samples[: max(1, math.ceil(reach))]
+        return np.asarray(np.nan_to_num(samples.astype(np.result_type(samples, np.float64))))
+
+    def antenna_at(self, pose: Array) -> Array:
+        """Return the antenna, shape (2,), at a body pose."""
+        return transform(pose, np.array([self.mount.x_m, self.mount.y_m]))
+
+    def add(self, frame: RadarFrame | BasebandFrame, pose: Array) -> Patch | None:
+        """Take a frame and the body pose (3,) when it was taken; return a patch that is complete.
+
+        Poses come from odometry, or any path without jumps. A frame is RF or I/Q.
+        """
+        samples = self.near(frame)
+        start_m = frame.range_start_m - self.mount.range_offset_m
+        antenna = self.antenna_at(pose)
         if self._looks and not self._continues(self._looks[-1], frame, samples):
             self._looks.clear()
-        if self._static.mean is not None and self._static.mean.size != samples.size:
-            self._static = StaticPart(memory=self.rule.memory)
-        self._static.add(samples, antenna)
+        if not self._is_known:
+            if self._n_bins != samples.size:
+                self._n_bins, self._static = samples.size, StaticPart(memory=self.rule.memory)
+            self._static.add(samples, antenna, float(pose[2]))
         way_m = 0.0
         if self._looks:
             last = self._looks[-1]
-            before = compose(last.pose, np.array([self.mount.x_m, self.mount.y_m, 0.0]))[:2]
-            step_m = float(np.linalg.norm(antenna - before))
+            step_m = float(np.linalg.norm(antenna - self.antenna_at(last.pose)))
             if step_m < self.rule.spacing_m:
                 return None
             way_m = last.way_m + step_m
@@ -155,7 +190,7 @@ class PatchMaker:
         self._looks = [look for look in self._looks if look.way_m >= keep_m]
         return patch
 
-    def _continues(self, last: _Look, frame: RadarFrame, samples: Array) -> bool:
+    def _continues(self, last: _Look, frame: RadarFrame | BasebandFrame, samples: Samples) -> bool:
         is_same = (
             samples.size == last.samples.size
             and frame.range_start_m - self.mount.range_offset_m == last.range_start_m
@@ -164,14 +199,9 @@ class PatchMaker:
 
     def _made(self, bin_length_m: float) -> Patch:
         looks, static = self._looks, self._static.mean
-        pulse = self._pulse_of(bin_length_m)
         rows = np.array([look.samples for look in looks])
         if static is not None:
             rows = rows - static
-        profile_filter = self._filter[1] if self._filter and self._filter[0] is pulse else None
-        if profile_filter is None or profile_filter.n_bins != rows.shape[1]:
-            profile_filter = ProfileFilter(pulse, rows.shape[1], bin_length_m)
-            self._filter = pulse, profile_filter
         middle_m = 0.5 * (looks[0].way_m + looks[-1].way_m)
         middle = int(np.argmin([abs(look.way_m - middle_m) for look in looks]))
         origin = looks[middle].pose
@@ -183,5 +213,20 @@ class PatchMaker:
             poses=np.array([between(origin, look.pose) for look in looks]),
             middle=middle,
             origin=origin,
-            profiles=profile_filter.apply(rows, looks[0].range_start_m),
+            profiles=self._profiles(rows, looks[0].range_start_m, bin_length_m),
         )
+
+    def _profiles(self, rows: Samples, range_start_m: float, bin_length_m: float) -> RangeProfiles:
+        pulse = self._pulse_of(bin_length_m)
+        if np.iscomplexobj(rows):
+            model = pulse.model
+            return baseband_profiles(
+                *(rows, range_start_m, bin_length_m),
+                carrier_hz=model.carrier_hz,
+                sigma_m=model.sigma_m,
+            )
+        profile_filter = self._filter[1] if self._filter and self._filter[0] is pulse else None
+        if profile_filter is None or profile_filter.n_bins != rows.shape[1]:
+            profile_filter = ProfileFilter(pulse, rows.shape[1], bin_length_m)
+            self._filter = pulse, profile_filter
+        return profile_filter.apply(rows, range_start_m)

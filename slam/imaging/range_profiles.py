@@ -18,7 +18,8 @@ Filter
 Static part
     Leakage from transmitter to receiver and echoes of the robot itself are the same in all frames
     of a radar; echoes of the room turn their phase with every few millimetres of way. The mean of
-    frames that were taken at different places keeps the former alone.
+    frames that were taken at different places keeps the former alone, and the median of such means
+    at different headings leaves out walls that the robot drove along.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ _WHITENING = 0.94
 _NOISE_SHARE = 0.01
 # Linear interpolation between bins needs this many of them per envelope sigma.
 _BINS_PER_SIGMA = 3.0
+_HEADINGS = 36  # that the static part is learnt for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,25 +163,36 @@ def baseband_profiles(
 
 
 class StaticPart:
-    """The mean of the frames of one radar that were taken at different places.
+    """What is the same in the frames of one radar that were taken at different places.
 
     Frames are RF or I/Q, before the filter. While the robot stands nothing is added, so a start on
-    the spot does not make the room static. Behind ``memory`` frames, each new one takes the place
-    of a share of all earlier ones. A wall beside a straight path stands still, too, and fades
-    unless the memory is longer than that path.
+    the spot does not make the room static. A wall beside a straight path stands still, too, so the
+    mean is taken for every 10 degrees of heading apart, and the median over headings counts: the
+    wall fades where the robot has not turned yet, or never does. Behind ``memory`` frames of one
+    heading, each new one takes the place of a share of all earlier ones.
     """
 
     def __init__(self, *, memory: int = 300, spacing_m: float = 0.005) -> None:
-        self.mean: Samples | None = None
         self.n_places = 0
         self._memory = memory
         self._spacing_m = spacing_m
         self._last_m: Array | None = None
+        self._of_headings: dict[int, tuple[int, Samples]] = {}
 
-    def add(self, samples: Samples, antenna_m: Array) -> bool:
+    @property
+    def mean(self) -> Samples | None:
+        """Return the static part, shape (n_bins,); None before the first frame."""
+        if not self._of_headings:
+            return None
+        means = np.array([mean for _, mean in self._of_headings.values()])
+        if np.iscomplexobj(means):
+            return np.asarray(np.median(means.real, axis=0) + 1j * np.median(means.imag, axis=0))
+        return np.asarray(np.median(means, axis=0))
+
+    def add(self, samples: Samples, antenna_m: Array, heading_rad: float = 0.0) -> bool:
         """Take a frame (n_bins,) if its antenna (2,) or (3,) has moved; return whether it has.
 
-        Antennas are given in any frame that does not jump.
+        Antennas and headings are given in any frame that does not jump.
         """
         last_m = self._last_m
         if last_m is not None and float(np.linalg.norm(antenna_m - last_m)) < self._spacing_m:
@@ -187,8 +200,8 @@ class StaticPart:
         self._last_m = np.array(antenna_m, dtype=np.float64)
         self.n_places += 1
         known = np.nan_to_num(samples)
-        if self.mean is None:
-            self.mean = known
-        else:
-            self.mean = self.mean + (known - self.mean) / min(self.n_places, self._memory)
+        heading = math.floor(heading_rad / math.tau * _HEADINGS) % _HEADINGS
+        n, mean = self._of_headings.get(heading, (0, known))
+        new = mean + (known - mean) / min(n + 1, self._memory)
+        self._of_headings[heading] = n + 1, new
         return True

@@ -12,7 +12,8 @@ from slam.frames import RadarFrame
 from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, compose
 from slam.imaging.back_projection import back_project
-from slam.imaging.patches import Patch, PatchMaker, PatchRule
+from slam.imaging.patches import BasebandFrame, Patch, PatchMaker, PatchRule
+from slam.imaging.range_profiles import StaticPart
 
 Array = NDArray[np.float64]
 
@@ -146,3 +147,48 @@ def test_the_pulse_is_asked_for_with_every_patch() -> None:
     maker = PatchMaker(0, MOUNT, VIEW, pulse_of, RULE)
     made = [maker.add(frame_at(pose, i), pose) for i, pose in enumerate(line(0.6))]
     assert asked == [BIN_M] * sum(patch is not None for patch in made)
+
+
+def test_a_static_part_that_is_known_is_taken_out_and_stays_as_it_is() -> None:
+    def patch_of(static: StaticPart, leakage: float) -> Patch:
+        maker = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE, static=static)
+        made = [maker.add(frame_at(p, i, leakage=leakage), p) for i, p in enumerate(line(0.3))]
+        (patch,) = [one for one in made if one is not None]
+        return patch
+
+    far = np.array([0.0, -50.0, 0.0])  # from where nothing but leakage is in the frame
+    known, nothing = StaticPart(), StaticPart()
+    near = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE).near
+    known.add(near(frame_at(far, 0, leakage=0.03)), np.zeros(2))
+    nothing.add(near(frame_at(far, 0)), np.zeros(2))
+    found, expected = patch_of(known, 0.03), patch_of(nothing, 0.0)
+    np.testing.assert_allclose(found.profiles.values, expected.profiles.values, atol=1e-8)
+    assert known.n_places == 1
+
+
+def test_baseband_frames_come_to_a_focus_as_rf_frames_do() -> None:
+    bin_m, n_bins = 8 * BIN_M, 60
+    ranges_m = START_M + bin_m * np.arange(n_bins)
+    nothing = StaticPart()
+    nothing.add(np.zeros(n_bins, dtype=np.complex128), np.zeros(2))
+    view = replace(VIEW, max_range_m=5.0)  # beyond the bins
+    maker = PatchMaker(0, MOUNT, view, lambda _: PULSE, RULE, static=nothing)
+    made = []
+    for index, pose in enumerate(line(0.3)):
+        antenna = compose(pose, np.array([MOUNT.x_m, MOUNT.y_m, 0.0]))[:2]
+        r = math.dist(ROD, antenna)
+        x = ranges_m - MOUNT.range_offset_m - r
+        samples = 0.01 * np.exp(-0.5 * (x / MODEL.sigma_m) ** 2 - 1j * WAVE_NUMBER * r)
+        frame = BasebandFrame(
+            t_ns=200_000_000 * index,
+            samples=samples.astype(np.complex64),
+            range_start_m=START_M,
+            bin_length_m=bin_m,
+        )
+        made.append(maker.add(frame, pose))
+    (patch,) = [one for one in made if one is not None]
+    places = ROD - patch.origin[:2] + np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.2]])
+    image = back_project(patch.profiles, patch.aperture, places)
+    assert image.amplitude[0] == pytest.approx(0.01, rel=0.03)
+    assert image.coherence_factor[0] > 0.99
+    assert image.amplitude[1:].max() < 0.5 * 0.01

@@ -144,3 +144,31 @@ class TestStaticPart:
         static.add(np.array([np.nan, 1 + 2j]), np.zeros(2))
         assert static.mean is not None
         np.testing.assert_array_equal(static.mean, [0, 1 + 2j])
+
+    def test_a_wall_beside_the_legs_of_a_square_fades_no_more_than_the_turns_between_them(
+        self,
+    ) -> None:
+        # The wall's echo is the same on every leg; turns are few, but take most of the headings.
+        static, leakage, wall = StaticPart(), np.array([1.0, 0.0]), np.array([0.0, 1.0])
+        rng, place = np.random.default_rng(5), 0
+        for corner in range(4):
+            legs = [(corner * math.pi / 2 + 0.05, leakage + wall)] * 200
+            angles = corner * math.pi / 2 + np.arange(0.1, 1.6, 0.1)
+            turns = [(angle, leakage + wall * rng.normal(0.0, 0.1)) for angle in angles]
+            for heading, samples in legs + turns:
+                place += 1
+                static.add(samples, np.array([0.01 * place, 0.0]), heading)
+        assert static.mean is not None
+        np.testing.assert_allclose(static.mean, leakage, atol=0.1)
+        one_heading = StaticPart(memory=10_000)
+        for step in range(800):
+            one_heading.add(leakage + wall, np.array([0.01 * step, 0.0]))
+        assert one_heading.mean is not None
+        np.testing.assert_allclose(one_heading.mean, leakage + wall)
+
+    def test_headings_count_modulo_a_turn(self) -> None:
+        static = StaticPart()
+        for step, heading in enumerate((-0.05, math.tau - 0.05, 3 * math.tau - 0.05, 0.05)):
+            static.add(np.array([float(step)]), np.array([step, 0.0]), heading)
+        assert static.mean is not None
+        np.testing.assert_allclose(static.mean, [(1.0 + 3.0) / 2])
