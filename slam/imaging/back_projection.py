@@ -35,7 +35,7 @@ from slam.imaging.range_profiles import RangeProfiles
 Array = NDArray[np.float64]
 
 _PHASES = 4096
-_TURNS = np.exp(1j * math.tau * np.arange(_PHASES) / _PHASES)
+TURNS = np.exp(1j * math.tau * np.arange(_PHASES) / _PHASES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -138,7 +138,7 @@ def back_project(profiles: RangeProfiles, aperture: Aperture, points_m: Array) -
         aperture.min_range_m,
         aperture.max_range_m,
         points,
-        _TURNS,
+        TURNS,
         total,
         power,
         count,

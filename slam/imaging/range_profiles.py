@@ -40,6 +40,8 @@ Samples = NDArray[Any]  # RF: float64; I/Q: complex128
 _SPEED_OF_LIGHT_MPS = 299_792_458.0
 _WHITENING = 0.94
 _NOISE_SHARE = 0.01
+# Samples of an echo per bin of a profile
+_ECHO_STEPS = 8
 # Linear interpolation between bins needs this many of them per envelope sigma.
 _BINS_PER_SIGMA = 3.0
 _HEADINGS = 36  # that the static part is learnt for
@@ -57,12 +59,16 @@ class RangeProfiles:
         Range of bin 0, true metres from the antenna, and spacing of the bins.
     wave_number_rad_per_m
         k = 4 pi f_c / c: how fast the phase of an echo turns with its range.
+    echo
+        q, the profile of an echo of amplitude 1, at 0, 1/8, 2/8 ... bins from its peak; it is even,
+        and 0 beyond. None: not known.
     """
 
     values: Profiles
     range_start_m: float
     bin_length_m: float
     wave_number_rad_per_m: float
+    echo: Array | None = None
 
     @property
     def ranges_m(self) -> Array:
@@ -104,6 +110,10 @@ class ProfileFilter:
         # An echo of amplitude 1 has the peak 1: its spectrum is p times this. The factor 2 makes up
         # for the negative frequencies.
         self._spectrum = (2 * shape * p.sum() / (p * shape).sum()).astype(np.complex128)
+        turns = np.exp(1j * math.tau / (self._n_fft * _ECHO_STEPS) * np.arange(self._half))
+        at = np.arange(_ECHO_STEPS * model.half_length(bin_length_m))[:, np.newaxis]
+        at_carrier = np.exp(-1j * self.wave_number_rad_per_m * bin_length_m / _ECHO_STEPS * at)
+        self._echo = np.real(at_carrier[:, 0] * (turns**at @ (p * shape))) / (p * shape).sum()
         noise = self._spectrum
         if taps is not None:
             kernel = np.zeros(self._n_fft)
@@ -130,6 +140,7 @@ class ProfileFilter:
             range_start_m=range_start_m,
             bin_length_m=self.bin_length_m,
             wave_number_rad_per_m=self.wave_number_rad_per_m,
+            echo=self._echo,
         )
 
 
@@ -149,6 +160,7 @@ def baseband_profiles(
     """
     rows = np.nan_to_num(np.asarray(samples, dtype=np.complex128))
     n, between = rows.shape[1], max(1, math.ceil(_BINS_PER_SIGMA * bin_length_m / sigma_m))
+    step = _ECHO_STEPS * sigma_m * between / bin_length_m
     # As many bins of nothing behind the last: the ends of a frame are not each other's neighbours.
     spectrum = np.fft.fft(rows, 2 * n)
     padded = np.zeros((len(rows), 2 * n * between), dtype=np.complex128)
@@ -159,6 +171,7 @@ def baseband_profiles(
         range_start_m=range_start_m,
         bin_length_m=bin_length_m / between,
         wave_number_rad_per_m=4 * math.pi * carrier_hz / _SPEED_OF_LIGHT_MPS,
+        echo=np.exp(-0.5 * (np.arange(0.0, 6.0 * step, 1.0) / step) ** 2),
     )
 
 

@@ -1,0 +1,202 @@
+"""Points of a patch: the reflectors that are what they seem to be, with their covariances.
+
+Covariance
+    Noise: the range of a pulse of deviation s is known to s / snr, its bearing to
+    1 / (snr k L), L the deviation of the antenna's way across the line of sight (Kay 1993,
+    Fundamentals of Statistical Signal Processing vol. 1, section 3.9; snr is that of the patch).
+    Wheels: the least-squares bearing is a weighted sum of the phases, so of the errors of range at
+    the frames. The increments of odometry between frames err independently, but for three constants
+    (`slam.config.WheelNoise`); each error moves all antennas behind it, seen from the middle of the
+    patch, so its share in the bearing is a sum over them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import WheelNoise
+from slam.geometry import between
+from slam.imaging.patches import Patch
+from slam.imaging.reflectors import Reflectors, SeparationRule, separated
+
+Array = NDArray[np.float64]
+
+_PULSE_M = 0.052  # s, of a module with 1.4 GHz
+
+
+class PointKind(StrEnum):
+    """What the wavefront says of a reflector."""
+
+    POINT = "point"
+    ROUND = "round"  # the wavefront is flatter than that of a point, as that of a wide cylinder
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointRule:
+    """Which reflectors are points, and how well they are known."""
+
+    separation: SeparationRule = field(default_factory=SeparationRule)
+    wheels: WheelNoise = field(default_factory=WheelNoise)
+    least_snr: float = 8.0
+    least_coherence: float = 0.6
+    least_in_view: float = 0.5  # share of the frames
+    # Amplitude over that of the strongest point
+    least_share: float = 0.15
+    most_flatness: float = 0.5
+    # Beside a point a weaker one is part of it: nearer than this, and less than that share of it
+    apart_m: float = 0.1
+    beside_share: float = 0.5
+    range_floor_m: float = 1e-3
+    bearing_floor_rad: float = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PatchPoint:
+    """A point in the frame of its patch.
+
+    Attributes
+    ----------
+    x_m, y_m
+        Body frame of the middle of the patch; of something round, its nearest surface.
+    range_m, bearing_rad
+        From the antenna in the middle of the patch, and off its boresight.
+    covariance
+        Shape (2, 2), of x and y [m^2].
+    amplitude
+        On boresight at 1 m, in units of the frames.
+    snr
+        Root of its energy over what is left beside it.
+    coherence
+        0 to 1.
+    """
+
+    x_m: float
+    y_m: float
+    range_m: float
+    bearing_rad: float
+    covariance: Array
+    amplitude: float
+    snr: float
+    coherence: float
+    kind: PointKind
+
+
+def patch_points(patch: Patch, rule: PointRule | None = None) -> tuple[PatchPoint, ...]:
+    """Return the points of a patch, the nearest first."""
+    rule = rule or PointRule()
+    return points_of(patch, separated(patch, rule.separation), rule)
+
+
+def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[PatchPoint, ...]:
+    """Return those of the reflectors of a patch that are points, the nearest first."""
+    aperture = patch.aperture
+    assert aperture.boresights is not None
+    antenna, (bx, by) = aperture.antennas_m[patch.middle], aperture.boresights[patch.middle]
+    turn = np.array([[bx, -by], [by, bx]])
+    directions = np.column_stack([np.cos(reflectors.bearing_rad), np.sin(reflectors.bearing_rad)])
+    places = antenna + reflectors.range_m[:, np.newaxis] * directions @ turn.T
+    is_point = _are_points(patch, reflectors, places, rule)
+    order = np.flatnonzero(is_point)[np.argsort(reflectors.range_m[is_point])]
+    return tuple(
+        PatchPoint(
+            x_m=float(places[k, 0]),
+            y_m=float(places[k, 1]),
+            range_m=float(reflectors.range_m[k]),
+            bearing_rad=float(reflectors.bearing_rad[k]),
+            covariance=_covariance(patch, reflectors, k, places[k], rule),
+            amplitude=float(reflectors.amplitude[k]),
+            snr=float(reflectors.snr[k]),
+            coherence=float(reflectors.coherence[k]),
+            kind=PointKind.POINT,
+        )
+        for k in order.tolist()
+    )
+
+
+def in_view(patch: Patch, places: Array) -> Array:
+    """Return the share of the frames that have points (k, 2) in beam and range."""
+    aperture = patch.aperture
+    assert aperture.boresights is not None
+    ways = places[:, np.newaxis] - aperture.antennas_m
+    ranges_m = np.linalg.norm(ways, axis=2)
+    ahead = np.sum(ways * aperture.boresights, axis=2)
+    seen = ahead >= math.cos(aperture.half_beam_rad) * ranges_m
+    seen &= (ranges_m >= aperture.min_range_m) & (ranges_m <= aperture.max_range_m)
+    return np.asarray(seen.mean(axis=1))
+
+
+def _are_points(
+    patch: Patch, reflectors: Reflectors, places: Array, rule: PointRule
+) -> NDArray[np.bool_]:
+    amplitude = reflectors.amplitude
+    may_be = ~reflectors.is_plane & (reflectors.flatness <= rule.most_flatness)
+    strongest = float(np.max(amplitude, where=may_be, initial=0.0))
+    chosen = may_be & (amplitude >= rule.least_share * strongest)
+    chosen &= (reflectors.snr >= rule.least_snr) & (reflectors.coherence >= rule.least_coherence)
+    chosen &= in_view(patch, places) >= rule.least_in_view
+    apart = np.linalg.norm(places[:, np.newaxis] - places, axis=2)
+    is_weaker = amplitude[:, np.newaxis] < rule.beside_share * amplitude
+    return np.asarray(chosen & ~np.any((apart < rule.apart_m) & is_weaker, axis=1))
+
+
+def _covariance(
+    patch: Patch, reflectors: Reflectors, k: int, place: Array, rule: PointRule
+) -> Array:
+    """Return the covariance of a point (2, 2), body frame of the middle of the patch."""
+    profiles, antennas = patch.profiles, patch.aperture.antennas_m
+    ways = place - antennas
+    lines = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    sight = lines[patch.middle]
+    across = np.array([-sight[1], sight[0]])
+    weights = reflectors.levels[k] ** 2
+    # Ranges change with the bearing by the way across; a common phase is fitted, too.
+    lever = -(antennas - antennas[patch.middle]) @ across
+    lever -= np.average(lever, weights=weights)
+    spread = math.sqrt(float(np.average(lever**2, weights=weights)))
+    of_range = weights * lever / float(weights @ lever**2)  # bearing per error of each range
+    snr = float(reflectors.snr[k])
+    bearing = (1 / (snr * profiles.wave_number_rad_per_m * spread)) ** 2
+    bearing += _wheel_variance(patch, of_range[:, np.newaxis] * lines, rule.wheels)
+    bearing += rule.bearing_floor_rad**2
+    range_variance = (_PULSE_M / snr) ** 2 + rule.range_floor_m**2
+    range_m = float(reflectors.range_m[k])
+    return np.asarray(
+        range_variance * np.outer(sight, sight) + bearing * range_m**2 * np.outer(across, across)
+    )
+
+
+def _wheel_variance(patch: Patch, pulls: Array, wheels: WheelNoise) -> float:
+    """Return the variance of a sum over frames of -pulls (n, 2) . errors of the antennas.
+
+    Steps are those from frame to frame; the frame in the middle has no error.
+    """
+    poses, antennas, middle = patch.poses, patch.aperture.antennas_m, patch.middle
+    steps = np.array([between(*pair) for pair in pairwise(poses)])
+    # What each step moves: all behind it, or, before the middle, all ahead of it, the other way
+    moment = pulls[:, 1] * antennas[:, 0] - pulls[:, 0] * antennas[:, 1]
+    rows = np.column_stack([pulls, moment])
+    behind = np.cumsum(rows[::-1], axis=0)[::-1]
+    moved = np.where(
+        (np.arange(len(steps)) >= middle)[:, np.newaxis], behind[1:], behind[1:] - behind[0]
+    )
+    c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    along, left = moved[:, 0] * c + moved[:, 1] * s, moved[:, 1] * c - moved[:, 0] * s
+    turned = moved[:, 2] - (moved[:, 1] * poses[1:, 0] - moved[:, 0] * poses[1:, 1])
+    moved_by = np.column_stack([along, left, turned])
+    white = float(np.sum((moved_by * wheels.step_sigmas(steps)) ** 2))
+    way = np.hypot(steps[:, 0], steps[:, 1])
+    constants = (
+        float(np.sum(moved_by[:, :2] * steps[:, :2])),
+        float(turned @ steps[:, 2]),
+        float(turned @ way),
+    )
+    return white + sum(
+        (sigma * value) ** 2
+        for sigma, value in zip(wheels.calibration_sigmas, constants, strict=True)
+    )

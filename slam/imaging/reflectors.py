@@ -1,0 +1,148 @@
+"""A patch as the sum of a few reflectors and a rest.
+
+With D_f the antenna of frame f seen from that in the middle of the patch, e the direction of a
+reflector from there, r its range and h the curvature of its wavefront [1/m],
+
+    R_f = r + (h |D_f|**2 - 2 e . D_f) / (1 + sqrt(1 - 2 h e . D_f + h**2 |D_f|**2))
+
+is its range at frame f: of a point with h = 1 / r, of a plane with 0, of a cylinder of radius a
+with 1 / (r + a). Its profile is a_f q(x - R_f) exp(-j k R_f), with
+
+    a_f = c b_f (1 + g t_f)
+
+c complex; b_f the beam, cos**n of the angle off boresight, 3 dB down at the edge of the field of
+view; g real, t_f from -1 to 1 over the patch, for the law of range and what else is not known.
+
+Search
+    The cell of a polar grid where a point explains the most energy, |sum b_f v_f|**2 / sum b_f**2;
+    from there to the maximum, as a point and as a plane: range by a parabola through the logarithm,
+    bearing by least squares of the phase (Gauss-Newton). What explains more is subtracted, and the
+    next one searched (CLEAN; Hoegbom, Astronomy and Astrophysics Supplement 15 (1974) 417).
+Sweeps
+    Each is added again, placed anew in the absence of all others, and subtracted (RELAX; Li and
+    Stoica, IEEE Trans. Signal Processing 44 (1996) 281): least squares over all of them in the end.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.imaging import reflector_kernels as kernels
+from slam.imaging.back_projection import TURNS
+from slam.imaging.patches import Patch
+
+Array = NDArray[np.float64]
+
+_ROW_M, _SINE = 0.025, 0.025  # cells of the grid, in range and in sine of bearing
+_SINES = np.arange(-36, 37) * _SINE
+_BEYOND_M = 0.3  # echoes from there reach into the field of view
+_BEAM_STEPS = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reflectors:
+    """The reflectors of one patch, k of them; all arrays have one row for each.
+
+    Attributes
+    ----------
+    range_m, bearing_rad
+        From the antenna in the middle of the patch, and off its boresight.
+    is_plane
+        Whether a plane explains it better than a point does.
+    flatness
+        1 - h r where the curvature is free: 0 of a point, 1 of a plane.
+    energy
+        Sum of |a_f|**2.
+    amplitude
+        On boresight at 1 m under the law of a rod: c r**1.5.
+    coherence
+        Energy over that of v_f, 0 to 1.
+    snr
+        Root of the energy over the mean of what is left in the image at ranges near it.
+    levels
+        Shape (k, n): |a_f|.
+    """
+
+    range_m: Array
+    bearing_rad: Array
+    is_plane: NDArray[np.bool_]
+    flatness: Array
+    energy: Array
+    amplitude: Array
+    coherence: Array
+    snr: Array
+    levels: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeparationRule:
+    """How a patch is separated into reflectors."""
+
+    most: int = 16
+    # Energy of a cell over the median of the image from which on it is searched for
+    least_over_median: float = 30.0
+    # A plane must explain this times what a point does: both fit where the patch is short
+    plane_over_point: float = 1.1
+    sweeps: int = 2
+
+
+def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
+    """Return the reflectors of a patch, the strongest first as they were found.
+
+    Raises ValueError where the shape of an echo in the profiles is not known.
+    """
+    profiles, aperture = patch.profiles, patch.aperture
+    if profiles.echo is None or aperture.boresights is None:
+        raise ValueError("reflectors can be separated where echo and boresights are known")
+    n, (bx, by) = len(profiles.values), aperture.boresights[patch.middle]
+    turn = np.array([[bx, -by], [by, bx]])
+    track = np.hstack(
+        [
+            (aperture.antennas_m - aperture.antennas_m[patch.middle]) @ turn,
+            aperture.boresights @ turn,
+        ]
+    )
+    view = patch.view
+    power = math.log(0.5) / (2 * math.log(math.cos(view.opening_rad / 2)))
+    rows_m = np.arange(
+        max(view.min_range_m - 2 * _ROW_M, _ROW_M), view.max_range_m + _BEYOND_M, _ROW_M
+    )
+    image = np.empty((rows_m.size, _SINES.size))
+    found = np.zeros((rule.most, 8))
+    models = np.zeros((rule.most, n), dtype=np.complex128)
+    k = profiles.wave_number_rad_per_m
+    count = kernels.separate(
+        profiles.values.copy(),
+        np.array([profiles.range_start_m, 1 / profiles.bin_length_m, k / math.tau * TURNS.size, k]),
+        TURNS,
+        track,
+        np.linspace(0.0, 1.0, _BEAM_STEPS + 1) ** power,
+        profiles.echo,
+        rows_m,
+        np.arcsin(_SINES),
+        rule.least_over_median,
+        rule.plane_over_point,
+        rule.sweeps,
+        image,
+        found,
+        models,
+    )
+    range_m, bearing_rad, _, form, energy, curvature, _, coherence = found[:count].T
+    levels = np.abs(models[:count])
+    at = ((range_m - rows_m[0]) / _ROW_M).astype(np.intp)
+    rest = [image[max(0, i - 4) : i + 6].mean() if 0 <= i < len(image) else math.inf for i in at]
+    return Reflectors(
+        range_m=range_m,
+        bearing_rad=bearing_rad,
+        is_plane=form == 0,
+        flatness=1.0 - curvature * range_m,
+        energy=energy,
+        amplitude=levels.max(axis=1, initial=0.0) * range_m**1.5,
+        coherence=coherence,
+        snr=np.sqrt(energy / np.maximum(rest, 1e-300)),
+        levels=levels,
+    )
