@@ -1,8 +1,8 @@
 """Measure noise, jitter, leakage and pulse of real X4 modules from baseband recordings of them.
 
-The table holds what `like` in a scene's tables sets (`RECORDED` of `emulator.scene.scene`). Nobody
-recorded these figures by themselves: somebody moves in both public recordings, so noise, jitter and
-leakage are those of the quietest stretch, and are upper bounds; the pulse is that of what moves.
+The table holds what `like` in a scene's tables sets (`RECORDED` of `emulator.scene.scene`). The
+recordings were made for something else, and somebody moves in them: noise, jitter and leakage are
+those of the quietest stretch, and are upper bounds; the pulse is that of what moves.
 """
 
 import argparse
@@ -58,6 +58,11 @@ def measure(path: Path) -> Figures:
     iq = load(path).iq
     if iq is None or len(iq) < 2 * STRETCH:
         raise SystemExit(f"{path}: at least {2 * STRETCH} baseband frames are needed")
+    return figures_of(iq)
+
+
+def figures_of(iq: NDArray[np.complex64]) -> Figures:
+    """Return the figures of baseband frames, shape (n_frames, n_bins), as the module sent them."""
     frames = iq.astype(np.complex128)
     quiet = quietest(frames)
     strongest = quiet[:, int(np.argmax(np.abs(quiet).mean(axis=0)))]
@@ -121,14 +126,18 @@ def pulses_of_what_moves(frames: Complex) -> tuple[Array, Array]:
     frames from bin to bin is that of one pulse behind the module's filter. A Gaussian's is fitted.
     """
     moved = frames[LAG:] - frames[:-LAG]
+    around = np.ones(LAG + 1)
     found = []
-    for some in np.array_split(moved, PARTS):
-        for bins in np.array_split(some, PARTS, axis=1):
-            level = np.sqrt((np.abs(bins) ** 2).mean(axis=0))
-            even = bins / level  # what is far is weaker
-            even /= np.sqrt((np.abs(even) ** 2).mean(axis=1, keepdims=True))
-            n = even.shape[1]
-            products = [even[:, lag:] * even[:, : n - lag].conj() for lag in range(PULSE_LAGS)]
+    for bins in np.array_split(moved, PARTS, axis=1):
+        # what moves little counts as much; over many frames, as the level of a frame by itself
+        # depends on its correlation
+        power = np.convolve((np.abs(bins) ** 2).mean(axis=1), around, "same")
+        power /= np.convolve(np.ones(len(bins)), around, "same")
+        even = bins / np.sqrt(power)[:, np.newaxis]
+        even /= np.sqrt((np.abs(even) ** 2).mean(axis=0))  # what is far is weaker
+        n = even.shape[1]
+        for some in np.array_split(even, PARTS):
+            products = [some[:, lag:] * some[:, : n - lag].conj() for lag in range(PULSE_LAGS)]
             correlation = np.array([each.mean() for each in products])
             found.append(fitted_pulse(correlation / correlation[0].real))
     offsets, widths = np.array(found).T

@@ -48,15 +48,15 @@ CorrelationTime = Annotated[Number, Field(ge=1e-3, le=86_400)]
 RECORDED: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "x4m03_2025": {
         "noise": {"rf_sigma": 1.8e-5, "iterations": 16, "pulses_per_step": 300},
-        "leakage": {"amplitude": 0.060, "ringing": 0.26, "ringing_m": 0.36},
+        "leakage": {"amplitude": 0.059, "ringing": 0.25, "ringing_m": 0.35},
         "jitter": {"white_rad": 0.0031, "slow_rad": 0.032, "amplitude": 0.0011},
-        "pulse": {"carrier_offset_hz": -9e7, "width": 1.05, "skew": 0.0, "ringing": 0.0},
+        "pulse": {"carrier_offset_hz": -7.5e7, "width": 1.12, "skew": 0.0, "ringing": 0.0},
     },
     "x4_2017": {
         "noise": {"rf_sigma": 2.4e-5, "iterations": 16, "pulses_per_step": 300},
-        "leakage": {"amplitude": 0.042, "ringing": 0.21, "ringing_m": 0.49},
+        "leakage": {"amplitude": 0.041, "ringing": 0.20, "ringing_m": 0.50},
         "jitter": {"white_rad": 0.0011, "slow_rad": 0.0001, "amplitude": 0.0006},
-        "pulse": {"carrier_offset_hz": -1e8, "width": 1.0, "skew": 0.0, "ringing": 0.0},
+        "pulse": {"carrier_offset_hz": -7.8e7, "width": 1.07, "skew": 0.0, "ringing": 0.0},
     },
     "bare_x4": {
         "noise": {"rf_sigma": 3.1e-5, "iterations": 16, "pulses_per_step": 300},
