@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
-from slam.front_end.pulse import ModulePulse
+from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, between, transform
 from slam.imaging.back_projection import Aperture
 from slam.imaging.range_profiles import (
@@ -29,6 +29,18 @@ Array = NDArray[np.float64]
 
 # How far beyond the end of the field of view bins are kept: the pulse of an echo there
 _MARGIN_M = 0.3
+
+
+def longest_spacing_m(pulse: PulseModel, view: FieldOfView) -> float:
+    """Return how far an antenna may go from frame to frame.
+
+    Farther, the phase of an echo at the edge of the beam turns by more than half a period in
+    between, and it appears at the other edge, too (grating lobe): lambda / 2 over 2 sin(half beam).
+
+    >>> round(1e3 * longest_spacing_m(PulseModel(), FieldOfView()), 1)
+    19.1
+    """
+    return pulse.wavelength_m / (2 * math.sin(view.opening_rad / 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

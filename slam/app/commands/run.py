@@ -23,7 +23,13 @@ from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_s
 from slam.app.publish.sinks import Publishing
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.rig_files import load_rig
-from slam.app.run.live_source import LiveLog, LiveSource, drift_text, read_odometry
+from slam.app.run.live_source import (
+    LiveLog,
+    LiveSource,
+    SpacingWarning,
+    drift_text,
+    read_odometry,
+)
 from slam.app.run.maps import MapOptions, MapSaver, map_use
 from slam.app.run.output import ResultRow, RunProgress, note
 from slam.app.run.result_files import (
@@ -43,6 +49,8 @@ from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
 from slam.config import BackEnd, ConfigError, load_preset
 from slam.frames import RadarFrame
+from slam.front_end.pulse import PulseModel
+from slam.imaging.patches import longest_spacing_m
 from slam.library.slam import make_slam
 from slam.live.arrival_clock import ClockLine
 from slam.live.errors import AppError
@@ -182,6 +190,7 @@ def run_rig(
                 smoothing_asked=requests.asked,
                 map_file=begin.file,
             )
+            pulse = PulseModel(carrier_hz=config.matched_filter.carrier_hz)
             map_saver = MapSaver(maps.get("save_map"), slam, info)
             remove_earlier(out, (*RESULTS, *_STALE))
             session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
@@ -192,6 +201,7 @@ def run_rig(
                 RunProgress(info, source.lost_frames, also=lambda: _dropped_text(live)),
                 requests,
                 map_saver,
+                SpacingWarning(longest_spacing_m(pulse, info.field_of_view), live_odometry, log),
                 *([view.observer(info)] if view is not None else []),
             ]
             publishing.begin(info, log.log, start_ns)

@@ -11,6 +11,7 @@ likewise, so a frame's session time is what the odometry's clock showed when it 
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,14 +19,17 @@ from dataclasses import replace
 from queue import Empty
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from slam.app.odometry.live import MOST_STAMP_NS, LineSource, LiveOdometry, read_lines
-from slam.app.run.runner import LinkLog, frames_between
+from slam.app.run.runner import LinkLog, Odometry, frames_between
 from slam.app.session.writer import CannotWriteError, SessionLog
 from slam.live.arrival_clock import ArrivalClock
 from slam.live.errors import AppError
 from slam.live.frame_sources import radar_frame
 from slam.live.odometry_track import NS_PER_S, TumSample
-from slam.live.session_records import LogLine, RadarInfo, Scan, Snapshot
+from slam.live.session_records import LogLine, RadarInfo, Scan, SessionObserver, Snapshot
 from slam.live.ticks import (
     GRACE_NS,
     MOST_EVENTS,
@@ -61,6 +65,8 @@ END_NS = GRACE_NS
 """How long SLAM gets the last scans of a run whose duration or odometry is over."""
 _SOURCE_POLL_S = 0.05
 _DRIFT_EVERY_S = 60.0
+_FAR_SCANS = 5
+"""Scans too far from the one before until that is logged: odometry may jump once."""
 
 
 class LiveLog(LinkLog):
@@ -135,6 +141,40 @@ class LiveLog(LinkLog):
             self._log = None
             self.failure = str(error)
             self.log("run", f"{error}; the run goes on and is not recorded", warning=True)
+
+
+class SpacingWarning(SessionObserver):
+    """Logs one warning when the robot drives too far from frame to frame for images of the room.
+
+    Parameters
+    ----------
+    most_m
+        Longest way between two scans, see `slam.imaging.patches.longest_spacing_m`.
+    """
+
+    def __init__(self, most_m: float, odometry: Odometry, log: LinkLog) -> None:
+        self._most_m, self._odometry, self._log = most_m, odometry, log
+        self._last: tuple[int, NDArray[np.float64]] | None = None
+        self._n_far = 0  # scans that followed on each other
+
+    def on_scan(self, scan: Scan) -> None:
+        if not scan.used or self._n_far == _FAR_SCANS:
+            return
+        pose = self._odometry.pose_at(scan.t_ns)
+        last, self._last = self._last, (scan.t_ns, pose)
+        if last is None:
+            return
+        way_m = float(np.hypot(*(pose - last[1])[:2]))
+        self._n_far = self._n_far + 1 if way_m > self._most_m else 0
+        if self._n_far == _FAR_SCANS:
+            speed_mps = way_m * NS_PER_S / (scan.t_ns - last[0])
+            self._log.log(
+                "run",
+                f"frames are {100 * way_m:.1f} cm apart at {speed_mps:.2f} m/s: images of the room "
+                f"show false echoes from {100 * self._most_m:.1f} cm on; drive slower, or ask for "
+                f"--fps {math.ceil(speed_mps / self._most_m)}",
+                warning=True,
+            )
 
 
 class LiveSource:

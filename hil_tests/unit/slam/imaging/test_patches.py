@@ -12,7 +12,13 @@ from slam.frames import RadarFrame
 from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, compose
 from slam.imaging.back_projection import back_project
-from slam.imaging.patches import BasebandFrame, Patch, PatchMaker, PatchRule
+from slam.imaging.patches import (
+    BasebandFrame,
+    Patch,
+    PatchMaker,
+    PatchRule,
+    longest_spacing_m,
+)
 from slam.imaging.range_profiles import StaticPart
 
 Array = NDArray[np.float64]
@@ -192,3 +198,16 @@ def test_baseband_frames_come_to_a_focus_as_rf_frames_do() -> None:
     assert image.amplitude[0] == pytest.approx(0.01, rel=0.03)
     assert image.coherence_factor[0] > 0.99
     assert image.amplitude[1:].max() < 0.5 * 0.01
+
+
+@pytest.mark.parametrize("half_beam_deg", [20.0, 32.5, 60.0])
+def test_at_the_longest_spacing_echoes_of_both_edges_of_the_beam_look_alike(
+    half_beam_deg: float,
+) -> None:
+    view = FieldOfView(opening_rad=2 * math.radians(half_beam_deg))
+    step_m = longest_spacing_m(MODEL, view)
+    turns = [
+        4 * math.pi * 7.29e9 / 299_792_458.0 * step_m * math.sin(math.radians(bearing_deg))
+        for bearing_deg in (half_beam_deg, -half_beam_deg)
+    ]
+    assert turns[0] - turns[1] == pytest.approx(math.tau)

@@ -1,8 +1,9 @@
 """A run in real time: the threads that read, ticks from what arrives, and lost radars."""
 
+import math
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,12 +24,13 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
     drifting,
     drive_through,
 )
-from hil_tests.unit.slam.app.sessions import Listener
+from hil_tests.unit.slam.app.sessions import FRAME_NS, Listener
+from hil_tests.unit.slam.app.sessions import scan as scan_of
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.odometry.live import LiveOdometry, parse_source
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
-from slam.app.run.live_source import LiveSource, read_odometry
-from slam.app.run.runner import RunRecord, run_slam
+from slam.app.run.live_source import LiveSource, SpacingWarning, read_odometry
+from slam.app.run.runner import LinkLog, RunRecord, run_slam
 from slam.config import load_preset
 from slam.geometry import Mount
 from slam.library.evaluation import ate_rmse_m
@@ -37,6 +39,7 @@ from slam.live import ticks as run_readers
 from slam.live.arrival_clock import ClockLine
 from slam.live.errors import AppError
 from slam.live.frame_sources import RadarLink, sampler_limits
+from slam.live.odometry_track import OdometryTrack, TumSample
 from slam.live.session_records import Scan
 from slam.live.ticks import GRACE_NS, Inbox, SourceEvent, TickAssembler, reading
 from xethru_protocol.driver.frames import Frame, FrameGeometry
@@ -557,3 +560,37 @@ def test_odometry_whose_clock_is_set_while_it_is_trusted_is_told(drive: Drive) -
     source.settle()
     assert {scan.used for scan in source.scans()} == {True, False}
     assert "SLAM got no scan for 5 s" in words.about("run")
+
+
+def warnings_of_spacing(ways_m: list[float], unused: frozenset[int] = frozenset()) -> list[str]:
+    """Return what a robot is warned of that goes these ways between its scans."""
+    log, listener = LinkLog(), Listener()
+    log.attach(listener)
+    scans = [replace(scan_of(i), used=i not in unused) for i in range(len(ways_m) + 1)]
+    ends = zip(scans, np.cumsum([0.0, *ways_m]), strict=True)
+    odometry = OdometryTrack(
+        TumSample(t_ns=each.t_ns, x_m=3.0, y_m=float(y_m), qz=0.0, qw=1.0) for each, y_m in ends
+    )
+    warning = SpacingWarning(0.019, odometry, log)
+    for each in scans:
+        warning.on_scan(each)
+    assert all(line.warning for line in listener.lines)
+    return [line.text for line in listener.lines]
+
+
+def test_frames_too_far_apart_for_images_are_logged_once() -> None:
+    (text,) = warnings_of_spacing([0.03] * 20)
+    # 3 cm in the time of a frame of the tests' sessions; 1.9 cm of it need 1.58 times the rate
+    rate_hz = NS_PER_S / FRAME_NS
+    assert f"{0.03 * rate_hz:.2f} m/s" in text
+    assert f"--fps {math.ceil(rate_hz * 0.03 / 0.019)}" in text
+
+
+@pytest.mark.parametrize(
+    ("ways_m", "unused"),
+    [([0.018] * 20, ()), ([0.01, 0.01, 0.2, 0.01, 0.3, 0.01], ()), ([0.03] * 20, range(21))],
+)
+def test_a_slow_robot_a_jump_and_scans_without_odometry_are_not(
+    ways_m: list[float], unused: Iterable[int]
+) -> None:
+    assert warnings_of_spacing(ways_m, frozenset(unused)) == []
