@@ -152,10 +152,13 @@ class _ConfigTable(BaseModel):
     @classmethod
     def _as_written(cls, value: object, info: ValidationInfo) -> object:
         """Reject what Python would read as a number: true, false, quoted text in a file."""
-        if isinstance(value, bool):
-            raise ValueError("must be a number or a name, not true or false")
         assert info.field_name is not None
-        is_number = cls.model_fields[info.field_name].annotation in (int, float)
+        kind = cls.model_fields[info.field_name].annotation
+        if kind is bool and not isinstance(value, bool) and info.context != TEXT_ALLOWED:
+            raise ValueError("must be true or false, without quotes")
+        if isinstance(value, bool) and kind is not bool:
+            raise ValueError("must be a number or a name, not true or false")
+        is_number = kind in (int, float)
         if is_number and isinstance(value, str) and info.context != TEXT_ALLOWED:
             raise ValueError("must be a number, not text; write it without quotes")
         return value
@@ -399,6 +402,9 @@ class RobustConfig(_ConfigTable):
     """Ranges of nothing that stands there, per radar and frame."""
     wheel_walk_per_sqrt_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
     """How far the wheels' calibration wanders per root of a metre, in its standard deviations."""
+    patches: bool = False
+    """Whether points of coherent images (`slam.imaging`) are detections beside single ranges. Then
+    they alone begin landmarks that are points."""
 
     @property
     def field_of_view_rad(self) -> float:

@@ -37,13 +37,21 @@ from scipy.special import chdtri
 from slam.geometry import Rig, wrap_angles
 from slam.results import PredictedRange
 from slam.robust import kernels
-from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, BackEndParameters, RangeNoise
+from slam.robust.parameters import (
+    MARGIN_NATS,
+    TAIL_PROBABILITY,
+    BackEndParameters,
+    ImagedPointRule,
+    RangeNoise,
+)
 from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end reports.
 LONGEST_M = 1e6
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
+# Standard deviation of normal noise over the median of its magnitude
+_NORMAL_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +74,9 @@ class RangeScan:
     # its standard deviation, where that is known better than `RangeNoise.bearing_sigma_rad`
     bearings_rad: tuple[float, ...] | None = None
     bearing_sigmas_rad: tuple[float, ...] | None = None
+    # Points of a patch (`slam.imaging.patches`), beside the radar's single ranges. What is not
+    # among them may be there all the same.
+    is_patch: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError if a number is not finite, or missing for one of the ranges."""
@@ -170,6 +181,14 @@ class View:
             & (self.ranges_m >= noise.min_range_m - widen_m)
             & (self.ranges_m <= noise.max_range_m + widen_m)
         )
+
+    def without_crowds(self, noise: RangeNoise, apart_m: float) -> View:
+        """Return the view without features that others in view are as near to in range as that."""
+        inside = self.inside(noise, 0.0, apart_m)
+        gaps = np.abs(self.ranges_m[:, :, None] - self.ranges_m[:, None, :])
+        gaps[:, np.arange(gaps.shape[1]), np.arange(gaps.shape[1])] = math.inf
+        crowded = np.any((gaps < apart_m) & inside[:, None, :], axis=2)
+        return replace(self, off_boresight_rad=np.where(crowded, math.pi, self.off_boresight_rad))
 
 
 def view(state: State, antennas: Antennas) -> View:
@@ -461,6 +480,36 @@ def point_variances(scan: RangeScan, indices: Sequence[int], noise: RangeNoise) 
     return np.asarray(np.square(np.array(sigmas, dtype=np.float64).reshape(-1, 2)))
 
 
+class ImagedNoise:
+    """The noise of points of patches, learned from those of known landmarks.
+
+    Their own covariance holds noise and aperture, and is far too small; what the wheels do within a
+    patch, and the shape of targets, show in innovations.
+    """
+
+    def __init__(self, rule: ImagedPointRule) -> None:
+        self._rule = rule
+        self._innovations = np.zeros((0, 2))
+
+    def learn(self, innovations: Array) -> None:
+        """Take in innovations of range [m] and bearing [rad], shape (n, 2)."""
+        self._innovations = np.concatenate([self._innovations, innovations])[-self._rule.window :]
+
+    def of(self, scan: RangeScan) -> RangeScan:
+        """Return a patch's scan with no less noise than that."""
+        rule, learned = self._rule, np.zeros(2)
+        if len(self._innovations) == rule.window:
+            learned = _NORMAL_SIGMA * np.median(np.abs(self._innovations), axis=0)
+        range_m, bearing_rad = np.maximum(learned, [rule.least_sigma_m, rule.least_sigma_rad])
+        return replace(
+            scan,
+            sigmas_m=tuple([max(s, range_m) for s in scan.sigmas_m or ()]),
+            bearing_sigmas_rad=tuple(
+                [rule.bearing_share * max(s, bearing_rad) for s in scan.bearing_sigmas_rad or ()]
+            ),
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointMatches:
     """What detections with bearings are against the map."""
@@ -559,7 +608,7 @@ def find_points(
         pairs=tuple(pairs),
         evidence=tuple(against_new),
         refused=tuple(refused),
-        missed=tuple(missed.tolist()),
+        missed=() if scan.is_patch else tuple(missed.tolist()),
     )
 
 

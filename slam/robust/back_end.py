@@ -23,6 +23,7 @@ from slam.robust import kernels
 from slam.robust.association import (
     LONGEST_M,
     Antennas,
+    ImagedNoise,
     Known,
     Pairs,
     RangeScan,
@@ -41,6 +42,7 @@ from slam.robust.association import (
 from slam.robust.initialisation import (
     BodyPoint,
     FeatureRows,
+    Guess,
     Option,
     PointDetection,
     Question,
@@ -69,7 +71,7 @@ from slam.robust.map import (
     saved_map_of,
     take_map,
 )
-from slam.robust.parameters import BackEndParameters
+from slam.robust.parameters import BackEndParameters, ImagedPointRule
 from slam.robust.proposals.slips import Change, Course, judge_change, move_anew
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
@@ -142,6 +144,7 @@ class RobustBackEnd:
             scale * parameters.wheels.walk_lever_m,
         )
         self._tentative = TentativePoints(parameters)
+        self._imaged_noise = ImagedNoise(parameters.imaged or ImagedPointRule())
         self._existence = Existence(
             parameters.map, rule.min_frames, parameters.ranges.detection_probability
         )
@@ -383,6 +386,9 @@ class RobustBackEnd:
         Without ``solve`` merges and the solution over all poses wait for a later time. With
         ``decide`` what is unclear is taken for the likeliest; without it, questions stay open.
         """
+        patches = [scan for scan in scans if scan.is_patch]
+        if patches:
+            scans = [scan for scan in scans if not scan.is_patch]
         radars = {scan.radar for scan in scans}
         if len(radars) < len(scans) or max(radars, default=0) >= len(self.rig.mounts):
             raise ValueError(
@@ -399,7 +405,7 @@ class RobustBackEnd:
             scans = [scan for scan in scans if scan.bearings_rad is None]
             looks = [scan for scan in looks if scan.bearings_rad is None]
         widened = [scan.with_added_sigma(added_m) for scan in looks]
-        seen = self._walls.look(view(self.state, antennas), antennas)
+        seen = self._look(antennas)
         beacons = self._beacon_rows()
         known = find_known(
             self.state, seen, widened, self._side_of, self.parameters, beacons=beacons
@@ -427,6 +433,9 @@ class RobustBackEnd:
             continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
             likelihoods, predicted = [*likelihoods, *evidence], [*predicted, *more]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
+        for scan in patches:
+            likelihoods += self._take_points(self._imaged_noise.of(scan), added_m)[2]
+            self._decide()
         of_tracklets = self._initialise_landmarks()
         self._delete_vanished(solve=solve)
         self._n_updates += 1
@@ -435,8 +444,8 @@ class RobustBackEnd:
             self._merge()
             if is_due(self._log, self.state, self.parameters):
                 self.relinearise()
-        while decide and (question := self.question()) is not None:
-            self.answer(question, question.options[0])
+        if decide:
+            self._decide()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
@@ -445,6 +454,11 @@ class RobustBackEnd:
             predicted=tuple(predicted),
             evidence=(*likelihoods, *evidence_of_misses, *of_tracklets),
         )
+
+    def _decide(self) -> None:
+        """Take what is unclear for the likeliest."""
+        while (question := self.question()) is not None:
+            self.answer(question, question.options[0])
 
     def relinearise(self) -> bool:
         """Solve for all poses and replace the belief; return whether that worked.
@@ -493,7 +507,12 @@ class RobustBackEnd:
         self._unassigned.clear()
         self._tentative.clear()
         self._motion = motion
-        return self._walls.look(view(self.state, antennas), antennas)
+        return self._look(antennas)
+
+    def _look(self, antennas: Antennas) -> View:
+        """Return the view of all features of which single ranges may be."""
+        seen, rule = self._walls.look(view(self.state, antennas), antennas), self.parameters.imaged
+        return seen if rule is None else seen.without_crowds(self.parameters.ranges, rule.crowd_m)
 
     def _count(self, known: Known) -> list[int]:
         """Count hits and misses; return landmarks surely in view and not heard, once per radar."""
@@ -684,7 +703,7 @@ class RobustBackEnd:
         continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
         hit_ids = {landmark_id for _, _, landmark_id in continued}
         for landmark_id in sorted(hit_ids):
-            self._existence.hit(landmark_id)
+            self._existence.hit(landmark_id, self.parameters.frames_per_scan)
         refused = [(index, ids[row]) for index, row in found.refused]
         for index, landmark_id in refused:
             self._log_detections(
@@ -728,6 +747,7 @@ class RobustBackEnd:
         measured = [(scan.ranges_m[index], scan.bearings_rad[index]) for index in indices]
         innovations = np.array(measured) - view_of.predicted
         innovations[:, 1] = wrap_angles(innovations[:, 1])
+        self._imaged_noise.learn(innovations)
         variances = point_variances(scan, indices, noise)
         variances[:, 0] += np.square(state.feature_added_sigmas_m[rows])
         gain, weighted, white, scales = kernels.weigh(
@@ -794,7 +814,7 @@ class RobustBackEnd:
         Those with labels, and those of which a scan says where they are, are not it.
         """
         beside = self._log.seen_from({one.pose for one in tentative.seen})
-        apart = self.parameters.tracklets.min_hits_per_radar
+        apart = self.parameters.fewest_detections
         barred = {
             row
             for row, id_ in enumerate(self.state.landmark_ids)
@@ -805,12 +825,12 @@ class RobustBackEnd:
 
     def question(self) -> Question | None:
         """Return which of several options the first tentative landmark is that is unclear."""
-        parameters, rule = self.parameters, self.parameters.tracklets
+        parameters = self.parameters
         for tentative in self._tentative.unclear():
-            if len(tentative.seen) < rule.min_frames:
-                continue
             point = self._common(tentative)
             found = self._possible(tentative, point)
+            if len(tentative.seen) < parameters.detections_to_ask(is_new=not found):
+                continue
             options = options_of(self.state, point, found, parameters.ranges.unmapped_per_m2)
             options.append(Option(evidence=0.0))
             if self._may_have_jumped(tentative):
@@ -861,7 +881,9 @@ class RobustBackEnd:
 
     def _place_point(self, tentative: TentativePoint, point: BodyPoint, row: int | None) -> None:
         """Update the landmark in a row with a tentative one, or add it to the map."""
-        state = self.state
+        state, tracklet = self.state, self._ranges_of(tentative)
+        if tracklet is not None:
+            point = self._body_point(tracklet)
         if row is None:
             landmark_id = initialise_landmark(state, point)
             if tentative.label is not None:
@@ -869,8 +891,23 @@ class RobustBackEnd:
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
-        self._existence.hit(landmark_id, len(tentative.seen))
+        self._existence.hit(landmark_id, len(tentative.seen) * self.parameters.frames_per_scan)
         self._log_detections(landmark_id, tentative.seen)
+        if tracklet is not None:
+            self._use(landmark_id, tracklet.seen)
+
+    def _ranges_of(self, tentative: TentativePoint) -> Tracklet | None:
+        """Return the unassigned single ranges of what patches hold, and use them up."""
+        rule = self.parameters.tracklets
+        if self.parameters.imaged is None:
+            return None
+        side = self._sides[self._side_of[tentative.seen[-1].radar]]
+        search = Search(radars=side, window=rule.long_window, min_frames=rule.min_hits_per_radar)
+        guess = Guess(target=tentative.point.point_m, covariance=tentative.point.covariance)
+        tracklet = self._walls.tracker(is_wall=False).follow(guess, self._unassigned, search)
+        if tracklet is not None:
+            self._unassigned.use_up(tracklet.members)
+        return tracklet
 
     def _initialise_landmarks(self) -> list[tuple[int, float]]:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one.
@@ -891,6 +928,8 @@ class RobustBackEnd:
                 wall_id = self._walls.place(wall)
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
+            if self.parameters.imaged is not None:
+                continue  # patches show points sooner, and apart from their neighbours
             search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
             if is_single:
                 search = Search(
@@ -902,27 +941,13 @@ class RobustBackEnd:
             tracker = self._walls.tracker(is_wall=False)
             is_point = None if is_single else self._walls.is_point
             for tracklet in tracker.find(guesses, self._unassigned, search, is_point):
-                evidence.append((self._place(tracklet), self._evidence_of(tracklet)))
+                nats = tracklet.evidence(self.parameters.ranges)
+                evidence.append((self._place(tracklet), nats))
         return evidence
-
-    def _evidence_of(self, tracklet: Tracklet) -> float:
-        """Return the nats of the ranges of a tracklet, as `_correct` returns those of single ones.
-
-        Each radar is taken to have one range in every frame.
-        """
-        noise = self.parameters.ranges
-        density = max(noise.clutter_per_m, 1.0 / (noise.max_range_m - noise.min_range_m))
-        log_n = -0.5 * (
-            tracklet.chi_square + float(np.sum(np.log(math.tau * tracklet.seen.variances)))
-        )
-        return log_n + len(tracklet.members) * math.log(noise.detection_probability / density)
 
     def _place(self, tracklet: Tracklet) -> int:
         """Let a tracklet be a landmark, new or of the map; return its id."""
-        state = self.state
-        point = tracklet.body_point()
-        share = max(state.range_errors.variance_share, 1.0)
-        point = replace(point, covariance=share * point.covariance)
+        state, point = self.state, self._body_point(tracklet)
         row = match(state, point)
         if row is None:
             landmark_id = initialise_landmark(state, point)
@@ -931,6 +956,10 @@ class RobustBackEnd:
             update_with_point(state, row, point)
         self._use(landmark_id, tracklet.seen)
         return landmark_id
+
+    def _body_point(self, tracklet: Tracklet) -> BodyPoint:
+        point, share = tracklet.body_point(), max(self.state.range_errors.variance_share, 1.0)
+        return replace(point, covariance=share * point.covariance)
 
     def _use(self, landmark_id: int, seen: Sightings) -> None:
         """Count and log the ranges of a tracklet as those of a landmark or a wall."""
@@ -1001,7 +1030,7 @@ class RobustBackEnd:
         ids = self.state.landmark_ids
         return any(
             self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]]
-            >= self.parameters.tracklets.min_hits_per_radar
+            >= self.parameters.fewest_detections
             for kept, gone in pairs
         )
 

@@ -760,9 +760,18 @@ class Branches:
         older = [row for row in rows if ids[row] not in new_ids]
         here = constellation_of(main.state, new, rule.model_sigma_m)
         there = constellation_of(main.state, older, rule.model_sigma_m)
-        placement = find_placement(here, there, rule)
+        is_possible = None if main.parameters.imaged is None else self._is_near
+        placement = find_placement(here, there, rule, is_possible)
         if placement is not None:
             main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs])
+
+    def _is_near(self, placement: Placement) -> bool:
+        """Return whether the robot may be as far from its pose as a placement takes it."""
+        pose = self.main.pose
+        away = compose(placement.motion, pose) - pose
+        away[2] = math.remainder(float(away[2]), math.tau)
+        covariance = self.main.pose_covariance + self.doubted_covariance
+        return float(away @ np.linalg.solve(covariance, away)) <= chdtri(3, TAIL_PROBABILITY)
 
     def _begin_carry(self, since: int) -> None:
         before, step = self._at(since), self._steps[since]

@@ -440,6 +440,15 @@ class Tracklet:
             outward=away / max(math.hypot(away[0], away[1]), _LEAST_WAY_M),
         )
 
+    def evidence(self, noise: RangeNoise) -> float:
+        """Return the nats of its ranges, if each radar has one range in every frame.
+
+        They are counted as in `slam.robust.association.weigh_known`.
+        """
+        density = max(noise.clutter_per_m, 1.0 / (noise.max_range_m - noise.min_range_m))
+        log_n = -0.5 * (self.chi_square + float(np.sum(np.log(math.tau * self.seen.variances))))
+        return log_n + len(self.members) * math.log(noise.detection_probability / density)
+
 
 def point_guesses(
     unassigned: UnassignedRanges, radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
@@ -912,7 +921,7 @@ class TentativePoints:
     def _is_landmark(self, one: TentativePoint) -> bool:
         hits, excess = len(one.seen), self._parameters.tracklets.excess_sigmas
         is_at_rest = one.chi_square <= chi_square_limit(2 * (hits - 1), excess)
-        return hits >= self._parameters.tracklets.min_hits_per_radar and is_at_rest
+        return hits >= self._parameters.fewest_detections and is_at_rest
 
     def _assigned(
         self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]

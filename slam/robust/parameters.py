@@ -416,6 +416,31 @@ class BranchRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ImagedPointRule:
+    """How points of patches are used (`slam.imaging.patches`)."""
+
+    new_patches: Annotated[int, Origin.CHOSEN, "patches"] = 2
+    """Fewest patches that hold a new landmark."""
+    unclear_patches: Annotated[int, Origin.CHOSEN, "patches"] = 4
+    """Fewest patches that hold one which may be a landmark of the map."""
+    frames_per_patch: Annotated[int, Origin.CHOSEN, "frames"] = 5
+    """As how many frames a patch counts for the existence of a landmark."""
+    crowd_m: Annotated[float, Origin.DATA_SHEET] = 0.13
+    """No single range is of a landmark while another one in view is as near in range as that: their
+    pulses overlap."""
+    least_sigma_m: Annotated[float, Origin.MEASURED] = 2e-3
+    """Least standard deviation of the range of a point; in `dense` it is 1.3 mm."""
+    least_sigma_rad: Annotated[float, Origin.MEASURED] = 2.5e-3
+    """The same of its bearing; in `dense` it is 2.9 mrad."""
+    bearing_share: Annotated[float, Origin.CHOSEN] = 3.0
+    """Factor on the standard deviation of bearings: those of one passage err alike."""
+    unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 1.0
+    """How many landmarks per square metre may not be in the map yet."""
+    window: Annotated[int, Origin.BUDGET, "points"] = 150
+    """Points of known landmarks whose innovations say what the noise is."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndParameters:
     """All parameters of the back end."""
 
@@ -431,3 +456,20 @@ class BackEndParameters:
     splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)
     jumps: JumpNoise = field(default_factory=JumpNoise)
+    imaged: ImagedPointRule | None = None  # None: there are no patches
+
+    @property
+    def fewest_detections(self) -> int:
+        """Return how many detections with bearings a landmark needs at least."""
+        return self.tracklets.min_hits_per_radar if self.imaged is None else self.imaged.new_patches
+
+    @property
+    def frames_per_scan(self) -> int:
+        """Return as how many frames a scan with bearings counts for the existence of a landmark."""
+        return 1 if self.imaged is None else self.imaged.frames_per_patch
+
+    def detections_to_ask(self, *, is_new: bool) -> int:
+        """Return from how many detections with bearings on it is decided what they are of."""
+        if self.imaged is None:
+            return self.tracklets.min_frames
+        return self.imaged.new_patches if is_new else self.imaged.unclear_patches

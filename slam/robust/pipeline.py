@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
-from slam.geometry import Rig, between, has_moved
+from slam.front_end.matched_filter import MatchedFilterDetector
+from slam.geometry import Rig, between, compose, has_moved
+from slam.imaging.imager import ImagedPatch, Imager
 from slam.results import (
     Belief,
     InputCheck,
@@ -28,9 +30,9 @@ from slam.results import (
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
-from slam.robust.parameters import BackEndParameters, RangeNoise
+from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
 from slam.robust.solver.growing_arrays import PackedRows
-from slam.robust.state import quarter_turn, rotation
+from slam.robust.state import calibrated_motion, quarter_turn, rotation
 
 Array = NDArray[np.float64]
 
@@ -70,6 +72,11 @@ class RobustSlam:
         self._detector = detector or make_detector(config, rig)
         self._noise_at, self._noise = noise_at, np.zeros((3, 3))  # the latter at the last state
         self._least_noise = np.diag(np.square([wheels.floor_m, wheels.floor_m, wheels.floor_rad]))
+        self._patches: PatchScans | None = None
+        if config.robust.patches:
+            learned = self._detector
+            pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None
+            self._patches = PatchScans(Imager(config, rig, wheels, pulses), rig, wheels)
         self._check = InputCheck(rig)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
@@ -109,7 +116,7 @@ class RobustSlam:
         """
         stamps_ns = self._check.stamps_ns(frames)
         detect = partial(detect_all, self._detector, frames, self.rig)
-        return self._take(detect, stamps_ns, pose_at, t_ns, given)
+        return self._take(detect, stamps_ns, pose_at, t_ns, given, frames)
 
     def flush(self) -> tuple[StepResult, ...]:
         return ()
@@ -155,10 +162,14 @@ class RobustSlam:
         pose_at: PoseAt,
         t_ns: int,
         given: Sequence[RangeScan] = (),
+        frames: Sequence[RadarFrame] = (),
     ) -> tuple[StepResult, ...]:
         pose = self._check.begin(pose_at, t_ns)
+        poses = {t_ns: pose}
+        if self._patches is not None:
+            poses |= {frame.t_ns: self._check.pose(pose_at, frame.t_ns) for frame in frames}
         if self._pose is None:
-            self._check.accept(t_ns)
+            self._accept(frames, poses, t_ns)
             self._pose, self._t_ns = pose, t_ns
             self._still, self._still_ns, self._stood_ns = pose, t_ns, 0
             self._noise_since(pose, t_ns)
@@ -166,6 +177,7 @@ class RobustSlam:
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         window = self.config.window
         if not has_moved(self._pose, pose, window.min_distance_m, window.min_turn_rad):
+            self._accept(frames, poses, t_ns)
             self._stand(pose, t_ns)
             return ()
         moved = {
@@ -173,6 +185,7 @@ class RobustSlam:
             for radar, stamp_ns in stamps_ns.items()
         }
         detections = detect()
+        self._accept(frames, poses, t_ns)
         self._stand(pose, t_ns)
         sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         branches = self._branches
@@ -180,7 +193,10 @@ class RobustSlam:
         covariance = self._noise_since(self._pose, t_ns)
         stood_s = self._stood_ns / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
-        report = branches.update([*self._scans(detections, sigmas_m, moved), *given])
+        scans = [*self._scans(detections, sigmas_m, moved), *given]
+        if self._patches is not None:
+            scans += self._patches.scans(self.back_end.state.calibration)
+        report = branches.update(scans)
         self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
         self._stamps_ns.append(t_ns)
         return (
@@ -194,9 +210,16 @@ class RobustSlam:
             ),
         )
 
-    def _stand(self, pose: Array, t_ns: int) -> None:
-        """Take a step: note for how long the wheels have stood."""
+    def _accept(
+        self, frames: Sequence[RadarFrame], poses: Mapping[int, Array], t_ns: int
+    ) -> None:
+        """Take a step; images take every frame, even where the robot has hardly moved."""
         self._check.accept(t_ns)
+        if self._patches is not None:
+            self._patches.take(frames, poses, t_ns, self.back_end.state.calibration)
+
+    def _stand(self, pose: Array, t_ns: int) -> None:
+        """Note for how long the wheels have stood."""
         if has_moved(self._still, pose, _STILL_M, _STILL_RAD):
             self._still, self._still_ns = pose, t_ns
         self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
@@ -262,14 +285,81 @@ class RobustSlam:
         ]
 
 
+class PatchScans:
+    """Points of patches as scans with bearings, each as of the newest pose.
+
+    The wheels' path is corrected by what is known of their calibration: an error of scale would
+    turn all bearings.
+    """
+
+    def __init__(self, imager: Imager, rig: Rig, wheels: WheelNoise) -> None:
+        self._imager, self._rig, self._wheels = imager, rig, wheels
+        # The newest pose, as reported and on the corrected path
+        self._reported: Array | None = None
+        self._path = np.zeros(3)
+        self._waiting: list[ImagedPatch] = []
+
+    def take(
+        self,
+        frames: Sequence[RadarFrame],
+        poses: Mapping[int, Array],
+        t_ns: int,
+        calibration: Array,
+    ) -> None:
+        """Image frames; odometry has the ``poses`` at their times and at that of the step."""
+        before = poses[t_ns] if self._reported is None else self._reported
+        path = self._path
+
+        def pose_at(t_ns: int) -> Array:
+            motion = calibrated_motion(between(before, poses[t_ns]), calibration, self._wheels)
+            return compose(path, np.append(motion.step_m, motion.turn_rad))
+
+        self._waiting += self._imager.step(frames, pose_at)
+        self._reported, self._path = poses[t_ns], pose_at(t_ns)
+
+    def scans(self, calibration: Array) -> list[RangeScan]:
+        """Return the scan of the oldest patch that waits; several if a patch of each radar does.
+
+        So those of one side are taken one after the other.
+        """
+        n = max(1, len(self._waiting) - len(self._rig.mounts) + 1)
+        ready, self._waiting = self._waiting[:n], self._waiting[n:]
+        return [self._scan(one, calibration) for one in ready if one.points]
+
+    def _scan(self, imaged: ImagedPatch, calibration: Array) -> RangeScan:
+        points, patch = imaged.points, imaged.patch
+        dx, dy, turn = between(self._path, patch.origin).tolist()
+        s, w, _ = calibration.tolist()
+        ranges_m = np.array([one.range_m for one in points])
+        angles = np.array([one.bearing_rad for one in points]) + patch.mount.yaw_rad
+        u = np.column_stack([np.cos(angles), np.sin(angles)])
+        axes = np.stack([u, quarter_turn(u)], axis=1)
+        covariances = np.array([one.covariance for one in points])
+        spread = np.einsum("nai,nij,naj->na", axes, covariances, axes)
+        # What the wheels do between the patch and the newest pose
+        along, _, heading = self._wheels.step_variances(math.hypot(dx, dy), turn)
+        return RangeScan(
+            radar=patch.radar,
+            is_patch=True,
+            moved=(dx * (1.0 + s), dy * (1.0 + s), turn * (1.0 + w)),  # as the wheels report it
+            ranges_m=tuple(ranges_m.tolist()),
+            sigmas_m=tuple(np.sqrt(spread[:, 0] + along).tolist()),
+            bearings_rad=tuple([one.bearing_rad for one in points]),
+            bearing_sigmas_rad=tuple(np.sqrt(spread[:, 1] / ranges_m**2 + heading).tolist()),
+        )
+
+
 def back_end_parameters(
     config: SlamConfig, wheels: WheelNoise, rules: BackEndParameters | None = None
 ) -> BackEndParameters:
     """Return the rules, by default those of this version, with the noise that is configured."""
     robust, limits = config.robust, config.detection
     reach_m = limits.max_range_m - limits.min_range_m
+    rules = rules or BackEndParameters()
+    imaged = (rules.imaged or ImagedPointRule()) if robust.patches else None
     return replace(
-        rules or BackEndParameters(),
+        rules,
+        imaged=imaged,
         wheels=replace(wheels, walk_per_sqrt_m=robust.wheel_walk_per_sqrt_m),
         ranges=RangeNoise(
             sigma_m=robust.range_sigma_m,
@@ -284,6 +374,7 @@ def back_end_parameters(
             field_of_view_rad=robust.field_of_view_rad,
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m,
+            **({} if imaged is None else {"unmapped_per_m2": imaged.unmapped_per_m2}),
         ),
     )
 
