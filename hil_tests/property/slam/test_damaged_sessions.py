@@ -116,7 +116,7 @@ def test_a_damaged_byte_anywhere_costs_one_chunk_at_most(
         assert len(is_readable_after_repair(path)) >= len(ALL_FRAMES) - 8, at
 
 
-@pytest.mark.parametrize("share", [0.3, 0.8])
+@pytest.mark.parametrize("share", [0.3, pytest.param(0.8, marks=pytest.mark.rare)])
 def test_a_killed_run_can_be_damaged_too(whole: bytes, tmp_path: Path, share: float) -> None:
     chance = random.Random(11)
     path = tmp_path / "damaged.mcap"

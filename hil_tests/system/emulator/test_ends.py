@@ -94,7 +94,7 @@ def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
     assert not (tmp_path / "l").exists()
 
 
-@pytest.mark.parametrize("pace", ["asap", "realtime"])
+@pytest.mark.parametrize("pace", [pytest.param("asap", marks=pytest.mark.rare), "realtime"])
 def test_a_host_killed_while_streaming_is_followed_by_another(pace: str) -> None:
     host = (
         "import sys\n"

@@ -76,7 +76,9 @@ def test_with_the_port_open(served: Served) -> None:
         assert radar.info().serial_number == served.serials[0]
 
 
-@pytest.mark.parametrize("mode", ["stay", "vanish", THOROUGH("rename")])
+@pytest.mark.parametrize(
+    "mode", [pytest.param("stay", marks=pytest.mark.rare), "vanish", THOROUGH("rename")]
+)
 def test_while_streaming(served: Served, mode: str) -> None:
     with open_radar(served.paths[0], reconnect_s=10.0) as radar:
         geometry = radar.configure_raw(CONFIG)

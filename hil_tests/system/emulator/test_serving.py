@@ -152,7 +152,7 @@ def test_the_speed_must_fit_and_can_be_changed(
             assert radar.ping() is PongCode.XTS_SPRP_READY
 
 
-@pytest.mark.parametrize("by", ["pty", "tcp"])
+@pytest.mark.parametrize("by", ["pty", pytest.param("tcp", marks=pytest.mark.rare)])
 def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(
     by: str, tmp_path: Path
 ) -> None:
@@ -221,7 +221,10 @@ def test_faults_hit_the_line_of_the_module(scenario: str) -> None:
         assert radar.fault_count == 0
 
 
-@pytest.mark.parametrize("downconversion", [False, True], ids=["rf", "baseband"])
+@pytest.mark.parametrize(
+    "downconversion",
+    [pytest.param(False, id="rf"), pytest.param(True, id="baseband", marks=pytest.mark.rare)],
+)
 def test_three_minutes_lack_no_frame(downconversion: bool) -> None:
     counters = counters_of(180.0, RawConfig(downconversion=downconversion))
     assert len(counters) == pytest.approx(180.0 * TIMER_HZ_AT_17, abs=1.5)

@@ -30,13 +30,13 @@ CTRL_S, CTRL_Q = b"\x13", b"\x11"
 
 # Programs, endings, and moments: seconds after the program has its handlers of signals.
 DEFAULT = [
-    ("record", HANG_UP, UNDER_WAY),
     ("record", NO_HANG_UP, UNDER_WAY),
     ("serve", HANG_UP, UNDER_WAY),
     ("serve", INT, 0.0),
-    ("serve", TERM, 0.4),
 ]
 SELDOM = [
+    ("record", HANG_UP, UNDER_WAY),
+    ("serve", TERM, 0.4),
     ("run", HANG_UP, UNDER_WAY),
     ("sweep", INT, UNDER_WAY),
     ("convert", NO_HANG_UP, 0.0),

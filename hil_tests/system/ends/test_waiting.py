@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -79,7 +80,7 @@ ROWS = [
     (EMULATOR, "faults", True),
     (EMULATOR, "options", True),
 ]
-DEFAULT = {"report SESSION --out PIPE", "evaluate TRACK TRACK", "serve smoke", "ping --port SILENT"}
+DEFAULT = {"evaluate PIPE TRACK", "evaluate TRACK TRACK", "serve smoke", "ping --port SILENT"}
 TABLE = [
     pytest.param(
         row, ending, marks=() if row[1] in DEFAULT else pytest.mark.rare, id=f"{row[1]}-{ending}"
@@ -93,8 +94,13 @@ TABLE = [
 @pytest.fixture(scope="module")
 def words(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Callable[[Path], Path]]]:
     folder = tmp_path_factory.mktemp("waiting")
-    session, track = folder / "session.mcap", folder / "track.tum"
-    record_session(session, "paper")
+    track = folder / "track.tum"
+
+    @cache
+    def session() -> Path:
+        record_session(folder / "session.mcap", "paper")
+        return folder / "session.mcap"
+
     track.write_text("".join(f"{row}.0 {row} 0 0 0 0 0 1\n" for row in range(9)))
     with ExitStack() as stack:
         ends = os.openpty()
@@ -107,7 +113,7 @@ def words(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Callab
             "PIPE": pipe_in,
             "SILENT": lambda place: Path(os.ttyname(ends[1])),
             "DEAF": lambda place: folder / "deaf",
-            "SESSION": lambda place: session,
+            "SESSION": lambda place: session(),
             "TRACK": lambda place: track,
             "OUT": lambda place: place / "new",
             "OUT.mcap": lambda place: place / "new.mcap",

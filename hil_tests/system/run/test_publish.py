@@ -270,7 +270,7 @@ class Unchanged(SessionObserver):
         self._keep(lambda: smoothed_row(smoothed).tobytes())
 
 
-@pytest.mark.parametrize("preset", ["robust", "paper"])
+@pytest.mark.parametrize("preset", ["robust", pytest.param("paper", marks=pytest.mark.rare)])
 def test_what_sinks_get_is_not_changed_later(preset: str, tmp_path: Path) -> None:
     """They read it in their own time, in their own threads."""
     record_session(tmp_path / "session.mcap", preset)

@@ -89,7 +89,10 @@ def signal_after(delay_s: float) -> Iterator[list[float]]:
         timer.join()
 
 
-@pytest.mark.parametrize("command", list(MODULES))
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(name, marks=() if name == "report" else pytest.mark.rare) for name in MODULES],
+)
 def test_a_signal_ends_the_reading_of_a_degenerate_file(
     command: str, degenerate: Path, tmp_path: Path
 ) -> None:

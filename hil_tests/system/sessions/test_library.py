@@ -13,7 +13,7 @@ from slam.live.session_records import Snapshot
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("preset", ["robust", "paper"])
+@pytest.mark.parametrize("preset", ["robust", pytest.param("paper", marks=pytest.mark.rare)])
 def test_a_loop_of_its_own_makes_the_recorded_states_again(preset: str, tmp_path: Path) -> None:
     record = record_session(path := tmp_path / "session.mcap", preset)
     session = open_session(str(path))

@@ -34,7 +34,7 @@ class Recorded:
     summary: dict[str, object]
 
 
-@pytest.fixture(scope="module", params=["robust", "paper"])
+@pytest.fixture(scope="module", params=["robust", pytest.param("paper", marks=pytest.mark.rare)])
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     folder = tmp_path_factory.mktemp("replay")
     # a third of the short scene: enough for landmarks, and for the paper's window to be full

@@ -104,7 +104,9 @@ def broken_pipe() -> Iterator[int]:
     os.close(write_end)
 
 
-@pytest.mark.parametrize("arguments", [["faults"], ["faults", "--json"]])
+@pytest.mark.parametrize(
+    "arguments", [["faults"], pytest.param(["faults", "--json"], marks=pytest.mark.rare)]
+)
 def test_a_reader_of_the_list_that_left_is_no_failure(
     arguments: list[str], broken_pipe: int
 ) -> None:

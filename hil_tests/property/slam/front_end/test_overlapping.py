@@ -205,7 +205,7 @@ def split_share(windows: Array, snr: float, split: SplitTest) -> float:
     return float(np.mean([len(fit) > 1 for fit in fits]))
 
 
-@pytest.mark.parametrize("snr", [16.0, 64.0])
+@pytest.mark.parametrize("snr", [16.0, pytest.param(64.0, marks=pytest.mark.rare)])
 def test_noise_splits_a_single_echo_as_rarely_as_stated(snr: float) -> None:
     often = SplitTest(model_error=0.0, false_split=0.05)
     # 1000 trials; the stated probability is an upper bound that the search nearly reaches

@@ -200,7 +200,7 @@ def one_landmark(prior: Array) -> State:
 TRIALS = 10_000
 
 
-@pytest.mark.parametrize("n_radars", [1, 2])
+@pytest.mark.parametrize("n_radars", [pytest.param(1, marks=pytest.mark.rare), 2])
 def test_true_ranges_pass_their_gates_as_often_as_they_say(n_radars: int) -> None:
     rng = np.random.default_rng(11)
     prior = 1e-4 * np.array([[1.0, 0.6], [0.6, 2.0]])

@@ -22,6 +22,7 @@ from slam.live.session_records import LogLine
 from xethru_protocol.operating_system import locked
 
 THOROUGH = partial(pytest.param, marks=pytest.mark.thorough)
+RARE = partial(pytest.param, marks=pytest.mark.rare)
 
 
 @pytest.mark.parametrize(("command", "option"), [("demo", "--out"), ("sweep", "--json")])
@@ -85,9 +86,9 @@ def trajectory(folder: Path) -> str:
 @pytest.mark.parametrize(
     ("scene", "code", "closed"),
     [
-        ("", 0, ">&-"),
         ("", 0, "<&- >&- 2>&-"),
-        ("mars", 2, "2>&-"),
+        RARE("", 0, ">&-"),
+        RARE("mars", 2, "2>&-"),
         THOROUGH("", 0, "2>&-"),
         THOROUGH("mars", 2, ">&-"),
         THOROUGH("mars", 2, "<&- >&- 2>&-"),

@@ -137,7 +137,7 @@ def test_a_solution_fuses_a_map_with_ranges_by_information() -> None:
     )
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.rare)])
 def test_a_robot_that_is_set_down_by_eye_joins_the_map(seed: int) -> None:
     poses = there_and_back()
     start = (0.07, -0.06, 0.08)
@@ -148,7 +148,7 @@ def test_a_robot_that_is_set_down_by_eye_joins_the_map(seed: int) -> None:
     assert nees_pose(branches.main.pose, branches.main.pose_covariance, poses[-1]) < 16.3
 
 
-@pytest.mark.parametrize("first", [0.0, 0.5])
+@pytest.mark.parametrize("first", [pytest.param(0.0, marks=pytest.mark.rare), 0.5])
 def test_a_robot_finds_its_place_and_what_has_changed(first: float) -> None:
     """One landmark stands elsewhere, one is new; until the place is known, it says so."""
     saved, places = day_one(), np.vstack([PLACES, [[0.6, -0.55]]])

@@ -89,7 +89,7 @@ def test_a_drum_is_mapped_at_its_axis_as_surely_as_it_says() -> None:
     assert np.mean(poses) < chdtri(3 * 6, 1e-3) / 6
 
 
-@pytest.mark.parametrize("mounts_m", [0.0, MOUNT_SIGMA_M])
+@pytest.mark.parametrize("mounts_m", [pytest.param(0.0, marks=pytest.mark.rare), MOUNT_SIGMA_M])
 def test_wheels_and_mounts_that_err_leave_the_pose_consistent(mounts_m: float) -> None:
     poses, mounts = [], []
     for seed in range(6):

@@ -252,8 +252,15 @@ def test_odometry_over_a_segment_is_its_steps_one_by_one() -> None:
     assert np.abs(every[problem.keys] - exact.poses).max() <= 1e-12
 
 
-@pytest.mark.parametrize("has_radii", [True, False])
-@pytest.mark.parametrize("walk", [0.0, 1e-5])
+@pytest.mark.parametrize(
+    ("has_radii", "walk"),
+    [
+        (False, 0.0),
+        (True, 1e-5),
+        pytest.param(True, 0.0, marks=pytest.mark.rare),
+        pytest.param(False, 1e-5, marks=pytest.mark.rare),
+    ],
+)
 def test_the_smoother_is_least_squares_and_its_complement_the_marginal(
     walk: float, *, has_radii: bool
 ) -> None:
@@ -497,7 +504,7 @@ def drive_along(
             )
 
 
-@pytest.mark.parametrize("n_ranges", [14, 60])
+@pytest.mark.parametrize("n_ranges", [14, pytest.param(60, marks=pytest.mark.rare)])
 def test_a_range_costs_a_row_of_numbers_and_no_object(n_ranges: int) -> None:
     """A range is 46 bytes at most and a pose 129, in buffers that may be half empty."""
     log, n_poses = RunLog(WheelNoise(), SplitRule().gap_poses), 1000

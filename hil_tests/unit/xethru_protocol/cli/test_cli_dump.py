@@ -187,7 +187,9 @@ def test_a_conversion_that_fails_brings_the_older_one_back(
     assert not [path for path in after if path.name.endswith(".old")]
 
 
-@pytest.mark.parametrize("name", ["new/copy.mcap", "new/copy"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("new/copy.mcap", marks=pytest.mark.rare), "new/copy"]
+)
 def test_a_conversion_that_is_killed_leaves_the_older_one_and_no_half_of_its_own(
     name: str, tmp_path: Path
 ) -> None:
@@ -218,7 +220,9 @@ def test_a_conversion_that_is_killed_leaves_the_older_one_and_no_half_of_its_own
         assert not list(tmp_path.rglob(".unfinished*"))
 
 
-@pytest.mark.parametrize("n_renamed", [0, 1, 2])
+@pytest.mark.parametrize(
+    "n_renamed", [1, *(pytest.param(number, marks=pytest.mark.rare) for number in (0, 2))]
+)
 def test_a_conversion_that_is_killed_between_renames_leaves_one_of_both_files(
     n_renamed: int, tmp_path: Path
 ) -> None:

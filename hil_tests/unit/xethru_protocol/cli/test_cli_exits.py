@@ -85,7 +85,14 @@ def test_input_that_is_closed() -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-@pytest.mark.parametrize("command", ["list", "info", "ping", "stream", "doctor"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "list",
+        "info",
+        *(pytest.param(n, marks=pytest.mark.rare) for n in ("ping", "stream", "doctor")),
+    ],
+)
 def test_what_cannot_be_printed_is_one_line(command: str) -> None:
     with PtyModule() as module:
         port = () if command == "list" else ("--port", module.path)

@@ -88,7 +88,7 @@ def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, n
         assert m.X4DriverSet(setting=X4Setting.FPS, value=17.0) in machine.received(name)
 
 
-@pytest.mark.parametrize("name", ["home", "elsewhere"])
+@pytest.mark.parametrize("name", [pytest.param("home", marks=pytest.mark.rare), "elsewhere"])
 def test_it_does_too_while_threads_use_it(machine: PtyMachine, name: str) -> None:
     with X4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0) as radar:
         radar.configure_raw()
@@ -117,7 +117,7 @@ def test_it_does_too_while_threads_use_it(machine: PtyMachine, name: str) -> Non
         assert pongs == 2
 
 
-@pytest.mark.parametrize("name", ["home", "elsewhere"])
+@pytest.mark.parametrize("name", [pytest.param("home", marks=pytest.mark.rare), "elsewhere"])
 @in_loop
 async def test_asynchronous_radar_does_too_while_two_tasks_use_it(
     machine: PtyMachine, name: str

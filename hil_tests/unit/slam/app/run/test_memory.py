@@ -56,7 +56,7 @@ def along_x(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.column_stack([x_m, np.zeros(len(x_m)), np.zeros(len(x_m))])
 
 
-@pytest.mark.parametrize("n_landmarks", [14, 70])
+@pytest.mark.parametrize("n_landmarks", [14, pytest.param(70, marks=pytest.mark.rare)])
 def test_what_a_run_keeps_of_a_state_does_not_grow_with_the_map(
     n_landmarks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

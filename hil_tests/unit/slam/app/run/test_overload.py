@@ -4,6 +4,7 @@ import signal
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,7 @@ from slam.live.ticks import Inbox, SourceEvent
 from slam.results import Pipeline, PoseAt, StepResult
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
+RARE = partial(pytest.param, marks=pytest.mark.rare)
 MOST_WAIT_S = 2.0
 PERIOD_S = 0.2
 
@@ -188,7 +190,7 @@ class Overloaded:
         return rows[: len(rows) - n_rest]
 
 
-@pytest.mark.parametrize("more_s", [0.21, 0.5, 1.0])
+@pytest.mark.parametrize("more_s", [RARE(0.21), RARE(0.5), 1.0])
 def test_a_signal_ends_a_run_whose_slam_is_too_slow_within_a_second(
     more_s: float, drive: Drive
 ) -> None:
@@ -203,7 +205,7 @@ def test_a_signal_ends_a_run_whose_slam_is_too_slow_within_a_second(
     assert counters == [*range(counters[0], counters[-1] + 1)]
 
 
-@pytest.mark.parametrize("more_s", [0.21, 0.5])
+@pytest.mark.parametrize("more_s", [RARE(0.21), 0.5])
 @pytest.mark.parametrize("what", ["duration", "odometry"])
 def test_its_duration_and_the_end_of_odometry_end_it_within_a_second(
     what: str, more_s: float, drive: Drive
@@ -220,7 +222,7 @@ def test_its_duration_and_the_end_of_odometry_end_it_within_a_second(
     assert over_s - 3 * PERIOD_S <= stamps_s[-1] < over_s  # the last pose may be a period older
 
 
-@pytest.mark.parametrize("more_s", [0.21, 0.5, 2.0])
+@pytest.mark.parametrize("more_s", [RARE(0.21), 0.5, RARE(2.0)])
 def test_a_scan_is_dropped_exactly_if_it_waited_more_than_two_seconds(
     more_s: float, drive: Drive
 ) -> None:
