@@ -43,15 +43,18 @@ class PointRule:
 
     separation: SeparationRule = field(default_factory=SeparationRule)
     wheels: WheelNoise = field(default_factory=WheelNoise)
-    least_snr: float = 8.0
+    least_snr: float = 12.0
     least_coherence: float = 0.6
-    least_in_view: float = 0.5  # share of the frames
-    # Amplitude over that of the strongest point
-    least_share: float = 0.15
-    most_flatness: float = 0.5
-    # Beside a point a weaker one is part of it: nearer than this, and less than that share of it
-    apart_m: float = 0.1
-    beside_share: float = 0.5
+    # Share of the frames: above one half, as one that is seen in fewer would be false
+    least_in_view: float = 0.56
+    # Amplitude over that of the strongest that is no plane
+    least_share: float = 0.2
+    # Up to the first it is a point, beyond the second a plane, between the two something round
+    flatness: tuple[float, float] = (0.3, 0.6)
+    # Within this range of a stronger one, and a smaller share of it, it may be what the model of
+    # that one leaves; twice the share where it is as near across the line of sight
+    beside_m: float = 0.12
+    beside_share: float = 0.25
     range_floor_m: float = 1e-3
     bearing_floor_rad: float = 1e-3
 
@@ -113,9 +116,9 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
             amplitude=float(reflectors.amplitude[k]),
             snr=float(reflectors.snr[k]),
             coherence=float(reflectors.coherence[k]),
-            kind=PointKind.POINT,
+            kind=PointKind.POINT if flat <= rule.flatness[0] else PointKind.ROUND,
         )
-        for k in order.tolist()
+        for k, flat in zip(order.tolist(), reflectors.flatness[order].tolist(), strict=True)
     )
 
 
@@ -134,15 +137,15 @@ def in_view(patch: Patch, places: Array) -> Array:
 def _are_points(
     patch: Patch, reflectors: Reflectors, places: Array, rule: PointRule
 ) -> NDArray[np.bool_]:
-    amplitude = reflectors.amplitude
-    may_be = ~reflectors.is_plane & (reflectors.flatness <= rule.most_flatness)
-    strongest = float(np.max(amplitude, where=may_be, initial=0.0))
-    chosen = may_be & (amplitude >= rule.least_share * strongest)
+    may_be = reflectors.flatness <= rule.flatness[1]
+    amplitude, size = reflectors.amplitude, np.sqrt(reflectors.energy)
+    chosen = may_be & (amplitude >= rule.least_share * amplitude.max(where=may_be, initial=0.0))
     chosen &= (reflectors.snr >= rule.least_snr) & (reflectors.coherence >= rule.least_coherence)
     chosen &= in_view(patch, places) >= rule.least_in_view
-    apart = np.linalg.norm(places[:, np.newaxis] - places, axis=2)
-    is_weaker = amplitude[:, np.newaxis] < rule.beside_share * amplitude
-    return np.asarray(chosen & ~np.any((apart < rule.apart_m) & is_weaker, axis=1))
+    is_beside = np.abs(reflectors.range_m[:, np.newaxis] - reflectors.range_m) < rule.beside_m
+    is_near = np.linalg.norm(places[:, np.newaxis] - places, axis=2) < rule.beside_m
+    share = rule.beside_share * (1 + is_near)
+    return np.asarray(chosen & ~np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1))
 
 
 def _covariance(

@@ -35,7 +35,8 @@ ECHO_STEPS = 8  # samples of an echo per bin: `slam.imaging.range_profiles`
 _STEP_BINS = 2.0  # of range, for the parabola
 _MOST_BEARING, _MOST_CURVATURE = 0.02, 0.5  # of one move [rad], [1/m]
 _CURVATURE_STEP = 0.01  # of the difference quotient [1/m]
-_CELLS_AWAY = 11  # rows of the image that one echo changes, on either side
+_ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
+_LEAST_COSINE = 0.4
 
 
 @kernel("float64(float64, float64, float64)")
@@ -114,44 +115,62 @@ def add_echoes(
 
 @kernel(
     "void(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], float64[::1], int64, int64, float64[:, ::1])"
+    "float64[::1], int64, int64, float64[:, ::1])"
 )
 def image_rows(
     values: NDArray[np.complex64],
     scale: Array,
     turns: Complex,
     track: Array,
-    beam: Array,
     rows_m: Array,
     bearings: Array,
     first: int,
     end: int,
     image: Array,
 ) -> None:
-    """Put the energy that a point in each cell would explain into rows of an image."""
+    """Put the energy that a point in each cell would explain into rows of an image.
+
+    Here the beam has an edge, where the gain is ``_LEAST_COSINE`` squared, and is even within.
+    """
     last, mask = values.shape[1] - 1, turns.shape[0] - 1
+    start, per_bin, per_m = scale[0], scale[1], scale[2]
     for i in range(max(0, first), min(rows_m.shape[0], end)):
         for j in range(bearings.shape[0]):
             qx, qy = rows_m[i] * math.cos(bearings[j]), rows_m[i] * math.sin(bearings[j])
-            real, imag, weight = 0.0, 0.0, 1e-12
+            real, imag, count = 0.0, 0.0, 0
             for f in range(track.shape[0]):
                 dx, dy = qx - track[f, 0], qy - track[f, 1]
                 r = math.sqrt(dx * dx + dy * dy)
-                at = (r - scale[0]) * scale[1]
-                ahead = dx * track[f, 2] + dy * track[f, 3]
-                if not 0.0 <= at < last or ahead <= 0.0:
+                at = (r - start) * per_bin
+                if not 0.0 <= at < last or dx * track[f, 2] + dy * track[f, 3] < _LEAST_COSINE * r:
                     continue
-                gain = beam_gain(ahead / r, beam)
                 low = int(at)
                 part = at - low
                 near, far = values[f, low], values[f, low + 1]
                 u = near.real + part * (far.real - near.real)
                 v = near.imag + part * (far.imag - near.imag)
-                turn = turns[int(r * scale[2] + 0.5) & mask]
-                real += gain * (u * turn.real - v * turn.imag)
-                imag += gain * (u * turn.imag + v * turn.real)
-                weight += gain * gain
-            image[i, j] = (real * real + imag * imag) / weight
+                turn = turns[int(r * per_m + 0.5) & mask]
+                real += u * turn.real - v * turn.imag
+                imag += u * turn.imag + v * turn.real
+                count += 1
+            image[i, j] = (real * real + imag * imag) / max(count, 1)
+
+
+@kernel("int64(float64[:, ::1], float64[::1], float64)")
+def strongest_cell(image: Array, rows_m: Array, least_over_level: float) -> int:
+    """Return the cell whose energy, under the law of a rod, is largest; -1 if none stands out.
+
+    The level of an image is its geometric mean: of noise alone, 0.56 times the mean.
+    """
+    total, best, most = 0.0, -1, 0.0
+    for i in range(image.shape[0]):
+        for j in range(image.shape[1]):
+            total += math.log(image[i, j] + 1e-300)
+            at_1_m = image[i, j] * rows_m[i] ** 3
+            if at_1_m > most:
+                best, most = i * image.shape[1] + j, at_1_m
+    is_out = best >= 0 and image.flat[best] > least_over_level * math.exp(total / image.size)
+    return best if is_out else -1
 
 
 @kernel(
@@ -216,42 +235,53 @@ def refine(
     ``form`` 0: the curvature stays, 1: it is that of a point, 2: it is free.
     """
     step_m = _STEP_BINS / scale[1]
-    h, g, levels = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    levels = np.zeros(3)
     for _ in range(rounds):
         if form == 1:
             place[2] = 1.0 / place[0]
+        bearing, curvature = 0.0, 0.0
         for side in range(3):
             read_echoes(
                 values, scale, turns, track, place, ((side + 1) % 3 - 1) * step_m, ranges, echoes
             )
             if side == 0:
                 fit_amplitudes(track, beam, place, gains, echoes, amplitudes)
-                h[:] = 0.0
-                g[:] = 0.0
                 ex, ey = math.cos(place[1]), math.sin(place[1])
+                # Normal equations of phase = common + bearing b + curvature c, the common removed
+                w, wb, wc, wbb, wbc, wcc = 1e-30, 0.0, 0.0, 0.0, 0.0, 0.0
+                y, yb, yc = 0.0, 0.0, 0.0
                 for f in range(track.shape[0]):
-                    x, y = track[f, 0], track[f, 1]
-                    along, across, square = x * ex + y * ey, y * ex - x * ey, x * x + y * y
+                    px, py = track[f, 0], track[f, 1]
+                    along, across, square = px * ex + py * ey, py * ex - px * ey, px * px + py * py
                     under = 1.0 + place[2] * (place[2] * square - 2.0 * along)
-                    bend = way_difference(place[2] + _CURVATURE_STEP, along, square)
-                    bend -= way_difference(place[2] - _CURVATURE_STEP, along, square)
+                    b, c = scale[3] * across / math.sqrt(max(1e-6, under)), 0.0
+                    if form == 2:
+                        bend = way_difference(place[2] + _CURVATURE_STEP, along, square)
+                        bend -= way_difference(place[2] - _CURVATURE_STEP, along, square)
+                        c = -scale[3] * bend / (2.0 * _CURVATURE_STEP)
                     # Phase by which the echo is ahead of the model's, times its square
                     ahead = (echoes[f] * amplitudes[f].conjugate()).imag
                     weight = amplitudes[f].real ** 2 + amplitudes[f].imag ** 2
-                    row = (
-                        1.0,
-                        scale[3] * across / math.sqrt(max(1e-6, under)),
-                        -scale[3] * bend / (2.0 * _CURVATURE_STEP) if form == 2 else 0.0,
-                    )
-                    for a in range(3):
-                        g[a] += ahead * row[a]
-                        for b in range(3):
-                            h[a, b] += weight * row[a] * row[b]
-                if form != 2:
-                    h[2, 2] = 1.0
-                for a in range(3):
-                    h[a, a] += 1e-9 * h[a, a] + 1e-30
-                move = np.linalg.solve(h, g)
+                    w += weight
+                    wb += weight * b
+                    wc += weight * c
+                    wbb += weight * b * b
+                    wbc += weight * b * c
+                    wcc += weight * c * c
+                    y += ahead
+                    yb += ahead * b
+                    yc += ahead * c
+                wbb += 1e-12 - wb * wb / w
+                wbc -= wb * wc / w
+                wcc += 1e-12 - wc * wc / w
+                yb -= wb * y / w
+                yc -= wc * y / w
+                if form == 2:
+                    det = max(wbb * wcc - wbc * wbc, 1e-9 * wbb * wcc)
+                    bearing = (wcc * yb - wbc * yc) / det
+                    curvature = (wbb * yc - wbc * yb) / det
+                else:
+                    bearing = yb / wbb
             total = 0j
             for f in range(track.shape[0]):
                 total += echoes[f] * amplitudes[f].conjugate()
@@ -259,8 +289,8 @@ def refine(
         bend = levels[1] + levels[2] - 2.0 * levels[0]
         steps = 0.5 * (levels[2] - levels[1]) / bend if bend < -1e-9 else 0.0
         place[0] = max(step_m, place[0] + step_m * min(2.0, max(-2.0, steps)))
-        place[1] += min(_MOST_BEARING, max(-_MOST_BEARING, move[1]))
-        place[2] += min(_MOST_CURVATURE, max(-_MOST_CURVATURE, move[2]))
+        place[1] += min(_MOST_BEARING, max(-_MOST_BEARING, bearing))
+        place[2] += min(_MOST_CURVATURE, max(-_MOST_CURVATURE, curvature))
     if form == 1:
         place[2] = 1.0 / place[0]
     read_echoes(values, scale, turns, track, place, 0.0, ranges, echoes)
@@ -269,8 +299,8 @@ def refine(
 
 @kernel(
     "int64(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], float64[::1], float64[::1], float64, float64, int64, float64[:, ::1], "
-    "float64[:, ::1], complex128[:, ::1])"
+    "float64[::1], float64[::1], float64[::1], float64, float64, float64, int64, "
+    "float64[:, ::1], float64[:, ::1], complex128[:, ::1])"
 )
 def separate(
     values: NDArray[np.complex64],
@@ -281,8 +311,9 @@ def separate(
     echo: Array,
     rows_m: Array,
     bearings: Array,
-    least_over_median: float,
-    plane_over_point: float,
+    least_over_level: float,
+    least_share: float,
+    more_than_point: float,
     sweeps: int,
     image: Array,
     found: Array,
@@ -290,8 +321,8 @@ def separate(
 ) -> int:
     """Take reflectors out of profiles, the strongest first; return how many.
 
-    What is left stays in ``values``, and its image in ``image``. Rows of ``found`` (most, 8) are
-    range, bearing, curvature, form, energy, free curvature, energy with it, coherence; those of
+    What is left stays in ``values``, and its image in ``image``. Rows of ``found`` (most, 7) are
+    range, bearing, curvature, form, energy, curvature where it is free, and coherence; those of
     ``models`` (most, frames) the amplitudes.
     """
     n = track.shape[0]
@@ -299,64 +330,64 @@ def separate(
     echoes, amplitudes = np.zeros(n, dtype=np.complex128), np.zeros(n, dtype=np.complex128)
     all_ranges = np.zeros((found.shape[0], n))
     place, other = np.zeros(3), np.zeros(3)
-    row_m = rows_m[1] - rows_m[0]
-    image_rows(values, scale, turns, track, beam, rows_m, bearings, 0, rows_m.size, image)
-    count = 0
+    row_m, strongest, count = rows_m[1] - rows_m[0], 0.0, 0
+    image_rows(values, scale, turns, track, rows_m, bearings, 0, rows_m.size, image)
     while count < found.shape[0]:
-        top = int(np.argmax(image))
-        i, j = top // image.shape[1], top % image.shape[1]
-        if image[i, j] <= least_over_median * np.median(image):
+        top = strongest_cell(image, rows_m, least_over_level)
+        if top < 0:
             break
-        other[:] = rows_m[i], bearings[j], 0.0
-        plane = refine(
-            values, scale, turns, track, beam, other, 0, 4, ranges, gains, echoes, amplitudes
-        )
+        i, j = top // image.shape[1], top % image.shape[1]
+        before = image[i, j]
         place[:] = rows_m[i], bearings[j], 0.0
         energy = refine(
-            values, scale, turns, track, beam, place, 1, 4, ranges, gains, echoes, amplitudes
+            values, scale, turns, track, beam, place, 1, 3, ranges, gains, echoes, amplitudes
         )
-        form = 1
-        if plane > plane_over_point * energy:
-            form = 0
-            place[:] = other
-            energy = refine(
-                values, scale, turns, track, beam, place, 0, 0, ranges, gains, echoes, amplitudes
-            )
-        if energy <= 0.0:
+        strongest = max(strongest, energy * place[0] ** 3)
+        if energy * place[0] ** 3 < least_share * least_share * strongest:
             break
+        found[count, 3] = 1
+        other[:] = place
+        free = refine(
+            values, scale, turns, track, beam, other, 2, 4, ranges, gains, echoes, amplitudes
+        )
+        if free > more_than_point * energy:
+            found[count, 3] = 2
+            place[:] = other
+        else:
+            refine(
+                values, scale, turns, track, beam, place, 1, 0, ranges, gains, echoes, amplitudes
+            )
         add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
         found[count, :3] = place
-        found[count, 3] = form
         all_ranges[count], models[count] = ranges, amplitudes
-        middle = int((place[0] - rows_m[0]) / row_m)
-        first, end = middle - _CELLS_AWAY, middle + _CELLS_AWAY + 1
-        before = image[i, j]
-        image_rows(values, scale, turns, track, beam, rows_m, bearings, first, end, image)
         count += 1
+        middle = int((place[0] - rows_m[0]) / row_m + 0.5)
+        first, end = min(i, middle) - _ROWS_AWAY, max(i, middle) + _ROWS_AWAY + 1
+        image_rows(values, scale, turns, track, rows_m, bearings, first, end, image)
         if image[i, j] >= before:
             break
-    for sweep in range(sweeps + 1):
+    for sweep in range(sweeps):
         for k in range(count):
             add_echoes(values, scale, turns, echo, all_ranges[k], models[k], 1.0)
-            place[:] = found[k, :3]
             form = int(found[k, 3])
-            if sweep == sweeps:
-                other[:] = place
-                found[k, 6] = refine(
-                    values, scale, turns, track, beam, other, 2, 4,
+            if sweep == sweeps - 1:
+                other[:] = found[k, :3]
+                refine(
+                    values, scale, turns, track, beam, other, 2, 3,
                     ranges, gains, echoes, amplitudes,
                 )  # fmt: skip
                 found[k, 5] = other[2]
-            found[k, 4] = refine(
-                values, scale, turns, track, beam, place, form, 2 if sweep < sweeps else 0,
+            place[:] = found[k, :3]
+            energy = refine(
+                values, scale, turns, track, beam, place, form, 2,
                 ranges, gains, echoes, amplitudes,
             )  # fmt: skip
             whole = 1e-300
             for f in range(n):
                 whole += echoes[f].real ** 2 + echoes[f].imag ** 2
-            found[k, 7] = found[k, 4] / whole
             found[k, :3] = place
+            found[k, 4], found[k, 6] = energy, energy / whole
             all_ranges[k], models[k] = ranges, amplitudes
             add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
-    image_rows(values, scale, turns, track, beam, rows_m, bearings, 0, rows_m.size, image)
+    image_rows(values, scale, turns, track, rows_m, bearings, 0, rows_m.size, image)
     return count

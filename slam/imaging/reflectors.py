@@ -37,9 +37,9 @@ from slam.imaging.patches import Patch
 
 Array = NDArray[np.float64]
 
-_ROW_M, _SINE = 0.025, 0.025  # cells of the grid, in range and in sine of bearing
-_SINES = np.arange(-36, 37) * _SINE
-_BEYOND_M = 0.3  # echoes from there reach into the field of view
+_ROW_M, _SINE = 0.05, 0.04  # cells of the grid, in range and in sine of bearing
+_SINES = np.arange(-20, 21) * _SINE
+_BEYOND_M = 0.2  # echoes from there reach into the field of view
 _BEAM_STEPS = 256
 
 
@@ -51,8 +51,6 @@ class Reflectors:
     ----------
     range_m, bearing_rad
         From the antenna in the middle of the patch, and off its boresight.
-    is_plane
-        Whether a plane explains it better than a point does.
     flatness
         1 - h r where the curvature is free: 0 of a point, 1 of a plane.
     energy
@@ -69,7 +67,6 @@ class Reflectors:
 
     range_m: Array
     bearing_rad: Array
-    is_plane: NDArray[np.bool_]
     flatness: Array
     energy: Array
     amplitude: Array
@@ -83,10 +80,12 @@ class SeparationRule:
     """How a patch is separated into reflectors."""
 
     most: int = 16
-    # Energy of a cell over the median of the image from which on it is searched for
-    least_over_median: float = 30.0
-    # A plane must explain this times what a point does: both fit where the patch is short
-    plane_over_point: float = 1.1
+    # Energy of a cell over the level of the image from which on it is searched for
+    least_over_level: float = 40.0
+    # Amplitude under the law of a rod, over that of the strongest
+    least_share: float = 0.05
+    # What a free curvature must explain over what a point does
+    more_than_point: float = 1.1
     sweeps: int = 2
 
 
@@ -112,7 +111,7 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         max(view.min_range_m - 2 * _ROW_M, _ROW_M), view.max_range_m + _BEYOND_M, _ROW_M
     )
     image = np.empty((rows_m.size, _SINES.size))
-    found = np.zeros((rule.most, 8))
+    found = np.zeros((rule.most, 7))
     models = np.zeros((rule.most, n), dtype=np.complex128)
     k = profiles.wave_number_rad_per_m
     count = kernels.separate(
@@ -124,21 +123,21 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         profiles.echo,
         rows_m,
         np.arcsin(_SINES),
-        rule.least_over_median,
-        rule.plane_over_point,
+        rule.least_over_level,
+        rule.least_share,
+        rule.more_than_point,
         rule.sweeps,
         image,
         found,
         models,
     )
-    range_m, bearing_rad, _, form, energy, curvature, _, coherence = found[:count].T
+    range_m, bearing_rad, _, _, energy, curvature, coherence = found[:count].T
     levels = np.abs(models[:count])
     at = ((range_m - rows_m[0]) / _ROW_M).astype(np.intp)
-    rest = [image[max(0, i - 4) : i + 6].mean() if 0 <= i < len(image) else math.inf for i in at]
+    rest = [image[max(0, i - 2) : i + 4].mean() if 0 <= i < len(image) else math.inf for i in at]
     return Reflectors(
         range_m=range_m,
         bearing_rad=bearing_rad,
-        is_plane=form == 0,
         flatness=1.0 - curvature * range_m,
         energy=energy,
         amplitude=levels.max(axis=1, initial=0.0) * range_m**1.5,

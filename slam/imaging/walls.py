@@ -54,7 +54,7 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
     for k in np.argsort(reflectors.range_m).tolist():
         sure = reflectors.snr[k] >= rule.least_snr
         sure &= reflectors.coherence[k] >= rule.least_coherence
-        if not reflectors.is_plane[k] or not sure:
+        if reflectors.flatness[k] <= rule.flatness[1] or not sure:
             continue
         c, s = np.cos(reflectors.bearing_rad[k]), np.sin(reflectors.bearing_rad[k])
         normal = np.array([c * bx - s * by, s * bx + c * by])
