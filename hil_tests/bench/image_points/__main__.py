@@ -36,6 +36,10 @@ def pair(errors: Sequence[NDArray[np.float64]], scale: float) -> str:
     return f"{number(robust_sigma(errors), scale, 1)} / {number(rms(errors), scale, 1)}"
 
 
+SUMMED = ("dense", "fresh", "walls", "pillars", "people", "scene")
+"""Tables whose rows differ by the room alone: the last row has all of them."""
+WITH_WALLS = ("walls", "pillars", "scene")
+
 Columns = dict[str, Callable[[Score], str]]
 
 POINTS: Columns = {
@@ -87,8 +91,8 @@ def numbers_of(label: str, score: Score) -> dict[str, object]:
 
 
 def print_table(name: str, rows: Iterator[Row], out: Path | None) -> None:
-    """Print a table as its rows come, and the sum of them."""
-    columns = POINTS | BY_KIND if name in ("walls", "pillars", "scene") else POINTS
+    """Print a table as its rows come."""
+    columns = POINTS | BY_KIND if name in WITH_WALLS else POINTS
     heads = [name, *columns]
     sys.stdout.write(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}\n")
     every: list[Score] = []
@@ -105,7 +109,8 @@ def print_table(name: str, rows: Iterator[Row], out: Path | None) -> None:
         scores = row.scores()
         every.extend(scores)
         finish(row.label, Score.together(scores))
-    finish("all", Score.together(every))
+    if name in SUMMED:
+        finish("all", Score.together(every))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -28,7 +28,7 @@ from slam.imaging.patches import Patch, PatchRule
 Array = NDArray[np.float64]
 
 SLIPPED_M, SLIPPED_RAD = 0.01, 0.02
-"""Errors of odometry inside a patch that only a slip makes; wheels alone err a fifth of that."""
+"""Errors of odometry in a patch that are most likely a slip: wheels alone err less."""
 TURN_WAY_M = 0.05
 """Longest way of the body in a patch of turning on the spot."""
 

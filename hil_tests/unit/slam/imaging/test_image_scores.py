@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
+from hil_tests.bench.image_points.drives import drive
 from hil_tests.bench.image_points.scoring import (
     FaceLengths,
     Score,
@@ -18,8 +19,10 @@ from hil_tests.bench.image_points.scoring import (
     robust_sigma,
     score_points,
 )
+from hil_tests.bench.image_points.tables import cases, with_scene
 from hil_tests.bench.image_points.truth import Kind, RoomTruth
 from slam.geometry import FieldOfView, Mount, between, compose
+from slam.imaging.patches import PatchRule
 
 Array = NDArray[np.float64]
 
@@ -258,3 +261,18 @@ def test_sigmas_count_a_bias() -> None:
     assert rms(errors) == pytest.approx(math.sqrt((3 * 0.02**2 + 0.08**2) / 4))
     assert math.isnan(rms([]))
     assert math.isnan(robust_sigma([]))
+
+
+def test_a_short_drive_past_the_imager_is_scored() -> None:
+    (case,) = cases("dense:0")
+    way = {"waypoints_m": ((0.0, 0.0), (0.7, 0.0)), "laps": ("forward",)}
+    (short,) = with_scene((case,), lambda scene: _driven(scene, way))
+    score = drive(short, PatchRule())
+    assert score.n_scans > 0.7 / 0.05 * 5  # 1 cm a scan, there and back
+    assert score.recall > 0.8
+    assert score.precision > 0.6
+    assert rms(score.along_m) < 0.01
+
+
+def _driven(scene: Scene, way: dict[str, object]) -> Scene:
+    return scene.model_copy(update={"path": scene.path.model_copy(update=way)})
