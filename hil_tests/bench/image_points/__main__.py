@@ -59,7 +59,7 @@ def recall_of(kind: Kind) -> Callable[[Score], str]:
 
 
 BY_KIND: Columns = {
-    **{f"{kind}s": recall_of(kind) for kind in Kind},
+    **{f"{kind}s": recall_of(kind) for kind in Kind if kind is not Kind.EDGE},
     "lines": lambda score: number(score.line_share),
     "false lines": lambda score: number(score.false_line_share),
 }
@@ -85,8 +85,9 @@ def numbers_of(label: str, score: Score) -> dict[str, object]:
         **values,
         **{name: getattr(score, name) for name in counts},
         "lengths_m": [score.seen_m, score.found_m, score.line_m, score.false_line_m],
-        "seen": dict(score.seen),
+        "required": dict(score.required),
         "found": dict(score.found),
+        "found_besides": dict(score.found_besides),
     }
 
 

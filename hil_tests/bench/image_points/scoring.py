@@ -2,14 +2,14 @@
 
 The frame of a patch is the true body frame at the time of its middle: what odometry gathered before
 does not count, what it errs inside the patch, and errors of mounts, do. A reflector
-(`hil_tests.bench.image_points.truth`) is required where it is seen in at least half of the frames
-of a patch. Points are matched one to one with these, within a largest distance: as many pairs as
-there can be, and of these the nearest.
+(`hil_tests.bench.image_points.truth`) is required where it is in view, and strong enough, in at
+least half of the frames of a patch. Points are matched one to one with these and with those that
+may be found, within a largest distance: as many pairs as there can be, and of these the nearest.
 
 recall
-    Required reflectors that have a point, over all that are required; edges are not required.
+    Required reflectors that have a point, over all that are required.
 precision
-    Points that have a reflector, edges included, over all points.
+    Points that have a reflector, required or not, over all points.
 along, across
     Difference of the distances from the nominal antenna in the middle of the patch, and of the
     bearings. The robust sigma is 1.4826 times the median of the absolute values, so a bias counts.
@@ -32,7 +32,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from hil_tests.bench.image_points.truth import Kind, RoomTruth, points_along
+from hil_tests.bench.image_points.truth import (
+    ALLOWED_SIGMAS,
+    REQUIRED_SIGMAS,
+    Kind,
+    RoomTruth,
+    points_along,
+)
 from slam.geometry import Mount, between, transform, wrap_angles
 
 Array = NDArray[np.float64]
@@ -65,20 +71,23 @@ class ScoredPatch:
 
     Attributes
     ----------
-    seen, found
-        Reflectors by index in the room, those seen in at least half of the frames, edges included.
+    required, found, found_besides
+        Reflectors by index in the room: those that are required, those of them that have a point,
+        and others that have one.
     n_points
-        Right ones have a reflector in ``found``.
+        Right ones have a reflector in either.
     n_late
-        False points within the largest distance of a reflector seen in less than half the frames.
+        False points within the largest distance of a reflector in view in less than half the
+        frames.
     n_near_people
         False points within `NEAR_PERSON_M` of a person or mover.
     along_m, across_rad
         Errors of the points of required reflectors.
     """
 
-    seen: tuple[int, ...]
+    required: tuple[int, ...]
     found: tuple[int, ...]
+    found_besides: tuple[int, ...]
     n_points: int
     n_late: int
     n_near_people: int
@@ -108,12 +117,14 @@ def score_points(
     places_m = transform(
         inside_out, truth.reflectors.surfaces_m(np.array([view.x_m[0, 0], view.y_m[0, 0]]))
     )
-    shares = truth.seen(poses, t_ns).mean(axis=0)
+    echoes = truth.echoes(poses, t_ns)
     is_edge = np.array([kind is Kind.EDGE for kind in truth.reflectors.kinds], dtype=np.bool_)
-    seen = np.flatnonzero(shares >= 0.5)
-    pairs = pairs_within(points_m, places_m[seen], most_m)
-    matched = [(point, int(seen[row])) for point, row in pairs]
-    measured = [(point, reflector) for point, reflector in matched if not is_edge[reflector]]
+    required = ((echoes >= REQUIRED_SIGMAS).mean(axis=0) >= 0.5) & ~is_edge
+    shares = (echoes >= ALLOWED_SIGMAS).mean(axis=0)
+    allowed = np.flatnonzero(shares >= 0.5)
+    pairs = pairs_within(points_m, places_m[allowed], most_m)
+    matched = [(point, int(allowed[row])) for point, row in pairs]
+    measured = [(point, reflector) for point, reflector in matched if required[reflector]]
     rest = np.ones(len(points_m), dtype=np.bool_)
     rest[[point for point, _ in matched]] = False
     reported = points_m[[point for point, _ in measured]] - antenna
@@ -122,8 +133,9 @@ def score_points(
     late = places_m[(shares > 0) & (shares < 0.5)]
     people = transform(inside_out, truth.people_m(t_ns).reshape(-1, 2))
     return ScoredPatch(
-        seen=tuple(seen.tolist()),
-        found=tuple(reflector for _, reflector in matched),
+        required=tuple(np.flatnonzero(required).tolist()),
+        found=tuple(reflector for _, reflector in measured),
+        found_besides=tuple(reflector for _, reflector in matched if not required[reflector]),
         n_points=len(points_m),
         n_late=_n_near(points_m[rest], late, most_m),
         n_near_people=_n_near(points_m[rest], people, NEAR_PERSON_M),
@@ -224,11 +236,12 @@ class Score:
     n_points: int = 0
     n_late: int = 0
     n_near_people: int = 0
-    seen: Counter[Kind] = field(default_factory=Counter)
+    required: Counter[Kind] = field(default_factory=Counter)
     found: Counter[Kind] = field(default_factory=Counter)
+    found_besides: Counter[Kind] = field(default_factory=Counter)
     along_m: list[Array] = field(default_factory=list)
     across_rad: list[Array] = field(default_factory=list)
-    room_seen: set[tuple[str, int]] = field(default_factory=set)
+    room_required: set[tuple[str, int]] = field(default_factory=set)
     room_found: set[tuple[str, int]] = field(default_factory=set)
     seen_m: float = 0.0
     found_m: float = 0.0
@@ -243,10 +256,11 @@ class Score:
         self.n_points += patch.n_points
         self.n_late += patch.n_late
         self.n_near_people += patch.n_near_people
-        self.seen.update(kinds[each] for each in patch.seen)
+        self.required.update(kinds[each] for each in patch.required)
         self.found.update(kinds[each] for each in patch.found)
-        for places, room in ((patch.seen, self.room_seen), (patch.found, self.room_found)):
-            room.update((run, each) for each in places if kinds[each] is not Kind.EDGE)
+        self.found_besides.update(kinds[each] for each in patch.found_besides)
+        self.room_required.update((run, each) for each in patch.required)
+        self.room_found.update((run, each) for each in patch.found)
         self.along_m.append(patch.along_m)
         self.across_rad.append(patch.across_rad)
 
@@ -269,19 +283,18 @@ class Score:
 
     @property
     def recall(self) -> float:
-        found, seen = (count.total() - count[Kind.EDGE] for count in (self.found, self.seen))
-        return _share(found, seen)
+        return _share(self.found.total(), self.required.total())
 
     def recall_of(self, kind: Kind) -> float:
-        return _share(self.found[kind], self.seen[kind])
+        return _share(self.found[kind], self.required[kind])
 
     @property
     def precision(self) -> float:
-        return _share(self.found.total(), self.n_points)
+        return _share(self.found.total() + self.found_besides.total(), self.n_points)
 
     @property
     def room_recall(self) -> float:
-        return _share(len(self.room_found), len(self.room_seen))
+        return _share(len(self.room_found), len(self.room_required))
 
     @property
     def line_share(self) -> float:

@@ -1,9 +1,10 @@
 """What one radar of an emulated room can see: points that reflect, and faces seen at right angles.
 
-The emulator's own echo model (`emulator.echo.echo`) decides. A reflector is seen in a frame where
-it is in beam and range of the field of view, from the true pose and the true mount, and its echo is
-at least `LEAST_SIGMAS` standard deviations of the white noise per RF sample, shadows and beam
-included. What counts as its place:
+The emulator's own echo model (`emulator.echo.echo`) decides. A reflector is in view in a frame
+where it is in beam and range of the field of view, from the true pose and the true mount. How
+strong its echo is, in standard deviations of the white noise per RF sample, has shadows and beam in
+it. From `REQUIRED_SIGMAS` on it must be found; down to `ALLOWED_SIGMAS` it may be, since an image
+sums frames. What counts as its place:
 
 target
     A rod or a point, so a desk's or a chair's leg, where it stands; a body's scattering points in
@@ -16,7 +17,7 @@ corner
     they meet. Two faces at another angle have no place that is the same for all antennas.
 edge
     A free end of a wall, or a corner of a box. It diffracts: strong beside its own mirror image,
-    weak elsewhere. A point there is right, but none that is missing counts as missed.
+    weak elsewhere. It may be found, and need not.
 face
     A wall, or a side of a box, is a line. It is seen at normal incidence where the foot of the
     perpendicular from the antenna lies on it, in beam and range, and its echo is strong enough.
@@ -53,7 +54,7 @@ from xethru_protocol.wire.codes import TxCenterFrequency
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-LEAST_SIGMAS = 4.0
+REQUIRED_SIGMAS, ALLOWED_SIGMAS = 4.0, 1.0
 _RIGHT_ANGLE = math.sin(math.radians(1.0))
 _SAME_PLACE_M = 1e-3
 _WAVELENGTH_M = SPEED_OF_LIGHT_MPS / x4.CARRIER_HZ[TxCenterFrequency.LOW_BAND]
@@ -109,7 +110,7 @@ class RoomTruth:
     def __init__(self, scene: Scene, radar: int, view: FieldOfView, seed: int = 0) -> None:
         self._scene, self._radar, self._view = scene, scene.radars[radar], view
         self._seed = seed
-        self._least = LEAST_SIGMAS * scene.noise.rf_sigma
+        self._noise = scene.noise.rf_sigma
         self._targets = Targets(scene.targets, seed)
         self.faces = faces_of(scene.walls, scene.objects)
         self._pairs = corner_pairs(self.faces)
@@ -153,8 +154,11 @@ class RoomTruth:
         """Return where the radar truly is at true poses (n, 3)."""
         return viewpoint(self._radar, poses)
 
-    def seen(self, poses: Array, t_ns: NDArray[np.int64]) -> Flags:
-        """Return which reflectors are seen from true poses (n, 3) at times (n,), shape (n, k)."""
+    def echoes(self, poses: Array, t_ns: NDArray[np.int64]) -> Array:
+        """Return how strong echoes are from true poses (n, 3) at times (n,), shape (n, k).
+
+        In standard deviations of the noise; 0 out of view.
+        """
         view = self.viewpoint(poses)
         direct = []
         for each in self._targets.scatterers(t_ns):
@@ -176,7 +180,8 @@ class RoomTruth:
         amplitude = np.concatenate([*direct, apexes, edges], axis=1)
         x, y = self.reflectors.places_m.T
         range_m, cosine = view.towards(x, y)
-        return self._in_view(range_m - self.reflectors.radii_m, cosine) & (amplitude >= self._least)
+        in_view = self._in_view(range_m - self.reflectors.radii_m, cosine)
+        return np.where(in_view, amplitude / self._noise, 0.0)
 
     def feet_m(self, poses: Array) -> Array:
         """Return where along each face it is seen at normal incidence, (n, n_faces); NaN: not."""
@@ -186,7 +191,7 @@ class RoomTruth:
         along = self.faces.along(view.x_m, view.y_m)
         range_m, cosine = view.towards(*self.faces.at(along))
         mirrors = face_reflections(self.faces, view, _WAVELENGTH_M).amplitude[:, : len(self.faces)]
-        is_seen = self._in_view(range_m, cosine) & (mirrors >= self._least)
+        is_seen = self._in_view(range_m, cosine) & (mirrors >= REQUIRED_SIGMAS * self._noise)
         return np.where(is_seen, along, np.nan)
 
     def people_m(self, t_ns: NDArray[np.int64]) -> Array:
