@@ -208,6 +208,12 @@ def _add_session_options(parser: argparse.ArgumentParser) -> None:
         help="leave out of the session what only other viewers draw: B-scans, paths, ellipses",
     )
     parser.add_argument(
+        "--no-image",
+        dest="has_image",
+        action="store_false",
+        help="make no radar image of the room, which takes a tenth of the time of SLAM",
+    )
+    parser.add_argument(
         "--rerun",
         type=_rerun_target,
         metavar="WHERE",
@@ -447,14 +453,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         metavar="RIG",
         help="rig file or scene: where the radars of a bag sit, named UWBradar1 and so on",
     )
-    convert.add_argument(
-        "--frame-area",
-        dest="area_m",
-        type=float,
-        nargs=2,
-        metavar=("START", "END"),
-        help="what the modules of a bag were asked for, module metres (default: 0.2 9.4)",
-    )
+    _add_frame_area(convert, "what the modules of a bag were asked for (default: 0.2 9.4)")
     convert.add_argument(
         "--truth",
         dest="truth_topic",
@@ -617,6 +616,72 @@ def _add_map(parser: argparse.ArgumentParser) -> None:
             )
 
 
+def _add_image(image: argparse.ArgumentParser) -> None:
+    image.add_argument(
+        "source",
+        type=_session,
+        metavar="SESSION|RECORDING",
+        help="a session.mcap, a run's folder, or a recording that `xethru record` has written",
+    )
+    image.add_argument(
+        "--path",
+        type=_path_of_image,
+        metavar="PATH",
+        help="where the robot was: smoothed, estimate or odometry of a session, or FILE.tum "
+        "(default: the first that the session has)",
+    )
+    image.add_argument(
+        "--cell", dest="cell_m", type=_metres, default=0.02, metavar="M", help="(default: 0.02)"
+    )
+    image.add_argument(
+        "--range",
+        dest="reach_m",
+        type=_metres,
+        default=2.0,
+        metavar="M",
+        help="how far from the radars (default: %(default)g)",
+    )
+    image.add_argument(
+        "--area",
+        dest="area_m",
+        type=_coordinate,
+        nargs=4,
+        metavar=("X0", "Y0", "X1", "Y1"),
+        help="corners of the image, metres in the frame of the path (default: all that is seen)",
+    )
+    image.add_argument(
+        "--mount",
+        type=_coordinate,
+        nargs=3,
+        metavar=("X", "Y", "DEGREES"),
+        help="of a recording: where its radar sits on the robot or cart, metres forward and to the "
+        "left, and where it looks, counter-clockwise from forward",
+    )
+    image.add_argument("--rig", metavar="RIG", help="of a recording: the rig file, for --mount")
+    _add_frame_area(image, "of a recording that does not say it: as the module read it back")
+    _add_out(image, "out/image")
+
+
+def _path_of_image(text: str) -> str:
+    if text in {"smoothed", "estimate", "odometry"} or text.endswith(".tum"):
+        return text
+    raise argparse.ArgumentTypeError(
+        f"must be smoothed, estimate, odometry or FILE.tum, not {shown(text)}"
+    )
+
+
+def _add_frame_area(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add `--frame-area` of a command that reads what does not have it."""
+    parser.add_argument(
+        "--frame-area",
+        dest="frame_area_m",
+        type=float,
+        nargs=2,
+        metavar=("START", "END"),
+        help=f"{text}, module metres",
+    )
+
+
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     benchmark.add_argument(
         "name",
@@ -717,6 +782,17 @@ _COMMANDS = (
         _add_map,
         "Shows a map, writes it as GeoJSON, or makes one map of two whose landmarks lie on each "
         "other in one way only.",
+    ),
+    _Subcommand(
+        "image",
+        "slam.app.commands.image:run_image",
+        "make an image of the room from the raw frames of a session or a recording",
+        _add_image,
+        "Sums raw frames along the path of their radar, 25 cm at a time, and writes what they show "
+        "of the room: image.png, arrays in image.npz, and map.yaml with map.pgm, which nav2's map "
+        "server loads.",
+        "With one radar on a cart that looks to the left, and poses by the clock of the recording: "
+        "uwb-slam image rec --path poses.tum --mount 0.1 0.2 90",
     ),
     _Subcommand(
         "benchmark",

@@ -110,14 +110,11 @@ def aperture_of(mount: Mount, view: FieldOfView, poses: Array) -> Aperture:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BasebandFrame:
-    """A frame of a module with downconversion: ``samples`` (n_bins,), complex, I + jQ.
-
-    The rest is as in `RadarFrame`.
-    """
+class RecordedFrame:
+    """A frame without counter and radar, as in `RadarFrame`; its samples may be I + jQ."""
 
     t_ns: int
-    samples: NDArray[np.complexfloating]
+    samples: Samples
     range_start_m: float
     bin_length_m: float
 
@@ -160,18 +157,19 @@ class PatchMaker:
         self._n_bins = 0  # that the static part is learnt of
         self._filter: tuple[ModulePulse, ProfileFilter] | None = None
 
-    def near(self, frame: RadarFrame | BasebandFrame) -> Samples:
+    def near(self, frame: RadarFrame | RecordedFrame) -> Samples:
         """Return the samples up to the end of the field of view, those that are NaN as 0."""
         start_m = frame.range_start_m - self.mount.range_offset_m
         reach = (self.view.max_range_m + _MARGIN_M - start_m) / frame.bin_length_m
         samples = frame.samples[: max(1, math.ceil(reach))]
-        return np.asarray(np.nan_to_num(samples.astype(np.result_type(samples, np.float64))))
+        own = samples.astype(np.result_type(samples, np.float64))
+        return own if np.isfinite(own).all() else np.asarray(np.nan_to_num(own))
 
     def antenna_at(self, pose: Array) -> Array:
         """Return the antenna, shape (2,), at a body pose."""
         return transform(pose, np.array([self.mount.x_m, self.mount.y_m]))
 
-    def add(self, frame: RadarFrame | BasebandFrame, pose: Array) -> Patch | None:
+    def add(self, frame: RadarFrame | RecordedFrame, pose: Array) -> Patch | None:
         """Take a frame and the body pose (3,) when it was taken; return a patch that is complete.
 
         Poses come from odometry, or any path without jumps. A frame is RF or I/Q.
@@ -202,7 +200,7 @@ class PatchMaker:
         self._looks = [look for look in self._looks if look.way_m >= keep_m]
         return patch
 
-    def _continues(self, last: _Look, frame: RadarFrame | BasebandFrame, samples: Samples) -> bool:
+    def _continues(self, last: _Look, frame: RadarFrame | RecordedFrame, samples: Samples) -> bool:
         is_same = (
             samples.size == last.samples.size
             and frame.range_start_m - self.mount.range_offset_m == last.range_start_m

@@ -213,7 +213,7 @@ class StaticPart:
             return False
         self._last_m = np.array(antenna_m, dtype=np.float64)
         self.n_places += 1
-        known = np.nan_to_num(samples)
+        known = samples if np.isfinite(samples).all() else np.nan_to_num(samples)
         heading = math.floor(heading_rad / math.tau * _HEADINGS) % _HEADINGS
         n, mean = self._of_headings.get(heading, (0, known))
         new = mean + (known - mean) / min(n + 1, self._memory)

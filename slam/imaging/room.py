@@ -17,16 +17,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry import transform
 from slam.imaging.back_projection import Aperture, Grid, back_project
 from slam.imaging.patches import Patch, aperture_of
 
 Array = NDArray[np.float64]
 
+LEVEL_DB = 0.4
+"""Of one step of `RoomImage.levels`."""
 _RANGE_POWER = 1.5
 _LEAST_SEEN = 0.5  # of a patch's frames
 # An echo is 2 to 4 cm wide across the line of sight: larger cells are looked at in several points.
 _MOST_SPACING_M = 0.025
-_STEP = 64  # cells by which an image grows
+_STEP = 16  # cells by which an image grows
 _DIRECTIONS = np.linspace(-1.0, 1.0, 9)
 
 
@@ -68,20 +71,37 @@ class RoomImage:
     def coherence(self) -> NDArray[np.float32]:
         return np.asarray(self._layers[1])
 
-    def add(self, patch: Patch, poses: Array) -> None:
-        """Add a patch whose body was at poses (n, 3), in the frame of the image, at its times."""
+    @property
+    def levels(self) -> NDArray[np.int8]:
+        """Return the image as pictures show it: 100 of the brightest cell, 1 less per 0.4 dB.
+
+        0 at 40 dB below and darker, -1 where nothing was in view.
+        """
+        values = np.nan_to_num(self.values)
+        shares = values / np.max(values, initial=np.finfo(np.float32).tiny)
+        steps = 100 + 20 / LEVEL_DB * np.log10(np.maximum(shares, 1e-6))
+        return np.where(np.isnan(self.values), -1, np.clip(steps, 0, 100)).astype(np.int8)
+
+    def add(self, patch: Patch, origin: Array) -> None:
+        """Add a patch, whose own frame is at ``origin`` (3,) in the frame of the image."""
+        poses = np.column_stack(
+            [transform(origin, patch.poses[:, :2]), origin[2] + patch.poses[:, 2]]
+        )
         aperture, profiles = aperture_of(patch.mount, patch.view, poses), patch.profiles
         grid, rows, columns = self._part(*_reach(aperture))
         if not (grid.rows and grid.columns):
             return
         k = math.ceil(grid.cell_m / _MOST_SPACING_M - 1e-9)
         fine = replace(grid, cell_m=grid.cell_m / k, rows=k * grid.rows, columns=k * grid.columns)
-        sums = back_project(profiles.times_range(_RANGE_POWER), aperture, fine.centres_m)
-        values = np.where(sums.count >= _LEAST_SEEN * len(profiles.values), sums.weighted, -1.0)
-        step_m = aperture.length_m / max(len(profiles.values) - 1, 1)
+        n, points = len(profiles.values), fine.centres_m
+        # What half of the frames of a way see, one in its middle sees: other points cost time
+        is_near = _in_view(aperture, (n - 1) // 2, points) | _in_view(aperture, n // 2, points)
+        sums = back_project(profiles.times_range(_RANGE_POWER), aperture, points[is_near])
+        step_m = aperture.length_m / max(n - 1, 1)
         turn_rad = profiles.wave_number_rad_per_m * 2 * step_m * math.sin(aperture.half_beam_rad)
-        is_sure = np.full(values.shape, turn_rad < math.tau)
-        new = np.stack([values, sums.coherence_factor, is_sure])
+        new = np.full((3, *is_near.shape), -1.0)
+        new[0, is_near] = np.where(sums.count >= _LEAST_SEEN * n, sums.weighted, -1.0)
+        new[1, is_near], new[2] = sums.coherence_factor, turn_rad < math.tau
         if k > 1:
             new = new.reshape(3, grid.rows, k, grid.columns, k).swapaxes(2, 3)
             new = new.reshape(3, grid.rows, grid.columns, k * k)
@@ -125,6 +145,16 @@ class RoomImage:
         self._layers = np.pad(self._layers, room, constant_values=np.nan)
         x_m, y_m = (step_m * first).tolist()
         self.grid = replace(grid, x_m=x_m, y_m=y_m, rows=rows, columns=columns)
+
+
+def _in_view(aperture: Aperture, frame: int, points_m: Array) -> NDArray[np.bool_]:
+    """Return which points (..., 2) one frame has in view, but for the nearest ones."""
+    assert aperture.boresights is not None
+    away_m = points_m - aperture.antennas_m[frame]
+    range_m = np.hypot(away_m[..., 0], away_m[..., 1])
+    ahead_m = away_m @ aperture.boresights[frame]
+    is_ahead = ahead_m >= math.cos(aperture.half_beam_rad) * range_m
+    return np.asarray(is_ahead & (range_m <= aperture.max_range_m))
 
 
 def _reach(aperture: Aperture) -> tuple[Array, Array]:

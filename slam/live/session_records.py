@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
 from slam.geometry import PAPERS_FIELD, FieldOfView, Mount, ReceivedPulse
+from slam.imaging.back_projection import Grid
 from slam.live.errors import AppError
 from slam.results import PoseAt, SmoothedRun, StepResult
 
@@ -131,6 +132,11 @@ class SessionInfo:
         )
 
     @property
+    def is_world_known(self) -> bool:
+        """Whether a true path may be expected: for a scene, not for a real drive."""
+        return len(self.true_landmarks_m) > 0 or len(self.outlines_m) > 0
+
+    @property
     def settings(self) -> dict[str, Any]:
         """SLAM's settings as recorded, of whatever version; {} where they cannot be read."""
         try:
@@ -220,6 +226,23 @@ class Snapshot:
     step: StepResult | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RadarImage:
+    """The room as the radars saw it until a session time.
+
+    Attributes
+    ----------
+    grid
+        Its cells, map frame.
+    levels
+        Shape (rows, columns), int8: `slam.imaging.room.RoomImage.levels`.
+    """
+
+    t_ns: int
+    grid: Grid
+    levels: NDArray[np.int8]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogLine:
     """One line about the link: a command, its answer, a fault. `t_ns` is session time."""
@@ -285,6 +308,9 @@ class SessionObserver:
 
         A run that has none, as the paper's, does not call it.
         """
+
+    def on_image(self, image: RadarImage) -> None:
+        """Get the radar image so far, every few seconds; a run without one does not call it."""
 
     def on_log(self, line: LogLine) -> None: ...
 

@@ -29,7 +29,9 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.maps import MapOptions, MapSaver, map_use
 from slam.app.run.output import RunProgress, note, print_progress
+from slam.app.run.radar_image import RollingImage, path_of, session_image
 from slam.app.run.result_files import (
+    IMAGE,
     REPORT,
     RESULTS,
     SESSION,
@@ -38,7 +40,7 @@ from slam.app.run.result_files import (
     hold_folder,
     remove_earlier,
 )
-from slam.app.run.runner import LinkLog, RunSource, execute
+from slam.app.run.runner import LinkLog, RunRecord, RunSource, execute
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
@@ -47,8 +49,9 @@ from slam.front_end.numba_compilation import compile_kernels
 from slam.library.slam import make_slam
 from slam.live.errors import AppError, RadarSilentError
 from slam.live.frame_sources import RigSource
-from slam.live.odometry_track import read_odometry_socket
+from slam.live.odometry_track import OdometryTrack, read_odometry_socket
 from slam.live.session.description import settings_text
+from slam.live.session.reader import open_session
 from slam.live.session_records import Scan, SessionInfo, SessionObserver
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.optional_packages import install_command, what_is_missing
@@ -66,6 +69,7 @@ def run_demo(
     preset: str,
     wire: bool = False,
     lean: bool = False,
+    has_image: bool = True,
     rerun: str | None = None,
     publish: Sequence[str] = (),
     **maps: Unpack[MapOptions],
@@ -137,13 +141,17 @@ def run_demo(
                 out / SESSION, info, odometry, truth_at=trajectory.poses, drawn=not lean
             )
             stack.callback(log.close)
-            sinks: list[SessionObserver] = [
-                RunProgress(info, source.lost_frames, end_ns=trajectory.duration_ns),
-                map_saver,
+            shown: list[SessionObserver] = [
                 log,  # closed before the views: the record must not wait for them
                 publishing,
                 *([live.observer(info)] if live is not None else []),
                 *([make_view(out / VIEW, info)] if make_view is not None else []),
+            ]
+            sinks: list[SessionObserver] = [
+                RunProgress(info, source.lost_frames, end_ns=trajectory.duration_ns),
+                map_saver,
+                *([RollingImage(info, odometry, shown)] if has_image else []),
+                *shown,
             ]
             for row in early_bytes:
                 log.on_wire(*row)
@@ -154,15 +162,39 @@ def run_demo(
         if record.last is not None:
             # without the flag: the signal that ended the drive does not end the writing
             finish(out, source, record, StopFlag(), publishing=publishing, map_saver=map_saver)
-        if stop.received is not None:
-            raise StopRequestedError(stop.received, kept)
-        if scans.failure is not None:
-            raise EmulatorError(f"{scans.failure}{kept}")
-        if record.last is None:
-            raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
+            if has_image:
+                write_image(out, record, odometry)
+        _require_whole(record, scene, stop, scans.failure, kept)
         name_the_next(out, has_view=make_view is not None)
         if live is not None:
             live.keep_serving()
+
+
+def _require_whole(
+    record: RunRecord, scene: str, stop: StopFlag, failure: str | None, kept: str
+) -> None:
+    """Raise what ended a drive before its end; `kept` is what is left of it."""
+    if stop.received is not None:
+        raise StopRequestedError(stop.received, kept)
+    if failure is not None:
+        raise EmulatorError(f"{failure}{kept}")
+    if record.last is None:
+        raise AppError(f"{scene}: too short for SLAM, no state was estimated{kept}")
+
+
+def write_image(out: Path, record: RunRecord, odometry: OdometryTrack) -> None:
+    """Write the image of the session in a folder along the best path that the run has."""
+    # loads matplotlib, half a second
+    from slam.app.run.pictures import draw_image, picture
+
+    session = open_session(out / SESSION)
+    try:
+        image = session_image(session, path_of(record, odometry, session.info))
+    except AppError as error:
+        note(f"{out / IMAGE} is not written: {error}")
+        return
+    with picture(out / IMAGE, width_in=9.0, height_in=8.2, dpi=120) as figure:
+        draw_image(figure, image, session.info)
 
 
 def name_the_next(out: Path, *, has_view: bool) -> None:

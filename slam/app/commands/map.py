@@ -86,8 +86,8 @@ def _draw(saved: SavedMap, sigmas_m: np.ndarray, out: Path) -> None:
 def _convert(saved: SavedMap, out: Path) -> None:
     if out.suffix in {".yaml", ".yml", ".pgm"}:
         raise UsageError(
-            f"{out}: a grid as nav2 reads it needs the image that the radars make of a room, which "
-            "this version does not have; OUT.geojson has landmarks and walls"
+            f"{out}: a grid as nav2 reads it is made of raw frames, which a map does not have: see "
+            "`uwb-slam image`; OUT.geojson has landmarks and walls"
         )
     if out.suffix != ".geojson":
         raise UsageError(f"{out}: give a name that ends in .geojson")

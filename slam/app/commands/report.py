@@ -28,10 +28,12 @@ from slam.app.run.pictures import (
     ODOMETRY,
     PALE_INK,
     SMOOTHED,
+    draw_image,
     draw_map,
     label,
     svg_of,
 )
+from slam.app.run.radar_image import path_of, session_image
 from slam.app.run.replay import play, refuse_overwriting
 from slam.app.run.result_files import REPORT
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
@@ -469,6 +471,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
         height_in=6.6,
         narrow_height_in=5.8,
     )
+    _write_image(page, session, record)
     page.heading("Errors over time" if record.states.has_truth else "Over time")
     page.picture(
         "position errors and number of landmarks over time",
@@ -498,6 +501,29 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     _write_links(page, info, data, record)
     _write_parameters(page, info)
     return page.text()
+
+
+def _write_image(page: _Page, session: RecordedSession, record: RunRecord) -> None:
+    if session.info.has_detections:
+        return
+    page.heading("Radar image")
+    try:
+        image = session_image(session, path_of(record, session.odometry(), session.info))
+    except AppError as error:
+        page.note(f"There is none: {error}")
+        return
+    page.note(
+        "What the raw frames show, summed with their phases along 25 cm of each radar's way. "
+        "Bright is strong; grey was not in view. A wall answers where a radar faces it squarely."
+    )
+    page.picture(
+        "image of the room by its radars",
+        draw_image,
+        image,
+        session.info,
+        height_in=7.6,
+        narrow_height_in=4.9,
+    )
 
 
 def _write_numbers(

@@ -32,6 +32,7 @@ from slam.app.run.live_source import (
 )
 from slam.app.run.maps import MapOptions, MapSaver, map_use
 from slam.app.run.output import ResultRow, RunProgress, note
+from slam.app.run.radar_image import RollingImage
 from slam.app.run.result_files import (
     REPORT,
     RESULTS,
@@ -66,6 +67,8 @@ from xethru_protocol.operating_system import StopFlag, StopRequestedError
 _STALE = (VIEW, REPORT)
 """Made from a session by other commands; those of an earlier session would mislead."""
 _STEP_LIMIT_S = 0.3
+_LATE_NS = 200_000_000
+"""Where a scan waited longer for SLAM, nothing is added to the radar image."""
 
 
 def run_rig(
@@ -82,6 +85,7 @@ def run_rig(
     covariance: bool = False,
     wire: bool = False,
     lean: bool = False,
+    has_image: bool = True,
     rerun: str | None = None,
     publish: Sequence[str] = (),
     **maps: Unpack[MapOptions],
@@ -135,11 +139,10 @@ def run_rig(
             )
         stop.check()
         rig_source.start(RAW_CONFIG, fps)
-        wheels = rig_file.wheels.noise
         pipeline = make_slam(
             config,
             rig_file.rig,
-            wheels,
+            rig_file.wheels.noise,
             noise_at=live_odometry.noise_at if covariance else None,
             on_map=begin.on_map,
         )
@@ -166,7 +169,7 @@ def run_rig(
                 versions=versions(),
                 config_json=settings_text(config),
                 constants=slam_constants(),
-                wheels=asdict(wheels),
+                wheels=asdict(rig_file.wheels.noise),
                 simulated=are_emulated(links),
                 time_base="arrival",
                 # stamps of ROS are the time of day, or of a simulation that all programs share
@@ -196,13 +199,20 @@ def run_rig(
             session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
-            sinks: list[SessionObserver] = [
+            shown: list[SessionObserver] = [
                 publishing,
+                *([view.observer(info)] if view is not None else []),
+            ]
+            image = RollingImage(
+                info, live_odometry, [log, *shown], is_late=lambda: live.ticks.wait_ns > _LATE_NS
+            )
+            sinks: list[SessionObserver] = [
                 RunProgress(info, source.lost_frames, also=lambda: _dropped_text(live)),
                 requests,
                 map_saver,
                 SpacingWarning(longest_spacing_m(pulse, info.field_of_view), live_odometry, log),
-                *([view.observer(info)] if view is not None else []),
+                *([image] if has_image else []),
+                *shown,
             ]
             publishing.begin(info, log.log, start_ns)
             record = execute(source, sinks)
@@ -213,7 +223,7 @@ def run_rig(
                 source,
                 record,
                 StopFlag(),
-                _rows(record, live, live_odometry, slam),
+                _rows(record, live, live_odometry, slam, image),
                 publishing=publishing,
                 map_saver=map_saver,
             )
@@ -368,7 +378,11 @@ def _report_end(live: LiveSource, log: LiveLog, out: Path) -> None:
 
 
 def _rows(
-    record: RunRecord, live: LiveSource, odometry: LiveOdometry, slam: PromptSlam
+    record: RunRecord,
+    live: LiveSource,
+    odometry: LiveOdometry,
+    slam: PromptSlam,
+    image: RollingImage,
 ) -> list[ResultRow]:
     left_out = live.ticks.n_unused - live.ticks.n_dropped + slam.n_given_up
     load = live.busy_s / max(record.duration_ns / NS_PER_S, 1e-9)
@@ -390,6 +404,9 @@ def _rows(
             f"more scans recorded without SLAM; {live.ticks.n_left_out} frames came too late",
         ),
     ]
+    if image.n_left_out:
+        text = f"of the radar image, {image.n_left_out} left out while SLAM was late"
+        rows.append(("patches", f"{image.n_patches}", text))
     if (drift_ppm := odometry.drift_ppm) is not None:
         rows.append(("odometry", f"{drift_ppm:+.2f} ppm", "clock against this machine's"))
     for radar, clock in zip(live.radars, live.clocks, strict=True):

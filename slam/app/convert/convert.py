@@ -65,7 +65,7 @@ def run_convert(
     source: Path,
     out: Path,
     rig: str | None,
-    area_m: Sequence[float] | None,
+    frame_area_m: Sequence[float] | None,
     truth_topic: str,
     rate_hz: int,
     preset: str | None,
@@ -115,7 +115,7 @@ def run_convert(
                     stop,
                     preset=name,
                     rig=given_rig or AUTHORS_RIG,
-                    area_m=None if area_m is None else (area_m[0], area_m[1]),
+                    area_m=None if frame_area_m is None else (frame_area_m[0], frame_area_m[1]),
                     truth_topic=truth_topic,
                 )
     for line in warnings:

@@ -14,7 +14,7 @@ from slam.app.session.writer import SessionLog
 from slam.live.errors import AppError
 from slam.live.odometry_track import TumSample
 from slam.live.session import cdr
-from slam.live.session_records import LogLine, Scan, SessionInfo, Snapshot
+from slam.live.session_records import LogLine, RadarImage, Scan, SessionInfo, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.transport import host_and_port
 
@@ -109,6 +109,9 @@ class FoxgloveSink(Sink):
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         self._log.on_smoothed(smoothed)
+
+    def on_image(self, image: RadarImage) -> None:
+        self._log.on_image(image)
 
     def on_log(self, line: LogLine) -> None:
         self._log.on_log(line)

@@ -17,7 +17,14 @@ from uuid import uuid4
 from slam.app.errors import UsageError
 from slam.app.publish import SINKS
 from slam.live.errors import AppError
-from slam.live.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.live.session_records import (
+    LogLine,
+    RadarImage,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+)
 from slam.results import SmoothedRun
 from xethru_protocol.validation import choices, shown
 
@@ -211,6 +218,9 @@ class Publishing(SessionObserver):
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         self._put("on_smoothed", smoothed)
+
+    def on_image(self, image: RadarImage) -> None:
+        self._put("on_image", image)
 
     def on_log(self, line: LogLine) -> None:
         self._put("on_log", line)

@@ -29,7 +29,14 @@ from slam.live.arrival_clock import ArrivalClock
 from slam.live.errors import AppError
 from slam.live.frame_sources import radar_frame
 from slam.live.odometry_track import NS_PER_S, TumSample
-from slam.live.session_records import LogLine, RadarInfo, Scan, SessionObserver, Snapshot
+from slam.live.session_records import (
+    LogLine,
+    RadarImage,
+    RadarInfo,
+    Scan,
+    SessionObserver,
+    Snapshot,
+)
 from slam.live.ticks import (
     GRACE_NS,
     MOST_EVENTS,
@@ -117,6 +124,9 @@ class LiveLog(LinkLog):
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         self._write(lambda log: log.on_smoothed(smoothed))
+
+    def on_image(self, image: RadarImage) -> None:
+        self._write(lambda log: log.on_image(image))
 
     def pass_on(self, line: LogLine) -> None:
         if self._sinks is not None:

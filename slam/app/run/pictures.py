@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from slam.app.errors import naming
+from slam.app.run.radar_image import RoomPicture
 from slam.app.run.runner import LinkState, RunRecord, States
 from slam.app.run.summary import Summary
 from slam.geometry import between, compose, transform
+from slam.imaging.room import LEVEL_DB
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import SessionInfo, Snapshot
 from xethru_protocol.operating_system import each_line, written_whole
@@ -466,6 +468,60 @@ def _draw_landmarks(axes: Axes, last: Snapshot, map_extent_m: float) -> None:
         markeredgewidth=1.2,
         label=ellipse_text(enlarged),
     )
+
+
+def draw_image(
+    figure: Figure, image: RoomPicture, info: SessionInfo | None, name: str = ""
+) -> None:
+    """Draw a radar image with the path that it was made along.
+
+    Of a session also what is truly there, if the image is in the frame of the world; else `name` is
+    that of the recording.
+    """
+    title = f"{name}: what its radar saw"
+    if info is not None:
+        simulated = " (simulated)" if info.simulated else ""
+        title = f"{info.scene}{simulated}: what {len(info.radars)} radars see of the room"
+    grid, is_narrow = image.room.grid, figure.get_figwidth() <= NARROW_IN
+    axes = figure.add_subplot(aspect="equal", facecolor=_OUT_OF_VIEW)
+    right, top = grid.x_m + grid.columns * grid.cell_m, grid.y_m + grid.rows * grid.cell_m
+    shown = axes.imshow(
+        np.ma.masked_less(LEVEL_DB * (image.room.levels - 100.0), -100 * LEVEL_DB),
+        origin="lower",
+        extent=(grid.x_m, right, grid.y_m, top),
+        cmap="inferno",
+        interpolation="nearest",
+    )
+    axes.plot(
+        *image.path.poses[:, :2].T, color=_PATH, linewidth=0.8, label=f"path: {image.path.name}"
+    )
+    if info is not None and image.path.frame == "world":
+        for number, line in enumerate(info.outlines_m):
+            called = "true wall or box" if number == 0 else None
+            axes.plot(*line.T, color=_IN_IMAGE, linewidth=0.7, label=called)
+        if len(info.true_landmarks_m):
+            axes.plot(
+                *info.true_landmarks_m.T,
+                linestyle="none",
+                marker="o",
+                markersize=11,
+                markerfacecolor="none",
+                markeredgewidth=0.8,
+                color=_IN_IMAGE,
+                label="true landmark",
+            )
+    axes.set_xlim(grid.x_m, right)
+    axes.set_ylim(grid.y_m, top)
+    if is_narrow:
+        title = "\n".join(wrap(title, _TITLE_LETTERS))
+    label(axes, title, "x [m]", "y [m]", fontsize=10 if is_narrow else 11)
+    axes.grid(visible=False)
+    figure.colorbar(shown, ax=axes, shrink=0.7, label="below the brightest [dB]")
+    figure.legend(loc="outside lower left", ncols=3, frameon=False, handlelength=1.4)
+
+
+_OUT_OF_VIEW, _PATH, _IN_IMAGE = "#d8dbe0", "#4aa8ff", "#35e08a"
+"""Of a radar image: what no radar had in view, the path, and what is truly there."""
 
 
 def _world_from_odom(record: RunRecord) -> NDArray[np.float64]:

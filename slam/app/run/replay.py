@@ -40,7 +40,14 @@ from slam.live.errors import AppError, OdometryError
 from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
 from slam.live.session.reader import RecordedSession, begins_with, open_session
 from slam.live.session.state_rows import smoothed_row, state_row
-from slam.live.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
+from slam.live.session_records import (
+    Gap,
+    LogLine,
+    RadarImage,
+    Scan,
+    SessionObserver,
+    Snapshot,
+)
 from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
 from slam.robust.solver.growing_arrays import RowsByTime
 from xethru_protocol.operating_system import StopFlag
@@ -128,6 +135,8 @@ def play_states(
                     sink.on_snapshot(record)
                 elif isinstance(record, SmoothedRun):
                     sink.on_smoothed(record)
+                elif isinstance(record, RadarImage):
+                    sink.on_image(record)
                 elif isinstance(record, LogLine):
                     sink.on_log(record)
     return recorder.record()

@@ -33,8 +33,8 @@ from xethru_protocol.operating_system import (
 )
 
 SESSION, VIEW, REPORT = "session.mcap", "session.rrd", "report.html"
-SMOOTHED = "smoothed.tum"
-RESULTS = ("map.png", "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "odometry.tum")
+SMOOTHED, IMAGE = "smoothed.tum", "image.png"
+RESULTS = ("map.png", IMAGE, "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "odometry.tum")
 
 
 def finish(

@@ -36,6 +36,7 @@ from slam.live.session.description import (
 from slam.live.session.state_rows import smoothed_row, state_row, step_row
 from slam.live.session_records import (
     LogLine,
+    RadarImage,
     Scan,
     SessionInfo,
     SessionObserver,
@@ -233,9 +234,9 @@ class SessionLog(SessionObserver):
     true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`,
     `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`state_row`),
     `/slam/step`, what led to each (`step_row`); `/slam/smoothed`, the solution over all states, at
-    the end and when it was asked for (`smoothed_row`); where there are such, raw bytes in
-    `/radar/<name>/rx` and `tx`, and ranges that another program found in
-    `/radar/<name>/detections`.
+    the end and when it was asked for (`smoothed_row`); where there are such, the radar image so
+    far in `/image`, raw bytes in `/radar/<name>/rx` and `tx`, and ranges that another program found
+    in `/radar/<name>/detections`.
 
     Parameters
     ----------
@@ -381,6 +382,10 @@ class SessionLog(SessionObserver):
         self._file.write("/slam/smoothed", int(smoothed.t_ns[-1]), message)
         if self._drawings is not None:
             self._drawings.on_smoothed(smoothed)
+
+    def on_image(self, image: RadarImage) -> None:
+        self._file.add_topic("/image", cdr.OCCUPANCY_GRID)
+        self._file.write("/image", image.t_ns, cdr.occupancy_grid(image))
 
     def on_log(self, line: LogLine) -> None:
         t_ns = max(line.t_ns, self._start_ns)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import matplotlib
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from slam.app.rig.echo_arcs import arcs, wedge
 from slam.app.run.pictures import (
@@ -44,7 +47,7 @@ from slam.app.view.rerun_recording import (
 )
 from slam.geometry import compose, transform
 from slam.live.odometry_track import NS_PER_S
-from slam.live.session_records import RadarInfo, SessionInfo, Snapshot
+from slam.live.session_records import RadarImage, RadarInfo, SessionInfo, Snapshot
 from slam.results import Fix, Observation, SmoothedRun, StepResult
 from slam.robust.solver.growing_arrays import PackedRows
 
@@ -238,6 +241,25 @@ class MapLayer:
             draw_order=36.0,
         )
         self._recording.row("map/smoothed/landmarks", stamps, dots)
+
+    def on_image(self, image: RadarImage) -> None:
+        """Send the radar image so far, below everything else, at the last state."""
+        if self._last is None:
+            return
+        snapshot, stamps = self._last
+        grid, place = image.grid, snapshot.world_from_map
+        corner = transform(place, np.array([grid.x_m, grid.y_m + grid.rows * grid.cell_m]))
+        turned = rr.RotationAxisAngle(axis=[0, 0, 1], radians=-float(place[2]))
+        where = rr.Transform3D(
+            translation=[*screen(corner), 0.0],
+            rotation=turned,
+            scale=[grid.cell_m, grid.cell_m, 1.0],
+        )
+        self._recording.row("map/image", stamps, where)
+        cells = rr.EncodedImage(
+            contents=_png(image.levels[::-1]), media_type="image/png", draw_order=-10.0
+        )
+        self._recording.row("map/image/cells", stamps, cells)
 
     def send(self, rows: Sequence[Snapshot], stamps: RowTimes) -> None:
         """Send poses and echoes of some states."""
@@ -445,6 +467,22 @@ class MapLayer:
             path = screen(np.concatenate([points.rows[::_PATH_STEP], points.rows[-1:]]))
             line = rr.LineStrips2D([path], colors=colour, radii=radius_m, draw_order=order)
             self._recording.row(f"map/{name}/path", stamps, line)
+
+
+_OUT_OF_VIEW = 255
+_SHADES = (255 * matplotlib.colormaps["inferno"](np.linspace(0.0, 0.85, 101))[:, :3]).astype(
+    np.uint8
+)
+"""Of the levels of a radar image."""
+
+
+def _png(levels: NDArray[np.int8]) -> bytes:
+    """Return levels as a PNG of few colours, clear where nothing was in view; row 0 is on top."""
+    shown = Image.fromarray(np.where(levels < 0, _OUT_OF_VIEW, levels).astype(np.uint8))
+    shown.putpalette(_SHADES.tobytes())
+    file = io.BytesIO()
+    shown.save(file, format="png", transparency=_OUT_OF_VIEW)
+    return file.getvalue()
 
 
 def _crosses(points: Array, arm_m: float = 0.04) -> rr.LineStrips2D:

@@ -50,6 +50,7 @@ from slam.live.errors import AppError
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session_records import (
     LogLine,
+    RadarImage,
     RadarInfo,
     Scan,
     SessionInfo,
@@ -99,11 +100,6 @@ _POINTS = (
 )
 
 
-def is_world_known(info: SessionInfo) -> bool:
-    """Return whether a true path may be expected: for a scene, not for a real drive."""
-    return len(info.true_landmarks_m) > 0 or len(info.outlines_m) > 0
-
-
 def about(info: SessionInfo) -> str:
     """Return the text about a run."""
     is_robust = info.settings.get("back_end") == "robust"
@@ -111,8 +107,8 @@ def about(info: SessionInfo) -> str:
         n_radars=len(info.radars),
         block=BLOCK_FRAMES,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
-        truth=_TRUTH if is_world_known(info) else "",
-        numbers=_ERRORS if is_world_known(info) else _NO_ERRORS,
+        truth=_TRUTH if info.is_world_known else "",
+        numbers=_ERRORS if info.is_world_known else _NO_ERRORS,
         points="" if is_robust else _POINTS.format(states=TRAIL_STATES),
         smoothed=_SMOOTHED if is_robust else "",
     )
@@ -205,7 +201,7 @@ def _numbers(info: SessionInfo) -> rrb.Tabs:
         )
         for name, (origin, shown) in contents.items()
     ]
-    return rrb.Tabs(*views, active_tab=0 if is_world_known(info) else 1)
+    return rrb.Tabs(*views, active_tab=0 if info.is_world_known else 1)
 
 
 def _whole_run() -> rrb.TimeAxis:
@@ -492,6 +488,9 @@ class RerunView(SessionObserver):
         self._map.on_smoothed(smoothed)
         self._smoothed = smoothed
 
+    def on_image(self, image: RadarImage) -> None:
+        self._map.on_image(image)
+
     def on_log(self, line: LogLine) -> None:
         """Draw a line of the log; after `close` it is ignored."""
         self._link.on_log(line)
@@ -545,7 +544,7 @@ class RerunView(SessionObserver):
         stamps = self._stamps.at(range(n_states - len(rows), n_states))
         if rows and self._odom is not None:
             self._map.send(rows, stamps)
-            if self._is_live and is_world_known(self._info):  # an unknown one grows all the time
+            if self._is_live and self._info.is_world_known:  # an unknown one grows all the time
                 self._show_ground()
             send_numbers(self._recording, rows, stamps, self._odom)
             self._frames.send_detections(rows, stamps)

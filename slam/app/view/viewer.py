@@ -17,7 +17,14 @@ from urllib.parse import urlsplit
 from slam.app.run.output import note
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.live.errors import AppError
-from slam.live.session_records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.live.session_records import (
+    LogLine,
+    RadarImage,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+)
 from slam.results import SmoothedRun
 from xethru_protocol.cli.live import viewer
 from xethru_protocol.cli.live.viewer import HERE, ViewerKind
@@ -152,6 +159,10 @@ class _WhileWatched(SessionObserver):
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
         if self._is_watched:
             self._view.on_smoothed(smoothed)
+
+    def on_image(self, image: RadarImage) -> None:
+        if self._is_watched:
+            self._view.on_image(image)
 
     def on_log(self, line: LogLine) -> None:
         if self._is_watched:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
+from slam.imaging.back_projection import Grid
 from slam.live.odometry_track import NS_PER_S, TumSample
-from slam.live.session_records import LogLine, Snapshot
+from slam.live.session_records import LogLine, RadarImage, Snapshot
 from slam.results import SmoothedRun
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 RANGE = "sensor_msgs/msg/Range"
 IMAGE = "sensor_msgs/msg/Image"
+OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 LOG = "rcl_interfaces/msg/Log"
 NUMBER = "std_msgs/msg/UInt32"
@@ -288,6 +290,29 @@ def image(t_ns: int, frame: str, pixels: NDArray[np.float32]) -> bytes:
     message.numbers("B", 0)  # little-endian
     message.numbers("I", 4 * width, 4 * height * width)
     return message.array(pixels.astype("<f4")).done()
+
+
+def occupancy_grid(image: RadarImage) -> bytes:
+    """Pack an image as an OccupancyGrid of the map frame: its levels stand for probabilities."""
+    grid = image.grid
+    message = _Packer().header(image.t_ns, "map").stamp(image.t_ns).numbers("f", grid.cell_m)
+    message.numbers("I", grid.columns, grid.rows)
+    message.numbers("d", *planar(np.array([grid.x_m, grid.y_m, 0.0])))
+    return message.numbers("I", image.levels.size).array(image.levels).done()
+
+
+def read_occupancy_grid(t_ns: int, data: bytes) -> RadarImage:
+    """Read what `occupancy_grid` packed; a cell's length is as float32 had it."""
+    message = deserialise(data, OCCUPANCY_GRID)
+    info = message.info
+    grid = Grid(
+        x_m=info.origin.position.x,
+        y_m=info.origin.position.y,
+        cell_m=info.resolution,
+        rows=info.height,
+        columns=info.width,
+    )
+    return RadarImage(t_ns=t_ns, grid=grid, levels=message.data.reshape(grid.rows, grid.columns))
 
 
 def path(t_ns: int, frame: str, stamps_ns: NDArray[np.int64], poses: Array) -> bytes:

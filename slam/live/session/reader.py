@@ -38,7 +38,15 @@ from slam.live.session.description import (
 )
 from slam.live.session.lost_messages import read_gap
 from slam.live.session.state_rows import smoothed_of, snapshot_of, with_step
-from slam.live.session_records import Gap, LogLine, RadarInfo, Scan, SessionInfo, Snapshot
+from slam.live.session_records import (
+    Gap,
+    LogLine,
+    RadarImage,
+    RadarInfo,
+    Scan,
+    SessionInfo,
+    Snapshot,
+)
 from slam.results import NoiseAt, SmoothedRun
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.operating_system import StopFlag
@@ -219,7 +227,9 @@ class ScanEnd:
     truth: NDArray[np.float64] | None
 
 
-SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot | SmoothedRun | Gap
+SessionRecord: TypeAlias = (
+    RadarFrame | TumSample | LogLine | ScanEnd | Snapshot | SmoothedRun | RadarImage | Gap
+)
 """What `RecordedSession.records` yields; a TumSample is odometry."""
 
 
@@ -259,6 +269,7 @@ _READERS: Mapping[str, Callable[[McapMessage], SessionRecord]] = {
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
     "/log": lambda one: cdr.read_log_line(one.t_ns, one.data),
+    "/image": lambda one: cdr.read_occupancy_grid(one.t_ns, one.data),
     "/slam/smoothed": lambda one: smoothed_of(one.t_ns, unpack_array(DOUBLE_ARRAY, one.data)),
 }
 
@@ -381,7 +392,9 @@ class RecordedSession:
         """Yield every scan but those that damage or the end of a cut file left incomplete."""
         return (record for record in self.played() if isinstance(record, Scan))
 
-    def played(self) -> Iterator[Scan | TumSample | LogLine | Snapshot | SmoothedRun | Gap]:
+    def played(
+        self,
+    ) -> Iterator[Scan | TumSample | LogLine | Snapshot | SmoothedRun | RadarImage | Gap]:
         """Yield what `records` does, with the frames put together into scans as in `scans`."""
         held: list[tuple[RadarFrame, int]] = []
         for message, record in self._records():
@@ -405,6 +418,18 @@ class RecordedSession:
                     )
             else:
                 yield record
+
+    def frames(self) -> Iterator[RadarFrame]:
+        """Yield every frame without its radar's gain, used or not, and read nothing else."""
+        for radar, part, entry in self._messages():
+            if part == "frame":
+                info = self.info.radars[radar]
+                with _naming(self.path, entry):
+                    samples = unpack_array(FLOAT_ARRAY, entry.data)
+                    frame = recorded_frame(
+                        radar, info, samples, t_ns=entry.t_ns, counter=entry.sequence
+                    )
+                yield less_gain(frame, info.gain_db)
 
     def detections(self) -> dict[int, tuple[Detection, ...]]:
         """Return the recorded ranges by the time of their scan [ns]; amplitudes are unknown."""

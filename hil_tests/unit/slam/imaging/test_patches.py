@@ -13,10 +13,10 @@ from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, compose
 from slam.imaging.back_projection import back_project
 from slam.imaging.patches import (
-    BasebandFrame,
     Patch,
     PatchMaker,
     PatchRule,
+    RecordedFrame,
     longest_spacing_m,
 )
 from slam.imaging.range_profiles import StaticPart
@@ -185,7 +185,7 @@ def test_baseband_frames_come_to_a_focus_as_rf_frames_do() -> None:
         r = math.dist(ROD, antenna)
         x = ranges_m - MOUNT.range_offset_m - r
         samples = 0.01 * np.exp(-0.5 * (x / MODEL.sigma_m) ** 2 - 1j * WAVE_NUMBER * r)
-        frame = BasebandFrame(
+        frame = RecordedFrame(
             t_ns=200_000_000 * index,
             samples=samples.astype(np.complex64),
             range_start_m=START_M,

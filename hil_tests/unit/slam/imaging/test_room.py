@@ -61,7 +61,8 @@ def leg(start: Array, length_m: float = 0.25, step_m: float = 0.01) -> Array:
 def room_of(legs: list[tuple[Mount, Array]], rods: Array = RODS, **options: object) -> RoomImage:
     room = RoomImage(**options)  # type: ignore[arg-type]  # tests give what it takes
     for mount, poses in legs:
-        room.add(patch_at(poses, mount, rods), poses)
+        patch = patch_at(poses, mount, rods)
+        room.add(patch, patch.origin)
     return room
 
 
@@ -181,8 +182,8 @@ def test_patches_with_grating_lobes_show_only_what_no_other_does() -> None:
 def test_an_image_that_is_full_grows_no_further_and_keeps_what_it_has() -> None:
     room = RoomImage(cell_m=0.02, most_cells=100_000)
     near, far = LEGS[0][1], leg(np.array([40.0, 0.0, 0.0]))
-    room.add(patch_at(near), near)
+    room.add(patch_at(near), near[len(near) // 2])
     before, grid = room.values.copy(), room.grid
-    room.add(patch_at(far, rods=RODS + np.array([40.0, 0.0])), far)
+    room.add(patch_at(far, rods=RODS + np.array([40.0, 0.0])), far[len(far) // 2])
     assert room.grid == grid
     np.testing.assert_array_equal(room.values, before)
