@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from slam.app.benchmarks import BENCHMARKS
+from slam.app.benchmarks import BENCHMARKS, IMAGE_BENCHMARKS
 from slam.app.errors import EXIT_USAGE
 from slam.app.publish import SINKS
 from slam.app.sweep import FAMILIES, STRESSES
@@ -683,11 +683,12 @@ def _add_frame_area(parser: argparse.ArgumentParser, text: str) -> None:
 
 
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
+    known = {**BENCHMARKS, **IMAGE_BENCHMARKS}
     benchmark.add_argument(
         "name",
-        choices=tuple(BENCHMARKS),
+        choices=tuple(known),
         metavar="NAME",
-        help="; ".join(f"{name}: {text}" for name, text in BENCHMARKS.items()),
+        help="; ".join(f"{name}: {text}" for name, text in known.items()),
     )
     benchmark.add_argument(
         "--data", type=Path, required=True, metavar="DIR", help="folder with the files"
@@ -801,7 +802,8 @@ _COMMANDS = (
         _add_benchmark,
         "Runs the back end of preset robust on all drives of a public data set that you have "
         "fetched, with and without the ids of landmarks where the data allow, and prints each "
-        "path's error against the truth, beside dead reckoning. Writes paths as TUM text, a "
+        "path's error against the truth, beside dead reckoning. Of p440 it makes images instead, "
+        "and prints how sharp they are. Writes paths as TUM text, a "
         "picture NAME.png and NAME.json. docs/benchmarks.md says where the data are from.",
     ),
     _Subcommand(

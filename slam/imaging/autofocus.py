@@ -12,8 +12,8 @@ then looked for anew, and so on. Of all these paths the one that makes its point
 be it the one that was given. A shift or turn of all, which leaves images sharp, is not found.
 
 Sources: Wahl, Eichel, Ghiglia, Jakowatz, IEEE Trans. Aerospace and Electronic Systems 30 (1994)
-827, on phases of the brightest points; Evers, Jackson, IEEE Trans. Computational Imaging 5 (2019)
-606, on the same behind back-projection, for paths of any shape.
+827, on phases of the brightest points; Ash, IEEE Geoscience and Remote Sensing Letters 9 (2012)
+103, on back-projected images: a path is corrected where the image becomes sharper.
 """
 
 from __future__ import annotations

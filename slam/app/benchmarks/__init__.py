@@ -16,3 +16,8 @@ BENCHMARKS: Mapping[str, str] = {
 }
 """What each data set shows. Its module in this package, whose name has an underscore in place of a
 hyphen, has a function ``read_data_set(folder)`` that returns a `DataSet`."""
+
+IMAGE_BENCHMARKS: Mapping[str, str] = {
+    "p440": "a PulsON 440 radar on a rail before corner reflectors, for images (p440_*.npz)",
+}
+"""The same of data for images; the module has a function ``run_trials``."""

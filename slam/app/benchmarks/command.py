@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from slam.app.benchmarks import IMAGE_BENCHMARKS
 from slam.app.benchmarks.data_set import DataSet
 from slam.app.benchmarks.path_errors import (
     ODOMETRY,
@@ -55,6 +56,9 @@ def run_benchmark(stop: StopFlag, *, name: str, data: Path, out: Path, as_json: 
     Raises AppError if a file is missing, is not what it should be, or cannot be written.
     """
     module = import_module(f"slam.app.benchmarks.{name.replace('-', '_')}")
+    if name in IMAGE_BENCHMARKS:
+        module.run_trials(stop, data=data, out=out, as_json=as_json)
+        return
     data_set: DataSet = module.read_data_set(data)
     runs = []
     with made_folder(out):  # what cannot be written ends the command before any run
