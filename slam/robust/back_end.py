@@ -71,7 +71,7 @@ from slam.robust.map import (
     saved_map_of,
     take_map,
 )
-from slam.robust.parameters import BackEndParameters, ImagedPointRule
+from slam.robust.parameters import BackEndParameters
 from slam.robust.proposals.slips import Change, Course, judge_change, move_anew
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
@@ -144,7 +144,7 @@ class RobustBackEnd:
             scale * parameters.wheels.walk_lever_m,
         )
         self._tentative = TentativePoints(parameters)
-        self._imaged_noise = ImagedNoise(parameters.imaged or ImagedPointRule())
+        self._imaged_noise = ImagedNoise(parameters.imaged)
         self._existence = Existence(
             parameters.map, rule.min_frames, parameters.ranges.detection_probability
         )
@@ -387,8 +387,7 @@ class RobustBackEnd:
         ``decide`` what is unclear is taken for the likeliest; without it, questions stay open.
         """
         patches = [scan for scan in scans if scan.is_patch]
-        if patches:
-            scans = [scan for scan in scans if not scan.is_patch]
+        scans = [scan for scan in scans if not scan.is_patch]
         radars = {scan.radar for scan in scans}
         if len(radars) < len(scans) or max(radars, default=0) >= len(self.rig.mounts):
             raise ValueError(
@@ -433,9 +432,7 @@ class RobustBackEnd:
             continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
             likelihoods, predicted = [*likelihoods, *evidence], [*predicted, *more]
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
-        for scan in patches:
-            likelihoods += self._take_points(self._imaged_noise.of(scan), added_m)[2]
-            self._decide()
+        of_patches = self._take_patches(patches, added_m)
         of_tracklets = self._initialise_landmarks()
         self._delete_vanished(solve=solve)
         self._n_updates += 1
@@ -452,7 +449,7 @@ class RobustBackEnd:
             nis=nis,
             dof=dof,
             predicted=tuple(predicted),
-            evidence=(*likelihoods, *evidence_of_misses, *of_tracklets),
+            evidence=(*likelihoods, *evidence_of_misses, *of_patches, *of_tracklets),
         )
 
     def _decide(self) -> None:
@@ -511,8 +508,10 @@ class RobustBackEnd:
 
     def _look(self, antennas: Antennas) -> View:
         """Return the view of all features of which single ranges may be."""
-        seen, rule = self._walls.look(view(self.state, antennas), antennas), self.parameters.imaged
-        return seen if rule is None else seen.without_crowds(self.parameters.ranges, rule.crowd_m)
+        seen, noise = self._walls.look(view(self.state, antennas), antennas), self.parameters.ranges
+        if not noise.has_patches:
+            return seen
+        return seen.without_crowds(noise, self.parameters.imaged.crowd_m)
 
     def _count(self, known: Known) -> list[int]:
         """Count hits and misses; return landmarks surely in view and not heard, once per radar."""
@@ -653,6 +652,16 @@ class RobustBackEnd:
                 del self._waiting[label]
                 self._landmark_of_label[label] = landmark_id
                 self._existence.hit(landmark_id, waiting.n_ranges)
+
+    def _take_patches(
+        self, patches: Sequence[RangeScan], added_m: float
+    ) -> list[tuple[int, float]]:
+        """Take in the points of patches one after the other; return ids and evidence."""
+        found = list[tuple[int, float]]()
+        for scan in patches:
+            found += self._take_points(self._imaged_noise.of(scan), added_m)[2]
+            self._decide()
+        return found
 
     def _take_points(
         self, scan: RangeScan, added_m: float
@@ -899,7 +908,7 @@ class RobustBackEnd:
     def _ranges_of(self, tentative: TentativePoint) -> Tracklet | None:
         """Return the unassigned single ranges of what patches hold, and use them up."""
         rule = self.parameters.tracklets
-        if self.parameters.imaged is None:
+        if not self.parameters.ranges.has_patches:
             return None
         side = self._sides[self._side_of[tentative.seen[-1].radar]]
         search = Search(radars=side, window=rule.long_window, min_frames=rule.min_hits_per_radar)
@@ -928,7 +937,7 @@ class RobustBackEnd:
                 wall_id = self._walls.place(wall)
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
-            if self.parameters.imaged is not None:
+            if self.parameters.ranges.has_patches:
                 continue  # patches show points sooner, and apart from their neighbours
             search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
             if is_single:

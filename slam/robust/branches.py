@@ -760,7 +760,7 @@ class Branches:
         older = [row for row in rows if ids[row] not in new_ids]
         here = constellation_of(main.state, new, rule.model_sigma_m)
         there = constellation_of(main.state, older, rule.model_sigma_m)
-        is_possible = None if main.parameters.imaged is None else self._is_near
+        is_possible = self._is_near if main.parameters.ranges.has_patches else None
         placement = find_placement(here, there, rule, is_possible)
         if placement is not None:
             main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs])
@@ -771,7 +771,8 @@ class Branches:
         away = compose(placement.motion, pose) - pose
         away[2] = math.remainder(float(away[2]), math.tau)
         covariance = self.main.pose_covariance + self.doubted_covariance
-        return float(away @ np.linalg.solve(covariance, away)) <= chdtri(3, TAIL_PROBABILITY)
+        limit = float(chdtri(3, TAIL_PROBABILITY))
+        return float(away @ np.linalg.solve(covariance, away)) <= limit
 
     def _begin_carry(self, since: int) -> None:
         before, step = self._at(since), self._steps[since]

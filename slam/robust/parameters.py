@@ -73,6 +73,8 @@ class RangeNoise:
     # Where targets are detected
     min_range_m: float = 0.2
     max_range_m: float = 1.5
+    # Whether points of patches (`slam.imaging`) come beside single ranges
+    has_patches: bool = False
 
     @property
     def field_of_view(self) -> FieldOfView:
@@ -456,20 +458,21 @@ class BackEndParameters:
     splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)
     jumps: JumpNoise = field(default_factory=JumpNoise)
-    imaged: ImagedPointRule | None = None  # None: there are no patches
+    imaged: ImagedPointRule = field(default_factory=ImagedPointRule)
 
     @property
     def fewest_detections(self) -> int:
         """Return how many detections with bearings a landmark needs at least."""
-        return self.tracklets.min_hits_per_radar if self.imaged is None else self.imaged.new_patches
+        patches, otherwise = self.imaged.new_patches, self.tracklets.min_hits_per_radar
+        return patches if self.ranges.has_patches else otherwise
 
     @property
     def frames_per_scan(self) -> int:
         """Return as how many frames a scan with bearings counts for the existence of a landmark."""
-        return 1 if self.imaged is None else self.imaged.frames_per_patch
+        return self.imaged.frames_per_patch if self.ranges.has_patches else 1
 
     def detections_to_ask(self, *, is_new: bool) -> int:
         """Return from how many detections with bearings on it is decided what they are of."""
-        if self.imaged is None:
+        if not self.ranges.has_patches:
             return self.tracklets.min_frames
         return self.imaged.new_patches if is_new else self.imaged.unclear_patches

@@ -30,7 +30,7 @@ from slam.results import (
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
-from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
+from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import calibrated_motion, quarter_turn, rotation
 
@@ -116,7 +116,7 @@ class RobustSlam:
         """
         stamps_ns = self._check.stamps_ns(frames)
         detect = partial(detect_all, self._detector, frames, self.rig)
-        return self._take(detect, stamps_ns, pose_at, t_ns, given, frames)
+        return self._take(detect, stamps_ns, pose_at, t_ns, given=given, frames=frames)
 
     def flush(self) -> tuple[StepResult, ...]:
         return ()
@@ -161,6 +161,7 @@ class RobustSlam:
         stamps_ns: dict[int, int],
         pose_at: PoseAt,
         t_ns: int,
+        *,
         given: Sequence[RangeScan] = (),
         frames: Sequence[RadarFrame] = (),
     ) -> tuple[StepResult, ...]:
@@ -210,9 +211,7 @@ class RobustSlam:
             ),
         )
 
-    def _accept(
-        self, frames: Sequence[RadarFrame], poses: Mapping[int, Array], t_ns: int
-    ) -> None:
+    def _accept(self, frames: Sequence[RadarFrame], poses: Mapping[int, Array], t_ns: int) -> None:
         """Take a step; images take every frame, even where the robot has hardly moved."""
         self._check.accept(t_ns)
         if self._patches is not None:
@@ -356,10 +355,9 @@ def back_end_parameters(
     robust, limits = config.robust, config.detection
     reach_m = limits.max_range_m - limits.min_range_m
     rules = rules or BackEndParameters()
-    imaged = (rules.imaged or ImagedPointRule()) if robust.patches else None
+    unmapped_per_m2 = RangeNoise().unmapped_per_m2
     return replace(
         rules,
-        imaged=imaged,
         wheels=replace(wheels, walk_per_sqrt_m=robust.wheel_walk_per_sqrt_m),
         ranges=RangeNoise(
             sigma_m=robust.range_sigma_m,
@@ -374,7 +372,8 @@ def back_end_parameters(
             field_of_view_rad=robust.field_of_view_rad,
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m,
-            **({} if imaged is None else {"unmapped_per_m2": imaged.unmapped_per_m2}),
+            has_patches=robust.patches,
+            unmapped_per_m2=rules.imaged.unmapped_per_m2 if robust.patches else unmapped_per_m2,
         ),
     )
 

@@ -139,7 +139,7 @@ def find_placement(
     rule: BranchRule,
     is_possible: Callable[[Placement], bool] | None = None,
 ) -> Placement | None:
-    """Return the motion from ``here`` to ``there`` that stands out of the possible ones, or None."""
+    """Return the motion from ``here`` to ``there`` that stands out of those possible, or None."""
     found = find_placements(here, there, rule)
     if is_possible is not None:
         found = [one for one in found if is_possible(one)]

@@ -1,0 +1,282 @@
+"""Points of patches as detections: what their scans say, and what the back end makes of them."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam.app.sweep.run import make_case, source_of
+from slam.config import ConfigError, RobustConfig, WheelNoise, config_from_tables, load_preset
+from slam.frames import RadarFrame
+from slam.geometry import between, compose, paper_rig, transform
+from slam.imaging.imager import ImagedPatch, Imager
+from slam.imaging.patches import Patch
+from slam.imaging.points import PatchPoint, PointKind
+from slam.results import Belief
+from slam.robust.association import ImagedNoise, RangeScan, View, antennas_of
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.initialisation import body_point, detections_of
+from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
+from slam.robust.pipeline import PatchScans, RobustSlam, back_end_parameters
+
+Array = NDArray[np.float64]
+
+RIG = paper_rig()
+NOISE = RangeNoise(has_patches=True, unmapped_per_m2=1.0)
+PARAMETERS = BackEndParameters(ranges=NOISE)
+RULE = ImagedPointRule()
+ROD = np.array([0.3, 0.9])  # in view of radar 0 from about the origin
+
+
+class GivenPatches:
+    """An imager that has one patch, of the third frame, and looks up poses as a real one does."""
+
+    def __init__(self, make: Callable[[Array], ImagedPatch]) -> None:
+        self._make, self.n_steps = make, 0
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: Callable[[int], Array]
+    ) -> tuple[ImagedPatch, ...]:
+        self.n_steps += 1
+        return (self._make(pose_at(2)),) if self.n_steps == 3 else ()
+
+
+def imaged(origin: Array, rod: Array, covariance: Array) -> ImagedPatch:
+    """Return a patch of radar 0 about a pose that shows a rod, (2,) in its body frame, exactly."""
+    mount = RIG.mounts[0]
+    away = rod - (mount.x_m, mount.y_m)
+    point = PatchPoint(
+        x_m=float(rod[0]),
+        y_m=float(rod[1]),
+        range_m=math.hypot(*away),
+        bearing_rad=math.atan2(away[1], away[0]) - mount.yaw_rad,
+        covariance=covariance,
+        amplitude=0.015,
+        snr=30.0,
+        coherence=0.95,
+        kind=PointKind.POINT,
+    )
+    # Scans take the radar, the mount and the origin of a patch, and no profile.
+    patch = Patch(
+        radar=0,
+        mount=mount,
+        view=NOISE.field_of_view,
+        t_ns=np.array([2]),
+        poses=np.zeros((1, 3)),
+        middle=0,
+        origin=origin,
+        profiles=cast("Patch", None),  # type: ignore[arg-type]
+    )
+    return ImagedPatch(patch=patch, points=(point,), lines=())
+
+
+def test_a_point_lies_where_it_is_from_the_newest_pose() -> None:
+    """Wheels with errors of 2, 3 % and 0.05 rad/m, on a path that turns: known, they do no harm."""
+    s, w, kappa = 0.02, 0.03, 0.05
+    true = [np.zeros(3)]
+    for step in ([0.05, 0.0, 0.1], [0.04, 0.01, -0.2], [0.06, 0.0, 0.15], [0.05, 0.0, 0.1]):
+        true.append(compose(true[-1], np.array(step)))
+    reported = [np.array([3.0, -2.0, 1.0])]
+    for before, after in pairwise(true):
+        dx, dy, turn = between(before, after).tolist()
+        way = math.hypot(dx, dy)
+        step = np.array([(1 + s) * dx, (1 + s) * dy, (1 + w) * turn + kappa * way])
+        reported.append(compose(reported[-1], step))
+    rod_from_2 = transform(between(true[2], np.zeros(3)), ROD)
+    imager = GivenPatches(lambda origin: imaged(origin, rod_from_2, 1e-6 * np.eye(2)))
+    calibration = np.array([s, w, kappa])
+    scans = PatchScans(cast("Imager", imager), RIG, WheelNoise())
+    for t_ns, pose in enumerate(reported):
+        scans.take((), {t_ns: pose}, t_ns, calibration)
+    (scan,) = scans.scans(calibration)
+    assert scans.scans(calibration) == []
+    assert scan.is_patch
+    back_end = RobustBackEnd(RIG, PARAMETERS)
+    antennas = antennas_of(RIG, [scan], calibration)
+    (detection,) = detections_of(scan, [0], 0, antennas, NOISE)
+    point = body_point(back_end.state, antennas, detection)
+    expected = transform(between(true[4], np.zeros(3)), ROD)
+    np.testing.assert_allclose(point.point_m, expected, atol=1e-12)
+    # Noise: that of the point, 1 mm each way, and of the wheels between the two poses
+    back = between(true[4], true[2])
+    along, _, heading = WheelNoise().step_variances(math.hypot(back[0], back[1]), back[2])
+    assert scan.sigmas_m == pytest.approx((math.sqrt(1e-6 + along),))
+    across = 1e-6 / scan.ranges_m[0] ** 2
+    assert scan.bearing_sigmas_rad == pytest.approx((math.sqrt(across + heading),))
+
+
+def test_patches_of_all_radars_are_taken_one_a_state() -> None:
+    class AllAtOnce:
+        n_steps = 0
+
+        def step(
+            self, frames: Sequence[RadarFrame], pose_at: Callable[[int], Array]
+        ) -> tuple[ImagedPatch, ...]:
+            self.n_steps += 1
+            one = imaged(pose_at(self.n_steps - 1), ROD, 1e-6 * np.eye(2))
+            return (one,) * {1: 4, 2: 3}.get(self.n_steps, 0)
+
+    scans, zero = PatchScans(cast("Imager", AllAtOnce()), RIG, WheelNoise()), np.zeros(3)
+    taken = []
+    for t_ns in range(5):
+        scans.take((), {t_ns: zero}, t_ns, zero)
+        taken.append(len(scans.scans(zero)))
+    assert taken == [1, 3, 1, 1, 1]  # behind the first there are 3 and 3 more: 4 may wait
+
+
+def test_the_noise_of_points_is_that_of_their_innovations() -> None:
+    scan = seen_from(np.zeros(3), ROD)
+    noise = ImagedNoise(RULE)
+    assert noise.of(scan).sigmas_m == (RULE.least_sigma_m,)
+    assert noise.of(scan).bearing_sigmas_rad == pytest.approx((3 * RULE.least_sigma_rad,))
+    rng = np.random.default_rng(3)
+    innovations = rng.standard_normal((RULE.window, 2)) * (5e-3, 2e-2)
+    noise.learn(np.full((40, 2), 9.0))  # forgotten
+    noise.learn(innovations)
+    median = np.median(np.abs(innovations), axis=0)
+    learned = noise.of(replace(scan, sigmas_m=(0.0,)))
+    assert learned.sigmas_m == pytest.approx((1.4826 * median[0],))
+    assert learned.bearing_sigmas_rad == pytest.approx((3 * 1.4826 * median[1],))
+    assert noise.of(replace(scan, sigmas_m=(0.1,))).sigmas_m == (0.1,)
+
+
+def seen_from(pose: Array, *rods: Array) -> RangeScan:
+    """Return the scan of a patch of radar 0 that shows rods (2,) of the map from a pose."""
+    mount = RIG.mounts[0]
+    away = [transform(between(pose, np.zeros(3)), rod) - (mount.x_m, mount.y_m) for rod in rods]
+    return RangeScan(
+        radar=0,
+        is_patch=True,
+        ranges_m=tuple([math.hypot(*one) for one in away]),
+        sigmas_m=(1e-3,) * len(rods),
+        bearings_rad=tuple([math.atan2(one[1], one[0]) - mount.yaw_rad for one in away]),
+        bearing_sigmas_rad=(1e-3,) * len(rods),
+    )
+
+
+STEP = np.array([0.01, 0.0, 0.0])
+
+
+def ranges_at(pose: Array) -> list[RangeScan]:
+    """Return what radars 0 and 1 measure of the rod."""
+    found = []
+    for radar in (0, 1):
+        mount = RIG.mounts[radar]
+        antenna = transform(pose, np.array([mount.x_m, mount.y_m]))
+        range_m = math.hypot(*(ROD - antenna))
+        found.append(RangeScan(radar=radar, ranges_m=(range_m,), sigmas_m=(1e-3,)))
+    return found
+
+
+def test_two_patches_make_a_landmark_with_the_single_ranges_of_before() -> None:
+    """Ranges alone make none; patches that do not hold it later say nothing against it."""
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    counts = []
+    for number in range(25):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        patch = [seen_from(pose, ROD)] if number in (20, 22) else []
+        back_end.update([*ranges_at(pose), *patch])
+        counts.append(len(back_end.state.landmark_ids))
+    assert counts == [0] * 22 + [1] * 3
+    assert back_end.reported_rows() == [0]
+    np.testing.assert_allclose(back_end.state.landmarks_m[0], ROD, atol=1e-3)
+    used = len(back_end._log._ranges.rows)
+    assert used >= 2 + 2 * 15 + 2 * 2  # two points, what waited, and two states later
+    for _ in range(60):
+        back_end.predict(np.zeros(3))
+        back_end.update([seen_from(pose)])
+    assert back_end.reported_rows() == [0]
+
+
+def test_what_may_be_known_waits_for_four_patches() -> None:
+    """The pose is known to 0.3 m only: a rod 20 cm from a known one may be that."""
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    for _ in range(2):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        back_end.update([seen_from(pose, ROD)])
+    back_end.predict(STEP, np.diag([0.09, 0.09, 0.01]))
+    pose = compose(pose, STEP)
+    counts = []
+    for _ in range(4):
+        back_end.update([seen_from(pose, ROD + (0.2, 0.0))])
+        counts.append((len(back_end.state.landmark_ids), round(float(back_end.pose[0]), 2)))
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+    first, last = counts[:3], counts[3]
+    assert first == [(1, 0.03), (1, 0.04), (1, 0.05)]
+    assert last != (1, 0.06)  # it is decided now, whichever way
+
+
+def test_ranges_of_landmarks_at_one_range_are_not_used() -> None:
+    """Of the radar that hears both, within the field of view; of the other one they are."""
+    view = View(
+        ranges_m=np.array([[0.9, 1.0, 0.95, 1.3], [0.7, 1.0, 0.9, 1.3]]),
+        off_boresight_rad=np.array([[0.1, -0.2, 2.0, 0.0], [0.1, -0.2, 0.3, 0.0]]),
+        directions=np.zeros((2, 4, 2)),
+        by_feature=np.zeros((2, 4, 2)),
+        turned=np.zeros((2, 2, 2)),
+    )
+    left = view.without_crowds(NOISE, 0.13)
+    is_out = left.off_boresight_rad == math.pi
+    assert is_out.tolist() == [[True, True, True, False], [False, True, True, False]]
+    kept = ~is_out
+    np.testing.assert_array_equal(left.off_boresight_rad[kept], view.off_boresight_rad[kept])
+
+
+@pytest.mark.parametrize("value", ["true", 1, 1.0, "yes"])
+def test_the_switch_of_a_file_is_true_or_false(value: object) -> None:
+    with pytest.raises(ConfigError):
+        config_from_tables({"robust": {"patches": value}}, source="x.toml")
+    config = config_from_tables({"robust": {"patches": True}}, source="x.toml")
+    assert config.robust.patches
+    assert not RobustConfig().patches
+
+
+def test_the_option_is_off_in_the_preset() -> None:
+    preset = load_preset("robust")
+    assert not preset.robust.patches
+    assert back_end_parameters(preset, WheelNoise()).ranges == replace(
+        back_end_parameters(preset, WheelNoise()).ranges, has_patches=False, unmapped_per_m2=0.02
+    )
+
+
+def short_drive(patches: str) -> tuple[Belief, Array]:
+    """Return what is known at the end of the first leg of a dense room, and the true rods."""
+    case = make_case("dense:13", "robust", 13, settings={"robust.patches": patches}, laps=1)
+    source = source_of(case)
+    assert isinstance(source.slam, RobustSlam)
+    pose_at = source.odometry.pose_at
+    belief = None
+    for number, scan in enumerate(source.scans):
+        for result in source.slam.step(scan.frames, pose_at, scan.t_ns):
+            belief = result.belief
+        if number == 200:
+            break
+    source.close()
+    assert belief is not None
+    start = source.truth_at(np.array([0]))[0]
+    rods = transform(between(start, np.zeros(3)), source.info.true_landmarks_m)
+    return belief, np.asarray(rods)
+
+
+def test_a_dense_room_is_mapped_on_the_first_leg() -> None:
+    """With patches every rod that one sees for long is a landmark, without them some are not."""
+    found = []
+    for patches in ("true", "false"):
+        belief, rods = short_drive(patches)
+        end = belief.pose
+        # Beside the middle of the leg, 0.3 to 1 m from the antennas: in view for 0.4 m at least
+        is_beside = (rods[:, 0] > 0.2 * end[0]) & (rods[:, 0] < 0.8 * end[0])
+        is_beside &= (np.abs(rods[:, 1]) > 0.5) & (np.abs(rods[:, 1]) < 1.2)
+        gaps = np.linalg.norm(rods[is_beside][:, None] - belief.landmarks[None], axis=2)
+        found.append(int(np.count_nonzero(gaps.min(axis=1, initial=9.0) < 0.05)))
+        n = int(np.count_nonzero(is_beside))
+    assert found[0] == n
+    assert found[1] < n
