@@ -85,8 +85,8 @@ def test_a_point_lies_where_it_is_from_the_newest_pose() -> None:
     for before, after in pairwise(true):
         dx, dy, turn = between(before, after).tolist()
         way = math.hypot(dx, dy)
-        step = np.array([(1 + s) * dx, (1 + s) * dy, (1 + w) * turn + kappa * way])
-        reported.append(compose(reported[-1], step))
+        motion = np.array([(1 + s) * dx, (1 + s) * dy, (1 + w) * turn + kappa * way])
+        reported.append(compose(reported[-1], motion))
     rod_from_2 = transform(between(true[2], np.zeros(3)), ROD)
     imager = GivenPatches(lambda origin: imaged(origin, rod_from_2, 1e-6 * np.eye(2)))
     calibration = np.array([s, w, kappa])
@@ -205,7 +205,7 @@ def test_what_may_be_known_waits_for_four_patches() -> None:
     pose = compose(pose, STEP)
     counts = []
     for _ in range(4):
-        back_end.update([seen_from(pose, ROD + (0.2, 0.0))])
+        back_end.update([seen_from(pose, np.array([0.5, 0.9]))])
         counts.append((len(back_end.state.landmark_ids), round(float(back_end.pose[0]), 2)))
         back_end.predict(STEP)
         pose = compose(pose, STEP)
