@@ -216,6 +216,14 @@ def test_amplitude_jitter_is_common_to_a_frame_and_selected_by_its_counter() -> 
         assert not (other == whole).any()
 
 
+def test_amplitude_and_phase_jitter_are_independent() -> None:
+    jitter = CarrierJitter(JitterSpec(white_rad=0.1, amplitude=0.05), seed=2, serial=7)
+    indices, frames = np.arange(1000, dtype=np.int64), np.ones((1000, 1))
+    jitter.scale(frames, indices)
+    phases = jitter.phases_rad(indices, indices * 58_000_000)
+    assert abs(np.corrcoef(frames[:, 0], phases)[0, 1]) < 0.13  # 4 standard errors
+
+
 @pytest.mark.parametrize("position", [200.0, 199.50001, 312.123])
 def test_a_pulse_with_an_offset_of_its_carrier_is_its_formula(position: float) -> None:
     frame = sum_of_pulses(
