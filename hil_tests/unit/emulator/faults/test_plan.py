@@ -51,6 +51,10 @@ def test_every_parameter_has_a_meaning_and_a_limit(kind: str) -> None:
             "[[fault]]\nkind = 'stall'\nparameters = { seconds = -1 }",
             "fault[0]: parameters.seconds: ",
         ),
+        (
+            f"[[fault]]\nkind = 'counter_jump'\nparameters = {{ frames = {2**31 - 1} }}",
+            "fault[0]: parameters.frames: ",  # it would be a jump back
+        ),
         ("[[fault]]\nkind = 'stall'\nprobability = 2", "fault[0].probability: "),
         ("[[fault]]\nkind = 'stall'\nat_s = nan", "fault[0].at_s: "),
         ("[[fault]]\nkind = 'nack'\ncommand = 'PIG'", '"PIG"'),

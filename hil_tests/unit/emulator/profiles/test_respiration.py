@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from emulator.chip import Pace
+from emulator.echo.echo import SceneEcho
 from emulator.module.settings import RESPIRATION_PROFILES, DeviceOptions
-from emulator.profiles.doppler import SLOW
-from emulator.profiles.respiration import breathing_rate_hz, displacement_m
+from emulator.profiles.doppler import SLOW, NoiseMap, ProfileSweep
+from emulator.profiles.presence import PresenceProcessing
+from emulator.profiles.respiration import (
+    breathing_rate_hz,
+    displacement_m,
+    normalized_movement_list,
+)
 from emulator.scene.scene import Scene
 from hil_tests.unit.emulator.doubles import BareHost, ramp_device
 from hil_tests.unit.emulator.profiles.doubles import (
@@ -208,6 +214,23 @@ def test_lists_say_where() -> None:
     assert 0.3 < max(normalized.movement_slow) <= 1
     assert moving.movement_slow[0] == pytest.approx(np.mean(moving.movement_slow[1:]), rel=1e-5)
     assert 1 + int(np.argmax(moving.movement_slow[1:])) == 1 + strongest // 10
+
+
+def test_normalized_movement_is_0_at_an_excess_of_3_db_and_1_at_40() -> None:
+    sweep = ProfileSweep(
+        SceneEcho(room(), room().radars[0], seed=1),
+        zone_m=(1.0, 1.25),
+        tx_center_frequency=3,
+        largest_block=1,
+    )
+    processing = PresenceProcessing(sweep, NoiseMap())
+    excess_db = np.linspace(-7.0, 50.0, sweep.n_bins)
+    processing.excess[SLOW.instance] = 10.0 ** (excess_db / 10.0)
+    message = normalized_movement_list(7, processing, sweep)
+    inside = excess_db[sweep.in_zone]
+    expected = np.interp(inside, [3.0, 40.0], [0.0, 1.0])
+    np.testing.assert_allclose(message.movement_slow, expected, atol=1e-12)
+    assert message.movement_fast == (0.0,) * len(inside)
 
 
 @pytest.mark.parametrize("profile_id", sorted(RESPIRATION_PROFILES))

@@ -417,6 +417,27 @@ def test_the_bootloader_is_found_at_another_port(driver_on: DriverOn, decoy_runs
     assert other.bootloader.page(128) == b"\xff" * 512
 
 
+@pytest.mark.parametrize("banner", ["OLD BOOTLOADER", f"NEW BOOTLOADER ID:{CORE_ID}"])
+@pytest.mark.parametrize("core_id", [CORE_ID, None])
+def test_a_bootloader_is_known_by_its_port_where_a_number_is_missing(
+    driver_on: DriverOn, core_id: str | None, banner: str
+) -> None:
+    """Either the banner or the application has none: what comes back at the port is the module."""
+    machine = Machine("home")
+    module = UpdatableModule(core_id=core_id)
+    module.banner = banner.encode()
+
+    def behind_a_cable(command: m.Message) -> Said:
+        if isinstance(command, m.StartBootloader):
+            first.vanish_later(0.5)
+            machine.plug("home", module, first.now_ns * 1e-9 + 2.5)
+        return module(command)
+
+    radar, first = driver_on(behind_a_cable, ports=machine.ports, name="home")
+    machine.runs_on(first)
+    assert radar.firmware.start_bootloader() == banner
+
+
 # --- single questions
 
 

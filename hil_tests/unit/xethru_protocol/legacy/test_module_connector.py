@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -373,6 +374,7 @@ def test_a_recorder_that_a_script_forgets_leaves_a_whole_recording(
 ) -> None:
     connector = ModuleConnector(module.path)
     recorder = connector.get_data_recorder()
+    began_ns = time.time_ns()
     assert recorder.start_recording(legacy.AllDataTypes, str(tmp_path)) == 0
     xep = connector.get_xep()
     xep.x4driver_set_fps(20)
@@ -380,8 +382,13 @@ def test_a_recorder_that_a_script_forgets_leaves_a_whole_recording(
     del recorder, xep, connector
     gc.collect()
     (folder,) = tmp_path.iterdir()
-    stored = [one.info for one, _ in read_recording(folder) if isinstance(one, m.DataFloat)]
-    assert stored[: len(counters)] == counters
+    rows = [
+        (one.info, t_ns) for one, t_ns in read_recording(folder) if isinstance(one, m.DataFloat)
+    ]
+    assert [counter for counter, _ in rows][: len(counters)] == counters
+    # Unix time, in milliseconds
+    times_ns = [t_ns for _, t_ns in rows]
+    assert began_ns - 10**6 <= times_ns[0] <= times_ns[-1] <= time.time_ns()
 
 
 def test_recorder_reports_what_it_cannot_do(

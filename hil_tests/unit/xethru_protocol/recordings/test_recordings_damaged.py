@@ -1,5 +1,6 @@
 """Recordings that are damaged, incomplete, refused or cut off: those of the vendor first."""
 
+import io
 import os
 import shutil
 import signal
@@ -30,7 +31,7 @@ from xethru_protocol.recordings import (
     read_recording,
     recording_facts,
 )
-from xethru_protocol.recordings.mcap import LocatedRecord
+from xethru_protocol.recordings.mcap import LocatedRecord, index_of
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role
 
@@ -397,6 +398,19 @@ def test_a_cut_index_of_mcap_is_reported_after_all_messages(missing: int, tmp_pa
     messages, faults = read_with_faults(path)
     assert len(messages) == len(expected)
     assert [fault.offset for fault in faults] == [path.stat().st_size]
+
+
+def test_the_index_of_a_whole_mcap_file_is_read_and_a_damaged_one_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    convert(copy_of("float", tmp_path), path)
+    whole = path.read_bytes()
+    (at,) = struct.unpack_from("<Q", whole, len(whole) - 28)  # behind the data, by the footer
+    found = list(index_of(io.BytesIO(whole), len(whole)))
+    assert (found[0].at, found[-1].at) == (at, len(whole) - 37)
+    assert found[-1].code == 0x02
+    damaged = bytearray(whole)
+    damaged[at + 12] ^= 1
+    assert not list(index_of(io.BytesIO(damaged), len(damaged)))
 
 
 def test_a_record_of_mcap_that_claims_more_than_the_file_is_not_waited_for(tmp_path: Path) -> None:
