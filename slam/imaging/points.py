@@ -45,8 +45,7 @@ class PointRule:
     wheels: WheelNoise = field(default_factory=WheelNoise)
     least_snr: float = 12.0
     least_coherence: float = 0.6
-    # Share of the frames: above one half, as one that is seen in fewer would be false
-    least_in_view: float = 0.56
+    least_in_view: float = 0.51  # share of the frames
     # Amplitude over that of the strongest that is no plane
     least_share: float = 0.2
     # Up to the first it is a point, beyond the second a plane, between the two something round
@@ -144,7 +143,7 @@ def _are_points(
     chosen &= in_view(patch, places) >= rule.least_in_view
     is_beside = np.abs(reflectors.range_m[:, np.newaxis] - reflectors.range_m) < rule.beside_m
     is_near = np.linalg.norm(places[:, np.newaxis] - places, axis=2) < rule.beside_m
-    share = rule.beside_share * (1 + is_near)
+    share = np.where(is_near, 2 * rule.beside_share, rule.beside_share)
     return np.asarray(chosen & ~np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1))
 
 

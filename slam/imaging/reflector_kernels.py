@@ -156,18 +156,19 @@ def image_rows(
             image[i, j] = (real * real + imag * imag) / max(count, 1)
 
 
-@kernel("int64(float64[:, ::1], float64[::1], float64)")
-def strongest_cell(image: Array, rows_m: Array, least_over_level: float) -> int:
+@kernel("int64(float64[:, ::1], float64[::1], float64[::1], float64)")
+def strongest_cell(image: Array, rows_m: Array, floors: Array, least_over_level: float) -> int:
     """Return the cell whose energy, under the law of a rod, is largest; -1 if none stands out.
 
-    The level of an image is its geometric mean: of noise alone, 0.56 times the mean.
+    It must be above the floor of its row, and stand out of the level of the image: the geometric
+    mean, of noise alone 0.56 times the mean.
     """
     total, best, most = 0.0, -1, 0.0
     for i in range(image.shape[0]):
         for j in range(image.shape[1]):
             total += math.log(image[i, j] + 1e-300)
             at_1_m = image[i, j] * rows_m[i] ** 3
-            if at_1_m > most:
+            if at_1_m > most and image[i, j] > floors[i]:
                 best, most = i * image.shape[1] + j, at_1_m
     is_out = best >= 0 and image.flat[best] > least_over_level * math.exp(total / image.size)
     return best if is_out else -1
@@ -299,7 +300,7 @@ def refine(
 
 @kernel(
     "int64(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], float64[::1], float64[::1], float64, float64, float64, int64, "
+    "float64[::1], float64[::1], float64[::1], float64, float64, float64, float64, int64, "
     "float64[:, ::1], float64[:, ::1], complex128[:, ::1])"
 )
 def separate(
@@ -313,6 +314,7 @@ def separate(
     bearings: Array,
     least_over_level: float,
     least_share: float,
+    beside_share: float,
     more_than_point: float,
     sweeps: int,
     image: Array,
@@ -331,9 +333,10 @@ def separate(
     all_ranges = np.zeros((found.shape[0], n))
     place, other = np.zeros(3), np.zeros(3)
     row_m, strongest, count = rows_m[1] - rows_m[0], 0.0, 0
+    floors = np.zeros(rows_m.size)
     image_rows(values, scale, turns, track, rows_m, bearings, 0, rows_m.size, image)
     while count < found.shape[0]:
-        top = strongest_cell(image, rows_m, least_over_level)
+        top = strongest_cell(image, rows_m, floors, least_over_level)
         if top < 0:
             break
         i, j = top // image.shape[1], top % image.shape[1]
@@ -362,6 +365,8 @@ def separate(
         all_ranges[count], models[count] = ranges, amplitudes
         count += 1
         middle = int((place[0] - rows_m[0]) / row_m + 0.5)
+        for row in range(max(0, middle - _ROWS_AWAY), min(rows_m.size, middle + _ROWS_AWAY + 1)):
+            floors[row] = max(floors[row], beside_share * beside_share * energy)
         first, end = min(i, middle) - _ROWS_AWAY, max(i, middle) + _ROWS_AWAY + 1
         image_rows(values, scale, turns, track, rows_m, bearings, first, end, image)
         if image[i, j] >= before:

@@ -37,8 +37,8 @@ from slam.imaging.patches import Patch
 
 Array = NDArray[np.float64]
 
-_ROW_M, _SINE = 0.05, 0.04  # cells of the grid, in range and in sine of bearing
-_SINES = np.arange(-20, 21) * _SINE
+_ROW_M, _CELL_RAD = 0.05, 0.042  # cells of the grid
+_OFF_BORESIGHT_RAD = 0.95  # beyond the edge of the beam, where echoes are still strong
 _BEYOND_M = 0.2  # echoes from there reach into the field of view
 _BEAM_STEPS = 256
 
@@ -84,6 +84,9 @@ class SeparationRule:
     least_over_level: float = 40.0
     # Amplitude under the law of a rod, over that of the strongest
     least_share: float = 0.05
+    # Size over that of one that was found at a range within 12 cm of it: less may be what is left
+    # of that one
+    beside_share: float = 0.2
     # What a free curvature must explain over what a point does
     more_than_point: float = 1.1
     sweeps: int = 2
@@ -110,7 +113,11 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
     rows_m = np.arange(
         max(view.min_range_m - 2 * _ROW_M, _ROW_M), view.max_range_m + _BEYOND_M, _ROW_M
     )
-    image = np.empty((rows_m.size, _SINES.size))
+    yaws = np.arctan2(track[:, 3], track[:, 2])
+    bearings = np.arange(
+        yaws.min() - _OFF_BORESIGHT_RAD, yaws.max() + _OFF_BORESIGHT_RAD, _CELL_RAD
+    )
+    image = np.empty((rows_m.size, bearings.size))
     found = np.zeros((rule.most, 7))
     models = np.zeros((rule.most, n), dtype=np.complex128)
     k = profiles.wave_number_rad_per_m
@@ -122,9 +129,10 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         np.linspace(0.0, 1.0, _BEAM_STEPS + 1) ** power,
         profiles.echo,
         rows_m,
-        np.arcsin(_SINES),
+        bearings,
         rule.least_over_level,
         rule.least_share,
+        rule.beside_share,
         rule.more_than_point,
         rule.sweeps,
         image,
