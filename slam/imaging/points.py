@@ -43,7 +43,7 @@ class PointRule:
 
     separation: SeparationRule = field(default_factory=SeparationRule)
     wheels: WheelNoise = field(default_factory=WheelNoise)
-    least_snr: float = 12.0
+    least_snr: float = 10.0
     least_coherence: float = 0.6
     least_in_view: float = 0.51  # share of the frames
     # Amplitude over that of the strongest that is no plane

@@ -37,6 +37,7 @@ _MOST_BEARING, _MOST_CURVATURE = 0.02, 0.5  # of one move [rad], [1/m]
 _CURVATURE_STEP = 0.01  # of the difference quotient [1/m]
 _ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
 _LEAST_COSINE = 0.4
+_BURST = 3.0
 
 
 @kernel("float64(float64, float64, float64)")
@@ -154,6 +155,28 @@ def image_rows(
                 imag += u * turn.imag + v * turn.real
                 count += 1
             image[i, j] = (real * real + imag * imag) / max(count, 1)
+
+
+@kernel("void(complex64[:, ::1])")
+def remove_bursts(values: NDArray[np.complex64]) -> None:
+    """Set to 0 what is in one frame alone: pulses of other modules.
+
+    That is a bin more than ``_BURST`` times as strong as in the four frames around its own: echoes move by less than a tenth of their width from frame to frame.
+    """
+    n = values.shape[0]
+    squares = np.zeros(values.shape, dtype=np.float64)
+    for f in range(n):
+        for b in range(values.shape[1]):
+            squares[f, b] = values[f, b].real ** 2 + values[f, b].imag ** 2
+    for f in range(n):
+        first = max(0, min(f - 2, n - 5))
+        for b in range(values.shape[1]):
+            largest = 0.0
+            for other in range(first, min(n, first + 5)):
+                if other != f:
+                    largest = max(largest, squares[other, b])
+            if squares[f, b] > _BURST * _BURST * largest:
+                values[f, b] = 0.0
 
 
 @kernel("int64(float64[:, ::1], float64[::1], float64[::1], float64)")
@@ -334,6 +357,7 @@ def separate(
     place, other = np.zeros(3), np.zeros(3)
     row_m, strongest, count = rows_m[1] - rows_m[0], 0.0, 0
     floors = np.zeros(rows_m.size)
+    remove_bursts(values)
     image_rows(values, scale, turns, track, rows_m, bearings, 0, rows_m.size, image)
     while count < found.shape[0]:
         top = strongest_cell(image, rows_m, floors, least_over_level)
