@@ -29,6 +29,9 @@ Array = NDArray[np.float64]
 
 # How far beyond the end of the field of view bins are kept: the pulse of an echo there
 _MARGIN_M = 0.3
+# Until the robot has turned, a wall beside its way stands still like the robot itself, so only what
+# is nearer than the robot is large is taken for its own; from so many headings on, all.
+_ROBOT_M, _TURNED = 0.45, 4
 
 
 def longest_spacing_m(pulse: PulseModel, view: FieldOfView) -> float:
@@ -211,6 +214,9 @@ class PatchMaker:
         looks, static = self._looks, self._static.mean
         rows = np.array([look.samples for look in looks])
         if static is not None:
+            if not self._is_known and self._static.n_headings < _TURNED:
+                near = round((_ROBOT_M - looks[0].range_start_m) / bin_length_m)
+                static = np.where(np.arange(static.size) < near, static, 0.0)
             rows = rows - static
         middle_m = 0.5 * (looks[0].way_m + looks[-1].way_m)
         middle = int(np.argmin([abs(look.way_m - middle_m) for look in looks]))

@@ -54,6 +54,8 @@ class PointRule:
     # that one leaves; twice the share where it is as near across the line of sight
     beside_m: float = 0.12
     beside_share: float = 0.25
+    least_wall_share: float = 0.3  # size over that of the strongest reflector
+    image_m: float = 0.06  # this near to where an image would be, a reflector is one
     range_floor_m: float = 1e-3
     bearing_floor_rad: float = 1e-3
 
@@ -101,8 +103,7 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
     assert aperture.boresights is not None
     antenna, (bx, by) = aperture.antennas_m[patch.middle], aperture.boresights[patch.middle]
     turn = np.array([[bx, -by], [by, bx]])
-    directions = np.column_stack([np.cos(reflectors.bearing_rad), np.sin(reflectors.bearing_rad)])
-    places = antenna + reflectors.range_m[:, np.newaxis] * directions @ turn.T
+    places = antenna + reflectors.places_m @ turn.T
     is_point = _are_points(patch, reflectors, places, rule)
     order = np.flatnonzero(is_point)[np.argsort(reflectors.range_m[is_point])]
     return tuple(
@@ -136,15 +137,47 @@ def in_view(patch: Patch, places: Array) -> Array:
 def _are_points(
     patch: Patch, reflectors: Reflectors, places: Array, rule: PointRule
 ) -> NDArray[np.bool_]:
-    may_be = reflectors.flatness <= rule.flatness[1]
-    amplitude, size = reflectors.amplitude, np.sqrt(reflectors.energy)
+    may_be, amplitude = reflectors.flatness <= rule.flatness[1], reflectors.amplitude
     chosen = may_be & (amplitude >= rule.least_share * amplitude.max(where=may_be, initial=0.0))
-    chosen &= (reflectors.snr >= rule.least_snr) & (reflectors.coherence >= rule.least_coherence)
-    chosen &= in_view(patch, places) >= rule.least_in_view
-    is_beside = np.abs(reflectors.range_m[:, np.newaxis] - reflectors.range_m) < rule.beside_m
-    is_near = np.linalg.norm(places[:, np.newaxis] - places, axis=2) < rule.beside_m
+    chosen &= stand_out(reflectors, rule) & (in_view(patch, places) >= rule.least_in_view)
+    return chosen & ~_are_images(reflectors, rule)
+
+
+def stand_out(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
+    """Return which reflectors are more than noise, and than what stronger ones beside them leave."""
+    size, range_m = np.sqrt(reflectors.energy), reflectors.range_m
+    xy = reflectors.places_m
+    is_beside = np.abs(range_m[:, np.newaxis] - range_m) < rule.beside_m
+    is_near = np.linalg.norm(xy[:, np.newaxis] - xy, axis=2) < rule.beside_m
     share = np.where(is_near, 2 * rule.beside_share, rule.beside_share)
-    return np.asarray(chosen & ~np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1))
+    is_less = np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1)
+    is_sure = (reflectors.snr >= rule.least_snr) & (reflectors.coherence >= rule.least_coherence)
+    return np.asarray(is_sure & ~is_less)
+
+
+def _are_images(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
+    """Return which reflectors lie where a wall of the patch shows another one.
+
+    With q' the mirror image of q, waves that meet the wall on one way only come from the range
+    (|q| + |q'|) / 2 and the mean of the directions of q and q', those that meet it twice from q'.
+    """
+    is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[1])
+    xy, range_m = reflectors.places_m, reflectors.range_m
+    are = np.zeros(range_m.size, dtype=np.bool_)
+    for normal, distance_m in zip(
+        xy[is_wall] / range_m[is_wall, np.newaxis], range_m[is_wall], strict=True
+    ):
+        before_m = distance_m - xy @ normal
+        is_before = (before_m > rule.image_m) & ~is_wall
+        mirrored = xy[is_before] + 2 * before_m[is_before, np.newaxis] * normal
+        far_m = np.linalg.norm(mirrored, axis=1)
+        once = xy[is_before] / range_m[is_before, np.newaxis] + mirrored / far_m[:, np.newaxis]
+        once /= np.linalg.norm(once, axis=1, keepdims=True)
+        once *= 0.5 * (range_m[is_before] + far_m)[:, np.newaxis]
+        images = np.vstack([mirrored, once])
+        off_m = np.linalg.norm(xy[:, np.newaxis] - images, axis=2)
+        are |= off_m.min(axis=1, initial=math.inf) < rule.image_m
+    return are
 
 
 def _covariance(

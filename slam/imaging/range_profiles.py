@@ -193,6 +193,11 @@ class StaticPart:
         self._of_headings: dict[int, tuple[int, Samples]] = {}
 
     @property
+    def n_headings(self) -> int:
+        """Return how many headings, 10 degrees apart, it is known from."""
+        return len(self._of_headings)
+
+    @property
     def mean(self) -> Samples | None:
         """Return the static part, shape (n_bins,); None before the first frame."""
         if not self._of_headings:

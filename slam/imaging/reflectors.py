@@ -74,6 +74,12 @@ class Reflectors:
     snr: Array
     levels: Array
 
+    @property
+    def places_m(self) -> Array:
+        """Return places (k, 2) from the antenna in the middle, x along its boresight."""
+        directions = np.column_stack([np.cos(self.bearing_rad), np.sin(self.bearing_rad)])
+        return np.asarray(self.range_m[:, np.newaxis] * directions)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeparationRule:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.imaging.patches import Patch
-from slam.imaging.points import PointRule, in_view
+from slam.imaging.points import PointRule, in_view, stand_out
 from slam.imaging.reflectors import Reflectors, separated
 
 Array = NDArray[np.float64]
@@ -51,10 +51,11 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
     assert aperture.boresights is not None
     antennas, (bx, by) = aperture.antennas_m, aperture.boresights[patch.middle]
     lines = []
+    size = np.sqrt(reflectors.energy)
+    is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[1])
+    is_wall &= size >= rule.least_wall_share * size.max(initial=0.0)
     for k in np.argsort(reflectors.range_m).tolist():
-        sure = reflectors.snr[k] >= rule.least_snr
-        sure &= reflectors.coherence[k] >= rule.least_coherence
-        if reflectors.flatness[k] <= rule.flatness[1] or not sure:
+        if not is_wall[k]:
             continue
         c, s = np.cos(reflectors.bearing_rad[k]), np.sin(reflectors.bearing_rad[k])
         normal = np.array([c * bx - s * by, s * bx + c * by])
