@@ -38,7 +38,6 @@ def pair(errors: Sequence[NDArray[np.float64]], scale: float) -> str:
 
 SUMMED = ("dense", "fresh", "walls", "pillars", "people", "scene")
 """Tables whose rows differ by the room alone: the last row has all of them."""
-WITH_WALLS = ("walls", "pillars", "scene")
 
 Columns = dict[str, Callable[[Score], str]]
 
@@ -63,7 +62,14 @@ BY_KIND: Columns = {
     "lines": lambda score: number(score.line_share),
     "false lines": lambda score: number(score.false_line_share),
 }
-"""Of rooms with walls; beside each kind its recall."""
+"""Of rooms with walls; under each kind its recall."""
+
+NEAR_PEOPLE: Columns = {
+    "false points": lambda score: str(score.n_false),
+    "of them near people": lambda score: str(score.n_near_people),
+}
+
+MORE_COLUMNS = {"walls": BY_KIND, "pillars": BY_KIND, "scene": BY_KIND, "people": NEAR_PEOPLE}
 
 
 def numbers_of(label: str, score: Score) -> dict[str, object]:
@@ -93,7 +99,7 @@ def numbers_of(label: str, score: Score) -> dict[str, object]:
 
 def print_table(name: str, rows: Iterator[Row], out: Path | None) -> None:
     """Print a table as its rows come."""
-    columns = POINTS | BY_KIND if name in WITH_WALLS else POINTS
+    columns = POINTS | MORE_COLUMNS.get(name, {})
     heads = [name, *columns]
     sys.stdout.write(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}\n")
     every: list[Score] = []

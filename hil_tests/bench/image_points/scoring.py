@@ -289,8 +289,12 @@ class Score:
         return _share(self.found[kind], self.required[kind])
 
     @property
+    def n_false(self) -> int:
+        return self.n_points - self.found.total() - self.found_besides.total()
+
+    @property
     def precision(self) -> float:
-        return _share(self.found.total() + self.found_besides.total(), self.n_points)
+        return _share(self.n_points - self.n_false, self.n_points)
 
     @property
     def room_recall(self) -> float:

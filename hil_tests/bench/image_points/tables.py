@@ -115,7 +115,7 @@ def heading_rows() -> Iterator[Row]:
 
 def slip_rows() -> Iterator[Row]:
     for scene in ("lab", "dense:0"):
-        given = cases(scene, stress="slip", seeds=3)
+        given = cases(scene, stress="slip", seeds=2)
         yield Row(label=f"{scene}, slip, all patches", cases=given)
         yield Row(label=f"{scene}, slip, patches with a slip", cases=given, counts=has_slip)
 
