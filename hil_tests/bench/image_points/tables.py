@@ -12,7 +12,7 @@ from dataclasses import replace
 from emulator.scene.scene import Scene
 from hil_tests.bench.image_points.drives import Row, has_slip, is_turn
 from hil_tests.bench.image_points.scoring import MATCH_M
-from slam.app.sweep import CLEAN, STRESSES
+from slam.app.sweep import CLEAN
 from slam.app.sweep.run import Case, make_case
 from slam.imaging.patches import PatchRule
 
@@ -21,6 +21,11 @@ MODEL_ERROR_M = 0.10
 MODEL_ERRORS = ("wander_3", "wander_10", "mismatch")
 DENSE = ("dense:0", "dense:5")
 """Rooms of the tables that vary one thing."""
+FRAME_STRESSES = (
+    *(CLEAN, "wander_3", "wander_10", "mismatch", "pulse_wide", "pulse", "mounts", "stamps"),
+    *("offsets_20", "rod_rod", "bursts", "walk"),
+)
+"""Those of what happens inside a patch; slips have a table of their own."""
 APERTURES_M = (0.12, 0.20, 0.25, 0.40, 0.60)
 # Metres per second, and frames per second.
 DRIVES = ((0.05, 5), (0.1, 5), (0.15, 5), (0.25, 5), (0.3, 20))
@@ -121,9 +126,7 @@ def slip_rows() -> Iterator[Row]:
 
 
 def stress_rows() -> Iterator[Row]:
-    for stress in (CLEAN, *STRESSES):
-        if stress in ("carried", "all", "dead", "outliers", "noise_stated_low", "silent"):
-            continue  # of passages or detections, not of frames inside a patch
+    for stress in FRAME_STRESSES:
         yield stressed("lab", stress)
     yield stressed("classroom", "mismatch")
     yield stressed("dense:0", "pulse")
