@@ -255,7 +255,7 @@ def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path
                 source=source,
                 out=out,
                 rig=None,
-                area_m=None,
+                frame_area_m=None,
                 truth_topic="/slam_out_pose",
                 rate_hz=5,
                 preset=None,
