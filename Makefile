@@ -111,6 +111,8 @@ pictures: $(VENV)/installed-test
 	$(BIN)/uwb-slam demo --out out/pictures/demo
 	$(BIN)/uwb-slam demo --scene classroom --out out/pictures/classroom
 	cp out/pictures/classroom/map.png fixtures/pictures/classroom_map.png
+	$(BIN)/uwb-slam demo --scene office:20 --out out/pictures/office
+	cp out/pictures/office/image.png fixtures/pictures/office_image.png
 	$(BIN)/uwb-slam view out/pictures/demo --screenshot fixtures/pictures/lab_rerun.png --at 330
 	$(BIN)/uwb-slam report out/pictures/demo
 	$(BIN)/python -m hil_tests.browser out/pictures/demo/report.html fixtures/pictures/lab_report.png

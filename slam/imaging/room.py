@@ -4,9 +4,9 @@ A cell holds the largest value of all patches that it was in view of. The value 
 show, the amplitude times the root of the coherence factor, of echoes multiplied by range**1.5, the
 law by which those of rods fall: so it is the amplitude that a rod there would have at 1 m. Radars
 and patches are not summed with their phases, so an error of the path from patch to patch does not
-blur the image. A cell counts where at least half of the frames of a patch saw it: of few frames the
-coherence factor is large by chance. Patches whose frames are so far apart that they have grating
-lobes, as those of turns on the spot, show only what no other patch does.
+blur the image. A cell counts where most frames of a patch saw it: of few frames the coherence
+factor is large by chance. Patches whose frames are so far apart that they have grating lobes, as
+those of turns on the spot, show only what no other patch does.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 LEVEL_DB = 0.4
 """Of one step of `RoomImage.levels`."""
 _RANGE_POWER = 1.5
-_LEAST_SEEN = 0.5  # of a patch's frames
 # An echo is 2 to 4 cm wide across the line of sight: larger cells are looked at in several points.
 _MOST_SPACING_M = 0.025
 _STEP = 16  # cells by which an image grows
@@ -55,21 +54,14 @@ class RoomImage:
     """
 
     def __init__(
-        self, *, cell_m: float = 0.02, area: Grid | None = None, most_cells: int = 1 << 22
+        self, *, cell_m: float = 0.02, area: Grid | None = None, most_cells: int = 1 << 21
     ) -> None:
         self.grid = area or Grid(x_m=0.0, y_m=0.0, cell_m=cell_m, rows=0, columns=0)
         self._most_cells = most_cells if area is None else 0
         # Value, coherence, and whether a patch without grating lobes gave them
         shape = (3, self.grid.rows, self.grid.columns)
         self._layers = np.full(shape, np.nan, dtype=np.float32)
-
-    @property
-    def values(self) -> NDArray[np.float32]:
-        return np.asarray(self._layers[0])
-
-    @property
-    def coherence(self) -> NDArray[np.float32]:
-        return np.asarray(self._layers[1])
+        self.values, self.coherence = self._layers[:2]
 
     @property
     def levels(self) -> NDArray[np.int8]:
@@ -94,13 +86,12 @@ class RoomImage:
         k = math.ceil(grid.cell_m / _MOST_SPACING_M - 1e-9)
         fine = replace(grid, cell_m=grid.cell_m / k, rows=k * grid.rows, columns=k * grid.columns)
         n, points = len(profiles.values), fine.centres_m
-        # What half of the frames of a way see, one in its middle sees: other points cost time
-        is_near = _in_view(aperture, (n - 1) // 2, points) | _in_view(aperture, n // 2, points)
+        is_near = _in_view(aperture, n // 2, points)  # what most frames see, so does the middle one
         sums = back_project(profiles.times_range(_RANGE_POWER), aperture, points[is_near])
         step_m = aperture.length_m / max(n - 1, 1)
         turn_rad = profiles.wave_number_rad_per_m * 2 * step_m * math.sin(aperture.half_beam_rad)
         new = np.full((3, *is_near.shape), -1.0)
-        new[0, is_near] = np.where(sums.count >= _LEAST_SEEN * n, sums.weighted, -1.0)
+        new[0, is_near] = np.where(2 * sums.count > n, sums.weighted, -1.0)
         new[1, is_near], new[2] = sums.coherence_factor, turn_rad < math.tau
         if k > 1:
             new = new.reshape(3, grid.rows, k, grid.columns, k).swapaxes(2, 3)
@@ -143,6 +134,7 @@ class RoomImage:
         (left, below), (right, above) = _STEP * (begin - first), _STEP * (last - end)
         room = ((0, 0), (below, above), (left, right))
         self._layers = np.pad(self._layers, room, constant_values=np.nan)
+        self.values, self.coherence = self._layers[:2]
         x_m, y_m = (step_m * first).tolist()
         self.grid = replace(grid, x_m=x_m, y_m=y_m, rows=rows, columns=columns)
 

@@ -69,7 +69,7 @@ def run_image(
         if area is None:
             width_m, height_m = (np.ptp(along.poses[:, :2], axis=0) + 2 * reach_m).tolist()
             _check_cells(width_m, height_m, cell_m)
-        return RoomImage(cell_m=cell_m, area=area)
+        return RoomImage(cell_m=cell_m, area=area, most_cells=_MOST_CELLS)
 
     info: SessionInfo | None = None
     if (session := _session_at(source, stop)) is not None:

@@ -273,11 +273,13 @@ def image_of(
             n_placed += 1
             pose, maker = path.moves_at(frame.t_ns), makers[radar]
             statics[radar].add(maker.near(frame), maker.antenna_at(pose), float(pose[2]))
+    if not n_frames:
+        raise NoImageError("holds no frames")
     if not n_placed:
         since, until, first, last = (at_ns / NS_PER_S for at_ns in times_ns)
-        raise AppError(
-            f"path {path.name}: is of {since:.3f} to {until:.3f} s, and no frame is: "
-            + (f"they are of {first:.3f} to {last:.3f} s" if n_frames else "there is none")
+        raise NoImageError(
+            f"frames are of {first:.3f} to {last:.3f} s, and path {path.name} is of {since:.3f} to "
+            f"{until:.3f} s, so it places none of them; give a path by the clock of the frames"
         )
     for radar, frame in frames():
         if path.is_known(frame.t_ns):
