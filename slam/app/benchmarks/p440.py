@@ -122,6 +122,8 @@ class Trial:
         antennas_m, bin_m = self.antennas_m(offset_ns), float(self.arrays["bin_length_m"])
         velocity = np.gradient(antennas_m, self.arrays["t_ns"] * 1e-9, axis=0)
         moves = np.linalg.norm(velocity, axis=1) >= self.meta["use"]["least_speed_mps"]
+        if np.count_nonzero(moves) < 2:
+            raise ValueError("no scans were taken in motion")
         rows = self.arrays["samples"][moves]
         start_m = float(self.arrays["range_start_m"]) - self.meta["range_offset_m"]
         profile_filter = ProfileFilter(_PULSE, rows.shape[1], bin_m)
@@ -132,23 +134,38 @@ class Trial:
 def read_trial(path: Path) -> Trial:
     """Read a file; AppError that says what is missing or wrong in it."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in _SHAPES}
-        sizes: dict[Hashable, int] = {3: 3, 4: 4}
-        for name, shape in _SHAPES.items():
-            have = arrays[name].shape
-            known = [sizes.setdefault(size, n) for size, n in zip(shape, have, strict=False)]
-            if len(have) != len(shape) or have != tuple(known):
-                raise ValueError(f"{name} has shape {have}, must have {shape}")
+        _check(arrays)
+        meta = json.loads(str(arrays["meta"]))
         arrays["samples"] = arrays["samples"].astype(np.float64)
-        name = path.stem.removeprefix("p440_rail_")
-        trial = Trial(name=name, arrays=arrays, meta=json.loads(str(arrays["meta"])))
-        _, aperture = trial.image(trial.meta["clock_offset_ns"])
-        if not aperture.length_m > 0.0 or not trial.cells_m.size:
-            raise ValueError("the radar does not move, or no area is given")
-    except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
+        trial = Trial(name=path.stem.removeprefix("p440_rail_"), arrays=arrays, meta=meta)
+        scans_ns, poses_ns = arrays["t_ns"] + meta["clock_offset_ns"], arrays["pose_t_ns"]
+        if not poses_ns[0] <= scans_ns[0] < scans_ns[-1] <= poses_ns[-1]:
+            raise ValueError("with clock_offset_ns, scans lie outside of the time of the poses")
+        if not 0 < len(meta["reflectors"]) == len(arrays["reflector_marker_m"]):
+            raise ValueError("reflectors must name each row of reflector_marker_m, at least one")
+        trial.image(meta["clock_offset_ns"])  # ValueError
+        _ = trial.cells_m
+    except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
         raise AppError(f"{path}: is not a trial of a P440: {error}; {REMEDY}") from None
     return trial
+
+
+def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ValueError that names an array of another shape, or with what is no finite number."""
+    sizes: dict[Hashable, int] = {3: 3, 4: 4}
+    for name, shape in _SHAPES.items():
+        values = arrays[name]
+        known = [sizes.setdefault(size, n) for size, n in zip(shape, values.shape, strict=False)]
+        if len(shape) != values.ndim or values.shape != tuple(known):
+            raise ValueError(f"{name} has shape {values.shape}, must have {shape}")
+        if name != "meta" and values.dtype.kind not in "iuf":
+            raise ValueError(f"{name} must hold numbers")
+        if name not in {"meta", "reflector_apex_m"} and not np.isfinite(values).all():
+            raise ValueError(f"{name} must hold finite numbers")
+        if name.endswith("t_ns") and (values.size < 2 or np.any(np.diff(values) <= 0)):
+            raise ValueError(f"{name} must hold at least two times, ascending")
 
 
 def coherent(image: Image, points_m: Array) -> Array:
