@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.app.benchmarks.text_columns import REMEDY, found
 from slam.app.run.output import print_progress, print_table, print_text, write_json
-from slam.app.run.pictures import ESTIMATE, SMOOTHED, label, picture
+from slam.app.run.pictures import ESTIMATE, label, picture
 from slam.app.run.result_files import made_folder
 from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.imaging.autofocus import autofocus
@@ -324,7 +324,7 @@ def draw(figure: Figure, trials: Sequence[Trial]) -> None:
             )
             axes.plot(*image[1].antennas_m[:, :2].T, color=ESTIMATE, linewidth=2.0)
             for _, _, apex_m in trial.reflectors:
-                axes.plot(*apex_m[:2], "o", markersize=12, markerfacecolor="none", color=SMOOTHED)
+                axes.plot(*apex_m[:2], "o", markersize=12, markerfacecolor="none", color="white")
             label(axes, f"{trial.name}, {each.__name__}", "x [m]", "y [m]")
             axes.grid(visible=False)
     figure.colorbar(drawn, ax=panels, label="below the brightest cell [dB]", shrink=0.6)
@@ -338,7 +338,7 @@ def run_trials(stop: StopFlag, *, data: Path, out: Path, as_json: bool) -> None:
     trials = [read_trial(path) for path in found(data, "p440_*.npz")]
     with made_folder(out):
         rows = evaluate(trials, stop)
-        title = "P440 radar on a rail: blue its path, green corner reflectors (real data)"
+        title = "P440 radar on a rail: blue its path, white corner reflectors (real data)"
         width_in = 4.2 * len(trials) + 1.2
         with picture(out / "p440.png", width_in=width_in, height_in=8.2, title=title) as figure:
             draw(figure, trials)
