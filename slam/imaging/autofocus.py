@@ -11,9 +11,8 @@ e_n and c_i follow by least squares, with a random walk of mean zero as the prio
 then looked for anew, and so on. Of all these paths the one that makes its points brightest is kept,
 be it the one that was given. A shift or turn of all, which leaves images sharp, is not found.
 
-Sources: Wahl, Eichel, Ghiglia, Jakowatz, IEEE Trans. Aerospace and Electronic Systems 30 (1994)
-827, on phases of the brightest points; Ash, IEEE Geoscience and Remote Sensing Letters 9 (2012)
-103, on back-projected images: a path is corrected where the image becomes sharper.
+Sources: Wahl, Eichel, Ghiglia, Jakowatz, IEEE Trans. Aerosp. Electron. Syst. 30 (1994) 827: phases
+of bright points; Ash, IEEE Geosci. Remote Sens. Lett. 9 (2012) 103: sharp back-projected images.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _NOISE_IMAGES = 100.0  # of so many images of noise alone, one has a point that 
 class FocusRule:
     """How the error of a path is looked for."""
 
-    knots: int = 8
+    knots: int = 8  # at least 2
     repetitions: int = 4
     points: int = 3  # the brightest
     apart_m: float = 0.5  # least distance between two of them
@@ -77,8 +76,8 @@ def _bright(weighted: RangeProfiles, aperture: Aperture, points_m: Array, rule: 
     image, found = back_project(weighted, aperture, points_m), list[Array]()
     # Of noise alone |S1|**2 / S2 has an exponential distribution of mean 1.
     stands_out = np.abs(image.total) ** 2 > math.log(_NOISE_IMAGES * len(points_m)) * image.power
-    is_seen = image.count == len(aperture.antennas_m)
-    left = np.where(stands_out & is_seen, np.abs(image.total), 0.0)
+    stands_out &= image.count == len(aperture.antennas_m)
+    left = np.where(stands_out, np.abs(image.total), 0.0)
     while len(found) < rule.points and left.any():
         found.append(points_m[left.argmax()])
         left[np.linalg.norm(points_m - found[-1], axis=1) < rule.apart_m] = 0.0
@@ -105,14 +104,15 @@ def _errors(
 ) -> Array:
     """Return the errors at the knots, (n, 2), of a path from which the ``known`` are taken off."""
     n, m = len(known), len(points_m)
-    walk = np.vstack([np.diff(np.eye(n), axis=0), np.ones(n)]) / walk_m  # and their mean is zero
+    walk = np.vstack([np.diff(np.eye(n), axis=0), np.ones(n)]) / walk_m  # its mean is zero
     rows, values = [np.pad(np.kron(walk, np.eye(2)), ((0, 0), (0, m)))], [np.zeros(2 * n)]
     for constant, point in zip(np.eye(m), points_m, strict=True):
         echoes = echoes_at(weighted, moved.antennas_m, point)
         sums, sight = hats.T @ echoes, point - moved.antennas_m
         weight = np.abs(sums) / np.maximum(hats.T @ np.abs(echoes), 1e-30) / _PHASE_SIGMA_RAD
         sight /= np.linalg.norm(sight, axis=1)[:, None]
-        per_m = -weighted.wave_number_rad_per_m * hats.T @ sight[:, :2] / hats.sum(axis=0)[:, None]
+        turns = -weighted.wave_number_rad_per_m * hats.T @ sight[:, :2]
+        per_m = turns / np.maximum(hats.sum(axis=0)[:, None], 1e-30)
         slopes = np.kron(np.eye(n), np.ones(2)) * np.tile(per_m, n)  # of each knot, its x and y
         rows.append(np.hstack([slopes, np.tile(constant, (n, 1))]) * weight[:, None])
         values.append((np.unwrap(np.angle(sums)) + np.sum(per_m * known, axis=1)) * weight)

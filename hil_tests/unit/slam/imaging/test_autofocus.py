@@ -103,6 +103,21 @@ def test_an_antenna_that_stands_is_left_alone() -> None:
     )
 
 
+def test_knots_without_a_profile_follow_their_neighbours() -> None:
+    """Nine profiles, 3 cm apart, and knots every 1.6 cm."""
+    true_m = straight(0.24, 9)
+    error_m = 4e-3 * np.array([0.0, 0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0])
+    path = Aperture(antennas_m=true_m + np.column_stack([np.zeros(9), error_m]))
+    # Few cells: of thousands, noise alone would have one as coherent as nine profiles can be.
+    cells_m = PLACES[1] + 0.01 * np.stack(np.meshgrid([-1.0, 0.0, 1.0], [0.0]), axis=-1)
+    profiles = profiles_of(true_m, [(PLACES[1], 0.02)])
+    rule = FocusRule(knots=16, walk_m_per_sqrt_m=0.02)
+    found = autofocus(profiles, path, cells_m, rule)
+    best = peaks(profiles, Aperture(antennas_m=true_m))[1]
+    assert peaks(profiles, path)[1] < 0.85 * best
+    assert peaks(profiles, found)[1] > 0.97 * best
+
+
 def test_in_space_heights_stay_and_the_plane_is_corrected_alike() -> None:
     true_m = straight(0.6, 121)
     path_m = spoilt(true_m, 0.01, seed=3)
