@@ -431,7 +431,8 @@ def test_a_bootloader_is_known_by_its_port_where_a_number_is_missing(
         if isinstance(command, m.StartBootloader):
             first.vanish_later(0.5)
             machine.plug("home", module, first.now_ns * 1e-9 + 2.5)
-        return module(command)
+        # the bootloader hears nothing before it is a device of its own
+        return module(command) if module.runs_application else []
 
     radar, first = driver_on(behind_a_cable, ports=machine.ports, name="home")
     machine.runs_on(first)
