@@ -48,7 +48,6 @@ from numpy.lib.format import (
 )
 
 from xethru_protocol.operating_system import written_whole
-from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.recordings.clock import steady_times
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
@@ -59,6 +58,7 @@ from xethru_protocol.recordings.recorded_messages import (
     FaultHandler,
     RecordingError,
     RecordingFault,
+    optional_packages,
     reading,
     report,
     writing,
@@ -417,20 +417,8 @@ def _read_npy(path: Path, downconversion: bool | None) -> Frames:
 _LARGEST_MAT = 2**31  # bytes of a variable: the format counts them in 32 bits, with a sign
 
 
-@contextmanager
-def _optional_scipy() -> Iterator[None]:
-    """Import scipy; RecordingError without it."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        missing = what_is_missing(error)
-        if missing is None:
-            raise
-        raise RecordingError(f"a .mat file needs a package that is optional; {missing}") from None
-
-
 def _write_mat(fresh: Path, frames: Frames, kind: FrameKind, path: Path) -> None:
-    with _optional_scipy():
+    with optional_packages("a .mat file needs a package that is optional"):
         from scipy.io import savemat
 
     size = frames.n_frames * frames.n_bins * DTYPES[kind].itemsize
@@ -488,7 +476,7 @@ def _check_elements(data: memoryview, order: str) -> None:
 
 
 def _read_mat(path: Path) -> Frames:
-    with _optional_scipy():
+    with optional_packages("a .mat file needs a package that is optional"):
         from scipy.io import loadmat
 
     _check_mat(path)

@@ -20,7 +20,6 @@ from xethru_protocol.recordings import pcap, wire_capture
 from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file, write_array_file
 from xethru_protocol.recordings.formats import (
     message_name,
-    optional_packages,
     read_recording,
     recording_content,
     recording_facts,
@@ -34,6 +33,7 @@ from xethru_protocol.recordings.recorded_messages import (
     RecordingFacts,
     RecordingFault,
     TimedMessages,
+    optional_packages,
 )
 from xethru_protocol.recordings.vendor.writer import RecordingWriter
 from xethru_protocol.validation import suffix_of

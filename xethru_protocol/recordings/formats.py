@@ -2,14 +2,12 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import starmap
 from pathlib import Path
 from typing import Any, Literal
 
-from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.recordings import wire_capture
 from xethru_protocol.recordings.array_files import is_array_file
 from xethru_protocol.recordings.clock import steady_messages
@@ -26,6 +24,7 @@ from xethru_protocol.recordings.recorded_messages import (
     RecordingFault,
     TimedMessages,
     is_like,
+    optional_packages,
     reading,
 )
 from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
@@ -103,18 +102,6 @@ def recording_format(path: Path | str) -> RecordingFormat:
         f"{path} is not a recording: those are .mcap, .xtwire, arrays (.npz, .npy, .mat, .csv), and"
         " directories or files of ModuleConnector, such as xethru_datafloat_*.dat"
     )
-
-
-@contextmanager
-def optional_packages() -> Iterator[None]:
-    """Import what knows MCAP; RecordingError without the packages that it needs."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        missing = what_is_missing(error)
-        if missing is None:
-            raise
-        raise RecordingError(f"MCAP needs packages that are optional; {missing}") from None
 
 
 def read_recording(

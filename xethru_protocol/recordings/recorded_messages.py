@@ -9,6 +9,7 @@ from operator import ne
 from pathlib import Path
 from typing import Any, Self, get_type_hints
 
+from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.validation import reason_of, shown
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.table import Response
@@ -24,6 +25,18 @@ RERUN_MAGIC = b"RRF"
 
 class RecordingError(XeThruError):
     """A recording cannot be read or written."""
+
+
+@contextmanager
+def optional_packages(what: str = "MCAP needs packages that are optional") -> Iterator[None]:
+    """Import what a format needs; RecordingError, with ``what`` in it, where that is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = what_is_missing(error)
+        if missing is None:
+            raise
+        raise RecordingError(f"{what}; {missing}") from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
 from xethru_protocol.driver.matching import Listeners
-from xethru_protocol.recordings.formats import optional_packages
-from xethru_protocol.recordings.recorded_messages import GrowingFile, RecordingError
+from xethru_protocol.recordings.recorded_messages import (
+    GrowingFile,
+    RecordingError,
+    optional_packages,
+)
 from xethru_protocol.recordings.vendor.layouts import KIND_OF_MESSAGE
 from xethru_protocol.recordings.vendor.writer import (
     RecordingWriter,

@@ -275,7 +275,6 @@ FIRST, LAST = 90.0, 150.0
 FILTER = PulseFilter(
     ModulePulse(model=MODEL, error=0.0), N_WHOLE, BIN_M, false_alarms=0.1, noise_is_known=True
 )
-MARGIN = round(1.5 * MODEL_SIGMA)
 
 
 @st.composite

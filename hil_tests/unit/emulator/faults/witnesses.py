@@ -44,14 +44,6 @@ def four_samples(frames: list[Frame], true: list[Frame], line: FaultyLine) -> No
     assert changed(frames, true) == dict.fromkeys(hit(line), 4)
 
 
-def frames_that_were_hit(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
-    assert list(changed(frames, true)) == hit(line)
-
-
-def all_from_the_first(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
-    assert set(changed(frames, true)) >= set(counters(frames)[1:])
-
-
 def steps_back(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
     steps = np.diff(counters(frames))
     assert sorted(set(steps.tolist())) == [-4, 1]
