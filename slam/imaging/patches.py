@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 _MARGIN_M = 0.3
 # Until the robot has turned, a wall beside its way stands still like the robot itself, so only what
 # is nearer than the robot is large is taken for its own; from so many headings on, all.
-_ROBOT_M, _TURNED = 0.45, 4
+_ROBOT_M, _TURNED = 0.45, 8
 
 
 def longest_spacing_m(pulse: PulseModel, view: FieldOfView) -> float:

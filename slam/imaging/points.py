@@ -48,12 +48,13 @@ class PointRule:
     least_in_view: float = 0.51  # share of the frames
     # Amplitude over that of the strongest that is no plane
     least_share: float = 0.2
-    # Up to the first it is a point, beyond the second a plane, between the two something round
-    flatness: tuple[float, float] = (0.3, 0.6)
+    # Up to the first it is a point, up to the second something round, beyond the last a plane
+    flatness: tuple[float, float, float] = (0.2, 0.5, 0.6)
     # Within this range of a stronger one, and a smaller share of it, it may be what the model of
     # that one leaves; twice the share where it is as near across the line of sight
     beside_m: float = 0.12
     beside_share: float = 0.25
+    beside_wall_share: float = 0.1
     least_wall_share: float = 0.3  # size over that of the strongest reflector
     image_m: float = 0.06  # this near to where an image would be, a reflector is one
     range_floor_m: float = 1e-3
@@ -144,12 +145,13 @@ def _are_points(
 
 
 def stand_out(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
-    """Return which reflectors are more than noise, and than what stronger ones beside them leave."""
+    """Return which reflectors are more than noise and what stronger ones beside them leave."""
     size, range_m = np.sqrt(reflectors.energy), reflectors.range_m
     xy = reflectors.places_m
     is_beside = np.abs(range_m[:, np.newaxis] - range_m) < rule.beside_m
     is_near = np.linalg.norm(xy[:, np.newaxis] - xy, axis=2) < rule.beside_m
     share = np.where(is_near, 2 * rule.beside_share, rule.beside_share)
+    share = np.where(reflectors.flatness > rule.flatness[2], rule.beside_wall_share, share)
     is_less = np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1)
     is_sure = (reflectors.snr >= rule.least_snr) & (reflectors.coherence >= rule.least_coherence)
     return np.asarray(is_sure & ~is_less)
@@ -161,7 +163,7 @@ def _are_images(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
     With q' the mirror image of q, waves that meet the wall on one way only come from the range
     (|q| + |q'|) / 2 and the mean of the directions of q and q', those that meet it twice from q'.
     """
-    is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[1])
+    is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[2])
     xy, range_m = reflectors.places_m, reflectors.range_m
     are = np.zeros(range_m.size, dtype=np.bool_)
     for normal, distance_m in zip(

@@ -202,8 +202,7 @@ class StaticPart:
         """Return the static part, shape (n_bins,); None before the first frame."""
         if not self._of_headings:
             return None
-        most = max(n for n, _ in self._of_headings.values())
-        means = np.array([mean for n, mean in self._of_headings.values() if 4 * n >= most])
+        means = np.array([mean for _, mean in self._of_headings.values()])
         if np.iscomplexobj(means):
             return np.asarray(np.median(means.real, axis=0) + 1j * np.median(means.imag, axis=0))
         return np.asarray(np.median(means, axis=0))

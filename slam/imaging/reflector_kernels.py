@@ -38,6 +38,7 @@ _CURVATURE_STEP = 0.01  # of the difference quotient [1/m]
 _ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
 _LEAST_COSINE = 0.4
 _BURST = 3.0
+_WALL = 0.4  # curvature over that of a point: the model of a plane leaves less beside it
 
 
 @kernel("float64(float64, float64, float64)")
@@ -161,7 +162,8 @@ def image_rows(
 def remove_bursts(values: NDArray[np.complex64]) -> None:
     """Set to 0 what is in one frame alone: pulses of other modules.
 
-    That is a bin more than ``_BURST`` times as strong as in the four frames around its own: echoes move by less than a tenth of their width from frame to frame.
+    That is a bin more than ``_BURST`` times as strong as in the four frames around its own: echoes
+    move by less than a tenth of their width from frame to frame.
     """
     n = values.shape[0]
     squares = np.zeros(values.shape, dtype=np.float64)
@@ -389,8 +391,11 @@ def separate(
         all_ranges[count], models[count] = ranges, amplitudes
         count += 1
         middle = int((place[0] - rows_m[0]) / row_m + 0.5)
+        floor = beside_share * beside_share * energy
+        if place[0] * place[2] < _WALL:
+            floor *= 0.25
         for row in range(max(0, middle - _ROWS_AWAY), min(rows_m.size, middle + _ROWS_AWAY + 1)):
-            floors[row] = max(floors[row], beside_share * beside_share * energy)
+            floors[row] = max(floors[row], floor)
         first, end = min(i, middle) - _ROWS_AWAY, max(i, middle) + _ROWS_AWAY + 1
         image_rows(values, scale, turns, track, rows_m, bearings, first, end, image)
         if image[i, j] >= before:

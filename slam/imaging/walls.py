@@ -52,7 +52,7 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
     antennas, (bx, by) = aperture.antennas_m, aperture.boresights[patch.middle]
     lines = []
     size = np.sqrt(reflectors.energy)
-    is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[1])
+    is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[2])
     is_wall &= size >= rule.least_wall_share * size.max(initial=0.0)
     for k in np.argsort(reflectors.range_m).tolist():
         if not is_wall[k]:
