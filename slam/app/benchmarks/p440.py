@@ -18,7 +18,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -55,6 +55,7 @@ _SHAPES: Mapping[str, tuple[Hashable, ...]] = {
 _PULSE = ModulePulse(model=PulseModel(carrier_hz=3.95e9, bandwidth_hz=1.7e9), error=0.0)
 _CELL_M = 0.04  # of the picture; an echo is 5 cm wide across
 _NEAR_M = 0.15  # So far from its apex a reflector is looked for: its next echo is 19 cm away
+_MOST_M2 = 1000.0  # of the picture
 _SAME_M = 0.02  # Trials whose markers are no farther apart have one reflector
 _CLOCK_STEP_NS = 1_000_000
 _CUT_STEP_M = 0.002
@@ -135,9 +136,11 @@ def read_trial(path: Path) -> Trial:
     """Read a file; AppError that says what is missing or wrong in it."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
+            if missing := [name for name in _SHAPES if name not in archive.files]:
+                raise ValueError(f"it has no array {missing[0]}")
             arrays = {name: archive[name] for name in _SHAPES}
         _check(arrays)
-        meta = json.loads(str(arrays["meta"]))
+        meta = json.loads(str(arrays["meta"]), parse_constant=_refuse)
         arrays["samples"] = arrays["samples"].astype(np.float64)
         trial = Trial(name=path.stem.removeprefix("p440_rail_"), arrays=arrays, meta=meta)
         scans_ns, poses_ns = arrays["t_ns"] + meta["clock_offset_ns"], arrays["pose_t_ns"]
@@ -145,11 +148,21 @@ def read_trial(path: Path) -> Trial:
             raise ValueError("with clock_offset_ns, scans lie outside of the time of the poses")
         if not 0 < len(meta["reflectors"]) == len(arrays["reflector_marker_m"]):
             raise ValueError("reflectors must name each row of reflector_marker_m, at least one")
-        trial.image(meta["clock_offset_ns"])  # ValueError
-        _ = trial.cells_m
+        (left, right), (low, high) = meta["use"]["background_box_m"]
+        if not (left < right and 0.0 < (right - left) * (high - low) < _MOST_M2):
+            raise ValueError(f"background_box_m must be an area below {_MOST_M2:g} square metres")
+        image = trial.image(meta["clock_offset_ns"])
+        echoes = coherent(image, np.array([apex_m for _, _, apex_m in trial.reflectors]))
+        if not min(echoes.min(), np.median(coherent(image, trial.cells_m[::8, ::8]))) > 0.0:
+            raise ValueError("scans do not reach over the reflectors and background_box_m")
     except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
-        raise AppError(f"{path}: is not a trial of a P440: {error}; {REMEDY}") from None
+        why = f"meta has no {error}" if isinstance(error, KeyError) else error
+        raise AppError(f"{path}: is not a trial of a P440: {why}; {REMEDY}") from None
     return trial
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"meta holds {constant}, must hold finite numbers")
 
 
 def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -264,15 +277,14 @@ def losses_db(trial: Trial, stop: StopFlag) -> list[dict[str, list[float]]]:
     profiles, aperture = image
     peaks = [peak_near(image, apex_m) for _, _, apex_m in trial.reflectors]
     lost: list[dict[str, list[float]]] = [defaultdict(list) for _ in peaks]
+    rows = [*zip(lost, peaks, strict=True)]
     for name, (scale, walk_m) in _PATH_ERRORS.items():
         for seed in _SEEDS:
             stop.check()
             path = replace(aperture, antennas_m=spoilt(aperture.antennas_m, scale, walk_m, seed))
             tried = {name: path, f"{name}, autofocus": autofocus(profiles, path, cells_m)}
-            for (what, each), (row, (peak_m, brightest)) in product(
-                tried.items(), zip(lost, peaks, strict=True)
-            ):
-                ratio = peak_near((profiles, each), peak_m)[1] / brightest
+            for (what, each), (row, (peak_m, best)) in product(tried.items(), rows):
+                ratio = peak_near((profiles, each), peak_m)[1] / best
                 row[what].append(-20.0 * math.log10(ratio))
     return lost
 
@@ -309,16 +321,14 @@ def draw(figure: Figure, trials: Sequence[Trial]) -> None:
     """Draw each trial, coherent above incoherent, in dB below its brightest cell."""
     panels = figure.subplots(2, len(trials), squeeze=False)
     for column, trial in zip(panels.T, trials, strict=True):
-        image, bounds_m = (
-            trial.image(trial.meta["clock_offset_ns"]),
-            trial.meta["use"]["background_box_m"],
-        )
+        image = trial.image(trial.meta["clock_offset_ns"])
+        x_m, y_m = trial.meta["use"]["background_box_m"]
         for axes, each in zip(column, (coherent, incoherent), strict=True):
             cells = each(image, trial.cells_m)
             drawn = axes.imshow(
                 20.0 * np.log10(np.maximum(cells / cells.max(), 1e-9)),
                 origin="lower",
-                extent=(*bounds_m[0], *bounds_m[1]),
+                extent=(*x_m, *y_m),
                 vmin=-_DRAWN_DB,
                 cmap="magma",
             )

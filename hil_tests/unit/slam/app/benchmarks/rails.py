@@ -70,10 +70,14 @@ def meta_of(**changed: object) -> NDArray[np.str_]:
         "range_offset_m": OFFSET_M,
         "lever_m": LEVER_M.tolist(),
         "reflectors": [{"name": name} for name in CORNERS_M],
-        "use": {"least_speed_mps": 0.05, "background_box_m": [[1.5, 4.5], [-2.0, 2.5]]},
+        "use": use_of(4.5),
     }
     kept = {name: value for name, value in (meta | changed).items() if value is not None}
     return np.array(json.dumps(kept))
+
+
+def use_of(right_m: float) -> dict[str, Any]:
+    return {"least_speed_mps": 0.05, "background_box_m": [[1.5, right_m], [-2.0, 2.5]]}
 
 
 def write_trial(folder: Path, name: str, arrays: Mapping[str, Any]) -> Path:

@@ -17,10 +17,12 @@ from slam.live.errors import AppError
 from xethru_protocol.operating_system import StopFlag
 
 
+@pytest.mark.slow
 def test_the_command_images_every_trial_of_a_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("slam.app.benchmarks.p440._SEEDS", range(1))
+    monkeypatch.setattr("slam.app.benchmarks.p440._CLOCK_STEP_NS", 5_000_000)
     monkeypatch.setattr("slam.app.benchmarks.p440._PATH_ERRORS", {"10 mm": (0.0, 0.010)})
     for seed, name in enumerate(("one", "two")):
         rails.write_trial(tmp_path / "data", name, rails.arrays_of(seed=seed))
@@ -129,9 +131,13 @@ def without(name: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
         (lambda a: a | {"pose_m": a["pose_m"][:-1]}, "pose_m"),
         (lambda a: a | {"samples": a["samples"][0]}, "samples"),
         (lambda a: a | {"meta": rails.meta_of(lever_m=None)}, "lever_m"),
-        (lambda a: a | {"meta": rails.meta_of(use={})}, "least_speed_mps"),
+        (lambda a: a | {"meta": rails.meta_of(use={})}, "background_box_m"),
         (lambda a: a | {"meta": np.array("{")}, "line 1"),
         (lambda a: a | {"meta": np.array("[]")}, "list"),
+        (lambda a: a | {"meta": rails.meta_of(range_offset_m=float("nan"))}, "NaN"),
+        (lambda a: a | {"meta": rails.meta_of(use=rails.use_of(1e6))}, "background_box_m"),
+        (lambda a: a | {"meta": rails.meta_of(range_offset_m=-50.0)}, "reach"),
+        (lambda a: a | {"reflector_apex_m": a["reflector_apex_m"] + 90.0}, "reach"),
         (lambda a: a | {"meta": rails.meta_of(reflectors=[])}, "reflectors"),
         (lambda a: a | {"meta": rails.meta_of(clock_offset_ns=0)}, "clock_offset_ns"),
         (lambda a: a | {"t_ns": a["t_ns"][::-1]}, "t_ns"),
