@@ -135,7 +135,9 @@ class Trial:
 def read_trial(path: Path) -> Trial:
     """Read a file; AppError that says what is missing or wrong in it."""
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as archive:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is not an .npz archive, or cannot be read")
+        with np.load(path, allow_pickle=False) as archive:
             if missing := [name for name in _SHAPES if name not in archive.files]:
                 raise ValueError(f"it has no array {missing[0]}")
             arrays = {name: archive[name] for name in _SHAPES}
