@@ -18,7 +18,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -52,6 +52,7 @@ _SHAPES: Mapping[str, tuple[Hashable, ...]] = {
     "reflector_apex_m": ("reflectors", 3),
     "meta": (),
 }
+_NOT_FINITE = ("meta", "reflector_apex_m")  # an apex that is not known is NaN
 _PULSE = ModulePulse(model=PulseModel(carrier_hz=3.95e9, bandwidth_hz=1.7e9), error=0.0)
 _CELL_M = 0.04  # of the picture; an echo is 5 cm wide across
 _NEAR_M = 0.15  # So far from its apex a reflector is looked for: its next echo is 19 cm away
@@ -142,7 +143,7 @@ def read_trial(path: Path) -> Trial:
                 raise ValueError(f"it has no array {missing[0]}")
             arrays = {name: archive[name] for name in _SHAPES}
         _check(arrays)
-        meta = json.loads(str(arrays["meta"]), parse_constant=_refuse)
+        meta = json.loads(str(arrays["meta"]))
         arrays["samples"] = arrays["samples"].astype(np.float64)
         trial = Trial(name=path.stem.removeprefix("p440_rail_"), arrays=arrays, meta=meta)
         scans_ns, poses_ns = arrays["t_ns"] + meta["clock_offset_ns"], arrays["pose_t_ns"]
@@ -163,10 +164,6 @@ def read_trial(path: Path) -> Trial:
     return trial
 
 
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"meta holds {constant}, must hold finite numbers")
-
-
 def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raise ValueError that names an array of another shape, or with what is no finite number."""
     sizes: dict[Hashable, int] = {3: 3, 4: 4}
@@ -175,9 +172,8 @@ def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
         known = [sizes.setdefault(size, n) for size, n in zip(shape, values.shape, strict=False)]
         if len(shape) != values.ndim or values.shape != tuple(known):
             raise ValueError(f"{name} has shape {values.shape}, must have {shape}")
-        if name != "meta" and values.dtype.kind not in "iuf":
-            raise ValueError(f"{name} must hold numbers")
-        if name not in {"meta", "reflector_apex_m"} and not np.isfinite(values).all():
+        is_number = values.dtype.kind in "iuf" or name == "meta"
+        if not is_number or (name not in _NOT_FINITE and not np.isfinite(values).all()):
             raise ValueError(f"{name} must hold finite numbers")
         if name.endswith("t_ns") and (values.size < 2 or np.any(np.diff(values) <= 0)):
             raise ValueError(f"{name} must hold at least two times, ascending")

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,15 @@ from PIL import Image
 
 from hil_tests.paths import shared_data
 from hil_tests.unit.slam.app.benchmarks import rails
-from slam.app.benchmarks.p440 import coherence, evaluate, focus, read_trial, spoilt, width_m
+from slam.app.benchmarks.p440 import (
+    coherence,
+    coherent,
+    evaluate,
+    focus,
+    read_trial,
+    spoilt,
+    width_m,
+)
 from slam.app.cli import main
 from slam.live.errors import AppError
 from xethru_protocol.operating_system import StopFlag
@@ -77,18 +86,25 @@ def test_an_echo_is_as_wide_as_its_pulse_and_the_aperture_allow(tmp_path: Path) 
     assert found["incoherent_m"] is None or found["incoherent_m"] > 5 * found["across_m"]
 
 
-def test_conjugated_phases_and_a_wrong_lever_do_not_focus(tmp_path: Path) -> None:
-    arrays = rails.arrays_of()
-    lever = rails.write_trial(
-        tmp_path, "lever", arrays | {"meta": rails.meta_of(lever_m=[0.3, 0.3, 0.3])}
-    )
-    right = rails.write_trial(tmp_path, "right", arrays)
-    peaks = []
-    for path in (right, lever):
-        trial = read_trial(path)
-        name, _, apex_m = trial.reflectors[0]
-        peaks.append(focus(trial, "given", rails.CLOCK_NS, (name, apex_m))["peak_m"])
-    assert np.linalg.norm(np.subtract(*peaks)) > 0.1
+def test_phases_that_turn_the_other_way_do_not_focus(tmp_path: Path) -> None:
+    trial = read_trial(rails.write_trial(tmp_path, "one", rails.arrays_of()))
+    profiles, aperture = trial.image(rails.CLOCK_NS)
+    turned = replace(profiles, values=np.conj(profiles.values))
+    for _, _, apex_m in trial.reflectors:
+        right, wrong = (coherent((each, aperture), apex_m) for each in (profiles, turned))
+        assert wrong < 0.2 * right
+
+
+def test_with_another_lever_a_reflector_is_elsewhere(tmp_path: Path) -> None:
+    longer = (rails.LEVER_M + np.array([0.0, 0.3, 0.0])).tolist()
+    arrays = rails.arrays_of() | {"meta": rails.meta_of(lever_m=longer)}
+    trial = read_trial(rails.write_trial(tmp_path, "lever", arrays))
+    # The radar is thought to be 0.3 m along its own y, which does not turn: so is what it sees.
+    moved_m = rails.TURN.apply([0.0, 0.3, 0.0])
+    name, _, apex_m = trial.reflectors[0]
+    found = focus(trial, "given", rails.CLOCK_NS, (name, apex_m + moved_m))
+    assert found["focus"]["coherence"] > 0.97
+    np.testing.assert_allclose(found["peak_m"][:2], (apex_m + moved_m)[:2], atol=0.003)
 
 
 def test_coherence_is_of_phases_and_not_of_amplitudes() -> None:
@@ -134,7 +150,7 @@ def without(name: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
         (lambda a: a | {"meta": rails.meta_of(use={})}, "background_box_m"),
         (lambda a: a | {"meta": np.array("{")}, "line 1"),
         (lambda a: a | {"meta": np.array("[]")}, "list"),
-        (lambda a: a | {"meta": rails.meta_of(range_offset_m=float("nan"))}, "NaN"),
+        (lambda a: a | {"meta": rails.meta_of(range_offset_m=float("nan"))}, "reach"),
         (lambda a: a | {"meta": rails.meta_of(use=rails.use_of(1e6))}, "background_box_m"),
         (lambda a: a | {"meta": rails.meta_of(range_offset_m=-50.0)}, "reach"),
         (lambda a: a | {"reflector_apex_m": a["reflector_apex_m"] + 90.0}, "reach"),
