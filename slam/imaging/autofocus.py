@@ -54,7 +54,7 @@ def autofocus(
     rule, way_m = rule or FocusRule(), aperture.length_m
     weighted = profiles.times(aperture.metres)
     points_m = _bright(weighted, aperture, points_m.reshape(-1, points_m.shape[-1]), rule)
-    if way_m == 0.0 or not len(points_m):
+    if not len(points_m):  # as where all antennas stand
         return aperture
     knot_m = way_m / (rule.knots - 1)
     at = (np.cumsum(aperture.metres) - aperture.metres / 2) / knot_m
