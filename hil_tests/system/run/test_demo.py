@@ -76,6 +76,7 @@ def test_exactly_the_promised_files(demo: Finished) -> None:
         "session.mcap",
         "session.rrd",
         "map.png",
+        "image.png",
         "summary.json",
         "estimate.tum",
         "smoothed.tum",
@@ -124,6 +125,7 @@ def test_the_rrd_holds_every_frame_and_a_blueprint(demo: Finished) -> None:
     rows = count_rows(demo.out / "session.rrd")
     assert sum(rows[f"/radar/{name}/frame"] for name in RADARS) == summary["frames"]
     assert rows["/link/log/front_left"] > 10
+    assert rows["/map/image/cells"] == rows["/map/image"] >= 2
     # that of the beginning, and that which shows the whole map
     assert len(RrdReader(demo.out / "session.rrd").blueprints()) == 2
 
@@ -136,6 +138,15 @@ def test_the_map_is_a_picture_with_all_its_colours(demo: Finished) -> None:
     found = {colour for _, colour in colours}
     for line_colour in ((31, 111, 208), (194, 37, 92)):  # estimate, landmarks
         assert line_colour in found
+
+
+def test_the_image_is_a_picture_of_the_room(demo: Finished) -> None:
+    with Image.open(demo.out / "image.png") as picture:
+        assert min(picture.size) >= 800
+        greys = np.asarray(picture.convert("L"))
+    # rods are bright on a dark ground, beside what no radar saw
+    assert (greys > 225).mean() > 1e-3
+    assert (greys < 30).mean() > 0.2
 
 
 def test_the_link_log_tells_how_the_radars_were_set_up(demo: Finished) -> None:
