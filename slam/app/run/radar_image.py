@@ -70,6 +70,10 @@ def _model(info: SessionInfo) -> PulseModel:
     )
 
 
+class NoImageError(AppError):
+    """There is nothing to make an image of; the message does not name the file."""
+
+
 class RollingImage(SessionObserver):
     """Images a run while it is driven: a patch for every 25 cm of each radar's way, once.
 
@@ -206,7 +210,7 @@ def path_of(
     """Return a path of a run by name: smoothed, estimate or odometry; None: the first that it has.
 
     In the frame of the world where that is known, else of the map; the wheels' path begins where
-    the estimate does. AppError if there is no such path.
+    the estimate does. NoImageError if there is no such path.
     """
     states, smoothed = record.states, record.smoothed
     name = name or ("smoothed" if smoothed else "estimate" if len(states) else "odometry")
@@ -228,7 +232,7 @@ def path_of(
         t_ns, poses, wheels = states.t_ns, states.estimate, odometry
         t_ns, poses = t_ns[~states.lost], poses[~states.lost]
     else:
-        raise AppError(f"there is no path {name}: replay the session, or take another --path")
+        raise NoImageError(f"there is no path {name}: replay the session, or take another --path")
     return ImagePath(name, frame, t_ns, np.array([compose(place, one) for one in poses]), wheels)
 
 
@@ -257,7 +261,7 @@ def image_of(
 ) -> RoomPicture:
     """Image frames, each with the index of its mount; they are read twice.
 
-    First for what stands still with the robot, then for patches. AppError if they show nothing.
+    First for what stands still with the robot, then for patches. NoImageError if they show nothing.
     """
     statics = [StaticPart(memory=_WHOLE) for _ in mounts]
     makers = [
@@ -288,7 +292,7 @@ def image_of(
                 room.add(patch, path.place_at(int(patch.t_ns[patch.middle])))
                 n_patches += 1
     if not np.isfinite(room.values).any():
-        raise AppError(
+        raise NoImageError(
             f"path {path.name}: its {n_patches} patches show nothing of the area; a patch takes "
             f"{_RULE.travel_m:g} m of way"
         )
