@@ -93,6 +93,7 @@ def broken(folder: Path, planted: dict[str, tuple[str, str]]) -> dict[str, bool]
 
 
 @pytest.mark.slow
+@pytest.mark.rare  # make check runs the linter itself
 def test_every_contract_holds_and_fails_on_a_planted_violation(tmp_path: Path) -> None:
     pytest.importorskip("importlinter", reason="import-linter is in the extra dev")
     assert set(PLANTED) == set(contracts())

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from hil_tests.paths import REPOSITORY
 
 RECORDINGS = REPOSITORY / "hil_tests" / "unit" / "xethru_protocol" / "recordings"
@@ -13,6 +15,7 @@ RECORDINGS = REPOSITORY / "hil_tests" / "unit" / "xethru_protocol" / "recordings
 FILES = [RECORDINGS / f"test_{name}.py" for name in ("real_recordings", "recordings_vendor")]
 
 
+@pytest.mark.rare  # seconds: pytest in other processes
 def test_tests_without_the_shared_data_are_one_line(tmp_path: Path) -> None:
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *FILES],

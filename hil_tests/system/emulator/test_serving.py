@@ -33,6 +33,7 @@ TIMER_HZ_AT_17 = 17.049379
 """What the chip's timer makes of FPS 17, measured. Protocol reference 9.6."""
 
 
+@pytest.mark.rare
 def test_the_usual_rate_is_what_a_uart_carries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -58,6 +59,7 @@ def scenario(tmp_path: Path) -> str:
     return str(path)
 
 
+@pytest.mark.rare
 def test_an_x4m200_is_served() -> None:
     with (
         emulator("serve", "visitor", "--model", "x4m200", "--option", "bad_value=clamp") as served,
@@ -183,6 +185,7 @@ def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(
     assert passed["rx"] in captured["rx"]  # what came before we listened is there, too
 
 
+@pytest.mark.rare
 def test_a_full_disk_under_the_capture_ends_the_proxy_with_one_line(tmp_path: Path) -> None:
     with emulator("serve", "--bare") as module:
         command = ["proxy", "--port", module.paths[0], "--wire", str(tmp_path / "a.xtwire")]
@@ -265,6 +268,7 @@ def test_what_the_driver_counts_is_what_the_truth_log_says(tmp_path: Path, scena
         assert (refused.returncode, refused.stdout) == (1, "")
 
 
+@pytest.mark.rare
 def test_a_playback_is_paused_and_goes_on() -> None:
     recording = FIXTURES / "recordings" / "float"
     with emulator("play", str(recording)) as served:

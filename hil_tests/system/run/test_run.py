@@ -197,6 +197,7 @@ def test_a_signal_leaves_a_session_that_replays(
     assert n_again > 5
 
 
+@pytest.mark.rare  # half a minute in real time; a unit test has the signal
 def test_sigusr1_writes_the_smoothed_path_while_it_runs(robot: Robot, tmp_path: Path) -> None:
     out = tmp_path / "out"
     session = out / "session.mcap"
