@@ -11,7 +11,7 @@ from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, Scripte
 from xethru_protocol.driver.link import Link, RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import OutputFeature, PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.codes import BAUD_RATES, OutputFeature, PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
 
@@ -398,12 +398,14 @@ def test_uart_is_talked_to_at_its_own_rate_again_after_a_reset(driver_on: Driver
 
 
 def test_uart_whose_rate_is_not_known_is_found_at_it(driver_on: DriverOn) -> None:
+    """Whichever of those in protocol reference 10 it is."""
     uart = UartModule()
-    uart.baudrate = 38400
     radar, line = driver_on(uart)
     uart.connect(line, 115200)
-    assert radar.find_baud_rate() == 38400
-    assert radar.ping() is PongCode.XTS_SPRP_READY
+    for rate in BAUD_RATES:
+        uart.baudrate = rate
+        assert radar.find_baud_rate() == rate
+        assert radar.ping() is PongCode.XTS_SPRP_READY
     uart.deaf = True
     assert radar.find_baud_rate() is None
     uart.deaf, uart.baudrate = False, 115200  # as after a restart
