@@ -56,6 +56,7 @@ class PointRule:
     beside_share: float = 0.25
     beside_wall_share: float = 0.1
     least_wall_share: float = 0.3  # size over that of the strongest reflector
+    on_wall_share: float = 0.3
     image_m: float = 0.06  # this near to where an image would be, a reflector is one
     range_floor_m: float = 1e-3
     bearing_floor_rad: float = 1e-3
@@ -141,7 +142,7 @@ def _are_points(
     may_be, amplitude = reflectors.flatness <= rule.flatness[1], reflectors.amplitude
     chosen = may_be & (amplitude >= rule.least_share * amplitude.max(where=may_be, initial=0.0))
     chosen &= stand_out(reflectors, rule) & (in_view(patch, places) >= rule.least_in_view)
-    return chosen & ~_are_images(reflectors, rule)
+    return np.asarray(chosen & ~_are_images(reflectors, rule))
 
 
 def stand_out(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
@@ -162,14 +163,16 @@ def _are_images(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
 
     With q' the mirror image of q, waves that meet the wall on one way only come from the range
     (|q| + |q'|) / 2 and the mean of the directions of q and q', those that meet it twice from q'.
+    What is weak and lies on a wall may be what the model leaves of it.
     """
     is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[2])
-    xy, range_m = reflectors.places_m, reflectors.range_m
+    xy, range_m, size = reflectors.places_m, reflectors.range_m, np.sqrt(reflectors.energy)
     are = np.zeros(range_m.size, dtype=np.bool_)
-    for normal, distance_m in zip(
-        xy[is_wall] / range_m[is_wall, np.newaxis], range_m[is_wall], strict=True
-    ):
+    for wall in np.flatnonzero(is_wall).tolist():
+        distance_m, size_of_wall = range_m[wall], size[wall]
+        normal = xy[wall] / distance_m
         before_m = distance_m - xy @ normal
+        are |= (np.abs(before_m) < rule.image_m) & (size < rule.on_wall_share * size_of_wall)
         is_before = (before_m > rule.image_m) & ~is_wall
         mirrored = xy[is_before] + 2 * before_m[is_before, np.newaxis] * normal
         far_m = np.linalg.norm(mirrored, axis=1)

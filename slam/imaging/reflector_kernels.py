@@ -33,7 +33,7 @@ Complex = NDArray[np.complex128]
 
 ECHO_STEPS = 8  # samples of an echo per bin: `slam.imaging.range_profiles`
 _STEP_BINS = 2.0  # of range, for the parabola
-_MOST_BEARING, _MOST_CURVATURE = 0.02, 0.5  # of one move [rad], [1/m]
+_MOST_BEARING, _MOST_CURVATURE = 0.02, 0.5  # of one move [rad], [1 / range]
 _CURVATURE_STEP = 0.01  # of the difference quotient [1/m]
 _ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
 _LEAST_COSINE = 0.4
@@ -316,7 +316,8 @@ def refine(
         steps = 0.5 * (levels[2] - levels[1]) / bend if bend < -1e-9 else 0.0
         place[0] = max(step_m, place[0] + step_m * min(2.0, max(-2.0, steps)))
         place[1] += min(_MOST_BEARING, max(-_MOST_BEARING, bearing))
-        place[2] += min(_MOST_CURVATURE, max(-_MOST_CURVATURE, curvature))
+        most = _MOST_CURVATURE / place[0]
+        place[2] += min(most, max(-most, curvature))
     if form == 1:
         place[2] = 1.0 / place[0]
     read_echoes(values, scale, turns, track, place, 0.0, ranges, echoes)
