@@ -45,16 +45,17 @@ class PointRule:
     wheels: WheelNoise = field(default_factory=WheelNoise)
     least_snr: float = 10.0
     least_coherence: float = 0.6
-    least_in_view: float = 0.51  # share of the frames
+    least_in_view: float = 0.5  # share of the frames
     # Amplitude over that of the strongest that is no plane
     least_share: float = 0.2
     # Up to the first it is a point, up to the second something round, beyond the last a plane
-    flatness: tuple[float, float, float] = (0.2, 0.5, 0.6)
+    flatness: tuple[float, float, float] = (0.3, 0.5, 0.6)
     # Within this range of a stronger one, and a smaller share of it, it may be what the model of
     # that one leaves; twice the share where it is as near across the line of sight
     beside_m: float = 0.12
     beside_share: float = 0.25
     beside_wall_share: float = 0.1
+    most_fading: float = 0.4
     least_wall_share: float = 0.3  # size over that of the strongest reflector
     on_wall_share: float = 0.3
     image_m: float = 0.06  # this near to where an image would be, a reflector is one
@@ -140,6 +141,14 @@ def _are_points(
     patch: Patch, reflectors: Reflectors, places: Array, rule: PointRule
 ) -> NDArray[np.bool_]:
     may_be, amplitude = reflectors.flatness <= rule.flatness[1], reflectors.amplitude
+    # Where a face ends, its echo fades, and its wavefront is between that of a plane and a point.
+    quarter = reflectors.levels.shape[1] // 4
+    first, last = (
+        reflectors.levels[:, part].mean(axis=1)
+        for part in (slice(0, quarter), slice(-quarter, None))
+    )
+    fades = np.abs(first - last) > rule.most_fading * (first + last)
+    may_be &= ~fades | (reflectors.flatness <= rule.flatness[0])
     chosen = may_be & (amplitude >= rule.least_share * amplitude.max(where=may_be, initial=0.0))
     chosen &= stand_out(reflectors, rule) & (in_view(patch, places) >= rule.least_in_view)
     return np.asarray(chosen & ~_are_images(reflectors, rule))

@@ -38,6 +38,7 @@ _CURVATURE_STEP = 0.01  # of the difference quotient [1/m]
 _ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
 _LEAST_COSINE = 0.4
 _BURST = 3.0
+_WHOLE = 0.9  # share of the energy that one reflector alone explains
 _WALL = 0.4  # curvature over that of a point: the model of a plane leaves less beside it
 
 
@@ -179,6 +180,14 @@ def remove_bursts(values: NDArray[np.complex64]) -> None:
                     largest = max(largest, squares[other, b])
             if squares[f, b] > _BURST * _BURST * largest:
                 values[f, b] = 0.0
+
+
+@kernel("float64(complex128[::1])")
+def energy_of(echoes: Complex) -> float:
+    total = 1e-300
+    for each in echoes:
+        total += each.real * each.real + each.imag * each.imag
+    return total
 
 
 @kernel("int64(float64[:, ::1], float64[::1], float64[::1], float64)")
@@ -357,7 +366,8 @@ def separate(
     ranges, gains = np.zeros(n), np.zeros(n)
     echoes, amplitudes = np.zeros(n, dtype=np.complex128), np.zeros(n, dtype=np.complex128)
     all_ranges = np.zeros((found.shape[0], n))
-    place, other = np.zeros(3), np.zeros(3)
+    place, other, bent = np.zeros(3), np.zeros(3), np.zeros(3)
+    facing = 0.0
     row_m, strongest, count = rows_m[1] - rows_m[0], 0.0, 0
     floors = np.zeros(rows_m.size)
     remove_bursts(values)
@@ -375,18 +385,34 @@ def separate(
         strongest = max(strongest, energy * place[0] ** 3)
         if energy * place[0] ** 3 < least_share * least_share * strongest:
             break
-        found[count, 3] = 1
         other[:] = place
         free = refine(
             values, scale, turns, track, beam, other, 2, 4, ranges, gains, echoes, amplitudes
         )
+        if free < _WHOLE * energy_of(echoes):
+            # A near wall looks like several points: its normal may be at another bearing
+            best = 0.0
+            for bearing in bearings:
+                bent[:] = place[0], bearing, 0.0
+                plane = refine(
+                    values, scale, turns, track, beam, bent, 0, 0,
+                    ranges, gains, echoes, amplitudes,
+                )  # fmt: skip
+                if plane > best:
+                    best, facing = plane, bearing
+            bent[:] = place[0], facing, 0.0
+            best = refine(
+                values, scale, turns, track, beam, bent, 2, 4, ranges, gains, echoes, amplitudes
+            )
+            if best > free:
+                free = best
+                other[:] = bent
         if free > more_than_point * energy:
             found[count, 3] = 2
             place[:] = other
         else:
-            refine(
-                values, scale, turns, track, beam, place, 1, 0, ranges, gains, echoes, amplitudes
-            )
+            found[count, 3] = 1
+        refine(values, scale, turns, track, beam, place, 0, 0, ranges, gains, echoes, amplitudes)
         add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
         found[count, :3] = place
         all_ranges[count], models[count] = ranges, amplitudes
@@ -417,11 +443,8 @@ def separate(
                 values, scale, turns, track, beam, place, form, 2,
                 ranges, gains, echoes, amplitudes,
             )  # fmt: skip
-            whole = 1e-300
-            for f in range(n):
-                whole += echoes[f].real ** 2 + echoes[f].imag ** 2
             found[k, :3] = place
-            found[k, 4], found[k, 6] = energy, energy / whole
+            found[k, 4], found[k, 6] = energy, energy / energy_of(echoes)
             all_ranges[k], models[k] = ranges, amplitudes
             add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
     image_rows(values, scale, turns, track, rows_m, bearings, 0, rows_m.size, image)
