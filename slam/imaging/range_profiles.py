@@ -110,10 +110,10 @@ class ProfileFilter:
         # An echo of amplitude 1 has the peak 1: its spectrum is p times this. The factor 2 makes up
         # for the negative frequencies.
         self._spectrum = (2 * shape * p.sum() / (p * shape).sum()).astype(np.complex128)
-        turns = np.exp(1j * math.tau / (self._n_fft * _ECHO_STEPS) * np.arange(self._half))
-        at = np.arange(_ECHO_STEPS * model.half_length(bin_length_m))[:, np.newaxis]
-        at_carrier = np.exp(-1j * self.wave_number_rad_per_m * bin_length_m / _ECHO_STEPS * at)
-        self._echo = np.real(at_carrier[:, 0] * (turns**at @ (p * shape))) / (p * shape).sum()
+        # At eighths of bins from its peak, the carrier removed
+        at_m = bin_length_m / _ECHO_STEPS * np.arange(_ECHO_STEPS * model.half_length(bin_length_m))
+        phases = np.outer(at_m, kappa - self.wave_number_rad_per_m)
+        self._echo = np.cos(phases) @ (p * shape) / (p * shape).sum()
         noise = self._spectrum
         if taps is not None:
             kernel = np.zeros(self._n_fft)

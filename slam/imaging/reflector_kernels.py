@@ -39,6 +39,7 @@ _ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
 _LEAST_COSINE = 0.4
 _BURST = 3.0
 _WHOLE = 0.9  # share of the energy that one reflector alone explains
+_NEAR_M = 0.6  # farther walls are found from the place of a point
 _WALL = 0.4  # curvature over that of a point: the model of a plane leaves less beside it
 
 
@@ -358,7 +359,7 @@ def separate(
 ) -> int:
     """Take reflectors out of profiles, the strongest first; return how many.
 
-    What is left stays in ``values``, and its image in ``image``. Rows of ``found`` (most, 7) are
+    What is left stays in ``values``. Rows of ``found`` (most, 7) are
     range, bearing, curvature, form, energy, curvature where it is free, and coherence; those of
     ``models`` (most, frames) the amplitudes.
     """
@@ -389,7 +390,7 @@ def separate(
         free = refine(
             values, scale, turns, track, beam, other, 2, 4, ranges, gains, echoes, amplitudes
         )
-        if free < _WHOLE * energy_of(echoes):
+        if place[0] < _NEAR_M and free < _WHOLE * energy_of(echoes):
             # A near wall looks like several points: its normal may be at another bearing
             best = 0.0
             for bearing in bearings:
@@ -404,7 +405,7 @@ def separate(
             best = refine(
                 values, scale, turns, track, beam, bent, 2, 4, ranges, gains, echoes, amplitudes
             )
-            if best > free:
+            if best > more_than_point * free:
                 free = best
                 other[:] = bent
         if free > more_than_point * energy:
@@ -447,5 +448,4 @@ def separate(
             found[k, 4], found[k, 6] = energy, energy / energy_of(echoes)
             all_ranges[k], models[k] = ranges, amplitudes
             add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
-    image_rows(values, scale, turns, track, rows_m, bearings, 0, rows_m.size, image)
     return count

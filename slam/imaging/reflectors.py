@@ -127,9 +127,13 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
     found = np.zeros((rule.most, 7))
     models = np.zeros((rule.most, n), dtype=np.complex128)
     k = profiles.wave_number_rad_per_m
+    values = profiles.values.copy()
+    scale = np.array(
+        [profiles.range_start_m, 1 / profiles.bin_length_m, k / math.tau * TURNS.size, k]
+    )
     count = kernels.separate(
-        profiles.values.copy(),
-        np.array([profiles.range_start_m, 1 / profiles.bin_length_m, k / math.tau * TURNS.size, k]),
+        values,
+        scale,
         TURNS,
         track,
         np.linspace(0.0, 1.0, _BEAM_STEPS + 1) ** power,
@@ -146,6 +150,10 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         models,
     )
     range_m, bearing_rad, _, _, energy, curvature, coherence = found[:count].T
+    image = np.empty((rows_m.size, bearings[::2].size))
+    kernels.image_rows(
+        values, scale, TURNS, track, rows_m, bearings[::2].copy(), 0, rows_m.size, image
+    )
     levels = np.abs(models[:count])
     at = ((range_m - rows_m[0]) / _ROW_M).astype(np.intp)
     rest = [image[max(0, i - 2) : i + 4].mean() if 0 <= i < len(image) else math.inf for i in at]
