@@ -25,6 +25,7 @@ from hil_tests.bench.image_points.scoring import Score, rms, robust_sigma
 from hil_tests.bench.image_points.tables import TABLES, rooms, stressed
 from hil_tests.bench.image_points.truth import Kind
 from slam.app.sweep import CLEAN, FAMILIES, STRESSES
+from slam.live.errors import AppError
 
 
 def number(value: float, scale: float = 1.0, digits: int = 2) -> str:
@@ -36,7 +37,7 @@ def pair(errors: Sequence[NDArray[np.float64]], scale: float) -> str:
     return f"{number(robust_sigma(errors), scale, 1)} / {number(rms(errors), scale, 1)}"
 
 
-SUMMED = ("dense", "fresh", "walls", "pillars", "people", "scene")
+SUMMED = ("dense", "fresh", "walls", "pillars", "scene")
 """Tables whose rows differ by the room alone: the last row has all of them."""
 
 Columns = dict[str, Callable[[Score], str]]
@@ -145,4 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except AppError as error:
+        sys.exit(f"image_points: {error}")

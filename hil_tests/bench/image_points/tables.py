@@ -143,8 +143,10 @@ def pillar_rows() -> Iterator[Row]:
 
 
 def people_rows() -> Iterator[Row]:
-    for scene in ("visitor", *rooms("people", "0-2")):
-        yield stressed(scene, CLEAN)
+    given = cases(*rooms("people", "0-2"))
+    yield Row(label="two people who walk", cases=given)
+    alone = with_scene(given, lambda scene: scene.model_copy(update={"people": ()}))
+    yield Row(label="the same rooms without them", cases=alone)
 
 
 def turn_rows() -> Iterator[Row]:
