@@ -41,7 +41,6 @@ from slam.robust.parameters import (
     MARGIN_NATS,
     TAIL_PROBABILITY,
     BackEndParameters,
-    ImagedPointRule,
     RangeNoise,
 )
 from slam.robust.state import Array, Indices, State, quarter_turn, rotation
@@ -50,8 +49,6 @@ from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 LONGEST_M = 1e6
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
-# Standard deviation of normal noise over the median of its magnitude
-_NORMAL_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -478,36 +475,6 @@ def point_variances(scan: RangeScan, indices: Sequence[int], noise: RangeNoise) 
         for index in indices
     ]
     return np.asarray(np.square(np.array(sigmas, dtype=np.float64).reshape(-1, 2)))
-
-
-class ImagedNoise:
-    """The noise of points of patches, learned from those of known landmarks.
-
-    Their own covariance holds noise and aperture, and is far too small; what the wheels do within a
-    patch, and the shape of targets, show in innovations.
-    """
-
-    def __init__(self, rule: ImagedPointRule) -> None:
-        self._rule = rule
-        self._innovations = np.zeros((0, 2))
-
-    def learn(self, innovations: Array) -> None:
-        """Take in innovations of range [m] and bearing [rad], shape (n, 2)."""
-        self._innovations = np.concatenate([self._innovations, innovations])[-self._rule.window :]
-
-    def of(self, scan: RangeScan) -> RangeScan:
-        """Return a patch's scan with no less noise than that."""
-        rule, learned = self._rule, np.zeros(2)
-        if len(self._innovations) == rule.window:
-            learned = _NORMAL_SIGMA * np.median(np.abs(self._innovations), axis=0)
-        range_m, bearing_rad = np.maximum(learned, [rule.least_sigma_m, rule.least_sigma_rad])
-        return replace(
-            scan,
-            sigmas_m=tuple([max(s, range_m) for s in scan.sigmas_m or ()]),
-            bearing_sigmas_rad=tuple(
-                [rule.bearing_share * max(s, bearing_rad) for s in scan.bearing_sigmas_rad or ()]
-            ),
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

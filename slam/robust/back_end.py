@@ -23,7 +23,6 @@ from slam.robust import kernels
 from slam.robust.association import (
     LONGEST_M,
     Antennas,
-    ImagedNoise,
     Known,
     Pairs,
     RangeScan,
@@ -44,7 +43,6 @@ from slam.robust.initialisation import (
     FeatureRows,
     Guess,
     Option,
-    PointDetection,
     Question,
     Search,
     Sightings,
@@ -65,6 +63,7 @@ from slam.robust.initialisation import (
 from slam.robust.map import (
     MERGE_SIGMA_M,
     Existence,
+    add_landmarks,
     apply_merge,
     find_merge,
     named_pairs,
@@ -92,7 +91,6 @@ from slam.robust.state import (
     calibrated_motion,
     free_motion,
     predict,
-    rotation,
 )
 from slam.robust.walls import WallKeeper
 
@@ -144,7 +142,6 @@ class RobustBackEnd:
             scale * parameters.wheels.walk_lever_m,
         )
         self._tentative = TentativePoints(parameters)
-        self._imaged_noise = ImagedNoise(parameters.imaged)
         self._existence = Existence(
             parameters.map, rule.min_frames, parameters.ranges.detection_probability
         )
@@ -231,28 +228,12 @@ class RobustBackEnd:
         ``pairs`` are ids of the own landmarks and of the other's that are one. Walls are taken to
         be independent of the other's landmarks.
         """
-        state, R = self.state, rotation(self.state.heading_rad)
-        known, size = other.full_covariance(), state.layout.landmark_size
+        state, known = self.state, other.full_covariance()
         row_of = {name: row for row, name in enumerate(other.unknowns)}
-        turn, at, added = np.eye(3)[:size, :size], np.array([1, 2]), list[tuple[int, list[int]]]()
-        turn[:2, :2] = R
-        for one in other.landmarks:
-            names = [f"{axis} {one.id}" for axis in ("x", "y", "radius")[:size]]
-            mine = [row_of[name] for name in names]
-            cross = np.zeros((state.P.size, size))
-            cross[:, :2] = state.P.columns(at)
-            corner = turn @ known[np.ix_(mine, mine)] @ turn.T
-            corner[:2, :2] += state.P.block(at)
-            for row, its in added:
-                columns = state.layout.columns(np.array([row]))
-                cross[columns] += turn @ known[np.ix_(its, mine)] @ turn.T
-            place = state.position_m + R @ (one.x_m, one.y_m)
-            new_id = state.augment(place, cross, (corner + corner.T) / 2)
-            if state.radius_sigma_m:
-                state.radii_m[-1] = one.radius_m
-            self._know(new_id, one)
-            added.append((state.landmark_ids.index(new_id), mine))
-        rows = {one.id: row for one, (row, _) in zip(other.landmarks, added, strict=True)}
+        added = add_landmarks(state, other, known, row_of)
+        for one, row in zip(other.landmarks, added, strict=True):
+            self._know(state.landmark_ids[row], one)
+        rows = {one.id: row for one, row in zip(other.landmarks, added, strict=True)}
         same = tuple((state.landmark_ids.index(own), rows[its]) for own, its in pairs)
         ids = named_pairs(state, same)
         apply_merge(state, same, MERGE_SIGMA_M)
@@ -388,21 +369,15 @@ class RobustBackEnd:
         """
         patches = [scan for scan in scans if scan.is_patch]
         scans = [scan for scan in scans if not scan.is_patch]
-        radars = {scan.radar for scan in scans}
-        if len(radars) < len(scans) or max(radars, default=0) >= len(self.rig.mounts):
-            raise ValueError(
-                f"scans of radars {[scan.radar for scan in scans]}; there is at most one of each "
-                f"of the {len(self.rig.mounts)} in the rig"
-            )
+        self._check_radars(scans)
         looks = [scan for scan in scans if scan.looks]
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         with_bearings = [scan for scan in scans if scan.bearings_rad is not None]
-        if with_bearings:
-            scans = [scan for scan in scans if scan.bearings_rad is None]
-            looks = [scan for scan in looks if scan.bearings_rad is None]
+        scans = [scan for scan in scans if scan.bearings_rad is None]
+        looks = [scan for scan in looks if scan.bearings_rad is None]
         widened = [scan.with_added_sigma(added_m) for scan in looks]
         seen = self._look(antennas)
         beacons = self._beacon_rows()
@@ -451,6 +426,14 @@ class RobustBackEnd:
             predicted=tuple(predicted),
             evidence=(*likelihoods, *evidence_of_misses, *of_patches, *of_tracklets),
         )
+
+    def _check_radars(self, scans: Sequence[RangeScan]) -> None:
+        radars = {scan.radar for scan in scans}
+        if len(radars) < len(scans) or max(radars, default=0) >= len(self.rig.mounts):
+            raise ValueError(
+                f"scans of radars {[scan.radar for scan in scans]}; there is at most one of each "
+                f"of the {len(self.rig.mounts)} in the rig"
+            )
 
     def _decide(self) -> None:
         """Take what is unclear for the likeliest."""
@@ -659,7 +642,7 @@ class RobustBackEnd:
         """Take in the points of patches one after the other; return ids and evidence."""
         found = list[tuple[int, float]]()
         for scan in patches:
-            found += self._take_points(self._imaged_noise.of(scan), added_m)[2]
+            found += self._take_points(scan, added_m)[2]
             self._decide()
         return found
 
@@ -715,7 +698,7 @@ class RobustBackEnd:
             self._existence.hit(landmark_id, self.parameters.frames_per_scan)
         refused = [(index, ids[row]) for index, row in found.refused]
         for index, landmark_id in refused:
-            self._log_detections(
+            self._log.add_detections(
                 landmark_id, detections_of(scan, [index], self._log.n_poses - 1, antennas, noise)
             )
         # Those that are seen rarely are missed often: half of the expected hits, at most.
@@ -756,7 +739,6 @@ class RobustBackEnd:
         measured = [(scan.ranges_m[index], scan.bearings_rad[index]) for index in indices]
         innovations = np.array(measured) - view_of.predicted
         innovations[:, 1] = wrap_angles(innovations[:, 1])
-        self._imaged_noise.learn(innovations)
         variances = point_variances(scan, indices, noise)
         variances[:, 0] += np.square(state.feature_added_sigmas_m[rows])
         gain, weighted, white, scales = kernels.weigh(
@@ -777,23 +759,9 @@ class RobustBackEnd:
         for row, detection in zip(
             rows, detections_of(scan, indices, pose, antennas, noise), strict=True
         ):
-            self._log_detections(ids[row], [detection])
+            self._log.add_detections(ids[row], [detection])
         state.apply(gain, weighted)
         return float(white @ white), likelihoods, predicted
-
-    def _log_detections(self, landmark_id: int, seen: Sequence[PointDetection]) -> None:
-        for one in seen:
-            self._log.add_range(
-                one.pose,
-                one.radar,
-                landmark_id,
-                antenna=one.nominal_m,
-                turn_rad=one.turn_rad,
-                range_m=one.range_m,
-                sigma_m=one.sigma_m,
-                bearing_rad=one.bearing_rad,
-                bearing_sigma_rad=one.bearing_sigma_rad,
-            )
 
     def _place_points(self) -> None:
         """Let tentative landmarks be those of the map that they certainly are, or have labels of.
@@ -901,7 +869,7 @@ class RobustBackEnd:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
         self._existence.hit(landmark_id, len(tentative.seen) * self.parameters.frames_per_scan)
-        self._log_detections(landmark_id, tentative.seen)
+        self._log.add_detections(landmark_id, tentative.seen)
         if tracklet is not None:
             self._use(landmark_id, tracklet.seen)
 
@@ -973,24 +941,7 @@ class RobustBackEnd:
     def _use(self, landmark_id: int, seen: Sightings) -> None:
         """Count and log the ranges of a tracklet as those of a landmark or a wall."""
         self._existence.hit(landmark_id, seen.n_frames)
-        for pose, radar, antenna, turn_rad, range_m, sigma_m in zip(
-            seen.poses.tolist(),
-            seen.radars.tolist(),
-            seen.nominal_m.tolist(),
-            seen.turns_rad.tolist(),
-            seen.measured_m.tolist(),
-            seen.sigmas_m.tolist(),
-            strict=True,
-        ):
-            self._log.add_range(
-                pose,
-                radar,
-                landmark_id,
-                antenna=(antenna[0], antenna[1]),
-                turn_rad=turn_rad,
-                range_m=range_m,
-                sigma_m=sigma_m,
-            )
+        self._log.add_sightings(landmark_id, seen)
 
     def _delete_vanished(self, *, solve: bool) -> None:
         """Delete landmarks that are not there any more; without ``solve``, no beacons."""

@@ -21,7 +21,7 @@ from slam.geometry import Rig
 from slam.results import OF_MOUNT, SavedLandmark, SavedMap, SavedRadar, SavedWall
 from slam.robust.association import Correspondence, Pairs, certain, correspondence, density_per_m2
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
-from slam.robust.state import HEAD_SIZE, Array, Indices, State, SymmetricMatrix
+from slam.robust.state import HEAD_SIZE, Array, Indices, State, SymmetricMatrix, rotation
 
 # Noise [m] of the statement that two landmarks are one: it is exact.
 MERGE_SIGMA_M = 1e-5
@@ -148,6 +148,34 @@ class MapPrior:
         covariance = self.covariance[np.ix_(rows, rows)] + _LEAST_M2 * np.eye(len(rows))
         information = np.linalg.inv(covariance)
         return HEAD_SIZE + columns, self.values[rows], (information + information.T) / 2
+
+
+def add_landmarks(
+    state: State, other: SavedMap, covariance: Array, row_of: Mapping[str, int]
+) -> list[int]:
+    """Add the landmarks of a map that is given in the body frame; return their rows.
+
+    ``covariance`` (k, k) is that of its unknowns, whose rows are given by name.
+    """
+    R, size = rotation(state.heading_rad), state.layout.landmark_size
+    turn, at, added = np.eye(3)[:size, :size], np.array([1, 2]), list[tuple[int, list[int]]]()
+    turn[:2, :2] = R
+    for one in other.landmarks:
+        names = [f"{axis} {one.id}" for axis in ("x", "y", "radius")[:size]]
+        mine = [row_of[name] for name in names]
+        cross = np.zeros((state.P.size, size))
+        cross[:, :2] = state.P.columns(at)
+        corner = turn @ covariance[np.ix_(mine, mine)] @ turn.T
+        corner[:2, :2] += state.P.block(at)
+        for row, its in added:
+            columns = state.layout.columns(np.array([row]))
+            cross[columns] += turn @ covariance[np.ix_(its, mine)] @ turn.T
+        place = state.position_m + R @ (one.x_m, one.y_m)
+        new_id = state.augment(place, cross, (corner + corner.T) / 2)
+        if state.radius_sigma_m:
+            state.radii_m[-1] = one.radius_m
+        added.append((state.landmark_ids.index(new_id), mine))
+    return [row for row, _ in added]
 
 
 def take_map(

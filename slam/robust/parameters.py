@@ -425,7 +425,7 @@ class ImagedPointRule:
     """Fewest patches that hold a new landmark."""
     unclear_patches: Annotated[int, Origin.CHOSEN, "patches"] = 4
     """Fewest patches that hold one which may be a landmark of the map."""
-    frames_per_patch: Annotated[int, Origin.CHOSEN, "frames"] = 5
+    frames_per_patch: Annotated[int, Origin.CHOSEN, "frames"] = 3
     """As how many frames a patch counts for the existence of a landmark."""
     crowd_m: Annotated[float, Origin.DATA_SHEET] = 0.13
     """No single range is of a landmark while another one in view is as near in range as that: their
@@ -438,8 +438,6 @@ class ImagedPointRule:
     """Factor on the standard deviation of bearings: those of one passage err alike."""
     unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 1.0
     """How many landmarks per square metre may not be in the map yet."""
-    window: Annotated[int, Origin.BUDGET, "points"] = 150
-    """Points of known landmarks whose innovations say what the noise is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,7 +30,7 @@ from slam.results import (
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
-from slam.robust.parameters import BackEndParameters, RangeNoise
+from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
 from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import calibrated_motion, quarter_turn, rotation
 
@@ -76,7 +76,8 @@ class RobustSlam:
         if config.robust.patches:
             learned = self._detector
             pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None
-            self._patches = PatchScans(Imager(config, rig, wheels, pulses), rig, wheels)
+            imager, rule = Imager(config, rig, wheels, pulses), parameters.imaged
+            self._patches = PatchScans(imager, rig, wheels, rule)
         self._check = InputCheck(rig)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
@@ -291,8 +292,8 @@ class PatchScans:
     turn all bearings.
     """
 
-    def __init__(self, imager: Imager, rig: Rig, wheels: WheelNoise) -> None:
-        self._imager, self._rig, self._wheels = imager, rig, wheels
+    def __init__(self, imager: Imager, rig: Rig, wheels: WheelNoise, rule: ImagedPointRule) -> None:
+        self._imager, self._rig, self._wheels, self._rule = imager, rig, wheels, rule
         # The newest pose, as reported and on the corrected path
         self._reported: Array | None = None
         self._path = np.zeros(3)
@@ -337,14 +338,17 @@ class PatchScans:
         spread = np.einsum("nai,nij,naj->na", axes, covariances, axes)
         # What the wheels do between the patch and the newest pose
         along, _, heading = self._wheels.step_variances(math.hypot(dx, dy), turn)
+        sigmas_m = np.maximum(np.sqrt(spread[:, 0] + along), self._rule.least_sigma_m)
+        sigmas_rad = np.sqrt(spread[:, 1] / ranges_m**2 + heading)
+        sigmas_rad = self._rule.bearing_share * np.maximum(sigmas_rad, self._rule.least_sigma_rad)
         return RangeScan(
             radar=patch.radar,
             is_patch=True,
             moved=(dx * (1.0 + s), dy * (1.0 + s), turn * (1.0 + w)),  # as the wheels report it
             ranges_m=tuple(ranges_m.tolist()),
-            sigmas_m=tuple(np.sqrt(spread[:, 0] + along).tolist()),
+            sigmas_m=tuple(sigmas_m.tolist()),
             bearings_rad=tuple([one.bearing_rad for one in points]),
-            bearing_sigmas_rad=tuple(np.sqrt(spread[:, 1] / ranges_m**2 + heading).tolist()),
+            bearing_sigmas_rad=tuple(sigmas_rad.tolist()),
         )
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import between, compose, wrap_angle, wrap_angles
+from slam.robust.initialisation import PointDetection, Sightings
 from slam.robust.map import SURE, MapPrior, fixed_values
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.solver.growing_arrays import PackedRows
@@ -298,6 +299,40 @@ class RunLog:
         whose = (pose, landmark_id, passage, radar)
         bearing = bearing_rad, bearing_sigma_rad
         self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m, *bearing))
+
+    def add_detections(self, landmark_id: int, seen: Iterable[PointDetection]) -> None:
+        for one in seen:
+            self.add_range(
+                one.pose,
+                one.radar,
+                landmark_id,
+                antenna=one.nominal_m,
+                turn_rad=one.turn_rad,
+                range_m=one.range_m,
+                sigma_m=one.sigma_m,
+                bearing_rad=one.bearing_rad,
+                bearing_sigma_rad=one.bearing_sigma_rad,
+            )
+
+    def add_sightings(self, landmark_id: int, seen: Sightings) -> None:
+        for pose, radar, antenna, turn_rad, range_m, sigma_m in zip(
+            seen.poses.tolist(),
+            seen.radars.tolist(),
+            seen.nominal_m.tolist(),
+            seen.turns_rad.tolist(),
+            seen.measured_m.tolist(),
+            seen.sigmas_m.tolist(),
+            strict=True,
+        ):
+            self.add_range(
+                pose,
+                radar,
+                landmark_id,
+                antenna=(antenna[0], antenna[1]),
+                turn_rad=turn_rad,
+                range_m=range_m,
+                sigma_m=sigma_m,
+            )
 
     def is_new_passage(self, landmark_id: int) -> bool:
         """Return whether a range of a landmark now would begin a passage."""

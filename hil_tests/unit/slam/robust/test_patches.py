@@ -18,7 +18,7 @@ from slam.imaging.imager import ImagedPatch, Imager
 from slam.imaging.patches import Patch
 from slam.imaging.points import PatchPoint, PointKind
 from slam.results import Belief
-from slam.robust.association import ImagedNoise, RangeScan, View, antennas_of
+from slam.robust.association import RangeScan, View, antennas_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import body_point, detections_of
 from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
@@ -88,9 +88,9 @@ def test_a_point_lies_where_it_is_from_the_newest_pose() -> None:
         motion = np.array([(1 + s) * dx, (1 + s) * dy, (1 + w) * turn + kappa * way])
         reported.append(compose(reported[-1], motion))
     rod_from_2 = transform(between(true[2], np.zeros(3)), ROD)
-    imager = GivenPatches(lambda origin: imaged(origin, rod_from_2, 1e-6 * np.eye(2)))
+    imager = GivenPatches(lambda origin: imaged(origin, rod_from_2, 16e-6 * np.eye(2)))
     calibration = np.array([s, w, kappa])
-    scans = PatchScans(cast("Imager", imager), RIG, WheelNoise())
+    scans = PatchScans(cast("Imager", imager), RIG, WheelNoise(), RULE)
     for t_ns, pose in enumerate(reported):
         scans.take((), {t_ns: pose}, t_ns, calibration)
     (scan,) = scans.scans(calibration)
@@ -102,12 +102,22 @@ def test_a_point_lies_where_it_is_from_the_newest_pose() -> None:
     point = body_point(back_end.state, antennas, detection)
     expected = transform(between(true[4], np.zeros(3)), ROD)
     np.testing.assert_allclose(point.point_m, expected, atol=1e-12)
-    # Noise: that of the point, 1 mm each way, and of the wheels between the two poses
+    # Noise: that of the point, 4 mm each way, and of the wheels between the two poses
     back = between(true[4], true[2])
     along, _, heading = WheelNoise().step_variances(math.hypot(back[0], back[1]), back[2])
-    assert scan.sigmas_m == pytest.approx((math.sqrt(1e-6 + along),))
-    across = 1e-6 / scan.ranges_m[0] ** 2
-    assert scan.bearing_sigmas_rad == pytest.approx((math.sqrt(across + heading),))
+    assert scan.sigmas_m == pytest.approx((math.sqrt(16e-6 + along),))
+    across = 16e-6 / scan.ranges_m[0] ** 2
+    assert scan.bearing_sigmas_rad == pytest.approx((3.0 * math.sqrt(across + heading),))
+
+
+def test_a_point_is_not_known_better_than_points_are() -> None:
+    imager = GivenPatches(lambda origin: imaged(origin, ROD, 1e-10 * np.eye(2)))
+    scans, zero = PatchScans(cast("Imager", imager), RIG, WheelNoise(), RULE), np.zeros(3)
+    for t_ns in range(3):
+        scans.take((), {t_ns: zero}, t_ns, zero)
+    (scan,) = scans.scans(zero)
+    assert scan.sigmas_m == (2e-3,)
+    assert scan.bearing_sigmas_rad == pytest.approx((7.5e-3,))
 
 
 def test_patches_of_all_radars_are_taken_one_a_state() -> None:
@@ -121,28 +131,12 @@ def test_patches_of_all_radars_are_taken_one_a_state() -> None:
             one = imaged(pose_at(self.n_steps - 1), ROD, 1e-6 * np.eye(2))
             return (one,) * {1: 4, 2: 3}.get(self.n_steps, 0)
 
-    scans, zero = PatchScans(cast("Imager", AllAtOnce()), RIG, WheelNoise()), np.zeros(3)
+    scans, zero = PatchScans(cast("Imager", AllAtOnce()), RIG, WheelNoise(), RULE), np.zeros(3)
     taken = []
     for t_ns in range(5):
         scans.take((), {t_ns: zero}, t_ns, zero)
         taken.append(len(scans.scans(zero)))
     assert taken == [1, 3, 1, 1, 1]  # behind the first there are 3 and 3 more: 4 may wait
-
-
-def test_the_noise_of_points_is_that_of_their_innovations() -> None:
-    scan = seen_from(np.zeros(3), ROD)
-    noise = ImagedNoise(RULE)
-    assert noise.of(scan).sigmas_m == (RULE.least_sigma_m,)
-    assert noise.of(scan).bearing_sigmas_rad == pytest.approx((3 * RULE.least_sigma_rad,))
-    rng = np.random.default_rng(3)
-    innovations = rng.standard_normal((RULE.window, 2)) * (5e-3, 2e-2)
-    noise.learn(np.full((40, 2), 9.0))  # forgotten
-    noise.learn(innovations)
-    median = np.median(np.abs(innovations), axis=0)
-    learned = noise.of(replace(scan, sigmas_m=(0.0,)))
-    assert learned.sigmas_m == pytest.approx((1.4826 * median[0],))
-    assert learned.bearing_sigmas_rad == pytest.approx((3 * 1.4826 * median[1],))
-    assert noise.of(replace(scan, sigmas_m=(0.1,))).sigmas_m == (0.1,)
 
 
 def seen_from(pose: Array, *rods: Array) -> RangeScan:
