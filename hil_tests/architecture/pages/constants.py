@@ -94,7 +94,7 @@ def group_of(
     found = []
     for name, hint in get_type_hints(owner, include_extras=True).items():
         value = values[name]
-        if not isinstance(value, int | float):
+        if isinstance(value, bool) or not isinstance(value, int | float):
             continue
         notes = get_args(hint)[1:]
         origins = tuple(note for note in notes if isinstance(note, Origin))
