@@ -5,8 +5,8 @@ show, the amplitude times the root of the coherence factor, of echoes multiplied
 law by which those of rods fall: so it is the amplitude that a rod there would have at 1 m. Radars
 and patches are not summed with their phases, so an error of the path from patch to patch does not
 blur the image. A cell counts where most frames of a patch saw it: of few frames the coherence
-factor is large by chance. Patches whose frames are so far apart that they have grating lobes, as
-those of turns on the spot, show only what no other patch does.
+factor is large by chance. Patches with grating lobes, whose frames are far apart, and patches of
+turns, whose beam sweeps past each thing in a part of them, show only what no other patch does.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ _RANGE_POWER = 1.5
 # An echo is 2 to 4 cm wide across the line of sight: larger cells are looked at in several points.
 _MOST_SPACING_M = 0.025
 _STEP = 16  # cells by which an image grows
+_MOST_TURN_RAD = 0.3  # of a patch whose beam stays on what it sees
 _DIRECTIONS = np.linspace(-1.0, 1.0, 9)
 
 
@@ -58,7 +59,7 @@ class RoomImage:
     ) -> None:
         self.grid = area or Grid(x_m=0.0, y_m=0.0, cell_m=cell_m, rows=0, columns=0)
         self._most_cells = most_cells if area is None else 0
-        # Value, coherence, and whether a patch without grating lobes gave them
+        # Value, coherence, and whether a sharp patch without grating lobes gave them
         shape = (3, self.grid.rows, self.grid.columns)
         self._layers = np.full(shape, np.nan, dtype=np.float32)
         self.values, self.coherence = self._layers[:2]
@@ -88,11 +89,12 @@ class RoomImage:
         n, points = len(profiles.values), fine.centres_m
         is_near = _in_view(aperture, n // 2, points)  # what most frames see, so does the middle one
         sums = back_project(profiles.times_range(_RANGE_POWER), aperture, points[is_near])
-        step_m = aperture.length_m / max(n - 1, 1)
+        step_m = np.linalg.norm(np.diff(aperture.antennas_m, axis=0), axis=1).max(initial=0.0)
         turn_rad = profiles.wave_number_rad_per_m * 2 * step_m * math.sin(aperture.half_beam_rad)
+        is_sure = turn_rad < math.tau and np.ptp(patch.poses[:, 2]) < _MOST_TURN_RAD
         new = np.full((3, *is_near.shape), -1.0)
         new[0, is_near] = np.where(2 * sums.count > n, sums.weighted, -1.0)
-        new[1, is_near], new[2] = sums.coherence_factor, turn_rad < math.tau
+        new[1, is_near], new[2] = sums.coherence_factor, is_sure
         if k > 1:
             new = new.reshape(3, grid.rows, k, grid.columns, k).swapaxes(2, 3)
             new = new.reshape(3, grid.rows, grid.columns, k * k)

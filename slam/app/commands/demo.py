@@ -29,7 +29,7 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.maps import MapOptions, MapSaver, map_use
 from slam.app.run.output import RunProgress, note, print_progress
-from slam.app.run.radar_image import RollingImage, path_of, session_image
+from slam.app.run.radar_image import NoImageError, RollingImage, path_of, session_image
 from slam.app.run.result_files import (
     IMAGE,
     REPORT,
@@ -190,7 +190,7 @@ def write_image(out: Path, record: RunRecord, odometry: OdometryTrack) -> None:
     session = open_session(out / SESSION)
     try:
         image = session_image(session, path_of(record, odometry, session.info))
-    except AppError as error:
+    except NoImageError as error:
         note(f"{out / IMAGE} is not written: {error}")
         return
     with picture(out / IMAGE, width_in=9.0, height_in=8.2, dpi=120) as figure:

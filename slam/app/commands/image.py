@@ -14,7 +14,14 @@ from slam.app.errors import UsageError, naming
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_table
 from slam.app.run.pictures import draw_image, picture
-from slam.app.run.radar_image import ImagePath, RoomPicture, image_of, path_of, session_image
+from slam.app.run.radar_image import (
+    ImagePath,
+    NoImageError,
+    RoomPicture,
+    image_of,
+    path_of,
+    session_image,
+)
 from slam.app.run.result_files import IMAGE, hold_folder, remove_earlier
 from slam.app.run.runner import RunRecord, RunRecorder
 from slam.front_end.pulse import PulseModel
@@ -72,33 +79,30 @@ def run_image(
         return RoomImage(cell_m=cell_m, area=area, most_cells=_MOST_CELLS)
 
     info: SessionInfo | None = None
-    if (session := _session_at(source, stop)) is not None:
-        if mount or rig or frame_area_m:
-            raise UsageError(f"{source}: a session has --mount, --rig and --frame-area of its own")
-        info = session.info
-        if info.has_detections:
-            raise AppError(f"{source}: holds ranges in place of frames, which make no image")
-        try:
+    try:
+        if (session := _session_at(source, stop)) is not None:
+            if mount or rig or frame_area_m:
+                raise UsageError(f"{source}: a session has mounts and frame areas of its own")
+            info = session.info
             along = given or path_of(*_states(session), info, path)
             image = session_image(session, along, room(along), reach_m=reach_m)
-        except OdometryError as error:
-            raise AppError(f"{source}: {error}") from None
-    else:
-        if given is None:
-            raise UsageError(
-                f"{source}: a recording has no path; give --path FILE.tum, the poses of the robot "
-                "or cart by the same clock"
-            )
-        mounts, frames = [_mount(source, mount, rig)], _recorded_frames(source, frame_area_m)
-        try:
+        else:
+            if given is None:
+                raise UsageError(
+                    f"{source}: a recording has no path; give --path FILE.tum, the poses of the "
+                    "robot or cart by the same clock"
+                )
+            mounts, frames = [_mount(source, mount, rig)], _recorded_frames(source, frame_area_m)
             image = image_of(
                 lambda: stop.each(frames()),
                 *(mounts, given, room(given)),
                 model=PulseModel(),
                 reach_m=reach_m,
             )
-        except RecordingError as error:
-            raise AppError(str(error)) from None
+    except (NoImageError, OdometryError) as error:
+        raise AppError(f"{source}: {error}") from None
+    except RecordingError as error:  # which names the file
+        raise AppError(str(error)) from None
     if given is not None and image.n_placed < image.n_frames:
         note(
             f"{source}: {image.n_frames - image.n_placed} of {image.n_frames} frames are left out: "
@@ -182,11 +186,8 @@ def _recorded_frames(
 ) -> Callable[[], Iterator[tuple[int, RecordedFrame]]]:
     """Return what reads the frames of a recording, RF or I/Q, whose time is known."""
     area_m = None if frame_area_m is None else (frame_area_m[0], frame_area_m[1])
-    try:
-        radar = load(source, lambda fault: note(f"{source}: {fault}"), area_m=area_m).radar
-        ranges_m, t_ns = radar.true_ranges_m, radar.t_ns
-    except RecordingError as error:
-        raise AppError(str(error)) from None
+    radar = load(source, lambda fault: note(f"{source}: {fault}"), area_m=area_m).radar
+    ranges_m, t_ns = radar.true_ranges_m, radar.t_ns
     if ranges_m is None or len(ranges_m) < 2:
         raise UsageError(
             f"{source}: does not say where its bins lie; give --frame-area START END, as the "

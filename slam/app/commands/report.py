@@ -33,7 +33,7 @@ from slam.app.run.pictures import (
     label,
     svg_of,
 )
-from slam.app.run.radar_image import path_of, session_image
+from slam.app.run.radar_image import NoImageError, path_of, session_image
 from slam.app.run.replay import play, refuse_overwriting
 from slam.app.run.result_files import REPORT
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord
@@ -509,7 +509,7 @@ def _write_image(page: _Page, session: RecordedSession, record: RunRecord) -> No
     page.heading("Radar image")
     try:
         image = session_image(session, path_of(record, session.odometry(), session.info))
-    except AppError as error:
+    except NoImageError as error:
         page.note(f"There is none: {error}")
         return
     page.note(

@@ -193,24 +193,27 @@ def run_rig(
                 smoothing_asked=requests.asked,
                 map_file=begin.file,
             )
-            pulse = PulseModel(carrier_hz=config.matched_filter.carrier_hz)
             map_saver = MapSaver(maps.get("save_map"), slam, info)
             remove_earlier(out, (*RESULTS, *_STALE))
             session_log = SessionLog(out / SESSION, info, start_ns=start_ns, drawn=not lean)
             held.callback(session_log.close)
             log.begin(session_log, start_ns)
-            shown: list[SessionObserver] = [
-                publishing,
-                *([view.observer(info)] if view is not None else []),
-            ]
+            shown = [view.observer(info)] if view is not None else []
             image = RollingImage(
-                info, live_odometry, [log, *shown], is_late=lambda: live.ticks.wait_ns > _LATE_NS
+                *(info, live_odometry, [log, publishing, *shown]),
+                is_late=lambda: live.ticks.wait_ns > _LATE_NS,
             )
             sinks: list[SessionObserver] = [
+                publishing,  # before what takes time
                 RunProgress(info, source.lost_frames, also=lambda: _dropped_text(live)),
                 requests,
                 map_saver,
-                SpacingWarning(longest_spacing_m(pulse, info.field_of_view), live_odometry, log),
+                SpacingWarning(
+                    longest_spacing_m(
+                        PulseModel(carrier_hz=config.matched_filter.carrier_hz), info.field_of_view
+                    ),
+                    *(live_odometry, log),
+                ),
                 *([image] if has_image else []),
                 *shown,
             ]

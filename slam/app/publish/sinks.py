@@ -246,6 +246,8 @@ class Publishing(SessionObserver):
         return rows
 
     def _put(self, method: str, event: object) -> None:
+        if self._is_closed:  # as for the radar image of the end of a run
+            return
         for each in self.queued:
             each.put(method, event)
             while each.warnings:  # each line comes back by `on_log`
