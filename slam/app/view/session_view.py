@@ -68,7 +68,8 @@ only. {data}
 
 * **Map** (left, metres, y up). {truth}Orange: where its *wheels* alone say it went. Blue: where
   *radar SLAM* says, with the robot as a disk with an arrow. Red: *landmarks* and walls it found,
-  with 95 % ellipses, enlarged as the map says. {smoothed}
+  with 95 % ellipses, enlarged as the map says. {smoothed} The glow below is the *radar image*: what
+  the raw frames show, summed along 25 cm of each radar's way.
 * **Around the robot**: a grey wedge is what one radar can see. An echo has a distance but no
   direction, so it is an arc: **green** if it moved the estimate, **dim** if not. {points}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, constant part removed. A

@@ -28,9 +28,10 @@ from hil_tests.unit.slam.app.sessions import (
 from hil_tests.unit.slam.live.session.test_state_rows import robust_state
 from slam.app.session.viewer_topics import Drawings, Topics
 from slam.app.session.writer import SessionLog
+from slam.imaging.back_projection import Grid
 from slam.live.odometry_track import TumSample
 from slam.live.session import cdr
-from slam.live.session_records import Scan, SessionInfo, Snapshot
+from slam.live.session_records import RadarImage, Scan, SessionInfo, Snapshot
 
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
 Messages = dict[str, list[tuple[int, Any]]]
@@ -487,7 +488,8 @@ def types_of(path: Path) -> dict[str, str]:
         }
 
 
-RARE = {  # in few sessions
+RARE = {  # in few sessions, or not before the robot has moved
+    "/image": "nav_msgs/msg/OccupancyGrid",
     "/radar/<name>/stream": "std_msgs/msg/UInt32",
     "/radar/<name>/rx": "std_msgs/msg/UInt8MultiArray",
     "/radar/<name>/tx": "std_msgs/msg/UInt8MultiArray",
@@ -528,6 +530,8 @@ def test_the_views_that_ship_show_what_sessions_have(tmp_path: Path) -> None:
     log.on_scan(scan(1, 4))
     log.on_snapshot(robust_state())
     log.on_smoothed(smoothed_run(3))
+    grid = Grid(x_m=0.0, y_m=0.0, cell_m=0.1, rows=1, columns=2)
+    log.on_image(RadarImage(t_ns=1, grid=grid, levels=np.array([[-1, 100]], dtype=np.int8)))
     log.close()
     found = read(tmp_path / "s.mcap")
     whole = types_of(tmp_path / "s.mcap")
