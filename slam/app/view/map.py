@@ -469,17 +469,15 @@ class MapLayer:
             self._recording.row(f"map/{name}/path", stamps, line)
 
 
-_OUT_OF_VIEW = 255
-_SHADES = (255 * matplotlib.colormaps["inferno"](np.linspace(0.0, 0.85, 101))[:, :3]).astype(
-    np.uint8
-)
+_SHADES = 255 * matplotlib.colormaps["inferno"](np.linspace(0.0, 0.85, 101))[:, :3]
 """Of the levels of a radar image."""
+_OUT_OF_VIEW = len(_SHADES)
 
 
 def _png(levels: NDArray[np.int8]) -> bytes:
     """Return levels as a PNG of few colours, clear where nothing was in view; row 0 is on top."""
     shown = Image.fromarray(np.where(levels < 0, _OUT_OF_VIEW, levels).astype(np.uint8))
-    shown.putpalette(_SHADES.tobytes())
+    shown.putpalette(np.vstack([_SHADES, np.zeros(3)]).astype(np.uint8).tobytes())
     file = io.BytesIO()
     shown.save(file, format="png", transparency=_OUT_OF_VIEW)
     return file.getvalue()

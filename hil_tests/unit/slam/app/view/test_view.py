@@ -1,5 +1,6 @@
 """Views in Rerun: pictures, tables and recordings of sessions."""
 
+import io
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info, smoothed_run, snapshot
@@ -15,8 +17,9 @@ from slam.app.view.rerun_recording import count_rows
 from slam.app.view.session_view import RerunView
 from slam.frames import Detection
 from slam.geometry import compose, transform
+from slam.imaging.back_projection import Grid
 from slam.live.errors import AppError
-from slam.live.session_records import LogLine, Scan, SessionInfo, Snapshot
+from slam.live.session_records import LogLine, RadarImage, Scan, SessionInfo, Snapshot
 from slam.paper.ekf import start
 from slam.results import Fix, Observation, StepResult, UpdateReport
 
@@ -318,6 +321,40 @@ def test_the_smoothed_path_is_drawn_at_the_last_state(tmp_path: Path) -> None:
     assert errors[7] == pytest.approx([float(np.hypot(*away[:2]))])
     wanted = away @ np.linalg.solve(made.pose_covariances[7], away) / 3
     assert nees[7] == pytest.approx([wanted])
+
+
+def test_the_radar_image_lies_on_the_map_where_its_cells_are(tmp_path: Path) -> None:
+    place = np.array([3.0, -1.0, 0.7])  # of the map frame in the world
+    levels = np.full((4, 6), -1, dtype=np.int8)
+    levels[1, 4], levels[2, 0] = 100, 30
+    grid = Grid(x_m=0.5, y_m=-2.0, cell_m=0.25, rows=4, columns=6)
+    view = RerunView(tmp_path / "s.rrd", session_info())
+    view.on_image(RadarImage(t_ns=0, grid=grid, levels=levels))  # before any state: not shown
+    view.on_scan(scan(0))
+    view.on_snapshot(replace(snapshot(0), world_from_map=place))
+    view.on_image(RadarImage(t_ns=0, grid=grid, levels=levels))
+    view.close()
+    entity = "/map/image"
+    (moved,) = (v for _, v in rows(tmp_path / "s.rrd", entity, "Transform3D:translation") if v)
+    (turned,) = (
+        v for _, v in rows(tmp_path / "s.rrd", entity, "Transform3D:rotation_axis_angle") if v
+    )
+    (scaled,) = (v for _, v in rows(tmp_path / "s.rrd", entity, "Transform3D:scale") if v)
+    (blob,) = (v for _, v in rows(tmp_path / "s.rrd", f"{entity}/cells", "EncodedImage:blob") if v)
+    with Image.open(io.BytesIO(bytes(blob[0]))) as picture:
+        pixels = np.asarray(picture.convert("RGBA"))
+    assert pixels.shape == (4, 6, 4)
+    assert (pixels[..., 3] > 0).sum() == 2
+    brightest = np.argmax(pixels[..., :3].sum(axis=-1) * (pixels[..., 3] > 0))
+    row, column = np.unravel_index(brightest, (4, 6))
+    # Rerun: pixels go right and down from the corner, then scale, rotation and translation
+    x, y = scaled[0][0] * (column + 0.5), scaled[0][1] * (row + 0.5)
+    angle = turned[0]["angle"] * turned[0]["axis"][2]
+    shown = np.array(
+        [x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)]
+    ) + np.array(moved[0][:2])
+    cell_m = transform(place, np.array([0.5 + 4.5 * 0.25, -2.0 + 1.5 * 0.25]))
+    np.testing.assert_allclose(shown, cell_m * [1, -1], atol=1e-5)
 
 
 def test_wall_clock_is_nowhere_in_the_data(finished: Path) -> None:
