@@ -214,7 +214,7 @@ class PatchMaker:
         looks, static = self._looks, self._static.mean
         rows = np.array([look.samples for look in looks])
         if static is not None:
-            if not self._is_known and self._static.n_headings < _TURNED:
+            if self._static.n_headings < _TURNED:
                 near = round((_ROBOT_M - looks[0].range_start_m) / bin_length_m)
                 static = np.where(np.arange(static.size) < near, static, 0.0)
             rows = rows - static

@@ -165,11 +165,13 @@ def test_a_static_part_that_is_known_is_taken_out_and_stays_as_it_is() -> None:
     far = np.array([0.0, -50.0, 0.0])  # from where nothing but leakage is in the frame
     known, nothing = StaticPart(), StaticPart()
     near = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE).near
-    known.add(near(frame_at(far, 0, leakage=0.03)), np.zeros(2))
-    nothing.add(near(frame_at(far, 0)), np.zeros(2))
+    for step in range(8):  # of as many headings as it takes to be sure of what is far away
+        place, heading = np.array([0.1 * step, 0.0]), 0.7 * step
+        known.add(near(frame_at(far, 0, leakage=0.03)), place, heading)
+        nothing.add(near(frame_at(far, 0)), place, heading)
     found, expected = patch_of(known, 0.03), patch_of(nothing, 0.0)
     np.testing.assert_allclose(found.profiles.values, expected.profiles.values, atol=1e-8)
-    assert known.n_places == 1
+    assert known.n_places == 8
 
 
 def test_baseband_frames_come_to_a_focus_as_rf_frames_do() -> None:
