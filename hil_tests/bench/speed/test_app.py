@@ -4,7 +4,9 @@ Bars (design, quality bars): whole pipeline in process, four radars at 5 Hz, at 
 real time with synthesis and 200 times without. `extra_info` carries the factor.
 """
 
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,7 +14,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.app.sessions import scan, session_info
+from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -21,11 +23,13 @@ from slam.app.rig.emulated import (
     rig_of,
     scene_and_config,
 )
+from slam.app.run.radar_image import RollingImage
 from slam.app.run.runner import execute, run_slam
 from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.session_view import RerunView
 from slam.live.odometry_track import OdometryTrack, TumSample
+from slam.live.session_records import SessionObserver
 from slam.paper.pipeline import UwbRadarSlam
 from xethru_protocol.operating_system import StopFlag
 
@@ -85,3 +89,27 @@ def test_logging_1024_frames(benchmark: BenchmarkFixture, tmp_path: Path, kind: 
         observer.close()
 
     repeat(benchmark, log)
+
+
+@pytest.mark.benchmark(
+    group="the radar image while driving, 200 scans of four radars (bar: 160 ms)",
+    timer=time.process_time,
+)
+def test_rolling_image(benchmark: BenchmarkFixture) -> None:
+    """1 cm from frame to frame along a straight leg of 2 m, the image given out every 5 s."""
+    info = session_info(4)
+    poses = [replace(snapshot(0), t_ns=scan(k).t_ns, counter=k) for k in range(200)]
+    scans = [scan(k, 4) for k in range(200)]
+    track = OdometryTrack(
+        TumSample(t_ns=one.t_ns, x_m=0.01 * one.counter, y_m=0.0, qz=0.0, qw=1.0) for one in scans
+    )
+
+    def image() -> int:
+        rolling = RollingImage(info, track, [SessionObserver()])
+        for one, pose in zip(scans, poses, strict=True):
+            rolling.on_scan(one)
+            rolling.on_snapshot(pose)
+        rolling.close()
+        return rolling.n_patches
+
+    assert repeat(benchmark, image) >= 4 * 6
