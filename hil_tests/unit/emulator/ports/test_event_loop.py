@@ -342,6 +342,22 @@ def test_a_line_that_is_hung_up_while_written_to_serves_every_port() -> None:
         link.close()
 
 
+def test_the_loop_waits_for_a_deadline_from_now_on() -> None:
+    """The clock of a machine that has been up for long."""
+
+    class Soon(Idle):
+        def wake_ns(self, now_ns: int) -> int | None:
+            return now_ns + 1_000_000
+
+    link = PairLine()
+    server = Server([Port(link, Soon())], clock_ns=lambda: 10**18)
+    began_s = time.monotonic()
+    server.turn(longest_wait_s=LIMIT_S)
+    assert time.monotonic() - began_s < LIMIT_S / 2
+    server.close()
+    link.close()
+
+
 def test_a_deadline_beyond_what_the_system_waits_for_is_no_error() -> None:
     class Distant(Idle):
         def wake_ns(self, now_ns: int) -> int | None:
