@@ -1,0 +1,281 @@
+"""Points and walls of patches against closed forms: echoes whose places are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam.config import SlamConfig, WheelNoise
+from slam.frames import RadarFrame
+from slam.front_end.pulse import ModulePulse, PulseModel
+from slam.geometry import FieldOfView, Mount, Rig, compose, transform
+from slam.imaging.imager import ImagedPatch, Imager
+from slam.imaging.patches import Patch
+from slam.imaging.points import PatchPoint, PointKind, PointRule, patch_points
+from slam.imaging.range_profiles import ProfileFilter, RangeProfiles
+from slam.imaging.walls import patch_lines
+
+Array = NDArray[np.float64]
+
+PULSE = ModulePulse(model=PulseModel(), error=0.08)
+BIN_M = 299_792_458.0 / (2 * 23.328e9)
+START_M, N_BINS = 0.2, 260
+K = 4 * math.pi * PULSE.model.carrier_hz / 299_792_458.0
+MOUNT = Mount(x_m=0.1, y_m=0.2, yaw_rad=math.pi / 2)
+VIEW = FieldOfView()
+MIDDLE = 12
+NO_WHEELS = WheelNoise(
+    along_m_per_sqrt_m=0.0,
+    across_m_per_sqrt_m=0.0,
+    heading_rad_per_sqrt_m=0.0,
+    heading_rad_per_rad=0.0,
+    scale_sigma=0.0,
+    turn_scale_sigma=0.0,
+    curvature_sigma_rad_per_m=0.0,
+    floor_m=0.0,
+    floor_rad=0.0,
+)
+SIGMA = 2e-4  # of white noise per RF sample
+
+
+def straight(n: int = 25, step_m: float = 0.01) -> Array:
+    """Return body poses (n, 3) along x, the one in the middle at the origin."""
+    x = step_m * (np.arange(n) - n // 2)
+    return np.column_stack([x, np.zeros(n), np.zeros(n)])
+
+
+def rf_frames(ranges_m: Array, amplitudes: Array, phase_rad: float = 0.3) -> Array:
+    """Return frames (n, N_BINS) with one echo each."""
+    x = START_M + BIN_M * np.arange(N_BINS) - ranges_m[:, np.newaxis]
+    envelope = np.exp(-0.5 * (x / PULSE.model.sigma_m) ** 2)
+    return np.asarray(amplitudes[:, np.newaxis] * envelope * np.cos(K * x + phase_rad))
+
+
+def antennas_of(poses: Array) -> Array:
+    return np.array([transform(pose, np.array([MOUNT.x_m, MOUNT.y_m])) for pose in poses])
+
+
+def of_point(poses: Array, place: Sequence[float], amplitude: float = 0.01) -> Array:
+    ways = np.array(place) - antennas_of(poses)
+    ranges_m = np.linalg.norm(ways, axis=1)
+    yaw = poses[:, 2] + MOUNT.yaw_rad
+    cosine = np.sum(ways * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=1) / ranges_m
+    return rf_frames(ranges_m, amplitude * cosine**2 * ranges_m**-1.5)
+
+
+def of_wall(poses: Array, y_m: float, amplitude: float = 0.04) -> Array:
+    ranges_m = y_m - antennas_of(poses)[:, 1]
+    return rf_frames(ranges_m, amplitude / ranges_m)
+
+
+def patch_of(frames: Array, poses: Array | None = None, middle: int = MIDDLE) -> Patch:
+    return Patch(
+        radar=0,
+        mount=MOUNT,
+        view=VIEW,
+        t_ns=np.arange(len(frames), dtype=np.int64) * 200_000_000,
+        poses=straight() if poses is None else poses,
+        middle=middle,
+        origin=np.zeros(3),
+        profiles=ProfileFilter(PULSE, N_BINS, BIN_M).apply(frames, START_M),
+    )
+
+
+def noise(seed: int, sigma: float = SIGMA) -> Array:
+    return np.random.default_rng(seed).normal(0.0, sigma, (25, N_BINS))
+
+
+def places(points: Sequence[PatchPoint]) -> Array:
+    return np.array([(point.x_m, point.y_m) for point in points]).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("place", [(0.1, 1.1), (0.45, 1.0), (-0.3, 1.3), (0.2, 0.6)])
+def test_without_noise_a_point_is_where_it_is(place: tuple[float, float]) -> None:
+    (point,) = patch_points(patch_of(of_point(straight(), place)))
+    assert math.dist((point.x_m, point.y_m), place) < 5e-4
+    assert point.range_m == pytest.approx(math.dist(place, (0.1, 0.2)), abs=3e-4)
+    assert point.kind is PointKind.POINT
+    assert point.amplitude == pytest.approx(0.01, rel=0.1)
+    assert point.coherence > 0.99
+
+
+def test_points_25_cm_apart_are_two() -> None:
+    true = np.array([(0.0, 1.0), (0.25, 1.0)])
+    frames = sum(of_point(straight(), place) for place in true)
+    found = places(patch_points(patch_of(frames + noise(1))))
+    assert len(found) == 2
+    assert np.linalg.norm(found[np.argsort(found[:, 0])] - true, axis=1).max() < 3e-3
+
+
+def test_a_weak_point_in_range_of_a_strong_one_is_found_beyond_its_pulse() -> None:
+    frames = of_point(straight(), (0.1, 0.8)) + of_point(straight(), (0.0, 1.3), 0.004)
+    found = places(patch_points(patch_of(frames + noise(2))))
+    assert np.linalg.norm(found - [(0.1, 0.8), (0.0, 1.3)], axis=1).max() < 4e-3
+
+
+def test_noise_alone_has_no_points_and_no_walls() -> None:
+    # 60 patches of some 250 resolution cells: one false alarm would be 7e-5 per cell.
+    for seed in range(60):
+        patch = patch_of(noise(seed))
+        assert not patch_points(patch)
+        assert not patch_lines(patch)
+
+
+def test_a_wall_is_a_line_and_no_point() -> None:
+    patch = patch_of(of_wall(straight(), 1.15) + noise(3))
+    assert not patch_points(patch)
+    (line,) = patch_lines(patch)
+    assert line.normal == pytest.approx([0.0, 1.0], abs=2e-3)
+    assert line.distance_m == pytest.approx(1.15, abs=5e-4)
+    assert line.ends_m == pytest.approx(np.array([(-0.02, 1.15), (0.22, 1.15)]), abs=3e-3)
+    assert line.amplitude == pytest.approx(0.04, rel=0.25)
+
+
+def test_a_near_wall_is_one_line() -> None:
+    patch = patch_of(of_wall(straight(), 0.55) + noise(4))
+    assert not patch_points(patch)
+    assert [line.distance_m for line in patch_lines(patch)] == pytest.approx([0.55], abs=1e-3)
+
+
+def test_a_point_has_no_line() -> None:
+    assert not patch_lines(patch_of(of_point(straight(), (0.1, 1.1))))
+
+
+def test_what_comes_by_way_of_a_wall_is_no_point() -> None:
+    poses, rod, wall_m = straight(), np.array([0.15, 0.75]), 1.15
+    image = np.array([rod[0], 2 * wall_m - rod[1]])
+    near, far = (np.linalg.norm(q - antennas_of(poses), axis=1) for q in (rod, image))
+    once = rf_frames((near + far) / 2, 0.01 * np.ones(25), 1.0)
+    twice = rf_frames(far, 0.004 * np.ones(25), 2.0)
+    frames = of_point(poses, rod.tolist()) + of_wall(poses, wall_m) + once + twice + noise(5)
+    patch = patch_of(frames)
+    assert places(patch_points(patch)) == pytest.approx(rod[np.newaxis], abs=3e-3)
+    assert len(patch_lines(patch)) == 1
+    # Without the wall they stand where they seem to be.
+    assert len(patch_points(patch_of(once + twice + noise(5)))) == 2
+
+
+def test_a_pulse_in_one_frame_changes_nothing() -> None:
+    frames = of_point(straight(), (0.0, 1.0)) + noise(6)
+    clean = places(patch_points(patch_of(frames)))
+    burst = frames.copy()
+    burst[7] += rf_frames(np.array([1.25]), np.array([0.05]))[0]
+    assert places(patch_points(patch_of(burst))) == pytest.approx(clean, abs=2e-4)
+
+
+def test_a_wide_cylinder_is_round_and_stands_at_its_surface() -> None:
+    centre, radius_m = np.array([0.1, 0.95]), 0.3
+    ranges_m = np.linalg.norm(centre - antennas_of(straight()), axis=1) - radius_m
+    (point,) = patch_points(patch_of(rf_frames(ranges_m, 0.01 / ranges_m)))
+    assert point.kind is PointKind.ROUND
+    assert (point.x_m, point.y_m) == pytest.approx((0.1, 0.65), abs=1e-3)
+
+
+def test_only_what_is_in_view_for_half_of_the_frames_is_a_point() -> None:
+    edge_rad = VIEW.opening_rad / 2
+    for off_rad, count in ((-0.12, 1), (0.12, 0)):
+        angle = math.pi / 2 - edge_rad - off_rad
+        place = 0.1 + 0.9 * math.cos(angle), 0.2 + 0.9 * math.sin(angle)
+        assert len(patch_points(patch_of(of_point(straight(), place)))) == count
+
+
+def test_a_rigid_motion_of_path_and_scene_moves_nothing_in_the_patch() -> None:
+    motion = np.array([3.0, -2.0, 2.2])
+    patch = patch_of(of_point(straight(), (0.2, 1.0)) + noise(7))
+    moved = patch.with_poses(np.array([compose(motion, pose) for pose in patch.poses]))
+    before, after = patch_points(patch), patch_points(moved)
+    assert places(after) == pytest.approx(places(before), abs=1e-9)
+    assert after[0].covariance == pytest.approx(before[0].covariance, rel=1e-6)
+
+
+def test_turning_on_the_spot_gives_points_too() -> None:
+    angles = np.linspace(-0.5, 0.5, 25)
+    poses = np.column_stack([np.zeros(25), np.zeros(25), angles])
+    (point,) = patch_points(patch_of(of_point(poses, (0.2, 1.1)) + noise(8), poses))
+    assert math.dist((point.x_m, point.y_m), (0.2, 1.1)) < 4e-3
+
+
+def test_covariance_is_that_of_noise_over_seeds() -> None:
+    rule = PointRule(wheels=NO_WHEELS, range_floor_m=0.0, bearing_floor_rad=0.0)
+    frames, sigma = of_point(straight(), (0.3, 1.2), 0.008), 2e-3
+    found = [patch_points(patch_of(frames + noise(seed, sigma)), rule)[0] for seed in range(60)]
+    scatter = np.cov(places(found).T)
+    stated = np.mean([point.covariance for point in found], axis=0)
+    assert np.trace(stated) == pytest.approx(np.trace(scatter), rel=0.8)
+    assert np.linalg.eigvalsh(np.linalg.solve(stated, scatter)).max() < 3.0
+
+
+def test_covariance_of_a_wrong_scale_is_its_share_of_the_tangent() -> None:
+    rule = PointRule(
+        wheels=replace(NO_WHEELS, scale_sigma=0.02), range_floor_m=0.0, bearing_floor_rad=0.0
+    )
+    place = np.array([0.6, 1.1])
+    bearing_rad = math.atan2(0.5, 0.9)
+    (point,) = patch_points(patch_of(of_point(straight(), place.tolist())), rule)
+    across = np.array([0.9, -0.5]) / math.hypot(0.5, 0.9)
+    stated_rad = math.sqrt(across @ point.covariance @ across) / math.hypot(0.5, 0.9)
+    assert stated_rad == pytest.approx(0.02 * math.tan(bearing_rad), rel=0.1)
+    # And so much it errs: odometry that reports 2 % too much
+    longer = straight() * [1.02, 1, 1]
+    (wrong,) = patch_points(patch_of(of_point(straight(), place.tolist()), longer), rule)
+    assert abs(wrong.bearing_rad - point.bearing_rad) == pytest.approx(stated_rad, rel=0.1)
+
+
+def test_covariance_of_wheels_is_that_of_drawn_paths() -> None:
+    wheels = replace(
+        NO_WHEELS, along_m_per_sqrt_m=4e-3, across_m_per_sqrt_m=2e-3, heading_rad_per_sqrt_m=0.02
+    )
+    rule = PointRule(wheels=wheels, range_floor_m=0.0, bearing_floor_rad=0.0)
+    frames, rng, found = of_point(straight(), (0.45, 1.0)), np.random.default_rng(9), []
+    for _ in range(80):
+        steps = np.column_stack([np.full(24, 0.01), np.zeros(24), np.zeros(24)])
+        steps += rng.normal(0, 1, (24, 3)) * [4e-4, 2e-4, 2e-3]  # root of 0.01 m is 0.1
+        poses = [np.zeros(3)]
+        for step in steps:
+            poses.append(compose(poses[-1], step))
+        patch = patch_of(frames, np.array(poses)).with_poses(np.array(poses))
+        found.append(patch_points(patch, rule)[0])
+    bearings = np.array([point.bearing_rad for point in found])
+    across = np.array([0.8, -0.35]) / math.hypot(0.8, 0.35)
+    stated = [math.sqrt(across @ p.covariance @ across) / math.hypot(0.8, 0.35) for p in found]
+    assert float(bearings.std()) == pytest.approx(float(np.mean(stated)), rel=0.3)
+
+
+def test_profiles_whose_echo_is_not_known_are_refused() -> None:
+    patch = patch_of(of_point(straight(), (0.1, 1.1)))
+    unknown = RangeProfiles(
+        values=patch.profiles.values,
+        range_start_m=START_M,
+        bin_length_m=BIN_M,
+        wave_number_rad_per_m=K,
+    )
+    with pytest.raises(ValueError, match="echo"):
+        patch_points(replace(patch, profiles=unknown))
+
+
+def test_an_imager_gives_the_points_of_its_patches() -> None:
+    poses = straight(60)
+    frames = of_point(poses, (0.1, 1.0)) + np.random.default_rng(10).normal(0, SIGMA, (60, N_BINS))
+    imager = Imager(SlamConfig(), Rig((MOUNT,)))
+    imaged: list[ImagedPatch] = []
+    for number, row in enumerate(frames):
+        frame = RadarFrame(
+            radar=0,
+            t_ns=200_000_000 * number,
+            counter=number + 1,
+            samples=row.astype(np.float32),
+            range_start_m=START_M,
+            bin_length_m=BIN_M,
+        )
+        imaged += imager.step([frame], lambda t_ns: poses[t_ns // 200_000_000])
+    assert len(imaged) >= 3
+    for each in imaged:
+        (point,) = each.points
+        there = transform(each.patch.origin, places([point])[0])
+        assert math.dist(there, (0.1, 1.0)) < 4e-3
+        assert places(patch_points(each.patch)) == pytest.approx(places(each.points))
