@@ -15,9 +15,8 @@ from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.front_end.pulse_estimation import PulseEstimator, module_pulse
 from slam.geometry import FieldOfView, Rig
 from slam.imaging.patches import Patch, PatchMaker, PatchRule
-from slam.imaging.points import PatchPoint, PointRule, points_of
+from slam.imaging.points import PatchLine, PatchPoint, PointRule, lines_of, points_of
 from slam.imaging.reflectors import separated
-from slam.imaging.walls import PatchLine, lines_of
 
 Array = NDArray[np.float64]
 PoseAt = Callable[[int], Array]

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.imaging import reflector_kernels as kernels
+from slam.imaging import kernels
 from slam.imaging.back_projection import TURNS
 from slam.imaging.patches import Patch
 

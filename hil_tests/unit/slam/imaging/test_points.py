@@ -16,9 +16,8 @@ from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, Rig, compose, transform
 from slam.imaging.imager import ImagedPatch, Imager
 from slam.imaging.patches import Patch
-from slam.imaging.points import PatchPoint, PointKind, PointRule, patch_points
+from slam.imaging.points import PatchPoint, PointKind, PointRule, patch_lines, patch_points
 from slam.imaging.range_profiles import ProfileFilter, RangeProfiles
-from slam.imaging.walls import patch_lines
 
 Array = NDArray[np.float64]
 
