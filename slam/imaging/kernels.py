@@ -33,12 +33,12 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 ECHO_STEPS = 8  # samples of an echo per bin: `slam.imaging.range_profiles`
-_STEP_BINS = 2.0  # of range, for the parabola
+_STEP_BINS = 2.0  # of range, for the parabola through the logarithm
 _MOST_BEARING, _MOST_CURVATURE = 0.02, 0.5  # of one move [rad], [1 / range]
 _CURVATURE_STEP = 0.01  # of the difference quotient [1/m]
 _ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
-_LEAST_COSINE = 0.4
-_BURST = 3.0
+_LEAST_COSINE = 0.4  # edge of the beam in the search
+_BURST = 3.0  # see `remove_bursts`
 _WHOLE = 0.9  # share of the energy that one reflector alone explains
 _NEAR_M = 0.6  # farther walls are found from the place of a point
 _WALL = 0.4  # curvature over that of a point: the model of a plane leaves less beside it
@@ -191,7 +191,7 @@ def image_rows(
 ) -> None:
     """Put the energy that a point in each cell would explain into rows of an image.
 
-    Here the beam has an edge, where the gain is ``_LEAST_COSINE`` squared, and is even within.
+    Here the beam has an edge, at the cosine ``_LEAST_COSINE``, and is even within.
     """
     last, mask = values.shape[1] - 1, turns.shape[0] - 1
     start, per_bin, per_m = scale[0], scale[1], scale[2]
@@ -393,7 +393,7 @@ def refine(
 
 @kernel(
     "int64(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], float64[::1], float64[::1], float64, float64, float64, float64, int64, "
+    "float64[::1], float64[::1], float64[::1], float64, float64, float64, float64, "
     "float64[:, ::1], float64[:, ::1], complex128[:, ::1])"
 )
 def separate(
@@ -409,7 +409,6 @@ def separate(
     least_share: float,
     beside_share: float,
     more_than_point: float,
-    sweeps: int,
     image: Array,
     found: Array,
     models: Complex,
@@ -485,24 +484,18 @@ def separate(
         image_rows(values, scale, turns, track, rows_m, bearings, first, end, image)
         if image[i, j] >= before:
             break
-    for sweep in range(sweeps):
-        for k in range(count):
-            add_echoes(values, scale, turns, echo, all_ranges[k], models[k], 1.0)
-            form = int(found[k, 3])
-            if sweep == sweeps - 1:
-                other[:] = found[k, :3]
-                refine(
-                    values, scale, turns, track, beam, other, 2, 3,
-                    ranges, gains, echoes, amplitudes,
-                )  # fmt: skip
-                found[k, 5] = other[2]
-            place[:] = found[k, :3]
-            energy = refine(
-                values, scale, turns, track, beam, place, form, 2,
-                ranges, gains, echoes, amplitudes,
-            )  # fmt: skip
-            found[k, :3] = place
-            found[k, 4], found[k, 6] = energy, energy / energy_of(echoes)
-            all_ranges[k], models[k] = ranges, amplitudes
-            add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
+    for k in range(count):
+        add_echoes(values, scale, turns, echo, all_ranges[k], models[k], 1.0)
+        other[:] = found[k, :3]
+        refine(values, scale, turns, track, beam, other, 2, 3, ranges, gains, echoes, amplitudes)
+        found[k, 5] = other[2]
+        place[:] = found[k, :3]
+        form = int(found[k, 3])
+        energy = refine(
+            values, scale, turns, track, beam, place, form, 2, ranges, gains, echoes, amplitudes
+        )
+        found[k, :3] = place
+        found[k, 4], found[k, 6] = energy, energy / energy_of(echoes)
+        all_ranges[k], models[k] = ranges, amplitudes
+        add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
     return count

@@ -204,7 +204,7 @@ def _are_points(
 ) -> NDArray[np.bool_]:
     may_be, amplitude = reflectors.flatness <= rule.flatness[1], reflectors.amplitude
     # Where a face ends, its echo fades, and its wavefront is between that of a plane and a point.
-    quarter = reflectors.levels.shape[1] // 4
+    quarter = max(1, reflectors.levels.shape[1] // 4)
     first, last = (
         reflectors.levels[:, part].mean(axis=1)
         for part in (slice(0, quarter), slice(-quarter, None))

@@ -18,9 +18,9 @@ Search
     from there to the maximum, as a point and as a plane: range by a parabola through the logarithm,
     bearing by least squares of the phase (Gauss-Newton). What explains more is subtracted, and the
     next one searched (CLEAN; Hoegbom, Astronomy and Astrophysics Supplement 15 (1974) 417).
-Sweeps
+Sweep
     Each is added again, placed anew in the absence of all others, and subtracted (RELAX; Li and
-    Stoica, IEEE Trans. Signal Processing 44 (1996) 281): least squares over all of them in the end.
+    Stoica, IEEE Trans. Signal Processing 44 (1996) 281). A second sweep gains nothing.
 """
 
 from __future__ import annotations
@@ -85,17 +85,16 @@ class Reflectors:
 class SeparationRule:
     """How a patch is separated into reflectors."""
 
-    most: int = 16
+    most: int = 12
     # Energy of a cell over the level of the image from which on it is searched for
     least_over_level: float = 40.0
     # Amplitude under the law of a rod, over that of the strongest
-    least_share: float = 0.05
+    least_share: float = 0.1
     # Size over that of one that was found at a range within 12 cm of it: less may be what is left
     # of that one
     beside_share: float = 0.2
     # What a free curvature must explain over what a point does
     more_than_point: float = 1.1
-    sweeps: int = 2
 
 
 def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
@@ -144,7 +143,6 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         rule.least_share,
         rule.beside_share,
         rule.more_than_point,
-        rule.sweeps,
         image,
         found,
         models,
