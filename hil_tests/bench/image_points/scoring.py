@@ -12,7 +12,8 @@ precision
     Points that have a reflector, required or not, over all points.
 along, across
     Difference of the distances from the nominal antenna in the middle of the patch, and of the
-    bearings. The robust sigma is 1.4826 times the median of the absolute values, so a bias counts.
+    bearings. The robust sigma is 1.4826 times the median of the absolute differences from the
+    median, so a bias shows in the RMS alone.
 room recall
     Reflectors that have a point in any patch, over those that are required in any.
 lines
@@ -322,9 +323,11 @@ def _share(part: float, whole: float) -> float:
 
 
 def robust_sigma(errors: Sequence[Array]) -> float:
-    """Return 1.4826 times the median of the absolute values; NaN of none."""
+    """Return 1.4826 times the median absolute deviation from the median; NaN of none."""
     values = np.concatenate([*errors, np.empty(0)])
-    return _MAD * float(np.median(np.abs(values))) if values.size else math.nan
+    if not values.size:
+        return math.nan
+    return _MAD * float(np.median(np.abs(values - np.median(values))))
 
 
 def rms(errors: Sequence[Array]) -> float:

@@ -270,10 +270,11 @@ def test_a_face_between_two_frames_that_do_not_see_it_is_not_seen() -> None:
     assert lengths.seen_m == pytest.approx(0.1, abs=0.011)
 
 
-def test_sigmas_count_a_bias() -> None:
-    errors = [np.array([0.02, 0.02]), np.empty(0), np.array([0.02, 0.08])]
-    assert robust_sigma(errors) == pytest.approx(1.4826 * 0.02)
-    assert rms(errors) == pytest.approx(math.sqrt((3 * 0.02**2 + 0.08**2) / 4))
+def test_a_bias_counts_in_the_rms_and_an_outlier_does_not_in_the_sigma() -> None:
+    errors = [np.array([0.02, 0.021]), np.empty(0), np.array([0.019, 0.08, 0.018])]
+    assert robust_sigma(errors) == pytest.approx(1.4826 * 0.001)
+    squares = 0.02**2 + 0.021**2 + 0.019**2 + 0.08**2 + 0.018**2
+    assert rms(errors) == pytest.approx(math.sqrt(squares / 5))
     assert math.isnan(rms([]))
     assert math.isnan(robust_sigma([]))
 
