@@ -37,12 +37,7 @@ from scipy.special import chdtri
 from slam.geometry import Rig, wrap_angles
 from slam.results import PredictedRange
 from slam.robust import kernels
-from slam.robust.parameters import (
-    MARGIN_NATS,
-    TAIL_PROBABILITY,
-    BackEndParameters,
-    RangeNoise,
-)
+from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, BackEndParameters, RangeNoise
 from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end reports.

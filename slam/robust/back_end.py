@@ -803,10 +803,13 @@ class RobustBackEnd:
     def question(self) -> Question | None:
         """Return which of several options the first tentative landmark is that is unclear."""
         parameters = self.parameters
+        if_new, if_possible = parameters.detections_to_ask
         for tentative in self._tentative.unclear():
+            if len(tentative.seen) < if_new:
+                continue
             point = self._common(tentative)
             found = self._possible(tentative, point)
-            if len(tentative.seen) < parameters.detections_to_ask(is_new=not found):
+            if found and len(tentative.seen) < if_possible:
                 continue
             options = options_of(self.state, point, found, parameters.ranges.unmapped_per_m2)
             options.append(Option(evidence=0.0))

@@ -431,7 +431,7 @@ class ImagedPointRule:
     """No single range is of a landmark while another one in view is as near in range as that: their
     pulses overlap."""
     least_sigma_m: Annotated[float, Origin.CHOSEN] = 2e-3
-    """Least standard deviation of the range of a point: rods in `dense` show 0.4 mm, others more."""
+    """Least standard deviation of the range of a point; rods of `dense` have 0.4 mm, others more."""
     least_sigma_rad: Annotated[float, Origin.MEASURED] = 2.5e-3
     """The same of its bearing; in `dense` it is 3.0 mrad, in `lab` 2.3 mrad."""
     bearing_share: Annotated[float, Origin.CHOSEN] = 3.0
@@ -469,8 +469,12 @@ class BackEndParameters:
         """Return as how many frames a scan with bearings counts for the existence of a landmark."""
         return self.imaged.frames_per_patch if self.ranges.has_patches else 1
 
-    def detections_to_ask(self, *, is_new: bool) -> int:
-        """Return from how many detections with bearings on it is decided what they are of."""
+    @property
+    def detections_to_ask(self) -> tuple[int, int]:
+        """Return from how many detections with bearings on it is decided what they are of.
+
+        If they are of nothing known, and if they may be.
+        """
         if not self.ranges.has_patches:
-            return self.tracklets.min_frames
-        return self.imaged.new_patches if is_new else self.imaged.unclear_patches
+            return self.tracklets.min_frames, self.tracklets.min_frames
+        return self.imaged.new_patches, self.imaged.unclear_patches
