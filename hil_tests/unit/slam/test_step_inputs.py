@@ -222,7 +222,9 @@ SCAN = RangeScan(
     bearings_rad=(0.1, 0.2),
     bearing_sigmas_rad=(0.0, 0.01),
 )
-NUMBERS = [each.name for each in fields(RangeScan) if each.name not in ("radar", "labels")]
+NUMBERS = [
+    each.name for each in fields(RangeScan) if each.name not in ("radar", "labels", "is_patch")
+]
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
