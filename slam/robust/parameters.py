@@ -431,7 +431,8 @@ class ImagedPointRule:
     """No single range is of a landmark while another one in view is as near in range as that: their
     pulses overlap."""
     least_sigma_m: Annotated[float, Origin.CHOSEN] = 2e-3
-    """Least standard deviation of the range of a point; rods of `dense` have 0.4 mm, others more."""
+    """Least standard deviation of the range of a point; rods of `dense` have 0.4 mm, others more.
+    """
     least_sigma_rad: Annotated[float, Origin.MEASURED] = 2.5e-3
     """The same of its bearing; in `dense` it is 3.0 mrad, in `lab` 2.3 mrad."""
     bearing_share: Annotated[float, Origin.CHOSEN] = 3.0

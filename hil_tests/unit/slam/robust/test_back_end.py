@@ -132,7 +132,8 @@ def test_a_range_of_uncertain_association_is_used_and_weighs_less() -> None:
     def after(**changes: float) -> tuple[bool, float, float]:
         """Return whether the range was used, how far it moved its landmark, and the NIS."""
         twin = copy.deepcopy(before)
-        twin.parameters = replace(parameters, ranges=replace(parameters.ranges, **changes))
+        ranges = replace(parameters.ranges, **changes)  # type: ignore[arg-type]  # numbers
+        twin.parameters = replace(parameters, ranges=ranges)
         report = twin.update(with_sigmas(off, sigma_m))
         row = twin.state.landmark_ids.index(landmark_id)
         moved = twin.state.landmarks_m[row] - before.state.landmarks_m[row]
