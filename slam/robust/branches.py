@@ -760,19 +760,9 @@ class Branches:
         older = [row for row in rows if ids[row] not in new_ids]
         here = constellation_of(main.state, new, rule.model_sigma_m)
         there = constellation_of(main.state, older, rule.model_sigma_m)
-        is_possible = self._is_near if main.parameters.ranges.has_patches else None
-        placement = find_placement(here, there, rule, is_possible)
+        placement = find_placement(here, there, rule)
         if placement is not None:
             main.merge_if_possible([(older[row], new[own]) for row, own in placement.pairs])
-
-    def _is_near(self, placement: Placement) -> bool:
-        """Return whether the robot may be as far from its pose as a placement takes it."""
-        pose = self.main.pose
-        away = compose(placement.motion, pose) - pose
-        away[2] = math.remainder(float(away[2]), math.tau)
-        covariance = self.main.pose_covariance + self.doubted_covariance
-        limit = float(chdtri(3, TAIL_PROBABILITY))
-        return float(away @ np.linalg.solve(covariance, away)) <= limit
 
     def _begin_carry(self, since: int) -> None:
         before, step = self._at(since), self._steps[since]

@@ -133,16 +133,9 @@ def stands_out(
     return True
 
 
-def find_placement(
-    here: Constellation,
-    there: Constellation,
-    rule: BranchRule,
-    is_possible: Callable[[Placement], bool] | None = None,
-) -> Placement | None:
-    """Return the motion from ``here`` to ``there`` that stands out of those possible, or None."""
+def find_placement(here: Constellation, there: Constellation, rule: BranchRule) -> Placement | None:
+    """Return the motion from ``here`` to ``there`` that stands out, or None."""
     found = find_placements(here, there, rule)
-    if is_possible is not None:
-        found = [one for one in found if is_possible(one)]
     return found[0] if len(found) == 1 else None
 
 
