@@ -29,13 +29,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.imaging.kernels import sum_profiles
+from slam.imaging.kernels import Signal, sum_profiles
 from slam.imaging.range_profiles import RangeProfiles
 
 Array = NDArray[np.float64]
 
 _PHASES = 4096
-TURNS = np.exp(1j * math.tau * np.arange(_PHASES) / _PHASES)
+_TURNS = np.exp(1j * math.tau * np.arange(_PHASES) / _PHASES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -105,11 +105,11 @@ class BackProjection:
         return np.asarray(self.amplitude * np.sqrt(self.coherence_factor))
 
 
-def _in_space(vectors: Array) -> Array:
-    """Return vectors (n, 2) or (n, 3) as (n, 3), contiguous."""
-    flat = np.zeros((len(vectors), 3))
-    flat[:, : vectors.shape[1]] = vectors
-    return flat
+def signal_of(profiles: RangeProfiles) -> Signal:
+    """Return what kernels read profiles from; its values are a copy."""
+    k, values = profiles.wave_number_rad_per_m, profiles.values.copy(order="C")
+    scale = [profiles.range_start_m, 1 / profiles.bin_length_m, k / math.tau * _PHASES, k]
+    return values, np.array(scale), _TURNS
 
 
 def back_project(profiles: RangeProfiles, aperture: Aperture, points_m: Array) -> BackProjection:
@@ -117,32 +117,22 @@ def back_project(profiles: RangeProfiles, aperture: Aperture, points_m: Array) -
 
     Raises ValueError where there is not one antenna for every profile.
     """
+    antennas_m, boresights = aperture.antennas_m, aperture.boresights
     n = len(profiles.values)
-    if len(aperture.antennas_m) != n or (
-        aperture.boresights is not None and len(aperture.boresights) != n
-    ):
+    if len(antennas_m) != n or (boresights is not None and len(boresights) != n):
         raise ValueError(f"{n} profiles need as many antennas and boresights")
-    shape = points_m.shape[:-1]
-    points = _in_space(points_m.reshape(-1, points_m.shape[-1]))
-    looks_everywhere = aperture.boresights is None
+    (*shape, dimensions), track = points_m.shape, np.zeros((n, 6))
+    track[:, : antennas_m.shape[1]] = antennas_m
+    cosine = -1.0
+    if boresights is not None:
+        track[:, 3 : 3 + boresights.shape[1]] = boresights
+        cosine = math.cos(aperture.half_beam_rad)
+    points = np.zeros((math.prod(shape), 3))
+    points[:, :dimensions] = points_m.reshape(-1, dimensions)
     total = np.empty(len(points), dtype=np.complex128)
     power, count = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
-    sum_profiles(
-        np.ascontiguousarray(profiles.values),
-        profiles.range_start_m,
-        profiles.bin_length_m,
-        profiles.wave_number_rad_per_m,
-        _in_space(aperture.antennas_m),
-        np.zeros((n, 3)) if aperture.boresights is None else _in_space(aperture.boresights),
-        -1.0 if looks_everywhere else math.cos(aperture.half_beam_rad),
-        aperture.min_range_m,
-        aperture.max_range_m,
-        points,
-        TURNS,
-        total,
-        power,
-        count,
-    )
+    view = np.array([cosine, aperture.min_range_m, aperture.max_range_m])
+    sum_profiles(signal_of(profiles), track, view, points, total, power, count)
     return BackProjection(
         total=total.reshape(shape), power=power.reshape(shape), count=count.reshape(shape)
     )

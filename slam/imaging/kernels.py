@@ -4,20 +4,20 @@ Formulas and sources are in `slam.imaging.back_projection` and `slam.imaging.ref
 the latter are metres from the antenna in the middle of the patch, x along its boresight. Arrays
 that many functions take:
 
-values
-    Profiles, shape (frames, bins), complex64.
-scale
-    Range of bin 0 [m], bins per metre, entries of ``turns`` per metre of range, k [rad/m].
-turns
-    exp(j x) at equal steps of one turn, their number a power of two.
+signal
+    Profiles, shape (frames, bins); their scale: range of bin 0 [m], bins per metre, entries of
+    ``turns`` per metre of range, k [rad/m]; and ``turns``: exp(j x) at equal steps of one turn,
+    their number a power of two.
 track
-    Shape (frames, 4): x, y of each antenna, and of the unit vector of its boresight.
+    Shape (frames, 6): each antenna, and the unit vector of its boresight.
+view
+    Cosine of the angle off boresight up to which a point is seen, least and largest range [m].
 beam
     Gain at equal steps of the cosine of the angle off boresight, 0 to 1.
 place
     Shape (3,): range, bearing and curvature of one reflector.
-ranges, echoes, amplitudes
-    Shape (frames,): R_f, v_f and the model's a_f of one reflector; written.
+work
+    Ranges R_f, gains, echoes v_f and the model's a_f of one reflector, shape (frames,); written.
 """
 
 from __future__ import annotations
@@ -31,6 +31,11 @@ from slam.front_end.numba_compilation import kernel
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+Signal = tuple[NDArray[np.complex64], Array, Complex]
+Work = tuple[Array, Array, Complex, Complex]
+
+_SIGNAL = "Tuple((complex64[:, ::1], float64[::1], complex128[::1]))"
+_WORK = "Tuple((float64[::1], float64[::1], complex128[::1], complex128[::1]))"
 
 ECHO_STEPS = 8  # samples of an echo per bin: `slam.imaging.range_profiles`
 _STEP_BINS = 2.0  # of range, for the parabola through the logarithm
@@ -45,45 +50,33 @@ _WALL = 0.4  # curvature over that of a point: the model of a plane leaves less 
 
 
 @kernel(
-    "void(complex64[:, ::1], float64, float64, float64, float64[:, ::1], float64[:, ::1], "
-    "float64, float64, float64, float64[:, ::1], complex128[::1], complex128[::1], "
+    f"void({_SIGNAL}, float64[:, ::1], float64[::1], float64[:, ::1], complex128[::1], "
     "float64[::1], int64[::1])"
 )
 def sum_profiles(
-    values: NDArray[np.complex64],
-    start_m: float,
-    bin_m: float,
-    wave_number: float,
-    antennas: Array,
-    boresights: Array,
-    cos_half_beam: float,
-    min_m: float,
-    max_m: float,
+    signal: Signal,
+    track: Array,
+    view: Array,
     points: Array,
-    turns: NDArray[np.complex128],
-    total: NDArray[np.complex128],
+    total: Complex,
     power: Array,
     count: NDArray[np.int64],
 ) -> None:
-    """Write the sums of profiles (frames, bins) at points; see `back_project`.
-
-    Antennas, boresights and points have shape (n, 3); ``turns`` is exp(j x) at equal steps of one
-    turn, their number a power of two.
-    """
-    last = values.shape[1] - 1
-    per_bin = 1.0 / bin_m
-    per_m = wave_number / (2.0 * math.pi) * turns.shape[0]
-    mask = turns.shape[0] - 1
+    """Write the sums of profiles at points (n, 3); see `back_project`."""
+    values, scale, turns = signal
+    last, mask = values.shape[1] - 1, turns.shape[0] - 1
+    start, per_bin, per_m = scale[0], scale[1], scale[2]
+    cosine, min_m, max_m = view[0], view[1], view[2]
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         real, imag, square_sum, seen = 0.0, 0.0, 0.0, 0
-        for f in range(antennas.shape[0]):
-            dx, dy, dz = x - antennas[f, 0], y - antennas[f, 1], z - antennas[f, 2]
+        for f in range(track.shape[0]):
+            dx, dy, dz = x - track[f, 0], y - track[f, 1], z - track[f, 2]
             range_m = math.sqrt(dx * dx + dy * dy + dz * dz)
-            along = dx * boresights[f, 0] + dy * boresights[f, 1] + dz * boresights[f, 2]
-            at = (range_m - start_m) * per_bin
-            is_seen = min_m <= range_m <= max_m and along >= cos_half_beam * range_m
-            if not (is_seen and 0.0 <= at < last):
+            at = (range_m - start) * per_bin
+            if not (0.0 <= at < last and min_m <= range_m <= max_m):
+                continue
+            if dx * track[f, 3] + dy * track[f, 4] + dz * track[f, 5] < cosine * range_m:
                 continue
             low = int(at)
             part = at - low
@@ -115,21 +108,11 @@ def beam_gain(cosine: float, beam: Array) -> float:
     return beam[int(cosine * (beam.shape[0] - 1) + 0.5)] if cosine > 0.0 else 0.0
 
 
-@kernel(
-    "void(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64, float64[::1], complex128[::1])"
-)
-def read_echoes(
-    values: NDArray[np.complex64],
-    scale: Array,
-    turns: Complex,
-    track: Array,
-    place: Array,
-    further_m: float,
-    ranges: Array,
-    echoes: Complex,
-) -> None:
+@kernel(f"void({_SIGNAL}, float64[:, ::1], float64[::1], float64, {_WORK})")
+def read_echoes(signal: Signal, track: Array, place: Array, further_m: float, work: Work) -> None:
     """Read what profiles have ``further_m`` behind one reflector; 0 out of the bins."""
+    values, scale, turns = signal
+    ranges, _, echoes, _ = work
     last, mask = values.shape[1] - 1, turns.shape[0] - 1
     ex, ey = math.cos(place[1]), math.sin(place[1])
     for f in range(track.shape[0]):
@@ -145,20 +128,12 @@ def read_echoes(
             echoes[f] = value * turns[int(r * scale[2] + 0.5) & mask]
 
 
-@kernel(
-    "void(complex64[:, ::1], float64[::1], complex128[::1], float64[::1], float64[::1], "
-    "complex128[::1], float64)"
-)
+@kernel(f"void({_SIGNAL}, float64[::1], float64[::1], complex128[::1], float64)")
 def add_echoes(
-    values: NDArray[np.complex64],
-    scale: Array,
-    turns: Complex,
-    echo: Array,
-    ranges: Array,
-    amplitudes: Complex,
-    sign: float,
+    signal: Signal, echo: Array, ranges: Array, amplitudes: Complex, sign: float
 ) -> None:
     """Add ``sign`` times the echoes of one reflector to profiles."""
+    values, scale, turns = signal
     mask, reach = turns.shape[0] - 1, (echo.shape[0] - 1) // ECHO_STEPS
     for f in range(ranges.shape[0]):
         turn = turns[int(ranges[f] * scale[2] + 0.5) & mask]
@@ -174,36 +149,28 @@ def add_echoes(
             values[f, b] += value * ((1.0 - part) * echo[low] + part * echo[low + 1])
 
 
-@kernel(
-    "void(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], int64, int64, float64[:, ::1])"
-)
+@kernel(f"void({_SIGNAL}, float64[:, ::1], float64[:, :, ::1], int64, int64, float64[:, ::1])")
 def image_rows(
-    values: NDArray[np.complex64],
-    scale: Array,
-    turns: Complex,
-    track: Array,
-    rows_m: Array,
-    bearings: Array,
-    first: int,
-    end: int,
-    image: Array,
+    signal: Signal, track: Array, cells: Array, first: int, end: int, image: Array
 ) -> None:
     """Put the energy that a point in each cell would explain into rows of an image.
 
-    Here the beam has an edge, at the cosine ``_LEAST_COSINE``, and is even within.
+    It is |S1|**2 / n at ``cells`` (rows, columns, 2), where the beam has an edge, at the cosine
+    ``_LEAST_COSINE``, and is even within. In the plane, this takes three quarters of the time of
+    `sum_profiles`.
     """
+    values, scale, turns = signal
     last, mask = values.shape[1] - 1, turns.shape[0] - 1
     start, per_bin, per_m = scale[0], scale[1], scale[2]
-    for i in range(max(0, first), min(rows_m.shape[0], end)):
-        for j in range(bearings.shape[0]):
-            qx, qy = rows_m[i] * math.cos(bearings[j]), rows_m[i] * math.sin(bearings[j])
+    for i in range(max(0, first), min(image.shape[0], end)):
+        for j in range(image.shape[1]):
+            x, y = cells[i, j, 0], cells[i, j, 1]
             real, imag, count = 0.0, 0.0, 0
             for f in range(track.shape[0]):
-                dx, dy = qx - track[f, 0], qy - track[f, 1]
+                dx, dy = x - track[f, 0], y - track[f, 1]
                 r = math.sqrt(dx * dx + dy * dy)
                 at = (r - start) * per_bin
-                if not 0.0 <= at < last or dx * track[f, 2] + dy * track[f, 3] < _LEAST_COSINE * r:
+                if not 0.0 <= at < last or dx * track[f, 3] + dy * track[f, 4] < _LEAST_COSINE * r:
                     continue
                 low = int(at)
                 part = at - low
@@ -266,21 +233,17 @@ def strongest_cell(image: Array, rows_m: Array, floors: Array, least_over_level:
     return best if is_out else -1
 
 
-@kernel(
-    "float64(float64[:, ::1], float64[::1], float64[::1], float64[::1], complex128[::1], "
-    "complex128[::1])"
-)
-def fit_amplitudes(
-    track: Array, beam: Array, place: Array, gains: Array, echoes: Complex, amplitudes: Complex
-) -> float:
+@kernel(f"float64(float64[:, ::1], float64[::1], float64[::1], {_WORK})")
+def fit_amplitudes(track: Array, beam: Array, place: Array, work: Work) -> float:
     """Fit a_f = c b_f (1 + g t_f) to echoes, g real and t_f -1 to 1; return the energy of a."""
+    _, gains, echoes, amplitudes = work
     n = track.shape[0]
     qx, qy = place[0] * math.cos(place[1]), place[0] * math.sin(place[1])
     w0, w1, w2 = 1e-30, 0.0, 1e-30
     s0, s1 = 0j, 0j
     for f in range(n):
         dx, dy = qx - track[f, 0], qy - track[f, 1]
-        ahead = dx * track[f, 2] + dy * track[f, 3]
+        ahead = dx * track[f, 3] + dy * track[f, 4]
         gain = 0.0
         if echoes[f] != 0.0:
             gain = beam_gain(ahead / (math.sqrt(dx * dx + dy * dy) + 1e-9), beam)
@@ -305,28 +268,16 @@ def fit_amplitudes(
     return (total.real * total.real + total.imag * total.imag) / norm
 
 
-@kernel(
-    "float64(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], int64, int64, float64[::1], float64[::1], complex128[::1], complex128[::1])"
-)
+@kernel(f"float64({_SIGNAL}, float64[:, ::1], float64[::1], float64[::1], int64, int64, {_WORK})")
 def refine(
-    values: NDArray[np.complex64],
-    scale: Array,
-    turns: Complex,
-    track: Array,
-    beam: Array,
-    place: Array,
-    form: int,
-    rounds: int,
-    ranges: Array,
-    gains: Array,
-    echoes: Complex,
-    amplitudes: Complex,
+    signal: Signal, track: Array, beam: Array, place: Array, form: int, rounds: int, work: Work
 ) -> float:
     """Move a place to where a reflector explains the most energy; return how much.
 
     ``form`` 0: the curvature stays, 1: it is that of a point, 2: it is free.
     """
+    _, scale, _ = signal
+    _, _, echoes, amplitudes = work
     step_m = _STEP_BINS / scale[1]
     levels = np.zeros(3)
     for _ in range(rounds):
@@ -334,11 +285,9 @@ def refine(
             place[2] = 1.0 / place[0]
         bearing, curvature = 0.0, 0.0
         for side in range(3):
-            read_echoes(
-                values, scale, turns, track, place, ((side + 1) % 3 - 1) * step_m, ranges, echoes
-            )
+            read_echoes(signal, track, place, ((side + 1) % 3 - 1) * step_m, work)
             if side == 0:
-                fit_amplitudes(track, beam, place, gains, echoes, amplitudes)
+                fit_amplitudes(track, beam, place, work)
                 ex, ey = math.cos(place[1]), math.sin(place[1])
                 # Normal equations of phase = common + bearing b + curvature c, the common removed
                 w, wb, wc, wbb, wbc, wcc = 1e-30, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -387,90 +336,76 @@ def refine(
         place[2] += min(most, max(-most, curvature))
     if form == 1:
         place[2] = 1.0 / place[0]
-    read_echoes(values, scale, turns, track, place, 0.0, ranges, echoes)
-    return fit_amplitudes(track, beam, place, gains, echoes, amplitudes)
+    read_echoes(signal, track, place, 0.0, work)
+    return fit_amplitudes(track, beam, place, work)
 
 
 @kernel(
-    "int64(complex64[:, ::1], float64[::1], complex128[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], float64[::1], float64[::1], float64, float64, float64, float64, "
-    "float64[:, ::1], float64[:, ::1], complex128[:, ::1])"
+    f"Tuple((float64[:, ::1], complex128[:, ::1]))({_SIGNAL}, float64[:, ::1], float64[::1], "
+    "float64[::1], float64[:, :, ::1], float64[::1], float64[::1], int64, UniTuple(float64, 4))"
 )
 def separate(
-    values: NDArray[np.complex64],
-    scale: Array,
-    turns: Complex,
+    signal: Signal,
     track: Array,
     beam: Array,
     echo: Array,
+    cells: Array,
     rows_m: Array,
     bearings: Array,
-    least_over_level: float,
-    least_share: float,
-    beside_share: float,
-    more_than_point: float,
-    image: Array,
-    found: Array,
-    models: Complex,
-) -> int:
-    """Take reflectors out of profiles, the strongest first; return how many.
+    most: int,
+    limits: tuple[float, float, float, float],
+) -> tuple[Array, Complex]:
+    """Take reflectors out of profiles, the strongest first; what is left stays in ``signal``.
 
-    What is left stays in ``values``. Rows of ``found`` (most, 7) are
-    range, bearing, curvature, form, energy, curvature where it is free, and coherence; those of
-    ``models`` (most, frames) the amplitudes.
+    Return range, bearing, curvature, form, energy, and curvature where it is free, of each, shape
+    (k, 6), and its amplitudes (k, frames). ``limits`` are those of `SeparationRule`.
     """
+    least_over_level, least_share, beside_share, more_than_point = limits
     n = track.shape[0]
     ranges, gains = np.zeros(n), np.zeros(n)
     echoes, amplitudes = np.zeros(n, dtype=np.complex128), np.zeros(n, dtype=np.complex128)
-    all_ranges = np.zeros((found.shape[0], n))
+    work = (ranges, gains, echoes, amplitudes)
+    found, models = np.zeros((most, 6)), np.zeros((most, n), dtype=np.complex128)
+    all_ranges = np.zeros((most, n))
     place, other, bent = np.zeros(3), np.zeros(3), np.zeros(3)
     facing = 0.0
     row_m, strongest, count = rows_m[1] - rows_m[0], 0.0, 0
     floors = np.zeros(rows_m.size)
-    remove_bursts(values)
-    image_rows(values, scale, turns, track, rows_m, bearings, 0, rows_m.size, image)
-    while count < found.shape[0]:
+    image = np.empty((rows_m.size, bearings.size))
+    remove_bursts(signal[0])
+    image_rows(signal, track, cells, 0, rows_m.size, image)
+    while count < most:
         top = strongest_cell(image, rows_m, floors, least_over_level)
         if top < 0:
             break
         i, j = top // image.shape[1], top % image.shape[1]
         before = image[i, j]
         place[:] = rows_m[i], bearings[j], 0.0
-        energy = refine(
-            values, scale, turns, track, beam, place, 1, 3, ranges, gains, echoes, amplitudes
-        )
+        energy = refine(signal, track, beam, place, 1, 3, work)
         strongest = max(strongest, energy * place[0] ** 3)
         if energy * place[0] ** 3 < least_share * least_share * strongest:
             break
         other[:] = place
-        free = refine(
-            values, scale, turns, track, beam, other, 2, 4, ranges, gains, echoes, amplitudes
-        )
+        free = refine(signal, track, beam, other, 2, 4, work)
         if place[0] < _NEAR_M and free < _WHOLE * energy_of(echoes):
             # A near wall looks like several points: its normal may be at another bearing
             best = 0.0
             for bearing in bearings:
                 bent[:] = place[0], bearing, 0.0
-                plane = refine(
-                    values, scale, turns, track, beam, bent, 0, 0,
-                    ranges, gains, echoes, amplitudes,
-                )  # fmt: skip
+                plane = refine(signal, track, beam, bent, 0, 0, work)
                 if plane > best:
                     best, facing = plane, bearing
             bent[:] = place[0], facing, 0.0
-            best = refine(
-                values, scale, turns, track, beam, bent, 2, 4, ranges, gains, echoes, amplitudes
-            )
+            best = refine(signal, track, beam, bent, 2, 4, work)
             if best > more_than_point * free:
                 free = best
                 other[:] = bent
+        found[count, 3] = 1
         if free > more_than_point * energy:
             found[count, 3] = 2
             place[:] = other
-        else:
-            found[count, 3] = 1
-        refine(values, scale, turns, track, beam, place, 0, 0, ranges, gains, echoes, amplitudes)
-        add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
+        refine(signal, track, beam, place, 0, 0, work)
+        add_echoes(signal, echo, ranges, amplitudes, -1.0)
         found[count, :3] = place
         all_ranges[count], models[count] = ranges, amplitudes
         count += 1
@@ -481,21 +416,17 @@ def separate(
         for row in range(max(0, middle - _ROWS_AWAY), min(rows_m.size, middle + _ROWS_AWAY + 1)):
             floors[row] = max(floors[row], floor)
         first, end = min(i, middle) - _ROWS_AWAY, max(i, middle) + _ROWS_AWAY + 1
-        image_rows(values, scale, turns, track, rows_m, bearings, first, end, image)
+        image_rows(signal, track, cells, first, end, image)
         if image[i, j] >= before:
             break
     for k in range(count):
-        add_echoes(values, scale, turns, echo, all_ranges[k], models[k], 1.0)
+        add_echoes(signal, echo, all_ranges[k], models[k], 1.0)
         other[:] = found[k, :3]
-        refine(values, scale, turns, track, beam, other, 2, 3, ranges, gains, echoes, amplitudes)
+        refine(signal, track, beam, other, 2, 3, work)
         found[k, 5] = other[2]
         place[:] = found[k, :3]
-        form = int(found[k, 3])
-        energy = refine(
-            values, scale, turns, track, beam, place, form, 2, ranges, gains, echoes, amplitudes
-        )
+        found[k, 4] = refine(signal, track, beam, place, int(found[k, 3]), 2, work)
         found[k, :3] = place
-        found[k, 4], found[k, 6] = energy, energy / energy_of(echoes)
-        all_ranges[k], models[k] = ranges, amplitudes
-        add_echoes(values, scale, turns, echo, ranges, amplitudes, -1.0)
-    return count
+        models[k] = amplitudes
+        add_echoes(signal, echo, ranges, amplitudes, -1.0)
+    return found[:count], models[:count]

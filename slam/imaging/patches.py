@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
 from slam.front_end.pulse import ModulePulse, PulseModel
-from slam.geometry import FieldOfView, Mount, between, transform
+from slam.geometry import FieldOfView, Mount, transform
 from slam.imaging.back_projection import Aperture
 from slam.imaging.range_profiles import (
     ProfileFilter,
@@ -58,7 +59,7 @@ class PatchRule:
     memory: int = 300  # frames of `StaticPart`
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Patch:
     """Profiles of one radar along a short way, in the body frame of its middle.
 
@@ -85,7 +86,7 @@ class Patch:
     origin: Array
     profiles: RangeProfiles
 
-    @property
+    @cached_property
     def aperture(self) -> Aperture:
         """Return antennas and boresights in the frame of the patch."""
         return aperture_of(self.mount, self.view, self.poses)
@@ -93,8 +94,15 @@ class Patch:
     def with_poses(self, poses: Array) -> Patch:
         """Return the patch on other poses (n, 3), of any frame, at the same times."""
         origin = poses[self.middle]
-        inside = np.array([between(origin, pose) for pose in poses])
-        return replace(self, poses=inside, origin=origin)
+        return replace(self, poses=seen_from(origin, poses), origin=origin)
+
+
+def seen_from(origin: Array, poses: Array) -> Array:
+    """Return poses (n, 3) in the frame of one (3,), or each in that of its own row (n, 3)."""
+    cosine, sine = np.cos(origin[..., 2]), np.sin(origin[..., 2])
+    dx, dy, turn = (poses - origin).T
+    turn = (turn + math.pi) % math.tau - math.pi
+    return np.column_stack([cosine * dx + sine * dy, cosine * dy - sine * dx, turn])
 
 
 def aperture_of(mount: Mount, view: FieldOfView, poses: Array) -> Aperture:
@@ -211,7 +219,7 @@ class PatchMaker:
         return is_same and 0 <= frame.t_ns - last.t_ns < self.rule.longest_stand_ns
 
     def _made(self, bin_length_m: float) -> Patch:
-        looks, static = self._looks, self._static.mean
+        looks, static = self._looks, self._static.samples
         rows = np.array([look.samples for look in looks])
         if static is not None:
             if self._static.n_headings < _TURNED:
@@ -226,7 +234,7 @@ class PatchMaker:
             mount=self.mount,
             view=self.view,
             t_ns=np.array([look.t_ns for look in looks], dtype=np.int64),
-            poses=np.array([between(origin, look.pose) for look in looks]),
+            poses=seen_from(origin, np.array([look.pose for look in looks])),
             middle=middle,
             origin=origin,
             profiles=self._profiles(rows, looks[0].range_start_m, bin_length_m),

@@ -15,14 +15,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import WheelNoise
-from slam.geometry import between
-from slam.imaging.patches import Patch
+from slam.imaging.patches import Patch, seen_from
 from slam.imaging.reflectors import Reflectors, SeparationRule, separated
 
 Array = NDArray[np.float64]
@@ -44,7 +42,6 @@ class PointRule:
     separation: SeparationRule = field(default_factory=SeparationRule)
     wheels: WheelNoise = field(default_factory=WheelNoise)
     least_snr: float = 10.0
-    least_coherence: float = 0.6
     least_in_view: float = 0.5  # share of the frames
     # Amplitude over that of the strongest that is no plane
     least_share: float = 0.2
@@ -76,11 +73,9 @@ class PatchPoint:
     covariance
         Shape (2, 2), of x and y [m^2].
     amplitude
-        On boresight at 1 m, in units of the frames.
+        Its largest in the patch, at 1 m under the law of a rod, in units of the frames.
     snr
         Root of its energy over what is left beside it.
-    coherence
-        0 to 1.
     """
 
     x_m: float
@@ -90,7 +85,6 @@ class PatchPoint:
     covariance: Array
     amplitude: float
     snr: float
-    coherence: float
     kind: PointKind
 
 
@@ -107,16 +101,11 @@ class PatchLine:
     ends_m
         Shape (2, 2): the feet of the perpendiculars from the first and the last antenna that saw
         it; the face may go on.
-    amplitude
-        At 1 m: it falls as 1 / r.
     """
 
     normal: Array
     distance_m: float
     ends_m: Array
-    amplitude: float
-    snr: float
-    coherence: float
 
 
 def patch_points(patch: Patch, rule: PointRule | None = None) -> tuple[PatchPoint, ...]:
@@ -143,7 +132,6 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
             covariance=_covariance(patch, reflectors, k, places[k], rule),
             amplitude=float(reflectors.amplitude[k]),
             snr=float(reflectors.snr[k]),
-            coherence=float(reflectors.coherence[k]),
             kind=PointKind.POINT if flat <= rule.flatness[0] else PointKind.ROUND,
         )
         for k, flat in zip(order.tolist(), reflectors.flatness[order].tolist(), strict=True)
@@ -174,16 +162,7 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
         feet = antennas + (distance_m - antennas @ normal)[:, np.newaxis] * normal
         if in_view(patch, feet[patch.middle][np.newaxis])[0] < rule.least_in_view:
             continue
-        lines.append(
-            PatchLine(
-                normal=normal,
-                distance_m=distance_m,
-                ends_m=feet[[0, -1]],
-                amplitude=float(reflectors.levels[k].max() * reflectors.range_m[k]),
-                snr=float(reflectors.snr[k]),
-                coherence=float(reflectors.coherence[k]),
-            )
-        )
+        lines.append(PatchLine(normal=normal, distance_m=distance_m, ends_m=feet[[0, -1]]))
     return tuple(lines)
 
 
@@ -225,8 +204,7 @@ def stand_out(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
     share = np.where(is_near, 2 * rule.beside_share, rule.beside_share)
     share = np.where(reflectors.flatness > rule.flatness[2], rule.beside_wall_share, share)
     is_less = np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1)
-    is_sure = (reflectors.snr >= rule.least_snr) & (reflectors.coherence >= rule.least_coherence)
-    return np.asarray(is_sure & ~is_less)
+    return np.asarray((reflectors.snr >= rule.least_snr) & ~is_less)
 
 
 def _are_images(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
@@ -288,7 +266,7 @@ def _wheel_variance(patch: Patch, pulls: Array, wheels: WheelNoise) -> float:
     Steps are those from frame to frame; the frame in the middle has no error.
     """
     poses, antennas, middle = patch.poses, patch.aperture.antennas_m, patch.middle
-    steps = np.array([between(*pair) for pair in pairwise(poses)])
+    steps = seen_from(poses[:-1], poses[1:])
     # What each step moves: all behind it, or, before the middle, all ahead of it, the other way
     moment = pulls[:, 1] * antennas[:, 0] - pulls[:, 0] * antennas[:, 1]
     rows = np.column_stack([pulls, moment])

@@ -44,7 +44,8 @@ _NOISE_SHARE = 0.01
 _ECHO_STEPS = 8
 # Linear interpolation between bins needs this many of them per envelope sigma.
 _BINS_PER_SIGMA = 3.0
-_HEADINGS = 36  # that the static part is learnt for
+# Of the static part: headings that it is learnt for, and how far the antenna goes between frames
+_HEADINGS, _SPACING_M = 36, 0.005
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,24 +115,19 @@ class ProfileFilter:
         at_m = bin_length_m / _ECHO_STEPS * np.arange(_ECHO_STEPS * model.half_length(bin_length_m))
         phases = np.outer(at_m, kappa - self.wave_number_rad_per_m)
         self._echo = np.cos(phases) @ (p * shape) / (p * shape).sum()
-        noise = self._spectrum
         if taps is not None:
             kernel = np.zeros(self._n_fft)
             kernel[np.arange(taps.size) - taps.size // 2] = taps
-            noise = self._spectrum * np.fft.rfft(kernel)[: self._half]
-        self._spectrum = noise
-        self.noise_gain = math.sqrt(float(np.sum(np.abs(noise) ** 2)) / (2 * self._n_fft))
-        """Deviation of each quadrature of a profile over that of white noise per RF sample."""
+            self._spectrum *= np.fft.rfft(kernel)[: self._half]
 
     def apply(self, samples: NDArray[np.floating], range_start_m: float) -> RangeProfiles:
-        """Return the profiles of frames (n_frames, n_bins); samples that are NaN count as 0.
+        """Return the profiles of frames (n_frames, n_bins).
 
         ``range_start_m`` is the range of bin 0, the module's range offset removed, so it sets the
         zero of range, and of phase.
         """
-        rows = np.nan_to_num(np.asarray(samples, dtype=np.float64).reshape(-1, self.n_bins))
-        whole = np.zeros((len(rows), self._n_fft), dtype=np.complex128)
-        whole[:, : self._half] = np.fft.rfft(rows, self._n_fft)[:, : self._half] * self._spectrum
+        whole = np.zeros((len(samples), self._n_fft), dtype=np.complex128)
+        whole[:, : self._half] = np.fft.rfft(samples, self._n_fft)[:, : self._half] * self._spectrum
         values = np.fft.ifft(whole)[:, : self.n_bins]
         ranges_m = range_start_m + self.bin_length_m * np.arange(self.n_bins)
         values *= np.exp(-1j * self.wave_number_rad_per_m * ranges_m)
@@ -158,12 +154,11 @@ def baseband_profiles(
     r_0, and whose bins hold the whole band; ``sigma_m`` is the deviation of their envelope. So
     many bins are put between two of them (by FFT) that there are three per ``sigma_m``.
     """
-    rows = np.nan_to_num(np.asarray(samples, dtype=np.complex128))
-    n, between = rows.shape[1], max(1, math.ceil(_BINS_PER_SIGMA * bin_length_m / sigma_m))
+    n, between = samples.shape[1], max(1, math.ceil(_BINS_PER_SIGMA * bin_length_m / sigma_m))
     step = _ECHO_STEPS * sigma_m * between / bin_length_m
     # As many bins of nothing behind the last: the ends of a frame are not each other's neighbours.
-    spectrum = np.fft.fft(rows, 2 * n)
-    padded = np.zeros((len(rows), 2 * n * between), dtype=np.complex128)
+    spectrum = np.fft.fft(samples, 2 * n)
+    padded = np.zeros((len(samples), 2 * n * between), dtype=np.complex128)
     padded[:, :n], padded[:, -n:] = spectrum[:, :n], spectrum[:, n:]
     values = between * np.fft.ifft(padded)[:, : (n - 1) * between + 1]
     return RangeProfiles(
@@ -185,10 +180,8 @@ class StaticPart:
     heading, each new one takes the place of a share of all earlier ones.
     """
 
-    def __init__(self, *, memory: int = 300, spacing_m: float = 0.005) -> None:
-        self.n_places = 0
+    def __init__(self, *, memory: int = 300) -> None:
         self._memory = memory
-        self._spacing_m = spacing_m
         self._last_m: Array | None = None
         self._of_headings: dict[int, tuple[int, Samples]] = {}
 
@@ -198,7 +191,7 @@ class StaticPart:
         return len(self._of_headings)
 
     @property
-    def mean(self) -> Samples | None:
+    def samples(self) -> Samples | None:
         """Return the static part, shape (n_bins,); None before the first frame."""
         if not self._of_headings:
             return None
@@ -207,19 +200,16 @@ class StaticPart:
             return np.asarray(np.median(means.real, axis=0) + 1j * np.median(means.imag, axis=0))
         return np.asarray(np.median(means, axis=0))
 
-    def add(self, samples: Samples, antenna_m: Array, heading_rad: float = 0.0) -> bool:
-        """Take a frame (n_bins,) if its antenna (2,) or (3,) has moved; return whether it has.
+    def add(self, samples: Samples, antenna_m: Array, heading_rad: float = 0.0) -> None:
+        """Take a frame (n_bins,) if its antenna (2,) or (3,) has moved.
 
         Antennas and headings are given in any frame that does not jump.
         """
         last_m = self._last_m
-        if last_m is not None and float(np.linalg.norm(antenna_m - last_m)) < self._spacing_m:
-            return False
+        if last_m is not None and float(np.linalg.norm(antenna_m - last_m)) < _SPACING_M:
+            return
         self._last_m = np.array(antenna_m, dtype=np.float64)
-        self.n_places += 1
-        known = samples if np.isfinite(samples).all() else np.nan_to_num(samples)
         heading = math.floor(heading_rad / math.tau * _HEADINGS) % _HEADINGS
-        n, mean = self._of_headings.get(heading, (0, known))
-        new = mean + (known - mean) / min(n + 1, self._memory)
+        n, mean = self._of_headings.get(heading, (0, samples))
+        new = mean + (samples - mean) / min(n + 1, self._memory)
         self._of_headings[heading] = n + 1, new
-        return True

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.imaging import kernels
-from slam.imaging.back_projection import TURNS
+from slam.imaging.back_projection import signal_of
 from slam.imaging.patches import Patch
 
 Array = NDArray[np.float64]
@@ -56,9 +56,7 @@ class Reflectors:
     energy
         Sum of |a_f|**2.
     amplitude
-        On boresight at 1 m under the law of a rod: c r**1.5.
-    coherence
-        Energy over that of v_f, 0 to 1.
+        Largest |a_f| r**1.5: that at 1 m, under the law of a rod.
     snr
         Root of the energy over the mean of what is left in the image at ranges near it.
     levels
@@ -70,7 +68,6 @@ class Reflectors:
     flatness: Array
     energy: Array
     amplitude: Array
-    coherence: Array
     snr: Array
     levels: Array
 
@@ -107,52 +104,38 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         raise ValueError("reflectors can be separated where echo and boresights are known")
     n, (bx, by) = len(profiles.values), aperture.boresights[patch.middle]
     turn = np.array([[bx, -by], [by, bx]])
-    track = np.hstack(
-        [
-            (aperture.antennas_m - aperture.antennas_m[patch.middle]) @ turn,
-            aperture.boresights @ turn,
-        ]
-    )
+    track = np.zeros((n, 6))
+    track[:, :2] = (aperture.antennas_m - aperture.antennas_m[patch.middle]) @ turn
+    track[:, 3:5] = aperture.boresights @ turn
     view = patch.view
     power = math.log(0.5) / (2 * math.log(math.cos(view.opening_rad / 2)))
     rows_m = np.arange(
         max(view.min_range_m - 2 * _ROW_M, _ROW_M), view.max_range_m + _BEYOND_M, _ROW_M
     )
-    yaws = np.arctan2(track[:, 3], track[:, 2])
+    yaws = np.arctan2(track[:, 4], track[:, 3])
     bearings = np.arange(
         yaws.min() - _OFF_BORESIGHT_RAD, yaws.max() + _OFF_BORESIGHT_RAD, _CELL_RAD
     )
-    image = np.empty((rows_m.size, bearings.size))
-    found = np.zeros((rule.most, 7))
-    models = np.zeros((rule.most, n), dtype=np.complex128)
-    k = profiles.wave_number_rad_per_m
-    values = profiles.values.copy()
-    scale = np.array(
-        [profiles.range_start_m, 1 / profiles.bin_length_m, k / math.tau * TURNS.size, k]
-    )
-    count = kernels.separate(
-        values,
-        scale,
-        TURNS,
+    directions = np.column_stack([np.cos(bearings), np.sin(bearings)])
+    cells = rows_m[:, np.newaxis, np.newaxis] * directions
+    signal = signal_of(profiles)
+    found, models = kernels.separate(
+        signal,
         track,
         np.linspace(0.0, 1.0, _BEAM_STEPS + 1) ** power,
         profiles.echo,
+        cells,
         rows_m,
         bearings,
-        rule.least_over_level,
-        rule.least_share,
-        rule.beside_share,
-        rule.more_than_point,
-        image,
-        found,
-        models,
+        rule.most,
+        (rule.least_over_level, rule.least_share, rule.beside_share, rule.more_than_point),
     )
-    range_m, bearing_rad, _, _, energy, curvature, coherence = found[:count].T
-    image = np.empty((rows_m.size, bearings[::2].size))
-    kernels.image_rows(
-        values, scale, TURNS, track, rows_m, bearings[::2].copy(), 0, rows_m.size, image
-    )
-    levels = np.abs(models[:count])
+    range_m, bearing_rad, _, _, energy, curvature = found.T
+    # What is left, on half as many cells
+    cells = np.ascontiguousarray(cells[:, ::2])
+    image = np.empty(cells.shape[:2])
+    kernels.image_rows(signal, track, cells, 0, len(image), image)
+    levels = np.abs(models)
     at = ((range_m - rows_m[0]) / _ROW_M).astype(np.intp)
     rest = [image[max(0, i - 2) : i + 4].mean() if 0 <= i < len(image) else math.inf for i in at]
     return Reflectors(
@@ -161,7 +144,6 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         flatness=1.0 - curvature * range_m,
         energy=energy,
         amplitude=levels.max(axis=1, initial=0.0) * range_m**1.5,
-        coherence=coherence,
         snr=np.sqrt(energy / np.maximum(rest, 1e-300)),
         levels=levels,
     )

@@ -171,7 +171,16 @@ def test_a_static_part_that_is_known_is_taken_out_and_stays_as_it_is() -> None:
         nothing.add(near(frame_at(far, 0)), place, heading)
     found, expected = patch_of(known, 0.03), patch_of(nothing, 0.0)
     np.testing.assert_allclose(found.profiles.values, expected.profiles.values, atol=1e-8)
-    assert known.n_places == 8
+    assert known.samples is not None
+    np.testing.assert_array_equal(known.samples, near(frame_at(far, 0, leakage=0.03)))
+
+
+def test_samples_that_are_not_known_count_as_zero() -> None:
+    frame = frame_at(np.zeros(3), 0)
+    frame.samples[3:5] = np.nan
+    near = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE).near(frame)
+    expected = np.append(frame.samples[:3], [0.0, 0.0])
+    np.testing.assert_array_equal(near[:5], expected)
 
 
 def test_baseband_frames_come_to_a_focus_as_rf_frames_do() -> None:

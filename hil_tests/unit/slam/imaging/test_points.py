@@ -100,7 +100,6 @@ def test_without_noise_a_point_is_where_it_is(place: tuple[float, float]) -> Non
     assert point.range_m == pytest.approx(math.dist(place, (0.1, 0.2)), abs=3e-4)
     assert point.kind is PointKind.POINT
     assert point.amplitude == pytest.approx(0.01, rel=0.1)
-    assert point.coherence > 0.99
 
 
 def test_points_25_cm_apart_are_two() -> None:
@@ -132,7 +131,6 @@ def test_a_wall_is_a_line_and_no_point() -> None:
     assert line.normal == pytest.approx([0.0, 1.0], abs=2e-3)
     assert line.distance_m == pytest.approx(1.15, abs=5e-4)
     assert line.ends_m == pytest.approx(np.array([(-0.02, 1.15), (0.22, 1.15)]), abs=3e-3)
-    assert line.amplitude == pytest.approx(0.04, rel=0.25)
 
 
 def test_a_near_wall_is_one_line() -> None:

@@ -58,7 +58,6 @@ def imaged(origin: Array, rod: Array, covariance: Array) -> ImagedPatch:
         covariance=covariance,
         amplitude=0.015,
         snr=30.0,
-        coherence=0.95,
         kind=PointKind.POINT,
     )
     # Scans take the radar, the mount and the origin of a patch, and no profile.
