@@ -289,9 +289,10 @@ def refine(
             if side == 0:
                 fit_amplitudes(track, beam, place, work)
                 ex, ey = math.cos(place[1]), math.sin(place[1])
-                # Normal equations of phase = common + bearing b + curvature c, the common removed
+                # Normal equations of phase = common + bearing b + curvature c, the common removed:
+                # amplitudes are fitted, so the weighted mean of the phases is 0.
                 w, wb, wc, wbb, wbc, wcc = 1e-30, 0.0, 0.0, 0.0, 0.0, 0.0
-                y, yb, yc = 0.0, 0.0, 0.0
+                yb, yc = 0.0, 0.0
                 for f in range(track.shape[0]):
                     px, py = track[f, 0], track[f, 1]
                     along, across, square = px * ex + py * ey, py * ex - px * ey, px * px + py * py
@@ -310,14 +311,11 @@ def refine(
                     wbb += weight * b * b
                     wbc += weight * b * c
                     wcc += weight * c * c
-                    y += ahead
                     yb += ahead * b
                     yc += ahead * c
                 wbb += 1e-12 - wb * wb / w
                 wbc -= wb * wc / w
                 wcc += 1e-12 - wc * wc / w
-                yb -= wb * y / w
-                yc -= wc * y / w
                 if form == 2:
                     det = max(wbb * wcc - wbc * wbc, 1e-9 * wbb * wcc)
                     bearing = (wcc * yb - wbc * yc) / det

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.imaging.patches import Patch, seen_from
-from slam.imaging.reflectors import Reflectors, SeparationRule, separated
+from slam.imaging.reflectors import Reflectors, SeparationRule
 
 Array = NDArray[np.float64]
 
@@ -108,12 +108,6 @@ class PatchLine:
     ends_m: Array
 
 
-def patch_points(patch: Patch, rule: PointRule | None = None) -> tuple[PatchPoint, ...]:
-    """Return the points of a patch, the nearest first."""
-    rule = rule or PointRule()
-    return points_of(patch, separated(patch, rule.separation), rule)
-
-
 def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[PatchPoint, ...]:
     """Return those of the reflectors of a patch that are points, the nearest first."""
     aperture = patch.aperture
@@ -136,12 +130,6 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
         )
         for k, flat in zip(order.tolist(), reflectors.flatness[order].tolist(), strict=True)
     )
-
-
-def patch_lines(patch: Patch, rule: PointRule | None = None) -> tuple[PatchLine, ...]:
-    """Return the walls of a patch, the nearest first."""
-    rule = rule or PointRule()
-    return lines_of(patch, separated(patch, rule.separation), rule)
 
 
 def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[PatchLine, ...]:

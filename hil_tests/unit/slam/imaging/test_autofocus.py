@@ -54,6 +54,16 @@ def test_an_error_that_is_linear_between_knots_is_found(seed: int) -> None:
     assert np.sqrt(np.mean(left_m[:, 1] ** 2)) < 0.5e-3 < np.std(error[:, 1])
 
 
+def test_the_unit_of_the_frames_is_of_no_matter() -> None:
+    true_m = straight(0.6, 121)
+    profiles, path = scene(true_m), Aperture(antennas_m=spoilt(true_m, 0.01, seed=2))
+    found, fainter = (
+        autofocus(each, path, CELLS_M) for each in (profiles, profiles.times(np.full(121, 1e-3)))
+    )
+    assert np.abs(found.antennas_m - path.antennas_m).max() > 1e-3
+    np.testing.assert_allclose(fainter.antennas_m, found.antennas_m, atol=1e-6)
+
+
 def test_a_right_path_stays() -> None:
     true_m = straight(0.6, 121)
     found = autofocus(scene(true_m), Aperture(antennas_m=true_m), CELLS_M)

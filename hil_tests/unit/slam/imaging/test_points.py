@@ -15,9 +15,17 @@ from slam.frames import RadarFrame
 from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, Rig, compose, transform
 from slam.imaging.imager import ImagedPatch, Imager
-from slam.imaging.patches import Patch
-from slam.imaging.points import PatchPoint, PointKind, PointRule, patch_lines, patch_points
+from slam.imaging.patches import Patch, seen_from
+from slam.imaging.points import (
+    PatchLine,
+    PatchPoint,
+    PointKind,
+    PointRule,
+    lines_of,
+    points_of,
+)
 from slam.imaging.range_profiles import ProfileFilter, RangeProfiles
+from slam.imaging.reflectors import separated
 
 Array = NDArray[np.float64]
 
@@ -40,6 +48,7 @@ NO_WHEELS = WheelNoise(
     floor_rad=0.0,
 )
 SIGMA = 2e-4  # of white noise per RF sample
+RULE = PointRule()
 
 
 def straight(n: int = 25, step_m: float = 0.01) -> Array:
@@ -83,6 +92,14 @@ def patch_of(frames: Array, poses: Array | None = None, middle: int = MIDDLE) ->
         origin=np.zeros(3),
         profiles=ProfileFilter(PULSE, N_BINS, BIN_M).apply(frames, START_M),
     )
+
+
+def patch_points(patch: Patch, rule: PointRule = RULE) -> tuple[PatchPoint, ...]:
+    return points_of(patch, separated(patch, rule.separation), rule)
+
+
+def patch_lines(patch: Patch) -> tuple[PatchLine, ...]:
+    return lines_of(patch, separated(patch, RULE.separation), RULE)
 
 
 def noise(seed: int, sigma: float = SIGMA) -> Array:
@@ -143,8 +160,14 @@ def test_a_point_has_no_line() -> None:
     assert not patch_lines(patch_of(of_point(straight(), (0.1, 1.1))))
 
 
-def test_what_comes_by_way_of_a_wall_is_no_point() -> None:
-    poses, rod, wall_m = straight(), np.array([0.15, 0.75]), 1.15
+# In the second case one echo is 13 cm behind the wall, the other beyond the field of view.
+@pytest.mark.parametrize(
+    ("place", "wall_m", "n_without"), [((0.15, 0.75), 1.15, 2), ((0.68, 1.15), 1.55, 1)]
+)
+def test_what_comes_by_way_of_a_wall_is_no_point(
+    place: tuple[float, float], wall_m: float, n_without: int
+) -> None:
+    poses, rod = straight(), np.array(place)
     image = np.array([rod[0], 2 * wall_m - rod[1]])
     near, far = (np.linalg.norm(q - antennas_of(poses), axis=1) for q in (rod, image))
     once = rf_frames((near + far) / 2, 0.01 * np.ones(25), 1.0)
@@ -154,7 +177,7 @@ def test_what_comes_by_way_of_a_wall_is_no_point() -> None:
     assert places(patch_points(patch)) == pytest.approx(rod[np.newaxis], abs=3e-3)
     assert len(patch_lines(patch)) == 1
     # Without the wall they stand where they seem to be.
-    assert len(patch_points(patch_of(once + twice + noise(5)))) == 2
+    assert len(patch_points(patch_of(once + twice + noise(5)))) == n_without
 
 
 def test_a_pulse_in_one_frame_changes_nothing() -> None:
@@ -207,20 +230,51 @@ def test_covariance_is_that_of_noise_over_seeds() -> None:
     assert np.linalg.eigvalsh(np.linalg.solve(stated, scatter)).max() < 3.0
 
 
-def test_covariance_of_a_wrong_scale_is_its_share_of_the_tangent() -> None:
-    rule = PointRule(
-        wheels=replace(NO_WHEELS, scale_sigma=0.02), range_floor_m=0.0, bearing_floor_rad=0.0
+@pytest.mark.parametrize("place", [(0.6, 1.1), (0.3, 0.6)])
+@pytest.mark.parametrize("constant", range(3))
+def test_covariance_of_a_wrong_constant_of_the_wheels_is_what_it_does(
+    constant: int, place: tuple[float, float]
+) -> None:
+    scale, turn, curvature = (0.02 * (constant == k) for k in range(3))
+    wheels = replace(
+        NO_WHEELS,
+        scale_sigma=scale,
+        turn_scale_sigma=turn,
+        curvature_sigma_rad_per_m=5.0 * curvature,
     )
-    place = np.array([0.6, 1.1])
-    bearing_rad = math.atan2(0.5, 0.9)
-    (point,) = patch_points(patch_of(of_point(straight(), place.tolist())), rule)
-    across = np.array([0.9, -0.5]) / math.hypot(0.5, 0.9)
-    stated_rad = math.sqrt(across @ point.covariance @ across) / math.hypot(0.5, 0.9)
-    assert stated_rad == pytest.approx(0.02 * math.tan(bearing_rad), rel=0.1)
-    # And so much it errs: odometry that reports 2 % too much
-    longer = straight() * [1.02, 1, 1]
-    (wrong,) = patch_points(patch_of(of_point(straight(), place.tolist()), longer), rule)
-    assert abs(wrong.bearing_rad - point.bearing_rad) == pytest.approx(stated_rad, rel=0.1)
+    rule = PointRule(wheels=wheels, range_floor_m=0.0, bearing_floor_rad=0.0)
+
+    def path(scale: float, turn: float, curvature: float) -> Array:
+        """Return a curve of 24 steps of 1 cm and 0.02 rad as the wheels report it."""
+        step = np.array([0.01 * (1 + scale), 0.0, 0.02 * (1 + turn) + 0.01 * 5.0 * curvature])
+        poses = [np.zeros(3)]
+        for _ in range(24):
+            poses.append(compose(poses[-1], step))
+        return seen_from(poses[MIDDLE], np.array(poses))
+
+    true = path(0.0, 0.0, 0.0)
+    frames = of_point(true, place)
+    (point,) = patch_points(patch_of(frames, true), rule)
+    ahead = np.array(place) - [MOUNT.x_m, MOUNT.y_m]
+    across = np.array([ahead[1], -ahead[0]]) / np.linalg.norm(ahead)
+    stated_rad = math.sqrt(across @ point.covariance @ across) / np.linalg.norm(ahead)
+    (wrong,) = patch_points(patch_of(frames, path(scale, turn, curvature)), rule)
+    assert abs(wrong.bearing_rad - point.bearing_rad) == pytest.approx(
+        stated_rad, rel=0.1, abs=1.5e-4
+    )
+
+
+def test_snr_is_that_of_the_noise_at_its_own_range() -> None:
+    # Four times as much noise beyond 1.05 m as up to there
+    level = np.where(START_M + BIN_M * np.arange(N_BINS) < 1.05, SIGMA, 4 * SIGMA)
+    gain = np.std(
+        ProfileFilter(PULSE, N_BINS, BIN_M).apply(noise(0, 1.0), START_M).values[:, 60:-60]
+    )
+    for place, sigma in (((0.1, 0.9), SIGMA), ((0.1, 1.6), 4 * SIGMA)):
+        range_m = place[1] - 0.2
+        (point,) = patch_points(patch_of(of_point(straight(), place) + noise(11, 1.0) * level))
+        expected = math.sqrt(25) * 0.01 * range_m**-1.5 / (gain * sigma)
+        assert point.snr == pytest.approx(expected, rel=0.3)
 
 
 def test_covariance_of_wheels_is_that_of_drawn_paths() -> None:
