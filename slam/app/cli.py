@@ -211,7 +211,7 @@ def _add_session_options(parser: argparse.ArgumentParser) -> None:
         "--no-image",
         dest="has_image",
         action="store_false",
-        help="make no radar image of the room, which takes a tenth of the time of SLAM",
+        help="make no radar image of the room, which takes a quarter of the time of SLAM",
     )
     parser.add_argument(
         "--rerun",

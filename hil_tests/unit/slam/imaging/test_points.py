@@ -15,6 +15,7 @@ from slam.frames import RadarFrame
 from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, Rig, compose, transform
 from slam.imaging.imager import ImagedPatch, Imager
+from slam.imaging.kernels import remove_bursts
 from slam.imaging.patches import Patch, seen_from
 from slam.imaging.points import (
     PatchLine,
@@ -188,6 +189,25 @@ def test_a_pulse_in_one_frame_changes_nothing() -> None:
     assert places(patch_points(patch_of(burst))) == pytest.approx(clean, abs=2e-4)
 
 
+def test_an_echo_that_begins_or_ends_within_the_patch_is_no_burst() -> None:
+    values = np.zeros((20, 3), dtype=np.complex64)
+    values[:10, 0], values[10:, 1], values[6, 2] = 1.0, 1j, 1.0
+    expected = values.copy()
+    expected[6, 2] = 0.0
+    remove_bursts(values)
+    np.testing.assert_array_equal(values, expected)
+
+
+@pytest.mark.parametrize("slope", [-0.6, 0.4])
+def test_the_amplitude_of_an_echo_may_change_evenly_along_the_patch(slope: float) -> None:
+    level = 0.01 * (1.0 + slope * np.linspace(-1.0, 1.0, 25))
+    ranges_m = np.linalg.norm(np.array([0.1, 1.1]) - antennas_of(straight()), axis=1)
+    found = separated(patch_of(rf_frames(ranges_m, level)), RULE.separation)
+    # The beam falls by 2 % to either end.
+    assert found.levels[0] == pytest.approx(level, rel=0.05)
+    assert found.energy[0] == pytest.approx(np.sum(level**2), rel=0.02)
+
+
 def test_a_wide_cylinder_is_round_and_stands_at_its_surface() -> None:
     centre, radius_m = np.array([0.1, 0.95]), 0.3
     ranges_m = np.linalg.norm(centre - antennas_of(straight()), axis=1) - radius_m
@@ -218,6 +238,8 @@ def test_turning_on_the_spot_gives_points_too() -> None:
     poses = np.column_stack([np.zeros(25), np.zeros(25), angles])
     (point,) = patch_points(patch_of(of_point(poses, (0.2, 1.1)) + noise(8), poses))
     assert math.dist((point.x_m, point.y_m), (0.2, 1.1)) < 4e-3
+    # While it faces the point its amplitude is largest, and falls by the beam to either side.
+    assert point.amplitude == pytest.approx(0.01, rel=0.05)
 
 
 def test_covariance_is_that_of_noise_over_seeds() -> None:
