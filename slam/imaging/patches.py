@@ -136,6 +136,7 @@ class _Look:
 
     t_ns: int
     pose: Array
+    antenna: Array
     samples: Samples
     range_start_m: float
     way_m: float  # of the antenna since the start
@@ -197,12 +198,19 @@ class PatchMaker:
         way_m = 0.0
         if self._looks:
             last = self._looks[-1]
-            step_m = float(np.linalg.norm(antenna - self.antenna_at(last.pose)))
+            step_m = math.dist(antenna, last.antenna)
             if step_m < self.rule.spacing_m:
                 return None
             way_m = last.way_m + step_m
         self._looks.append(
-            _Look(t_ns=frame.t_ns, pose=pose, samples=samples, range_start_m=start_m, way_m=way_m)
+            _Look(
+                t_ns=frame.t_ns,
+                pose=pose,
+                antenna=antenna,
+                samples=samples,
+                range_start_m=start_m,
+                way_m=way_m,
+            )
         )
         if way_m - self._looks[0].way_m < self.rule.travel_m:
             return None

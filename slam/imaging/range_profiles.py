@@ -206,7 +206,7 @@ class StaticPart:
         Antennas and headings are given in any frame that does not jump.
         """
         last_m = self._last_m
-        if last_m is not None and float(np.linalg.norm(antenna_m - last_m)) < _SPACING_M:
+        if last_m is not None and math.dist(antenna_m, last_m) < _SPACING_M:
             return
         self._last_m = np.array(antenna_m, dtype=np.float64)
         heading = math.floor(heading_rad / math.tau * _HEADINGS) % _HEADINGS
