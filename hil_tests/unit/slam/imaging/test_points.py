@@ -91,7 +91,7 @@ def patch_of(frames: Array, poses: Array | None = None, middle: int = MIDDLE) ->
         poses=straight() if poses is None else poses,
         middle=middle,
         origin=np.zeros(3),
-        profiles=ProfileFilter(PULSE, N_BINS, BIN_M).apply(frames, START_M),
+        profiles=ProfileFilter(PULSE, frames.shape[1], BIN_M).apply(frames, START_M),
     )
 
 
@@ -222,6 +222,27 @@ def test_only_what_is_in_view_for_half_of_the_frames_is_a_point() -> None:
         angle = math.pi / 2 - edge_rad - off_rad
         place = 0.1 + 0.9 * math.cos(angle), 0.2 + 0.9 * math.sin(angle)
         assert len(patch_points(patch_of(of_point(straight(), place)))) == count
+
+
+def test_frames_whose_bins_end_before_a_point_add_nothing_to_it() -> None:
+    frames = of_point(straight(), (0.5, 1.62))[:, :200]
+    found = separated(patch_of(frames), RULE.separation)
+    ahead_m, left_m = found.places_m[0]  # of an antenna that looks along y
+    place = antennas_of(straight())[MIDDLE] + [-left_m, ahead_m]
+    beyond_m = np.linalg.norm(place - antennas_of(straight()), axis=1) - START_M - 199 * BIN_M
+    assert beyond_m[0] > 1e-3
+    assert np.all(found.levels[0, beyond_m > 1e-3] == 0.0)
+    assert np.all(found.levels[0, beyond_m < -1e-3] > 0.0)
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.14, 1), (0.35, 2)])
+def test_beside_a_strong_echo_a_weak_one_is_what_its_model_leaves(share: float, count: int) -> None:
+    # Both are at 0.8 m; elsewhere something as weak is found.
+    strong, beside = of_point(straight(), (0.1, 1.0)), of_point(straight(), (0.45, 0.92))
+    patch = patch_of(strong + share * beside + noise(12))
+    assert len(separated(patch, RULE.separation).range_m) == count
+    apart = patch_of(strong + share * of_point(straight(), (0.2, 0.65)) + noise(12))
+    assert len(separated(apart, RULE.separation).range_m) == 2
 
 
 def test_a_rigid_motion_of_path_and_scene_moves_nothing_in_the_patch() -> None:
