@@ -138,6 +138,17 @@ def test_a_harmonic_of_a_faint_curtain_is_no_breathing(monkeypatch: pytest.Monke
     assert any(breathing_rate(frames, RANGES, RATE_HZ) for frames in iq)
 
 
+@pytest.mark.parametrize(("sway", "rate_hz"), [(0.0, 0.3), (1.5, None)])
+def test_a_stronger_line_just_below_the_band_is_what_moves(
+    sway: float, rate_hz: float | None
+) -> None:
+    """A sway of 4.2 a minute is no breath, and nobody's breath is answered beside it."""
+    steps = np.sin(2 * np.pi * 0.3 * T_S) + sway * np.sin(2 * np.pi * 0.07 * T_S)
+    noise = np.full(4 * len(steps) + 1, 0.4)
+    found = vital._periodicity_in_noise(steps, noise, RATE_HZ)
+    assert (found and found[0]) == (rate_hz and pytest.approx(rate_hz, abs=0.002))
+
+
 def test_slow_noise_is_no_breathing() -> None:
     """Of a time constant of 2 s, as a receiver's drift."""
     rng = np.random.default_rng(2)
