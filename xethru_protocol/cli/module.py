@@ -12,6 +12,7 @@ from xethru_protocol.cli.output import (
     Progress,
     bytes_text,
     counted,
+    frame_timeout_s,
     let_send,
     module_at,
     print_json,
@@ -157,7 +158,7 @@ def stream(arguments: Namespace) -> int:
         as_json = arguments.json or arguments.samples or not STDOUT.is_terminal
         live = None if as_json else _Live(radar)
         try:
-            for frame in radar.frames(arguments.count, timeout_s=max(2.0, 3.0 / rate)):
+            for frame in radar.frames(arguments.count, timeout_s=frame_timeout_s(rate)):
                 if live is None:
                     print_json(_as_json(frame, arguments.samples))
                 else:

@@ -171,7 +171,7 @@ _MOST = 10  # lines; a damaged text file has as many faults as lines
 def warn_of(command: str, faults: Sequence[RecordingFault]) -> None:
     """Print the first faults one by one, and the number of the others."""
     for fault in faults[:_MOST]:
-        warn(f"xethru {command}: {fault.file}: {fault.reason} (at byte {fault.offset})")
+        warn(f"xethru {command}: {fault}")
     if len(faults) > _MOST:
         warn(f"xethru {command}: and {len(faults) - _MOST} faults more")
 
@@ -220,6 +220,11 @@ def let_send(radar: X4M300, config: RawConfig | None, wanted_hz: float | None) -
     if config is None:
         return float(radar.description["rate_hz"])
     return radar.start(frame_rate(radar, wanted_hz))
+
+
+def frame_timeout_s(rate_hz: float) -> float:
+    """How long to wait for a frame of a radar that sends at this rate."""
+    return max(2.0, 3.0 / rate_hz)
 
 
 _USUAL_FPS = 17.0

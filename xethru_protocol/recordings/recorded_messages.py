@@ -51,6 +51,9 @@ class RecordingFault:
     reason: str
     minor: bool = False
 
+    def __str__(self) -> str:
+        return f"{self.file}: {self.reason} (at byte {self.offset})"
+
 
 FaultHandler = Callable[[RecordingFault], None]
 
@@ -60,7 +63,7 @@ def report(fault: RecordingFault, on_fault: FaultHandler | None) -> None:
     if on_fault is not None:
         on_fault(fault)
     elif not fault.minor:
-        raise RecordingError(f"{fault.file}: {fault.reason} (at byte {fault.offset})")
+        raise RecordingError(str(fault))
 
 
 @contextmanager

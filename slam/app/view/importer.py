@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if path.suffix == SUFFIX:
             read_note(path)  # says what is wrong with a head that is not one
         # Rerun takes half a second to load
-        from slam.app.view.raw_recording import draw, fault_text
+        from slam.app.view.raw_recording import draw
 
         with np.errstate(all="ignore"):  # samples of a damaged recording may be anything
             faults = draw(
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _end(str(error), EXIT_FAILED)
     if faults.first is not None:
         more = f", and {faults.costly - 1} more, see its log" if faults.costly > 1 else ""
-        return _end(f"{path}: damaged; {fault_text(faults.first)}{more}", EXIT_FAILED)
+        return _end(f"{path}: damaged; {faults.first}{more}", EXIT_FAILED)
     return 0
 
 

@@ -116,12 +116,8 @@ class Faults:
 
     def name_new(self, drawing: _Drawing) -> None:
         for fault in self._new:
-            drawing.log(fault_text(fault), "WARN")
+            drawing.log(str(fault), "WARN")
         self._new.clear()
-
-
-def fault_text(fault: RecordingFault) -> str:
-    return f"{fault.file}: {fault.reason} (at byte {fault.offset})"
 
 
 def bscan(samples: Samples) -> NDArray[np.float32]:

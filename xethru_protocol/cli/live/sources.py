@@ -17,6 +17,7 @@ from xethru_protocol.cli.arguments import raw_config
 from xethru_protocol.cli.output import (
     CommandFailed,
     frame_rate,
+    frame_timeout_s,
     let_send,
     module_at,
     print_warnings,
@@ -135,7 +136,7 @@ def _streamed(
     rate_hz = let_send(radar, config, wanted_hz)
     print_warnings(radar)
     steps, before = 0, None
-    for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate_hz)):
+    for frame in radar.frames(count, timeout_s=frame_timeout_s(rate_hz)):
         if before is not None:
             follows = frame.stream == before.stream and frame.counter > before.counter
             steps += frame.counter - before.counter if follows else 1

@@ -8,6 +8,7 @@ from typing import Any
 
 from xethru_protocol.cli.output import (
     CommandFailed,
+    frame_timeout_s,
     let_send,
     set_up,
     warn,
@@ -78,7 +79,7 @@ class RawFrames(Listen):
 
     def start(self, radar: X4M300) -> float:
         self._rate_hz = let_send(radar, self._config, self._fps)
-        return max(2.0, 3.0 / self._rate_hz)
+        return frame_timeout_s(self._rate_hz)
 
     def about(self, radar: X4M300) -> dict[str, Any]:
         return radar.description | {"rate_hz": self._rate_hz}
