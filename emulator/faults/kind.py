@@ -38,9 +38,13 @@ from xethru_protocol.wire.messages import Command, Response
 
 RfSamples = NDArray[np.float32]
 
+COUNTERS = 1 << 32  # after the last follows 0
+NS_PER_MS = 1_000_000
+SEEN_IN_TIMES = "nothing; the arrival times show it"
+NO_TIME_IN_FRAMES = "Frames carry no time; only when they arrive shows it."
+
 _FRAME = struct.Struct("<4sIxBBIII")
 _PAYLOAD = struct.Struct("<BBIII")
-_WRAP = 1 << 32
 _REPLIES = frozenset(
     {
         ResponseCode.XTS_SPR_PONG,
@@ -104,7 +108,7 @@ def frame_packet(counter: int, samples: RfSamples) -> bytes:
         ResponseCode.XTS_SPR_DATA,
         ElementType.XTS_SPRD_FLOAT,
         0,
-        counter % _WRAP,
+        counter % COUNTERS,
         samples.size,
     )
     return encode_no_escape(head + samples.astype("<f4", copy=False).tobytes())

@@ -240,12 +240,12 @@ def fault_spec(kind: str, **keys: Any) -> FaultSpec:  # noqa: ANN401 - any key, 
     return parse_fault(fault_table(kind, **keys))
 
 
-def parse_fault(table: object, source: str = "fault") -> FaultSpec:
+def parse_fault(table: object) -> FaultSpec:
     """Return a fault from a table; `FaultPlanError` if it is not one."""
     try:
         return FaultSpec.model_validate(table)
     except ValidationError as error:
-        raise FaultPlanError(f"{source}: {problem_text(error.errors(), FaultSpec)}") from None
+        raise FaultPlanError(f"fault: {problem_text(error.errors(), FaultSpec)}") from None
 
 
 def load_plan(path: Path | str) -> FaultPlan:

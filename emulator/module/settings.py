@@ -90,8 +90,6 @@ RESPIRATION_PROFILES = frozenset(
 STOCK_MODEL = "x4m300"
 """Where neither the scene nor the user names one."""
 X4M300_PROFILES = frozenset({MODELS["x4m300"].profile})
-DEFAULT_BAUDRATE = 115_200
-"""After every power-up; a rate is never saved."""
 BITS_PER_BYTE = 10
 """Start, eight data bits, stop."""
 _FALLING = b"\x01\x00"

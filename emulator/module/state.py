@@ -21,9 +21,10 @@ from emulator.module.memory import (
 )
 from emulator.module.modes import ModeMachine, ModuleState, Start
 from emulator.module.pins import IoPins
-from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
+from emulator.module.settings import DeviceOptions, ProfileSettings
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
+    POWER_UP_BAUD,
     ErrorCode,
     FileType,
     PresenceDirection,
@@ -297,7 +298,7 @@ class Module:
         self.wait = None
         self.asleep = False
         self._sleep_ns = None
-        self.uart_baudrate = DEFAULT_BAUDRATE
+        self.uart_baudrate = POWER_UP_BAUD
         self._baudrate_change = None
         self.trace_level: int = TraceLevel.NONE
         self.postprocessing: dict[int, m.PostprocessingValue] = {}

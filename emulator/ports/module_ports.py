@@ -18,12 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from emulator.module.settings import DEFAULT_BAUDRATE
 from emulator.ports.event_loop import Port, Service, wait_for
 from emulator.ports.pty import LinkError, PortWatch, PtyLink
 from emulator.ports.tcp import TcpLink
 from emulator.ports.usb_and_uart import UartLine, UsbLine
 from emulator.x4m300 import ByteDevice
+from xethru_protocol.wire.codes import POWER_UP_BAUD
 
 LOOK_AGAIN_NS = 20_000_000
 """How often to look whether the port is back; a host looks less often."""
@@ -74,9 +74,9 @@ class Plug(Service):
         link: PtyLink,
         present: Callable[[int], bool],
         *,
-        tcp: TcpLink | None = None,
-        watch: PortWatch | None = None,
-        renames: bool = False,
+        tcp: TcpLink | None,
+        watch: PortWatch,
+        renames: bool,
         moved: Callable[[], None],
     ) -> None:
         self._link = link
@@ -118,8 +118,7 @@ class Plug(Service):
         except LinkError:
             return  # no terminal is free, or a file is in the way: look again
         self._returns += 1
-        if self._watch is not None:
-            self._watch.follow(self._link.terminal)
+        self._watch.follow(self._link.terminal)
         self._moved()
 
 
@@ -142,7 +141,7 @@ class NamedDevice:
     device: ByteDevice
     start_skew_ns: int | None = None
     present: Callable[[int], bool] | None = None
-    uart_baud: Callable[[], int] = lambda: DEFAULT_BAUDRATE
+    uart_baud: Callable[[], int] = lambda: POWER_UP_BAUD
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,7 +17,7 @@ BAUD_RATES = (
 )
 """Rates of a UART. Protocol reference 10."""
 POWER_UP_BAUD = 115200
-"""A UART module's rate after every restart; without meaning on USB and ptys."""
+"""A UART module's rate after every restart, as none is saved; without meaning on USB and ptys."""
 
 
 class CommandCode(IntEnum):

@@ -9,6 +9,7 @@ from typing import Literal
 from pydantic import Field
 
 from emulator.faults.kind import (
+    NS_PER_MS,
     Catalogued,
     Context,
     Handling,
@@ -30,7 +31,6 @@ of_command = Catalogued(Layer.TRANSACTION, Target.COMMAND)
 of_reply = Catalogued(Layer.TRANSACTION, Target.REPLY)
 of_packet = Catalogued(Layer.TRANSACTION, Target.PACKET)
 
-_NS_PER_MS = 1_000_000
 _LONGEST_WAIT = 20.0  # multiples of the delay that a heavy tail reaches at most
 
 
@@ -83,7 +83,7 @@ def slow_reply(packet: bytes, wanted: _Slow, rng: Rng, context: Context) -> Piec
         factor = 2 * rng.uniform()
     elif wanted.tail == "heavy":
         factor = min((1 - rng.uniform()) ** -0.5, _LONGEST_WAIT)
-    return [Piece(packet, delay_ns=round(wanted.delay_ms * factor * _NS_PER_MS), aside=True)]
+    return [Piece(packet, delay_ns=round(wanted.delay_ms * factor * NS_PER_MS), aside=True)]
 
 
 @of_reply("1 stray")

@@ -7,7 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import Field
 
+from emulator.chip.chip import NS_PER_S
 from emulator.faults.kind import (
+    NO_TIME_IN_FRAMES,
+    NS_PER_MS,
+    SEEN_IN_TIMES,
     Action,
     Catalogued,
     Context,
@@ -41,7 +45,7 @@ of_reply = Catalogued(Layer.DEVICE, Target.REPLY)
 of_frame = Catalogued(Layer.DEVICE, Target.FRAME)
 of_time = Catalogued(Layer.TIME, Target.PACKET)
 
-_NS_PER_US, _NS_PER_MS, _NS_PER_S = 1_000, 1_000_000, 1_000_000_000
+_NS_PER_US = 1_000
 
 
 class _Away(Parameters):
@@ -94,10 +98,6 @@ class _SilenceLength(Parameters):
     seconds: float = Field(0.0, ge=0, le=86_400, description="how long, s; 0: for ever")
 
 
-_ARRIVAL = "nothing; the arrival times show it"
-_TIMING = "Frames carry no time; only when they arrive shows it."
-
-
 def _info_reply(item: InfoItem, text: str, context: Context) -> Pieces:
     command = context.command
     if not isinstance(command, SystemGetInfo) or command.item != item:
@@ -109,13 +109,13 @@ def _info_reply(item: InfoItem, text: str, context: Context) -> Pieces:
 @of_moment("1 reconnect", _Away)
 def unplug(wanted: _Away, rng: Rng) -> Sequence[Action]:
     """The port vanishes and comes back; the module restarts by that."""
-    return [Unplug(round(wanted.away_s * _NS_PER_S))]
+    return [Unplug(round(wanted.away_s * NS_PER_S))]
 
 
 @of_moment("1 reconnect", _MidFrame)
 def disconnect_mid_frame(wanted: _MidFrame, rng: Rng) -> Sequence[Action]:
     """The port vanishes in the middle of a frame and comes back."""
-    return [Unplug(round(wanted.away_s * _NS_PER_S), part_of_frame=wanted.part)]
+    return [Unplug(round(wanted.away_s * NS_PER_S), part_of_frame=wanted.part)]
 
 
 @of_moment("1 reboot, and ResponseTimeout where frames were waited for")
@@ -127,7 +127,7 @@ def watchdog_reboot(wanted: Parameters, rng: Rng) -> Sequence[Action]:
 @of_moment("restarts reboots", _Loop)
 def brown_out(wanted: _Loop, rng: Rng) -> Sequence[Action]:
     """The module restarts several times in a row; ten faults in a row start safe mode."""
-    period_ns = round(wanted.period_s * _NS_PER_S)
+    period_ns = round(wanted.period_s * NS_PER_S)
     return [
         Restart(delay_ns=index * period_ns, reason="brown-out") for index in range(wanted.restarts)
     ]
@@ -181,7 +181,7 @@ def stream_stopped(wanted: Parameters, rng: Rng) -> Sequence[Action]:
 )
 def range_offset_drift(packet: bytes, wanted: _Drift, rng: Rng, context: Context) -> Pieces:
     """Echoes wander in range, as with temperature."""
-    passed_s = (context.now_ns - context.since_ns) / _NS_PER_S
+    passed_s = (context.now_ns - context.since_ns) / NS_PER_S
     shift = round(wanted.bins * min(passed_s / wanted.seconds, 1.0))
     # what moves in at an end is not known: the end bin again
     return changed_frame(
@@ -190,30 +190,30 @@ def range_offset_drift(packet: bytes, wanted: _Drift, rng: Rng, context: Context
     )
 
 
-@of_time(_ARRIVAL, _Offset, lasting=True, hidden=_TIMING)
+@of_time(SEEN_IN_TIMES, _Offset, lasting=True, hidden=NO_TIME_IN_FRAMES)
 def start_offset(packet: bytes, wanted: _Offset, rng: Rng, context: Context) -> Pieces:
     """Everything comes later by the same time."""
-    return [Piece(packet, delay_ns=round(wanted.offset_ms * _NS_PER_MS))]
+    return [Piece(packet, delay_ns=round(wanted.offset_ms * NS_PER_MS))]
 
 
-@of_time(_ARRIVAL, _Ppm, lasting=True, hidden=_TIMING)
+@of_time(SEEN_IN_TIMES, _Ppm, lasting=True, hidden=NO_TIME_IN_FRAMES)
 def clock_drift(packet: bytes, wanted: _Ppm, rng: Rng, context: Context) -> Pieces:
     """The module's clock is slow."""
     delay_ns = round((context.now_ns - context.since_ns) * wanted.ppm * 1e-6)
     return [Piece(packet, delay_ns=delay_ns)]
 
 
-@of_time(_ARRIVAL, _Walk, lasting=True, hidden=_TIMING)
+@of_time(SEEN_IN_TIMES, _Walk, lasting=True, hidden=NO_TIME_IN_FRAMES)
 def jitter(packet: bytes, wanted: _Walk, rng: Rng, context: Context) -> Pieces:
     """Delays wander at random."""
     # reflected at 0: nothing can be early
     return [Piece(packet, delay_ns=round(abs(rng.walk(wanted.sigma_us)) * _NS_PER_US))]
 
 
-@of_time(_ARRIVAL, _Poll, lasting=True, hidden=_TIMING)
+@of_time(SEEN_IN_TIMES, _Poll, lasting=True, hidden=NO_TIME_IN_FRAMES)
 def usb_latency(packet: bytes, wanted: _Poll, rng: Rng, context: Context) -> Pieces:
     """The host polls now and then: packets come in batches, at multiples of a period."""
-    period_ns = round(wanted.period_ms * _NS_PER_MS)
+    period_ns = round(wanted.period_ms * NS_PER_MS)
     return [Piece(packet, delay_ns=(context.since_ns - context.now_ns) % period_ns)]
 
 
@@ -225,5 +225,5 @@ def usb_latency(packet: bytes, wanted: _Poll, rng: Rng, context: Context) -> Pie
 )
 def silent(packet: bytes, wanted: _SilenceLength, rng: Rng, context: Context) -> Pieces:
     """Nothing comes from the module, though its port is there."""
-    end_ns = context.since_ns + round(wanted.seconds * _NS_PER_S)
+    end_ns = context.since_ns + round(wanted.seconds * NS_PER_S)
     return [] if not wanted.seconds or context.now_ns < end_ns else [Piece(packet)]

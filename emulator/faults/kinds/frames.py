@@ -141,10 +141,14 @@ def early_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> 
     return _changed(packet, packet[:2] + bytes((END,)) + packet[2:])
 
 
+def _cut(packet: bytes, wanted: _BytesSent) -> Pieces:
+    return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
+
+
 @of_reply(f"1 fault at the next packet; {_LOST_REPLY}", _BytesSent)
 def truncated_reply(packet: bytes, wanted: _BytesSent, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a reply are sent."""
-    return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
+    return _cut(packet, wanted)
 
 
 @of_packet("1 fault 'packet longer than any receiver accepts'")
@@ -202,7 +206,7 @@ def cancelling_flips(packet: bytes, wanted: Parameters, rng: Rng, context: Conte
 @of_frame("1 frame lost, 1 fault; the next frame's first bytes are taken for samples", _BytesSent)
 def truncated_frame(packet: bytes, wanted: _BytesSent, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a radar frame are sent."""
-    return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
+    return _cut(packet, wanted)
 
 
 @of_frame("off_lattice_samples = samples", _Samples)

@@ -10,6 +10,9 @@ from pydantic import Field
 
 from emulator.chip.chip import NS_PER_S
 from emulator.faults.kind import (
+    COUNTERS,
+    NO_TIME_IN_FRAMES,
+    SEEN_IN_TIMES,
     Catalogued,
     Context,
     Layer,
@@ -30,7 +33,6 @@ of_frame = Catalogued(Layer.STREAM, Target.FRAME)
 of_packet = Catalogued(Layer.STREAM, Target.PACKET)
 of_environment = Catalogued(Layer.ENVIRONMENT, Target.FRAME)
 
-_WRAP = 1 << 32
 _CYCLES_PER_BIN = 7.29 / 23.328  # carrier of the pulse over the sampling rate, Hz / Hz
 
 
@@ -85,7 +87,6 @@ class _Fading(Parameters):
 
 _BACK = "A counter that goes back looks like a chip that was restarted, which loses nothing."
 _CONTENT = "The samples are values that the chip can give; only the scene shows the fault."
-_TIMING = "Frames carry no time; only when they arrive shows it."
 
 
 def _renumbered(packet: bytes, number: Callable[[int], int]) -> Pieces:
@@ -131,7 +132,7 @@ def counter_back(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context)
 def counter_wrap(packet: bytes, wanted: _FrameCount, rng: Rng, context: Context) -> Pieces:
     """The frame counter goes on shortly before 2**32, and wraps after some frames."""
     return _renumbered(
-        packet, lambda counter: _WRAP - wanted.frames + _since_first(counter, context)
+        packet, lambda counter: COUNTERS - wanted.frames + _since_first(counter, context)
     )
 
 
@@ -163,7 +164,7 @@ def reordered_frames(packet: bytes, wanted: Parameters, rng: Rng, context: Conte
     return [Piece(packet, behind=1)]
 
 
-@of_frame("nothing; the arrival times show it", _Slower, lasting=True, hidden=_TIMING)
+@of_frame(SEEN_IN_TIMES, _Slower, lasting=True, hidden=NO_TIME_IN_FRAMES)
 def slow_rate(packet: bytes, wanted: _Slower, rng: Rng, context: Context) -> Pieces:
     """Frames come at a lower rate than was asked for."""
     delay_ns = round((context.now_ns - context.since_ns) * wanted.percent / 100)
@@ -171,11 +172,11 @@ def slow_rate(packet: bytes, wanted: _Slower, rng: Rng, context: Context) -> Pie
 
 
 @of_packet(
-    "nothing; the arrival times show it, and ResponseTimeout if someone waits for less",
+    f"{SEEN_IN_TIMES}, and ResponseTimeout if someone waits for less",
     _Seconds,
     lasting=True,
     again="ends",
-    hidden=_TIMING,
+    hidden=NO_TIME_IN_FRAMES,
 )
 def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces:
     """Nothing comes for a while, then all at once."""
