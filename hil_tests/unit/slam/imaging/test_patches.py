@@ -126,6 +126,16 @@ def test_behind_a_long_stand_or_with_other_bins_a_patch_begins_anew() -> None:
     assert maker.add(frame_at(path[46], 90, n_bins=200), path[46]) is None
 
 
+@pytest.mark.parametrize(("stood_ns", "n_patches"), [(20_000_000_000, 0), (19_999_999_999, 1)])
+def test_a_robot_that_stood_for_20_s_may_have_been_moved(stood_ns: int, n_patches: int) -> None:
+    maker, made = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE), []
+    for index, pose in enumerate(line(0.3)):
+        frame = frame_at(pose, index)
+        later = 0 if index < 15 else stood_ns - 200_000_000
+        made.append(maker.add(replace(frame, t_ns=frame.t_ns + later), pose))
+    assert sum(patch is not None for patch in made) == n_patches
+
+
 def test_bins_beyond_the_field_of_view_are_left_out_and_the_range_offset_is_removed() -> None:
     (patch,) = patches_of(line(0.3))
     ranges_m = patch.profiles.ranges_m

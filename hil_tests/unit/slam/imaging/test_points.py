@@ -190,10 +190,11 @@ def test_a_pulse_in_one_frame_changes_nothing() -> None:
 
 
 def test_an_echo_that_begins_or_ends_within_the_patch_is_no_burst() -> None:
-    values = np.zeros((20, 3), dtype=np.complex64)
+    values = np.zeros((20, 4), dtype=np.complex64)
     values[:10, 0], values[10:, 1], values[6, 2] = 1.0, 1j, 1.0
+    values[[15, 19], 3] = 1.0  # the last frame is compared with the four before it
     expected = values.copy()
-    expected[6, 2] = 0.0
+    expected[[6, 15], [2, 3]] = 0.0
     remove_bursts(values)
     np.testing.assert_array_equal(values, expected)
 
@@ -222,6 +223,13 @@ def test_only_what_is_in_view_for_half_of_the_frames_is_a_point() -> None:
         angle = math.pi / 2 - edge_rad - off_rad
         place = 0.1 + 0.9 * math.cos(angle), 0.2 + 0.9 * math.sin(angle)
         assert len(patch_points(patch_of(of_point(straight(), place)))) == count
+
+
+def test_the_amplitude_of_an_echo_does_not_change_its_sign() -> None:
+    ranges_m = np.linalg.norm(np.array([0.1, 1.1]) - antennas_of(straight()), axis=1)
+    level = 0.01 * (1.0 + 1.6 * np.linspace(-1.0, 1.0, 25))
+    found = separated(patch_of(rf_frames(ranges_m, level)), RULE.separation)
+    assert np.all(np.diff(found.levels[0]) > 0.0)
 
 
 def test_frames_whose_bins_end_before_a_point_add_nothing_to_it() -> None:
