@@ -631,7 +631,12 @@ def _add_image(image: argparse.ArgumentParser) -> None:
         "(default: the first that the session has)",
     )
     image.add_argument(
-        "--cell", dest="cell_m", type=_metres, default=0.02, metavar="M", help="(default: 0.02)"
+        "--cell",
+        dest="cell_m",
+        type=_metres,
+        default=0.02,
+        metavar="M",
+        help="length of a cell, 1 at most (default: %(default)g)",
     )
     image.add_argument(
         "--range",

@@ -33,6 +33,7 @@ _MARGIN_M = 0.3
 # Until the robot has turned, a wall beside its way stands still like the robot itself, so only what
 # is nearer than the robot is large is taken for its own; from so many headings on, all.
 _ROBOT_M, _TURNED = 0.45, 8
+_MOST_SAMPLE = 1e12  # of a frame in any unit; squares of larger ones overflow
 
 
 def longest_spacing_m(pulse: PulseModel, view: FieldOfView) -> float:
@@ -170,12 +171,12 @@ class PatchMaker:
         self._filter: tuple[ModulePulse, ProfileFilter] | None = None
 
     def near(self, frame: RadarFrame | RecordedFrame) -> Samples:
-        """Return the samples up to the end of the field of view, those that are NaN as 0."""
+        """Return the samples up to the end of the field of view, 0 for what is none."""
         start_m = frame.range_start_m - self.mount.range_offset_m
         reach = (self.view.max_range_m + _MARGIN_M - start_m) / frame.bin_length_m
         samples = frame.samples[: max(1, math.ceil(reach))]
         own = samples.astype(np.result_type(samples, np.float64))
-        return own if np.isfinite(own).all() else np.asarray(np.nan_to_num(own))
+        return np.where(np.abs(own) < _MOST_SAMPLE, own, 0.0)
 
     def antenna_at(self, pose: Array) -> Array:
         """Return the antenna, shape (2,), at a body pose."""

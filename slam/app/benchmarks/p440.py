@@ -56,7 +56,11 @@ _NOT_FINITE = ("meta", "reflector_apex_m")  # an apex that is not known is NaN
 _PULSE = ModulePulse(model=PulseModel(carrier_hz=3.95e9, bandwidth_hz=1.7e9), error=0.0)
 _CELL_M = 0.04  # of the picture; an echo is 5 cm wide across
 _NEAR_M = 0.15  # So far from its apex a reflector is looked for: its next echo is 19 cm away
-_MOST_M2 = 1000.0  # of the picture
+_MOST_M2, _MOST_SIDE_M = 1000.0, 100.0  # of the picture
+_BIN_M = (
+    1e-3,
+    0.015,
+)  # Shortest and longest bin: a P440's are 9.15 mm; the pulse needs 19 mm or less
 _SAME_M = 0.02  # Trials whose markers are no farther apart have one reflector
 _CLOCK_STEP_NS = 1_000_000
 _CUT_STEP_M = 0.002
@@ -152,13 +156,21 @@ def read_trial(path: Path) -> Trial:
         if not 0 < len(meta["reflectors"]) == len(arrays["reflector_marker_m"]):
             raise ValueError("reflectors must name each row of reflector_marker_m, at least one")
         (left, right), (low, high) = meta["use"]["background_box_m"]
-        if not (left < right and 0.0 < (right - left) * (high - low) < _MOST_M2):
-            raise ValueError(f"background_box_m must be an area below {_MOST_M2:g} square metres")
+        sides_m = right - left, high - low
+        is_box = all(0.0 < side_m < _MOST_SIDE_M for side_m in sides_m)
+        if not (is_box and math.prod(sides_m) < _MOST_M2):
+            raise ValueError(
+                f"background_box_m must be an area below {_MOST_M2:g} square metres, no side of "
+                f"{_MOST_SIDE_M:g} m"
+            )
         image = trial.image(meta["clock_offset_ns"])
         echoes = coherent(image, np.array([apex_m for _, _, apex_m in trial.reflectors]))
         if not min(echoes.min(), np.median(coherent(image, trial.cells_m[::8, ::8]))) > 0.0:
             raise ValueError("scans do not reach over the reflectors and background_box_m")
-    except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
+    except (
+        *(OSError, EOFError, ValueError, ArithmeticError, LookupError, TypeError),
+        zipfile.BadZipFile,
+    ) as error:
         why = f"meta has no {error}" if isinstance(error, KeyError) else error
         raise AppError(f"{path}: is not a trial of a P440: {why}; {REMEDY}") from None
     return trial
@@ -177,6 +189,8 @@ def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
             raise ValueError(f"{name} must hold finite numbers")
         if name.endswith("t_ns") and (values.size < 2 or np.any(np.diff(values) <= 0)):
             raise ValueError(f"{name} must hold at least two times, ascending")
+    if not _BIN_M[0] <= arrays["bin_length_m"] <= _BIN_M[1]:
+        raise ValueError(f"bin_length_m must be {_BIN_M[0]:g} to {_BIN_M[1]:g}")
 
 
 def coherent(image: Image, points_m: Array) -> Array:
@@ -296,16 +310,19 @@ def evaluate(trials: Sequence[Trial], stop: StopFlag) -> list[Numbers]:
     numbers: list[Numbers] = []
     for trial in trials:
         print_progress(f"{trial.name}: {len(trial.arrays['t_ns'])} scans")
-        given_ns, by_motion_ns = int(trial.meta["clock_offset_ns"]), trial.clock_by_motion_ns()
-        others = [each for other in trials if other is not trial for each in other.reflectors]
-        lost = losses_db(trial, stop)
-        for (name, marker_m, apex_m), loss_db in zip(trial.reflectors, lost, strict=True):
-            own = (name, apex_m)
-            same = [each[::2] for each in others if math.dist(each[1], marker_m) < _SAME_M]
-            numbers += [
-                {"reflector": name, "loss_db": loss_db} | focus(trial, "given", given_ns, own),
-                {"reflector": name} | focus(trial, "motion", by_motion_ns, [*same, own][0]),
-            ]
+        try:
+            given_ns, by_motion_ns = int(trial.meta["clock_offset_ns"]), trial.clock_by_motion_ns()
+            others = [each for other in trials if other is not trial for each in other.reflectors]
+            lost = losses_db(trial, stop)
+            for (name, marker_m, apex_m), loss_db in zip(trial.reflectors, lost, strict=True):
+                own = (name, apex_m)
+                same = [each[::2] for each in others if math.dist(each[1], marker_m) < _SAME_M]
+                numbers += [
+                    {"reflector": name, "loss_db": loss_db} | focus(trial, "given", given_ns, own),
+                    {"reflector": name} | focus(trial, "motion", by_motion_ns, [*same, own][0]),
+                ]
+        except ValueError as error:  # with the clock of the motion, nothing may be in motion
+            raise AppError(f"{trial.name}: {error}; {REMEDY}") from None
     return numbers
 
 

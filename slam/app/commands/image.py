@@ -40,7 +40,8 @@ from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.recordings.recorded_messages import NO_TIME_NS, RecordingError
 
 _ARRAYS, _MAP, _MAP_CELLS = "image.npz", "map.yaml", "map.pgm"
-_MOST_CELLS = 1 << 22
+_MOST_CELLS, _MOST_CELL_M = 1 << 22, 1.0
+_BIN_M = 1e-3, 0.1  # Shortest and longest bin: an X4's are 6 mm of RF, 51 mm of I/Q
 _OCCUPIED, _FREE = 0.5, 0.196
 """Of nav2's map, shares of 40 dB: what is brighter than -20 dB counts as an obstacle."""
 _UNKNOWN = 205  # what nav2 writes for it: neither of both
@@ -61,6 +62,10 @@ def run_image(
 ) -> None:
     """Image a session or a recording, and write the image into a folder."""
     area = None
+    if cell_m > _MOST_CELL_M:
+        raise UsageError(
+            f"--cell {cell_m:g}: must be {_MOST_CELL_M:g} m at most; rods are 2 to 4 cm"
+        )
     if area_m is not None:
         x0, y0, x1, y1 = area_m
         if not (x0 < x1 and y0 < y1):
@@ -87,12 +92,13 @@ def run_image(
             along = given or path_of(*_states(session), info, path)
             image = session_image(session, along, room(along), reach_m=reach_m)
         else:
+            frames = _recorded_frames(source, frame_area_m)
             if given is None:
                 raise UsageError(
                     f"{source}: a recording has no path; give --path FILE.tum, the poses of the "
                     "robot or cart by the same clock"
                 )
-            mounts, frames = [_mount(source, mount, rig)], _recorded_frames(source, frame_area_m)
+            mounts = [_mount(source, mount, rig)]
             image = image_of(
                 lambda: stop.each(frames()),
                 *(mounts, given, room(given)),
@@ -133,7 +139,7 @@ def _check_cells(width_m: float, height_m: float, cell_m: float) -> None:
     n_cells = (width_m / cell_m) * (height_m / cell_m)
     if n_cells > _MOST_CELLS:
         raise UsageError(
-            f"{width_m:.1f} x {height_m:.1f} m in cells of {cell_m:g} m are {n_cells:.2g} cells, "
+            f"{width_m:.4g} x {height_m:.4g} m in cells of {cell_m:g} m are {n_cells:.2g} cells, "
             f"{_MOST_CELLS:.2g} at most: give a smaller --area, or a larger --cell"
         )
 
@@ -186,7 +192,7 @@ def _recorded_frames(
 ) -> Callable[[], Iterator[tuple[int, RecordedFrame]]]:
     """Return what reads the frames of a recording, RF or I/Q, whose time is known."""
     area_m = None if frame_area_m is None else (frame_area_m[0], frame_area_m[1])
-    radar = load(source, lambda fault: note(f"{source}: {fault}"), area_m=area_m).radar
+    radar = load(source, lambda fault: note(str(fault)), area_m=area_m).radar
     ranges_m, t_ns = radar.true_ranges_m, radar.t_ns
     if ranges_m is None or len(ranges_m) < 2:
         raise UsageError(
@@ -196,6 +202,11 @@ def _recorded_frames(
     if t_ns is None:
         raise AppError(f"{source}: does not say when its frames came, so none has a pose")
     bin_m = float(ranges_m[-1] - ranges_m[0]) / (len(ranges_m) - 1)
+    if not _BIN_M[0] <= bin_m <= _BIN_M[1]:
+        raise UsageError(
+            f"{source}: its bins lie from {ranges_m[0]:.4g} to {ranges_m[-1]:.4g} m, {bin_m:.4g} m "
+            "apart, as of no radar; give --frame-area START END, as the module read it back"
+        )
 
     def frames() -> Iterator[tuple[int, RecordedFrame]]:
         for block in radar.blocks():

@@ -39,6 +39,7 @@ _LIVE_CELL_M = 0.025  # echoes are 2 to 4 cm wide
 _OPENING_RAD = math.radians(76.0)  # to -4 dB of the beam
 _RULE = PatchRule(hop_m=PatchRule().travel_m)  # what overlaps shows little more
 _STOOD_M = 0.02  # less far apart, two poses are of a robot that stood meanwhile
+_FAR_M = 1e7  # farther away no pole or origin of a map is
 _WHOLE = 1 << 60  # frames in the memory of a static part: all
 _EVERY_NS, _EVERY_SHARE = 5 * NS_PER_S, 20
 """An image is given out so often, in a long run ever rarer: when a twentieth of it has passed."""
@@ -181,7 +182,7 @@ class ImagePath:
         self._wheels, self._track = wheels, PoseTrack()
         for stamp_ns, pose in zip(t_ns.tolist(), poses.tolist(), strict=True):
             self._track.add(stamp_ns, pose)
-        steps_m = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+        steps_m = np.hypot(*np.diff(poses[:, :2], axis=0).T)
         self._is_gap = (np.diff(t_ns) > MOST_GAP_NS) & (steps_m > _STOOD_M)
 
     def is_known(self, t_ns: int) -> bool:
@@ -263,6 +264,9 @@ def image_of(
 
     First for what stands still with the robot, then for patches. NoImageError if they show nothing.
     """
+    away_m = max(np.abs(path.poses[:, :2]).max(), *(max(abs(m.x_m), abs(m.y_m)) for m in mounts))
+    if away_m > _FAR_M:
+        raise NoImageError(f"a mount, or a pose of path {path.name}, is {away_m:.4g} m away")
     statics = [StaticPart(memory=_WHOLE) for _ in mounts]
     makers = [
         _maker(index, mount, model, reach_m, static)
@@ -291,7 +295,7 @@ def image_of(
             if patch is not None:
                 room.add(patch, path.place_at(int(patch.t_ns[patch.middle])))
                 n_patches += 1
-    if not np.isfinite(room.values).any():
+    if not np.nan_to_num(room.values).any():
         raise NoImageError(
             f"path {path.name}: its {n_patches} patches show nothing of the area; a patch takes "
             f"{_RULE.travel_m:g} m of way"

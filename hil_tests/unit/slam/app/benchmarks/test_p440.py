@@ -156,6 +156,10 @@ def without(name: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
         (lambda a: a | {"reflector_apex_m": a["reflector_apex_m"] + 90.0}, "reach"),
         (lambda a: a | {"meta": rails.meta_of(reflectors=[])}, "reflectors"),
         (lambda a: a | {"meta": rails.meta_of(clock_offset_ns=0)}, "clock_offset_ns"),
+        (lambda a: a | {"meta": rails.meta_of(clock_offset_ns=10**30)}, "large"),
+        (lambda a: a | {"bin_length_m": np.array(0.0)}, "bin_length_m"),
+        (lambda a: a | {"bin_length_m": np.array(1e-12)}, "bin_length_m"),
+        (lambda a: a | {"bin_length_m": np.array(1e6)}, "bin_length_m"),
         (lambda a: a | {"t_ns": a["t_ns"][::-1]}, "t_ns"),
         (lambda a: a | {"pose_t_ns": a["pose_t_ns"][::-1]}, "pose_t_ns"),
         (lambda a: a | {"pose_m": np.full_like(a["pose_m"], np.nan)}, "pose_m"),
@@ -185,6 +189,16 @@ def test_what_is_no_archive_is_named(tmp_path: Path, content: bytes) -> None:
 def test_a_folder_without_trials_ends_the_command(tmp_path: Path) -> None:
     assert main(["benchmark", "p440", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_trial_of_three_scans_ends_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arrays = rails.arrays_of()
+    few = {name: arrays[name][300:303] for name in ("samples", "t_ns")}
+    rails.write_trial(tmp_path, "few", arrays | few)
+    assert main(["benchmark", "p440", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
+    assert "few" in capsys.readouterr().err
 
 
 def check_focus(row: dict[str, Any], least_coherence: float, widest_m: float) -> None:

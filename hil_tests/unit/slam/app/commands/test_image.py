@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -195,6 +196,7 @@ class TestErrors:
             (("--cell", "0"), 2),
             (("--cell", "-0.1"), 2),
             (("--cell", "1e-5"), 2),
+            (("--cell", "50"), 2),
             (("--area", "0", "0", "1000", "1000"), 2),
             (("--area", "1", "1", "0", "0"), 2),
             (("--area", "50", "50", "51", "51"), 1),
@@ -275,15 +277,66 @@ class TestErrors:
             assert code == 2
             assert str(recording) in errors
 
+    @pytest.mark.parametrize(
+        ("change", "expected"),
+        [
+            ({"ranges_m": np.zeros(50)}, 2),
+            ({"ranges_m": np.full(50, np.nan)}, 2),
+            ({"ranges_m": 1e-9 * np.arange(50.0)}, 2),
+            ({"ranges_m": 2.0 - 0.0064 * np.arange(50.0)}, 2),
+            ({"rf": np.full((60, 50), np.nan, np.float32)}, 1),
+            ({"rf": np.zeros((60, 50), np.float32)}, 1),
+            ({"mount": ("1e300", "0", "90")}, 1),
+            ({"end": "1e300"}, 1),
+        ],
+    )
+    def test_what_no_radar_or_robot_sends(
+        self,
+        change: dict[str, Any],
+        expected: int,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        recording, path = tmp_path / "cart.npz", tmp_path / "path.tum"
+        arrays: dict[str, Any] = {
+            "rf": np.ones((60, 50), np.float32),
+            "t_ns": np.arange(60) * 10**8,
+            "ranges_m": 0.2 + 0.0064 * np.arange(50.0),
+        }
+        np.savez(recording, **arrays | {k: change[k] for k in arrays.keys() & change})
+        path.write_text(f"0 0 0 0 0 0 0 1\n6 {change.get('end', '0.6')} 0 0 0 0 0 1\n")
+        more = ("--path", path, "--mount", *change.get("mount", ("0", "0", "90")))
+        area = ("--area", "0", "0", "1", "1", "--out", tmp_path / "out")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # which a user would see
+            code, printed, errors = run(capsys, "image", recording, *more, *area)
+        assert (code, printed) == (expected, "")
+        assert str(recording) in errors
+        assert not (tmp_path / "out").exists()
+
+    def test_a_fault_of_a_recording_is_noted(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        recording, path = tmp_path / "cart.npz", tmp_path / "path.tum"
+        t_ns = np.arange(60) * 10**8
+        t_ns[40:] -= 3 * 10**9  # the recorder's clock was set back
+        ranges_m = 0.2 + 0.0064 * np.arange(50.0)
+        np.savez(recording, rf=np.ones((60, 50), np.float32), t_ns=t_ns, ranges_m=ranges_m)
+        path.write_text("0 0 0 0 0 0 0 1\n6 0.6 0 0 0 0 0 1\n")
+        more = ("--path", path, "--mount", "0", "0", "90", "--out", tmp_path / "out")
+        _, _, errors = run(capsys, "image", recording, *more)
+        assert f"{recording.name}: frame " in errors
+        assert "RecordingFault" not in errors
+
     def test_what_is_no_recording(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         text, path = tmp_path / "notes.txt", tmp_path / "path.tum"
         text.write_text("notes")
         path.write_text("0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
         for given in (tmp_path / "missing.mcap", text):
-            more = ("--path", path, "--mount", "0", "0", "90", "--out", tmp_path / "out")
-            code, _, errors = run(capsys, "image", given, *more)
-            assert code == 1
-            assert str(given) in errors
+            for more in ((), ("--path", path, "--mount", "0", "0", "90")):
+                code, _, errors = run(capsys, "image", given, *more, "--out", tmp_path / "out")
+                assert code == 1
+                assert str(given) in errors
 
 
 class TestWhileDriving:
