@@ -234,7 +234,7 @@ def device_info(link: Link, timeout_s: float = TIMEOUT_S) -> Steps[str]:
     return reply.data.decode("latin-1").rstrip()
 
 
-def enter(link: Link, timeout_s: float = reconnect.RESTART_S) -> Steps[str]:
+def _enter(link: Link) -> Steps[str]:
     try:
         return (yield from device_info(link))
     except DeviceError as error:  # the application does not know the command
@@ -262,31 +262,8 @@ def enter(link: Link, timeout_s: float = reconnect.RESTART_S) -> Steps[str]:
             return f"ID:{core_id}" in banner
         return path in {link.path, link.home}
 
-    yield from _await(link, is_ours, core_id is not None, timeout_s)
+    yield from _await(link, is_ours, core_id is not None)
     return banner
-
-
-def flash(link: Link, image: FirmwareImage, on_progress: OnProgress | None = None) -> Steps[None]:
-    banner = yield from enter(link)
-    unlocked = False
-
-    def note(done: int, total: int) -> None:
-        nonlocal unlocked
-        unlocked = True
-        if on_progress is not None:
-            on_progress(done, total)
-
-    try:
-        is_open = yield from _check(link, image, banner)
-        yield from _write(link, image, is_open, note)
-        readies = link.conversation.readies
-        yield from link.request(m.BootloaderStartApp(), START_TIMEOUT_S)
-    except FirmwareError:
-        raise
-    except XeThruError as error:
-        raise FirmwareError(_remedy(error, unlocked)) from error
-    core_id = banner.partition("ID:")[2][:16] or None
-    yield from _await_application(link, core_id, readies)
 
 
 def _core_id(link: Link) -> Steps[str | None]:
@@ -400,18 +377,16 @@ def _await_application(link: Link, core_id: str | None, readies: int) -> Steps[N
         return found == core_id if core_id and found else path in {link.path, link.home}
 
     try:
-        yield from _await(link, is_ours, core_id is not None, reconnect.RESTART_S)
+        yield from _await(link, is_ours, core_id is not None)
     except (ResponseTimeout, Disconnected) as error:
         raise FirmwareError(
             f"the firmware was written and its checksum is right, but it does not answer: {error}"
         ) from error
 
 
-def _await(
-    link: Link, is_ours: reconnect.Recognise, everywhere: bool, timeout_s: float
-) -> Steps[None]:
+def _await(link: Link, is_ours: reconnect.Recognise, everywhere: bool) -> Steps[None]:
     """Wait until what restarts answers, at its port or at another that is found to be its own."""
-    deadline_ns = link.conversation.deadline_ns(timeout_s)
+    deadline_ns = link.conversation.deadline_ns(reconnect.RESTART_S)
     try:
         while True:
             link.conversation.new_line(link.path)  # it will not answer earlier requests
@@ -425,7 +400,12 @@ def _await(
                 return
     except Disconnected:
         yield from reconnect.find_again(
-            link, deadline_ns, timeout_s, restore=False, is_ours=is_ours, everywhere=everywhere
+            link,
+            deadline_ns,
+            reconnect.RESTART_S,
+            restore=False,
+            is_ours=is_ours,
+            everywhere=everywhere,
         )
 
 
@@ -443,7 +423,7 @@ class Firmware(Part[KindT]):
 
         Until something is written, a module that is switched off and on starts its firmware again.
         """
-        return enter(link)
+        return _enter(link)
 
     @sends_once
     def write(
@@ -469,4 +449,23 @@ class Firmware(Part[KindT]):
         ResponseTimeout
             If neither firmware nor bootloader answers.
         """
-        return flash(link, image, on_progress)
+        banner = yield from _enter(link)
+        unlocked = False
+
+        def note(done: int, total: int) -> None:
+            nonlocal unlocked
+            unlocked = True
+            if on_progress is not None:
+                on_progress(done, total)
+
+        try:
+            is_open = yield from _check(link, image, banner)
+            yield from _write(link, image, is_open, note)
+            readies = link.conversation.readies
+            yield from link.request(m.BootloaderStartApp(), START_TIMEOUT_S)
+        except FirmwareError:
+            raise
+        except XeThruError as error:
+            raise FirmwareError(_remedy(error, unlocked)) from error
+        core_id = banner.partition("ID:")[2][:16] or None
+        yield from _await_application(link, core_id, readies)

@@ -658,9 +658,7 @@ class X4M300(RadarState[Blocking]):
     def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that sends commands; again after a reconnect, if that is on."""
         link = self._link
-        if link.reconnect_s > 0:
-            return self._run(reconnect.resilient(link, lambda: procedure(link, *args, **kwargs)))
-        return self._run(procedure(link, *args, **kwargs))
+        return self._run(reconnect.resilient(link, lambda: procedure(link, *args, **kwargs)))
 
     def _call_once(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that sends commands; a broken line raises `Disconnected`."""
@@ -692,9 +690,8 @@ class X4M300(RadarState[Blocking]):
             raise reentry(self._link.name)
 
     def _carry(self, procedure: Steps[T]) -> T:
+        self._refuse_reentry()
         thread = threading.get_ident()
-        if thread in self._inside:
-            raise reentry(self._link.name)
         self._inside.add(thread)
         try:
             with self._lock:
