@@ -207,7 +207,7 @@ class TextKind(_DataFileKind):
 
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:
         """Return the line of a message and its time [ms since 1970], with its end of line."""
-        time = (_UNIX + timedelta(milliseconds=time_ms)).astimezone(zone)
+        time = local_time(time_ms, zone)
         cells = (column.text(getattr(message, column.field, None)) for column in self.columns)
         return (";".join((time.isoformat(timespec="milliseconds"), *cells)) + "\n").encode(
             "latin-1"
@@ -266,6 +266,10 @@ def _text(
 
 
 _UNIX = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
+
+
+def local_time(time_ms: int, zone: tzinfo | None) -> datetime:
+    return (_UNIX + timedelta(milliseconds=time_ms)).astimezone(zone)
 
 
 def _time_ns(stamp: str) -> int:

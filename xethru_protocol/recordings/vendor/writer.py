@@ -11,7 +11,7 @@ import re
 import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta, tzinfo
+from datetime import timedelta, tzinfo
 from pathlib import Path
 from typing import Any, Self, TypedDict
 
@@ -35,6 +35,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     Meta,
     closing_order,
     id_in_names,
+    local_time,
 )
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.table import Response
@@ -72,13 +73,13 @@ class Split:
             return True
         if self.daily_hour is None:
             return False
-        began = _local_time(first_ms, zone)
+        began = local_time(first_ms, zone)
         end = began.replace(hour=self.daily_hour, minute=0, second=0, microsecond=0)
         if end <= began:
             end += timedelta(days=1)
         if zone is None:  # its offset may be another by then
             end = end.replace(tzinfo=None).astimezone()
-        return _local_time(time_ms, zone) >= end
+        return local_time(time_ms, zone) >= end
 
 
 FileListener = Callable[[type[Response], Path], None]
@@ -189,7 +190,7 @@ class _OpenDirectory:
     def _open_file(self, kind: DataFileKind, since_ms: int) -> _DataFileWriter:
         time_ms = self.meta.start_ms + since_ms
         base = self.options.basenames.get(kind.message, kind.file_prefix.removesuffix("_"))
-        stem = f"{base}_{_local_time(time_ms, self.options.timezone):%Y%m%d_%H%M%S}"
+        stem = f"{base}_{local_time(time_ms, self.options.timezone):%Y%m%d_%H%M%S}"
         name = stem + kind.suffix
         again_ms = time_ms % 1000
         # Several files within one second; the vendor's recorder takes the time of their end.
@@ -270,6 +271,7 @@ class RecordingWriter:
     >>> from tempfile import TemporaryDirectory
     >>> from xethru_protocol.wire.messages import DataFloat
     >>> import numpy as np
+    >>> from datetime import UTC
     >>> with TemporaryDirectory() as folder, RecordingWriter(folder, timezone=UTC) as writer:
     ...     _ = writer.write(DataFloat(info=1, values=np.zeros(3, np.float32)), 0)
     ...     sorted(path.name for path in Path(folder).iterdir())
@@ -433,15 +435,12 @@ def session_directory(
     ``t_ns`` is when the session begins [ns since 1970]. Characters of the id that do not belong
     into names of files become ``_``.
 
+    >>> from datetime import UTC
     >>> str(session_directory("recordings", "my session/1", 0, UTC))
     'recordings/xethru_recording_19700101_000000_my_session_1'
     """
-    stamp = _local_time(t_ns // MS_NS, timezone)
+    stamp = local_time(t_ns // MS_NS, timezone)
     return Path(folder) / f"xethru_recording_{stamp:%Y%m%d_%H%M%S}_{id_in_names(session_id)}"
-
-
-def _local_time(time_ms: int, zone: tzinfo | None) -> datetime:
-    return (datetime.fromtimestamp(0, UTC) + timedelta(milliseconds=time_ms)).astimezone(zone)
 
 
 def _checked_basenames(names: Mapping[type[Response], str]) -> Mapping[type[Response], str]:
