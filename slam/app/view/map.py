@@ -483,11 +483,11 @@ def _png(levels: NDArray[np.int8]) -> bytes:
     return file.getvalue()
 
 
-def _crosses(points: Array, arm_m: float = 0.04) -> rr.LineStrips2D:
+def _crosses(points: Array) -> rr.LineStrips2D:
     """Draw a cross at each point, shape (n, 2)."""
     strips = [
         screen(np.array([point - arm, point + arm]))
         for point in points
-        for arm in (np.array([arm_m, arm_m]), np.array([arm_m, -arm_m]))
+        for arm in (np.array([0.04, 0.04]), np.array([0.04, -0.04]))
     ]
     return rr.LineStrips2D(strips, colors=TRUTH_RGB, radii=0.008, draw_order=32.0)

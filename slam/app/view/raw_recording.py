@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.view.frames import chart_style, send_bscan, send_charts
+from slam.app.view.frames import BLOCK_FRAMES, chart_style, send_bscan, send_charts
 from slam.app.view.rerun_recording import DEVICE_TIME, RerunRecording, RowTimes, rr, rrb
 from xethru_protocol.cli.recordings import message_line
 from xethru_protocol.driver.frames import complex_of
@@ -28,7 +28,6 @@ from xethru_protocol.wire.x4 import BASEBAND_BIN_M, RF_BIN_M
 
 Samples = NDArray[np.float32] | NDArray[np.complex64]
 
-_BLOCK_FRAMES = 128
 """Frames of one B-scan; as many are held before they are sent."""
 _LINES = 256
 """Lines of the log that are sent together."""
@@ -79,7 +78,7 @@ def draw(
     for number, (message, t_ns) in enumerate(chain([first] if first else [], messages)):
         drawing.take(message, t_ns)
         faults.name_new(drawing)
-        if number % _BLOCK_FRAMES == 0 and is_closed.poll(0):
+        if number % BLOCK_FRAMES == 0 and is_closed.poll(0):
             break  # the viewer is gone
     faults.name_new(drawing)
     drawing.finish()
@@ -89,7 +88,7 @@ def draw(
         session=f", session {one_line(facts.session_id)}" if facts.session_id else "",
         kinds=", ".join(f"{count} {entity}" for entity, count in drawing.n_frames.items())
         or "none",
-        block=_BLOCK_FRAMES,
+        block=BLOCK_FRAMES,
     )
     document = rr.TextDocument(about, media_type=rr.MediaType.MARKDOWN)
     recording.static(f"{prefix}about", document)
@@ -244,7 +243,7 @@ class _Drawing:
         block = self._blocks[key]
         self._stamp(block.stamps, t_ns)
         block.samples.append(samples)
-        if len(block.samples) == _BLOCK_FRAMES:
+        if len(block.samples) == BLOCK_FRAMES:
             self._send(block)
 
     def _send(self, block: _UnsentFrames) -> None:
