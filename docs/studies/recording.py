@@ -20,7 +20,6 @@ from scipy.signal import welch
 
 from emulator.chip import Pace
 from emulator.echo.echo import echo_source
-from emulator.echo.paths import SPEED_OF_LIGHT_MPS
 from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
@@ -31,7 +30,7 @@ from xethru_protocol import load
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.processing.downconversion import CHANNELS, TAP_COUNT
-from xethru_protocol.wire.x4 import MODULE_SPEED_MPS, SAMPLING_RATE_HZ
+from xethru_protocol.wire.x4 import MODULE_SPEED_MPS, SAMPLING_RATE_HZ, SPEED_OF_LIGHT_MPS
 
 Array = NDArray[np.float64]
 Measure = Callable[["SlowTime"], tuple[Array, Array]]

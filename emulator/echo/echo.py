@@ -147,7 +147,6 @@ from emulator.chip.chip import CaptureSettings, EchoSource
 from emulator.echo.model_error import Bursts, StampError, TargetPairs, Wander
 from emulator.echo.other_modules import OtherModules
 from emulator.echo.paths import (
-    SPEED_OF_LIGHT_MPS,
     Reflections,
     Viewpoint,
     direct_reflections,
@@ -168,6 +167,7 @@ from emulator.echo.walls import (
 )
 from emulator.scene.scene import RadarSpec, Scene
 from xethru_protocol.wire import x4
+from xethru_protocol.wire.x4 import SPEED_OF_LIGHT_MPS
 
 _SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
 _SAMPLES_PER_MODULE_M = 2 * x4.SAMPLING_RATE_HZ / x4.MODULE_SPEED_MPS

@@ -32,7 +32,6 @@ from scipy.special import wofz
 from emulator.chip.chip import CaptureSettings
 from emulator.echo.paths import (
     NEAREST_M,
-    SPEED_OF_LIGHT_MPS,
     Viewpoint,
     beam_gain,
     reflection_phase_rad,
@@ -44,6 +43,7 @@ from xethru_protocol.wire.x4 import (
     FRAME_SAMPLES,
     MODULE_SPEED_MPS,
     SAMPLING_RATE_HZ,
+    SPEED_OF_LIGHT_MPS,
     SWEEP_SHARE,
 )
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from emulator.echo.pulse import SIGMA_S
 from emulator.scene.scene import AntennaSpec, LeakageSpec, RadarSpec, TargetSpec
+from xethru_protocol.wire.x4 import SPEED_OF_LIGHT_MPS
 
 BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
 """n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
 NEAREST_M = 0.05
 """Amplitude laws are held from here inwards."""
 RANGE_EXPONENT = {"rod": 1.5, "point": 2.0, "cylinder": 1.0}
-SPEED_OF_LIGHT_MPS = 299_792_458.0
 RINGING_DECAYS = 7
 """Over how many of its decay lengths the leakage rings; there it is 61 dB down."""
 _RINGING_STEP_M = SIGMA_S * SPEED_OF_LIGHT_MPS / 2  # pulses this close add up without ripple

@@ -31,7 +31,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.paths import SPEED_OF_LIGHT_MPS
 from emulator.profiles.doppler import (
     FAST,
     FRAME_RATE_HZ,
@@ -45,6 +44,7 @@ from emulator.profiles.doppler import (
 )
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import MatrixInstance, PresenceDirection, PresenceState
+from xethru_protocol.wire.x4 import SPEED_OF_LIGHT_MPS
 
 BEST_QUALITY = 10
 _DB_PER_QUALITY = 3.0

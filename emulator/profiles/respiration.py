@@ -32,7 +32,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.paths import SPEED_OF_LIGHT_MPS
 from emulator.profiles.doppler import FAST, SLOW, ProfileSweep
 from emulator.profiles.presence import (
     FULL_MOVEMENT_DB,
@@ -45,6 +44,7 @@ from emulator.profiles.presence import (
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import PresenceDirection, PresenceState, RespirationState
+from xethru_protocol.wire.x4 import SPEED_OF_LIGHT_MPS
 
 SLOWEST_HZ, FASTEST_HZ = 6 / 60, 40 / 60
 _LEAST_HZ = 3 / 60

@@ -29,13 +29,10 @@ from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout, XeThruError
 from xethru_protocol.wire.x4 import (
     FIRST_COUNTER,
-    MODULE_SPEED_MPS,
+    TRUE_PER_MODULE_METRE,
     Normalisation,
     frame_time_ns,
 )
-
-LIGHT_MPS = 299_792_458.0
-TRUE_PER_MODULE_METRE = LIGHT_MPS / MODULE_SPEED_MPS
 
 SILENCE_S = 5.0
 _POLL_S = 0.25

@@ -15,7 +15,8 @@ from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.errors import LocalProtocolError
 
 MODULE_SPEED_MPS = 3.0e8  # what the firmware uses for light
-TRUE_PER_MODULE_METRE = 299_792_458 / MODULE_SPEED_MPS
+SPEED_OF_LIGHT_MPS = 299_792_458.0
+TRUE_PER_MODULE_METRE = SPEED_OF_LIGHT_MPS / MODULE_SPEED_MPS
 SAMPLING_RATE_HZ = 23.328e9
 SAMPLE_M = 1.5e8 / SAMPLING_RATE_HZ  # from one sample to the next
 # The firmware's own constant for it is a float32; its other lengths are multiples in double (9.4).

@@ -35,7 +35,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.echo.paths import SPEED_OF_LIGHT_MPS, Viewpoint, direct_reflections, viewpoint
+from emulator.echo.paths import Viewpoint, direct_reflections, viewpoint
 from emulator.echo.people import mover_scatterer, person_scatterer
 from emulator.echo.targets import Targets
 from emulator.echo.walls import (
@@ -57,7 +57,7 @@ Flags = NDArray[np.bool_]
 REQUIRED_SIGMAS, ALLOWED_SIGMAS = 4.0, 1.0
 _RIGHT_ANGLE = math.sin(math.radians(1.0))
 _SAME_PLACE_M = 1e-3
-_WAVELENGTH_M = SPEED_OF_LIGHT_MPS / x4.CARRIER_HZ[TxCenterFrequency.LOW_BAND]
+_WAVELENGTH_M = x4.SPEED_OF_LIGHT_MPS / x4.CARRIER_HZ[TxCenterFrequency.LOW_BAND]
 
 
 class Kind(StrEnum):

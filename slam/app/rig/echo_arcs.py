@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import FieldOfView
-from slam.live.frame_sources import LIGHT_MPS
 from slam.live.session_records import RadarInfo
-from xethru_protocol.wire.x4 import CARRIER_HZ
+from xethru_protocol.wire.x4 import CARRIER_HZ, SPEED_OF_LIGHT_MPS
 
 _ARC_POINTS = 17
 
@@ -42,7 +41,7 @@ def envelope_db(echoes: NDArray[np.float32], bin_length_m: float) -> NDArray[np.
     n_bins - 2), -120 dB or more. The quadrature of the pulse comes from the central difference of
     the samples, which for a carrier of w radians per sample is its Hilbert partner times 2 sin w.
     """
-    phase_step_rad = 2.0 * np.pi * _CARRIER_HZ * 2.0 * bin_length_m / LIGHT_MPS
+    phase_step_rad = 2.0 * np.pi * _CARRIER_HZ * 2.0 * bin_length_m / SPEED_OF_LIGHT_MPS
     quadrature = (echoes[:, 2:] - echoes[:, :-2]) / np.float32(2.0 * np.sin(phase_step_rad))
     power = echoes[:, 1:-1] ** 2 + quadrature**2
     level_db: NDArray[np.float32] = np.float32(10.0) * np.log10(np.maximum(power, _LEAST_POWER))

@@ -35,13 +35,13 @@ from slam.app.rig.echo_arcs import envelope_db, wedge
 from slam.config import WheelNoise
 from slam.frames import RadarFrame
 from slam.geometry import between, compose
-from slam.live.frame_sources import TRUE_PER_MODULE_METRE
 from slam.live.odometry_track import NS_PER_S
 from slam.live.session import cdr
 from slam.live.session.cdr import Marker, Shape
 from slam.live.session_records import RadarInfo, Scan, SessionInfo, Snapshot
 from slam.results import SmoothedRun
 from xethru_protocol.recordings.mcap import STRING, pack_string
+from xethru_protocol.wire.x4 import TRUE_PER_MODULE_METRE
 
 Array = NDArray[np.float64]
 
