@@ -97,7 +97,7 @@ def picture(update: LiveUpdate, columns: int, rows: int, style: Style) -> list[s
     scale = scale_of(waterfall)
     profile = levels(in_decibels(_pooled(update.profile[np.newaxis], 1, width)[0]), scale)
 
-    lines = [_fitted(_head(update), columns), _fitted(update.vital.text, columns)]
+    lines = [_head(update)[:columns], update.vital.text[:columns]]
     lines.append(_title(f"newest frame, {scale[0]:.0f} to {scale[1]:.0f} dB", columns, style))
     lines += _with_margin([""] * n_profile, _bars(profile, n_profile, style))
     lines.append(_title(f"last {update.waterfall_s:.0f} s, newest above", columns, style))
@@ -125,10 +125,6 @@ def _head(update: LiveUpdate) -> str:
         f"{update.t_s:.1f} s, {update.n_frames} frames, {update.frame_rate_hz:.1f}/s{lost}, "
         f"clutter {update.clutter}, {update.name}"
     )
-
-
-def _fitted(text: str, columns: int) -> str:
-    return text[:columns]
 
 
 def _title(text: str, columns: int, style: Style) -> str:
