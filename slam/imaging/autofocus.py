@@ -75,7 +75,9 @@ def _bright(weighted: RangeProfiles, aperture: Aperture, points_m: Array, rule: 
     """Return the brightest of the points (n, d) that lie apart, (k, d)."""
     image, found = back_project(weighted, aperture, points_m), list[Array]()
     # Of noise alone |S1|**2 / S2 has an exponential distribution of mean 1.
-    stands_out = np.abs(image.total) ** 2 > math.log(_NOISE_IMAGES * len(points_m)) * image.power
+    stands_out = (
+        np.abs(image.total) ** 2 > math.log(_NOISE_IMAGES * max(1, len(points_m))) * image.power
+    )
     stands_out &= image.count == len(aperture.antennas_m)
     left = np.where(stands_out, np.abs(image.total), 0.0)
     while len(found) < rule.points and left.any():

@@ -167,7 +167,7 @@ class PatchMaker:
         self._looks: list[_Look] = []
         self._is_known = static is not None
         self._static = static or StaticPart(memory=self.rule.memory)
-        self._n_bins = 0  # that the static part is learnt of
+        self._bins = (0, 0.0, 0.0)  # number, start and length, of which the static part is learnt
         self._filter: tuple[ModulePulse, ProfileFilter] | None = None
 
     def near(self, frame: RadarFrame | RecordedFrame) -> Samples:
@@ -185,16 +185,23 @@ class PatchMaker:
     def add(self, frame: RadarFrame | RecordedFrame, pose: Array) -> Patch | None:
         """Take a frame and the body pose (3,) when it was taken; return a patch that is complete.
 
-        Poses come from odometry, or any path without jumps. A frame is RF or I/Q.
+        Poses come from odometry, or any path without jumps. A frame is RF or I/Q. Raises ValueError
+        if a number of the pose is not finite.
         """
+        if not np.isfinite(pose).all():
+            raise ValueError(f"the pose at {frame.t_ns} ns must be finite numbers, not {pose}")
         samples = self.near(frame)
         start_m = frame.range_start_m - self.mount.range_offset_m
         antenna = self.antenna_at(pose)
-        if self._looks and not self._continues(self._looks[-1], frame, samples):
+        bins, before = (samples.size, start_m, frame.bin_length_m), self._bins
+        self._bins = bins
+        if self._looks and not (
+            bins == before and 0 <= frame.t_ns - self._looks[-1].t_ns < self.rule.longest_stand_ns
+        ):
             self._looks.clear()
         if not self._is_known:
-            if self._n_bins != samples.size:
-                self._n_bins, self._static = samples.size, StaticPart(memory=self.rule.memory)
+            if bins != before:
+                self._static = StaticPart(memory=self.rule.memory)
             self._static.add(samples, antenna, float(pose[2]))
         way_m = 0.0
         if self._looks:
@@ -219,13 +226,6 @@ class PatchMaker:
         keep_m = self._looks[0].way_m + self.rule.hop_m
         self._looks = [look for look in self._looks if look.way_m >= keep_m]
         return patch
-
-    def _continues(self, last: _Look, frame: RadarFrame | RecordedFrame, samples: Samples) -> bool:
-        is_same = (
-            samples.size == last.samples.size
-            and frame.range_start_m - self.mount.range_offset_m == last.range_start_m
-        )
-        return is_same and 0 <= frame.t_ns - last.t_ns < self.rule.longest_stand_ns
 
     def _made(self, bin_length_m: float) -> Patch:
         looks, static = self._looks, self._static.samples
@@ -259,7 +259,8 @@ class PatchMaker:
                 sigma_m=model.sigma_m,
             )
         profile_filter = self._filter[1] if self._filter and self._filter[0] is pulse else None
-        if profile_filter is None or profile_filter.n_bins != rows.shape[1]:
+        bins = rows.shape[1], bin_length_m
+        if profile_filter is None or (profile_filter.n_bins, profile_filter.bin_length_m) != bins:
             profile_filter = ProfileFilter(pulse, rows.shape[1], bin_length_m)
             self._filter = pulse, profile_filter
         return profile_filter.apply(rows, range_start_m)

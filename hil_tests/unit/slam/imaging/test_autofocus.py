@@ -163,3 +163,14 @@ def test_a_patch_of_a_driving_robot_gets_back_half_of_what_its_path_has_lost() -
     before_db, after_db = np.mean(lost_db, axis=0)
     assert before_db > 1.0
     assert after_db < 0.5 * before_db
+
+
+def test_without_points_no_antenna_is_moved() -> None:
+    aperture = Aperture(antennas_m=np.column_stack([np.linspace(0.0, 0.3, 20), np.zeros(20)]))
+    profiles = RangeProfiles(
+        values=np.ones((20, 50), np.complex64),
+        range_start_m=0.2,
+        bin_length_m=0.0064,
+        wave_number_rad_per_m=305.0,
+    )
+    assert autofocus(profiles, aperture, np.zeros((0, 2))) is aperture

@@ -232,3 +232,43 @@ def test_at_the_longest_spacing_echoes_of_both_edges_of_the_beam_look_alike(
         for bearing_deg in (half_beam_deg, -half_beam_deg)
     ]
     assert turns[0] - turns[1] == pytest.approx(math.tau)
+
+
+def test_bins_of_another_length_begin_a_patch_and_a_filter_anew() -> None:
+    maker = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE)
+    few, longer_m = 250, 1.05 * BIN_M  # all of them within the field of view
+    patches = []
+    for index, pose in enumerate(line(0.8)):
+        frame = frame_at(pose, index, n_bins=few)
+        frame = frame if index < 20 else replace(frame, bin_length_m=longer_m)
+        patches.append(maker.add(frame, pose))
+    made = [patch for patch in patches if patch is not None]
+    assert made
+    assert all(patch.t_ns[0] >= 20 * 200_000_000 for patch in made)
+    assert {patch.profiles.bin_length_m for patch in made} == {longer_m}
+    # The filter, too, is that of the new bins, not one kept from patches before.
+    back = [maker.add(frame_at(p, 100 + i, n_bins=few), p) for i, p in enumerate(line(0.5))]
+    fresh = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE)
+    alone = [fresh.add(frame_at(p, 100 + i, n_bins=few), p) for i, p in enumerate(line(0.5))]
+    for one, other in zip(back, alone, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            np.testing.assert_array_equal(one.profiles.values, other.profiles.values)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+@pytest.mark.parametrize("at", [0, 2])
+def test_a_pose_that_is_not_finite_is_refused(number: float, at: int) -> None:
+    maker, pose = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE), np.zeros(3)
+    pose[at] = number
+    with pytest.raises(ValueError, match="200000000 ns"):
+        maker.add(frame_at(np.zeros(3), 1), pose)
+
+
+def test_samples_no_radar_sends_count_as_zero() -> None:
+    maker, pose = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE), np.zeros(3)
+    frame = frame_at(pose, 0)
+    frame.samples[[3, 4, 5]] = np.inf, -np.inf, 1e30
+    near = maker.near(frame)
+    np.testing.assert_array_equal(near[3:6], 0.0)
+    assert near[6:].any()
