@@ -128,6 +128,21 @@ def test_knots_without_a_profile_follow_their_neighbours() -> None:
     assert peaks(profiles, found)[1] > 0.97 * best
 
 
+def test_knots_are_at_equal_distances_however_far_profiles_are_apart() -> None:
+    """One reflector, profiles every 4 mm and then every 4 cm, an error with a bend at each knot."""
+    x_m = np.concatenate([np.arange(-0.3, 0.0, 0.004), np.arange(0.0, 0.3, 0.04)])
+    true_m = np.column_stack([x_m, np.zeros(x_m.size)])
+    at_knots_m = 1.5e-3 * np.array([1, -1, -1, 1, 1, -1, 1, -1])
+    error_m = np.interp(x_m, np.linspace(x_m[0], x_m[-1], 8), at_knots_m)
+    path = Aperture(antennas_m=true_m + np.column_stack([np.zeros(x_m.size), error_m]))
+    cells_m = PLACES[1] + 0.01 * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1)
+    rule = FocusRule(points=1, walk_m_per_sqrt_m=0.05)
+    found = autofocus(profiles_of(true_m, [(PLACES[1], 0.02)]), path, cells_m, rule)
+    left_m = transform(align_se2(found.antennas_m, true_m), found.antennas_m) - true_m
+    assert np.std(error_m) > 1e-3
+    assert math.sqrt(np.average(left_m[:, 1] ** 2, weights=path.metres)) < 0.25e-3
+
+
 def test_in_space_heights_stay_and_the_plane_is_corrected_alike() -> None:
     true_m = straight(0.6, 121)
     path_m = spoilt(true_m, 0.01, seed=3)

@@ -25,8 +25,8 @@ def rf_echo(range_m: float, phase_rad: float = 0.0, n_bins: int = N_BINS) -> Arr
     return np.asarray(np.exp(-0.5 * (x / SIGMA_M) ** 2) * np.cos(WAVE_NUMBER * x + phase_rad))
 
 
-def make_filter(taps: Array | None = None) -> ProfileFilter:
-    return ProfileFilter(ModulePulse(model=PulseModel(), error=0.1, equaliser=taps), N_BINS, BIN_M)
+def make_filter(taps: Array | None = None, n_bins: int = N_BINS) -> ProfileFilter:
+    return ProfileFilter(ModulePulse(model=PulseModel(), error=0.1, equaliser=taps), n_bins, BIN_M)
 
 
 def envelope(offsets_m: Array) -> Array:
@@ -62,6 +62,14 @@ def test_an_equaliser_acts_on_the_samples_before_the_filter() -> None:
     np.testing.assert_allclose(
         make_filter(taps).apply(samples[None], START_M).values, expected, atol=1e-6
     )
+
+
+def test_what_an_equaliser_moves_beyond_the_last_bin_does_not_come_back_at_the_first() -> None:
+    taps, n_bins = np.zeros(301), 340
+    taps[-1] = 1.0  # 150 bins later
+    last = rf_echo(START_M + (n_bins - 1) * BIN_M, n_bins=n_bins)
+    values = make_filter(taps, n_bins).apply(last[None], START_M).values
+    np.testing.assert_allclose(values[0, :100], 0.0, atol=1e-4)
 
 
 def test_filtering_is_linear() -> None:
