@@ -44,7 +44,6 @@ _CURVATURE_STEP = 0.01  # of the difference quotient [1/m]
 _ROWS_AWAY = 2  # rows of the image that one echo changes, on either side
 _LEAST_COSINE = 0.4  # edge of the beam in the search
 _BURST = 3.0  # see `remove_bursts`
-_WHOLE = 0.9  # share of the energy that one reflector alone explains
 _NEAR_M = 0.6  # farther walls are found from the place of a point
 _WALL = 0.4  # curvature over that of a point: the model of a plane leaves less beside it
 
@@ -205,14 +204,6 @@ def remove_bursts(values: NDArray[np.complex64]) -> None:
                     largest = max(largest, squares[other, b])
             if squares[f, b] > _BURST * _BURST * largest:
                 values[f, b] = 0.0
-
-
-@kernel("float64(complex128[::1])")
-def energy_of(echoes: Complex) -> float:
-    total = 1e-300
-    for each in echoes:
-        total += each.real * each.real + each.imag * each.imag
-    return total
 
 
 @kernel("int64(float64[:, ::1], float64[::1], float64[::1], float64)")
@@ -385,7 +376,7 @@ def separate(
             break
         other[:] = place
         free = refine(signal, track, beam, other, 2, 4, work)
-        if place[0] < _NEAR_M and free < _WHOLE * energy_of(echoes):
+        if place[0] < _NEAR_M:
             # A near wall looks like several points: its normal may be at another bearing
             best = 0.0
             for bearing in bearings:
