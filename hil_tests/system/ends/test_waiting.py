@@ -57,6 +57,7 @@ ROWS = [
     (UWB_SLAM, "replay SESSION --out OUT", True),
     (UWB_SLAM, "repair SESSION --out OUT", True),
     (UWB_SLAM, "convert SESSION OUT", True),
+    (UWB_SLAM, "image SESSION --path odometry --out OUT", True),
     (UWB_SLAM, "map show PIPE", False),
     (XETHRU, "list", True),
     *((XETHRU, f"{name} --port SILENT", False) for name in ("doctor", "ping", "info", "reset")),
