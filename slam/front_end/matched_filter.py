@@ -68,7 +68,7 @@ from slam.front_end.kernels import (
     SEVERAL,
 )
 from slam.front_end.overlapping import KnownPulse, SplitTest, fit_echoes, fit_whole_echoes
-from slam.front_end.pulse import ComplexArray, ModulePulse, PulseModel
+from slam.front_end.pulse import ComplexArray, ModulePulse, nominal_pulse
 from slam.front_end.pulse_estimation import PulseEstimator, module_pulse
 from slam.geometry import ReceivedPulse
 
@@ -419,10 +419,7 @@ class MatchedFilterDetector:
         """Take each radar's pulse from its rig file to begin with, and learn it from then on."""
         settings = config.matched_filter
         self.config = config
-        self._nominal = ModulePulse(
-            model=PulseModel(carrier_hz=settings.carrier_hz, bandwidth_hz=settings.bandwidth_hz),
-            error=settings.model_error,
-        )
+        self._nominal = nominal_pulse(settings)
         self.estimator = PulseEstimator(self._nominal.model, received)
         self._joint = config.detection.front_end is FrontEnd.JOINT
         self._filters: dict[tuple[int, int, float], PulseFilter] = {}

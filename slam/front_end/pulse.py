@@ -27,6 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.config import MatchedFilterConfig
+
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
@@ -111,3 +113,11 @@ class ModulePulse:
     # Real filter, shape (2 h + 1,), that turns the module's pulse into the model: convolved with
     # the samples of a frame, its middle at delay zero. None: echoes are the model as they come.
     equaliser: Array | None = None
+
+
+def nominal_pulse(settings: MatchedFilterConfig) -> ModulePulse:
+    """Return the pulse that is configured, for a module whose own is not known."""
+    return ModulePulse(
+        model=PulseModel(carrier_hz=settings.carrier_hz, bandwidth_hz=settings.bandwidth_hz),
+        error=settings.model_error,
+    )

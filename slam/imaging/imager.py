@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.config import SlamConfig, WheelNoise
 from slam.frames import RadarFrame
-from slam.front_end.pulse import ModulePulse, PulseModel
+from slam.front_end.pulse import ModulePulse, nominal_pulse
 from slam.front_end.pulse_estimation import PulseEstimator, module_pulse
 from slam.geometry import FieldOfView, Rig
 from slam.imaging.patches import Patch, PatchMaker, PatchRule
@@ -47,12 +47,9 @@ class Imager:
         pulses: PulseEstimator | None = None,
         rule: PatchRule | None = None,
     ) -> None:
-        settings, limits = config.matched_filter, config.detection
+        limits = config.detection
         self.point_rule = PointRule(wheels=wheels or WheelNoise())
-        self._nominal = ModulePulse(
-            model=PulseModel(carrier_hz=settings.carrier_hz, bandwidth_hz=settings.bandwidth_hz),
-            error=settings.model_error,
-        )
+        self._nominal = nominal_pulse(config.matched_filter)
         self._pulses = pulses or PulseEstimator(
             self._nominal.model, [mount.pulse for mount in rig.mounts]
         )

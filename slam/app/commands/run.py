@@ -50,7 +50,7 @@ from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
 from slam.config import BackEnd, ConfigError, load_preset
 from slam.frames import RadarFrame
-from slam.front_end.pulse import PulseModel
+from slam.front_end.pulse import nominal_pulse
 from slam.imaging.patches import longest_spacing_m
 from slam.library.slam import make_slam
 from slam.live.arrival_clock import ClockLine
@@ -210,7 +210,7 @@ def run_rig(
                 map_saver,
                 SpacingWarning(
                     longest_spacing_m(
-                        PulseModel(carrier_hz=config.matched_filter.carrier_hz), info.field_of_view
+                        nominal_pulse(config.matched_filter).model, info.field_of_view
                     ),
                     *(live_odometry, log),
                 ),

@@ -176,7 +176,7 @@ def test_one_radar_of_a_recording_is_imaged_by_poses_of_its_own(
     code, _, _ = run(capsys, "image", recording, *more, "--out", tmp_path / "out")
     assert code == 0
     for rod in RODS[:2]:
-        # nobody knows whether the chip makes up for its filter's half a sample of delay
+        # 5 cm is one bin: no document says whether the chip removes its filter's delay.
         assert np.abs(brightest_m(tmp_path / "out", rod) - rod).max() < 0.05
     rig = tmp_path / "cart.toml"
     rig.write_text(
