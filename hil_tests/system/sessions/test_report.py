@@ -23,6 +23,7 @@ from slam.app.run import pictures
 from slam.app.run.pictures import SMOOTHED
 from slam.app.view.rerun_recording import count_rows
 from slam.library.evaluation import ate_rmse_m
+from slam.robust.pipeline import RobustSlam
 
 pytestmark = pytest.mark.slow
 
@@ -97,6 +98,8 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("slam.app.commands.report.svg_of", svg_of)
+        patch.setattr(RobustSlam, "step", None)  # what was recorded is shown without SLAM
+        patch.setattr(RobustSlam, "step_detections", None)
         assert main(["report", str(session.parent)]) == 0
     return Reported(
         session=session,

@@ -100,7 +100,9 @@ def test_the_brightest_cells_of_a_session_are_within_two_cells_of_true_rods(made
         assert np.all(arrays["coherence"][seen] <= 1 + 1e-5)
 
 
-@pytest.mark.parametrize("path", ["estimate", "odometry", "truth"])
+@pytest.mark.parametrize(
+    "path", ["estimate", "odometry", pytest.param("truth", marks=pytest.mark.rare)]
+)
 def test_other_paths_show_the_same_rods(
     drive: Drive, path: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,7 +155,7 @@ def test_cells_and_area_are_as_asked_for(
         assert np.abs(brightest_m(tmp_path, rod) - rod).max() < 0.06
 
 
-@pytest.mark.parametrize("kind", ["rf", "iq"])
+@pytest.mark.parametrize("kind", [pytest.param("rf", marks=pytest.mark.rare), "iq"])
 def test_one_radar_of_a_recording_is_imaged_by_poses_of_its_own(
     drive: Drive, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -154,13 +154,16 @@ def test_the_file_has_a_line_for_the_command_and_one_per_run(tmp_path: Path) -> 
         assert PartFile(path, COMMAND).runs == part.runs == runs()[:count]
 
 
+@pytest.mark.parametrize("apart", [7, pytest.param(1, marks=pytest.mark.rare)])
 def test_cut_at_any_byte_it_loses_the_last_line_only_and_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    apart: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fsync", lambda _: None)  # thousands of them take seconds
     part_with(path := tmp_path / "o.part", 2)
     expected, whole = runs()[:2], path.read_bytes()
-    for size in range(len(whole) + 1):
+    ends = [at for at, byte in enumerate(whole) if byte == ord("\n")]
+    near = {at + k for at in ends for k in (-1, 0, 1, 2)}
+    for size in sorted({*range(0, len(whole), apart), *near} - {len(whole) + 1}):
         path.write_bytes(whole[:size])
         part = PartFile(path, COMMAND)
         n_lines = whole[:size].count(b"\n")
