@@ -84,20 +84,25 @@ def count_by_rosbags(path: Path) -> int:
         return sum(1 for connection, _, _ in reader.messages() if not is_of_head(connection.topic))
 
 
-def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("chunks", "apart"), [(5, 307), pytest.param(1, 101, marks=pytest.mark.rare)]
+)
+def test_a_cut_at_any_byte_leaves_a_prefix(
+    whole: Content, tmp_path: Path, chunks: int, apart: int
+) -> None:
     path = tmp_path / "cut.mcap"
     path.write_bytes(whole)
     everything = messages(path)
     assert len(everything) == N_SCANS * (3 + 5)
     longest, whole_until_ns = 0, -1
     # every record's first byte, the bytes beside it but of message indexes, which are two thirds
-    # of the records, all of a chunk's head, and a comb through the rest
+    # of the records, all of the heads of some chunks or all, and a comb through the rest
     starts = [at for _, at in records_of(whole)]
     before = starts[0]
     places = set(starts)
     places |= {at + k for at in starts if whole[at] != MESSAGE_INDEX for k in (-1, 1, 9)}
-    places |= {at + k for at in starts if whole[at] == CHUNK for k in range(0, 60, 3)}
-    places |= set(range(8, len(whole), 101))
+    places |= {at + k for at in chunks_of(whole)[::chunks] for k in range(0, 60, 3)}
+    places |= set(range(8, len(whole), apart))
     for cut in sorted(place for place in places if 8 <= place < len(whole)):
         path.write_bytes(whole[:cut])
         found = messages(path)

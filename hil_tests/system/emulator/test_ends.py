@@ -122,6 +122,7 @@ def test_a_host_killed_while_streaming_is_followed_by_another(pace: str) -> None
         assert served.end() == 0
 
 
+@pytest.mark.rare
 def test_bare_serves_stock_modules_without_odometry() -> None:
     with emulator("serve", "--bare", "--count", "3") as served:
         assert served.odometry is None
@@ -143,6 +144,7 @@ def test_odometry_comes_whole_under_asap_and_in_time_under_realtime() -> None:
     assert elapsed_s >= float(first[-1].split()[0])
 
 
+@pytest.mark.rare
 def test_a_long_link_directory_still_gets_a_socket(tmp_path: Path) -> None:
     links = tmp_path / ("long" * 20)
     with emulator("serve", "smoke", "--pace", "asap", "--link-dir", links) as served:

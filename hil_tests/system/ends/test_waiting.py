@@ -81,14 +81,16 @@ ROWS = [
     (EMULATOR, "faults", True),
     (EMULATOR, "options", True),
 ]
-DEFAULT = {"evaluate PIPE TRACK", "evaluate TRACK TRACK", "serve smoke", "ping --port SILENT"}
-TABLE = [
-    pytest.param(
-        row, ending, marks=() if row[1] in DEFAULT else pytest.mark.rare, id=f"{row[1]}-{ending}"
-    )
+DEFAULT = {"evaluate PIPE TRACK-SIGINT", "serve smoke-SIGTERM", "ping --port SILENT-SIGTERM"}
+CASES = [
+    (row, ending, f"{row[1]}-{ending}")
     for row in ROWS
     # Ctrl-C also lets a terminal go on
     for ending in (("SIGTERM",) if row[2] else ("SIGTERM", "SIGINT"))
+]
+TABLE = [
+    pytest.param(row, ending, marks=() if name in DEFAULT else pytest.mark.rare, id=name)
+    for row, ending, name in CASES
 ]
 
 

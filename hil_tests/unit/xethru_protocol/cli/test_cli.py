@@ -52,7 +52,7 @@ def test_stream_with_samples(module: PtyModule, capsys: pytest.CaptureFixture[st
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 0)],
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.rare), (None, 0)],
     ids=["SIGINT", "SIGTERM", "its reader leaves"],
 )
 def test_stream_ends_cleanly(module: PtyModule, number: signal.Signals | None, code: int) -> None:

@@ -40,17 +40,17 @@ def shell(command: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("redirection", "code", "out", "err"),
     [
-        ("", 0, 2 * ACK, ""),
+        pytest.param("", 0, 2 * ACK, "", marks=pytest.mark.rare),
         (">&-", 1, "", "xethru decode: standard output is closed; nothing can be printed\n"),
-        ("2>&-", 0, 2 * ACK, ""),
-        (">&- 2>&-", 1, "", ""),
+        pytest.param("2>&-", 0, 2 * ACK, "", marks=pytest.mark.rare),
+        pytest.param(">&- 2>&-", 1, "", "", marks=pytest.mark.rare),
         (
             ">/dev/full",
             1,
             "",
             "xethru decode: standard output cannot be written: No space left on device\n",
         ),
-        (">/dev/full 2>/dev/full", 1, "", ""),
+        pytest.param(">/dev/full 2>/dev/full", 1, "", "", marks=pytest.mark.rare),
         ("| head -1", 0, ACK, ""),
         ("-", 0, 2 * ACK, ""),  # a dash is standard input
     ],
@@ -106,8 +106,8 @@ def test_what_cannot_be_printed_is_one_line(command: str) -> None:
     ("number", "before", "code"),
     [
         (signal.SIGINT, signal.SIG_DFL, 130),
-        (signal.SIGTERM, signal.SIG_DFL, 143),
-        (signal.SIGHUP, signal.SIG_DFL, 129),
+        pytest.param(signal.SIGTERM, signal.SIG_DFL, 143, marks=pytest.mark.rare),
+        pytest.param(signal.SIGHUP, signal.SIG_DFL, 129, marks=pytest.mark.rare),
         (signal.SIGHUP, signal.SIG_IGN, 0),
     ],
     ids=["SIGINT", "SIGTERM", "SIGHUP", "SIGHUP with nohup"],

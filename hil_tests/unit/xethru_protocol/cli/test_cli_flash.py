@@ -68,7 +68,10 @@ def test_a_damaged_image_is_refused_before_the_port_is_opened(
     assert error.startswith(f"xethru flash: {damaged}: line 83 ")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.rare)],
+)
 def test_an_interruption_says_what_to_do(image: str, number: signal.Signals, code: int) -> None:
     module = UpdatableModule()
 

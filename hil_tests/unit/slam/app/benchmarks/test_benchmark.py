@@ -89,7 +89,7 @@ def test_the_table_has_a_row_per_run_and_their_mean(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = tmp_path / "data"
-    worlds.write_librsf(data, duration_s=10.0)
+    worlds.write_librsf(data, duration_s=5.0)
     for kind in ("Input", "GT"):
         text = (data / f"Small_{kind}.txt").read_text(encoding="ascii")
         (data / f"Other_{kind}.txt").write_text(text, encoding="ascii")

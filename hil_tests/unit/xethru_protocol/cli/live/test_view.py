@@ -373,7 +373,9 @@ def test_without_a_display_other_ways_are_named(
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc (Linux)")
-@pytest.mark.parametrize("ends_by", ["a signal", "its viewer"])
+@pytest.mark.parametrize(
+    "ends_by", [pytest.param("a signal", marks=pytest.mark.rare), "its viewer"]
+)
 def test_a_browser_is_served_until_the_end(ends_by: str, at_rest: Path) -> None:
     pytest.importorskip("rerun_cli")
     command = [*XETHRU, "view", str(at_rest), "--web"]
