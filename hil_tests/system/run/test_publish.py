@@ -94,25 +94,33 @@ def check(lines: list[dict[str, Any]], session: Path) -> None:
     assert (path["first"], path["states"]) == (0, len(states))
 
 
-def test_lines_are_the_states_of_the_run(
-    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_lines_are_the_states_of_the_run_and_keep_its_rate(
+    session: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    """On standard output they stand alone."""
     file = tmp_path / "lines.jsonl"
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_000_000)
     receiver.bind(("127.0.0.1", 0))
     receiver.settimeout(0.0)
     port = receiver.getsockname()[1]
-    sinks = ["--publish", f"jsonl:{file}", "--publish", f"udp://127.0.0.1:{port}"]
-    code, out, err = run(capsys, "replay", session, "--out", tmp_path / "again", *sinks)
+    places = (f"jsonl:{file}", f"udp://127.0.0.1:{port}", "jsonl:-")
+    sinks = [word for place in places for word in ("--publish", place)]
+    states = [*states_of(session)]
+    began_s = time.monotonic()
+    more = ("--out", tmp_path / "again", "--rate", "20")
+    code, out, err = run(capfd, "replay", session, *more, *sinks)
     assert code == 0, err
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert time.monotonic() - began_s > (states[-1] - states[0]) / 1e9 / 20
+    assert out == file.read_text()
+    lines = [json.loads(line) for line in out.splitlines()]
     check(lines, session)
     assert "recorded states came again, to the last bit, and so did the smoothed path" in err
+    assert "SLAM ATE" in err
     n_lines = len(lines)
-    for kind in ("jsonl", "udp"):
-        (row,) = (line.split() for line in out.splitlines() if line.startswith(f"to {kind} "))
-        assert row[2] == str(n_lines)
+    for kind, n_places in (("jsonl", 2), ("udp", 1)):
+        rows = [line.split() for line in err.splitlines() if line.startswith(f"to {kind} ")]
+        assert [row[2] for row in rows] == [str(n_lines)] * n_places
     with receiver:
         datagrams = []
         while True:
@@ -126,26 +134,6 @@ def test_lines_are_the_states_of_the_run(
     by_time = {line["t_ns"]: line for line in lines if line["kind"] == "state"}
     assert all(line["pose"] == by_time[line["t_ns"]]["pose"] for line in received)
     assert sum(line["reset"] for line in received) > 1
-
-
-def test_lines_on_standard_output_stand_alone(
-    session: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    code, out, err = run(capfd, "replay", session, "--out", tmp_path, "--publish", "jsonl:-")
-    assert code == 0
-    check([json.loads(line) for line in out.splitlines()], session)
-    assert "SLAM ATE" in err
-
-
-def test_the_rate_is_kept(
-    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    states = [*states_of(session)]
-    began_s = time.monotonic()
-    code, _, err = run(capsys, "replay", session, "--out", tmp_path, "--rate", "20")
-    assert code == 0
-    assert time.monotonic() - began_s > (states[-1] - states[0]) / 1e9 / 20
-    assert "recorded states came again, to the last bit" in err
 
 
 @contextmanager
