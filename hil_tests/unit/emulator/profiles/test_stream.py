@@ -175,7 +175,11 @@ def test_a_created_map_is_stored_and_used_again(monkeypatch: pytest.MonkeyPatch)
     assert set(states) == {PresenceState.INITIALIZING}
 
 
-@pytest.mark.parametrize("damage", [b"\xff", b"x" * 64, b"\x00" * 100])
+@pytest.mark.parametrize(
+    "damage",
+    [*(pytest.param(b, marks=pytest.mark.rare) for b in (b"\xff", b"x" * 64)), b"\x00" * 100],
+    ids=["a byte", "text", "zeros"],
+)
 def test_a_damaged_map_is_created_anew(damage: bytes) -> None:
     stream, module = profile(room(), noise_map_control=3)
     presence_until(stream, 125)

@@ -10,8 +10,6 @@ from emulator.scene.rooms import FAMILIES, room_tables
 from emulator.scene.scene import Scene, UnknownSceneError, load_scene
 from slam.app.sweep import FAMILIES as NAMED
 
-ROOMS = [(family, number) for family in FAMILIES for number in range(10)]
-
 # Third corner of the course, last target, and the sums of all numbers in the tables and of their
 # squares, of room 9, from another program with the same laws
 PUBLISHED = {
@@ -45,15 +43,16 @@ def off_course_m(scene: Scene, x: float, y: float) -> float:
     return nearest
 
 
-@pytest.mark.parametrize(("family", "number"), ROOMS)
-def test_a_room_is_a_scene_that_can_be_driven(family: str, number: int) -> None:
-    scene = load_scene(f"{family}:{number}")
-    assert scene == load_scene(f"{family}:{number}")
-    assert scene.name == f"{family}_{number}"
-    assert scene.path.laps == ("forward", "forward")
-    for target in scene.targets:
-        # chairs stand within the gap
-        assert off_course_m(scene, target.x_m, target.y_m) - target.radius_m > 0.34
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_room_is_a_scene_that_can_be_driven(family: str) -> None:
+    for number in range(10):
+        scene = load_scene(f"{family}:{number}")
+        assert scene == load_scene(f"{family}:{number}")
+        assert scene.name == f"{family}_{number}"
+        assert scene.path.laps == ("forward", "forward")
+        for target in scene.targets:
+            # chairs stand within the gap
+            assert off_course_m(scene, target.x_m, target.y_m) - target.radius_m > 0.34, number
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tracemalloc
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -343,11 +342,14 @@ def mcap_chunk(packed: bytes, claimed: int) -> bytes:
     return mcap_record(6, head + packed)
 
 
-@cache
 def packed_zeros(count: int) -> bytes:
-    packer = zstandard.ZstdCompressor(level=1).compressobj(size=count)
-    piece = bytes(1 << 22)
-    return b"".join(packer.compress(piece) for _ in range(count // len(piece))) + packer.flush()
+    """Return a Zstandard frame of zeros (RFC 8878): blocks of 128 KiB that repeat one byte."""
+    block, n_blocks = 1 << 17, count >> 17
+    repeated = (1 << 1 | block << 3).to_bytes(3, "little") + b"\0"
+    last = (1 | 1 << 1 | block << 3).to_bytes(3, "little") + b"\0"
+    # magic, a content size of 8 bytes, a window of 512 KiB
+    head = b"\x28\xb5\x2f\xfd\xc0\x48" + count.to_bytes(8, "little")
+    return head + (n_blocks - 1) * repeated + last
 
 
 @pytest.mark.parametrize(
@@ -364,6 +366,7 @@ def test_a_small_file_takes_no_large_memory(
     content: int, claimed: int, whole: bool, tmp_path: Path
 ) -> None:
     """Bounded by the largest chunk that is believed, 256 MiB, and two copies of it; and soon."""
+    assert zstandard.decompress(packed_zeros(1 << 18)) == bytes(1 << 18)
     chunk = mcap_chunk(packed_zeros(content), claimed)
     path = tmp_path / "zeros.mcap"
     magic = b"\x89MCAP0\r\n"
