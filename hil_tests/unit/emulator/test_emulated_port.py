@@ -1,6 +1,7 @@
 """An emulated module in one line of Python, and control of it."""
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,15 @@ def test_a_module_answers_at_the_port_until_the_block_ends() -> None:
     assert not Path(port).exists()
 
 
+@pytest.fixture
+def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Go to a folder with a package that is called as ours, and is not to be run."""
+    (tmp_path / "emulator").mkdir()
+    (tmp_path / "emulator" / "__init__.py").touch()
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("stranger")
 def test_an_error_in_the_block_ends_the_emulator() -> None:
     with pytest.raises(ZeroDivisionError), emulated_port() as port:
         _ = 1 / 0
@@ -30,40 +40,45 @@ def test_an_emulator_that_does_not_start_has_said_why(capfd: pytest.CaptureFixtu
     assert "xethru-emulator: nowhere: no such scene" in capfd.readouterr().err
 
 
-def test_a_running_emulator_is_controlled_by_its_port(tmp_path: Path) -> None:
-    with emulated_port() as port:
-        assert control(port, "fault add stall seconds=2")["ids"] == {"radar_1": 1}
-        (fault,) = control(port, "state")["radars"]["radar_1"]["faults"]
-        assert (fault["kind"], fault["parameters"]) == ("stall", {"seconds": 2.0})
-        with pytest.raises(ValueError, match="rain"):
-            control(port, "fault add rain")
-        with pytest.raises(ValueError, match="explode"):
-            control(port, "explode")
+@pytest.fixture(scope="module")
+def port() -> Iterator[str]:
+    with emulated_port() as place:
+        yield place
+
+
+def test_a_running_emulator_is_controlled_by_its_port(port: str, tmp_path: Path) -> None:
+    assert control(port, "fault add stall seconds=2")["ids"] == {"radar_1": 1}
+    (fault,) = control(port, "state")["radars"]["radar_1"]["faults"]
+    assert (fault["kind"], fault["parameters"]) == ("stall", {"seconds": 2.0})
+    with pytest.raises(ValueError, match="rain"):
+        control(port, "fault add rain")
+    with pytest.raises(ValueError, match="explode"):
+        control(port, "explode")
     with pytest.raises(
         FileNotFoundError, match=f"no emulator answers: No such file.*{tmp_path}/port"
     ):
         control(tmp_path / "port", "state")
 
 
-def test_any_path_to_a_port_finds_its_emulator(tmp_path: Path) -> None:
+def test_any_path_to_a_port_finds_its_emulator(port: str, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
-    with emulated_port() as port:
-        place = Path(port)
-        folder = tmp_path / "folder"
-        folder.symlink_to(place.parent)
-        link, second = tmp_path / "link", tmp_path / "second"
-        link.symlink_to(place)
-        second.symlink_to(link)
-        roundabout = tmp_path / "elsewhere" / ".." / "link"
-        terminal = place.resolve()
-        for path in (link, second, folder / place.name, roundabout, terminal):
-            assert control(path, "state")["ok"], path
-        control(port, "unplug")
-        for path in (link, folder / place.name):
-            assert control(path, "state")["radars"]["radar_1"]["present"] is False
-        # another folder has no such port, even by the same name
-        with pytest.raises(OSError, match="no emulator answers"):
-            control(tmp_path / "elsewhere" / place.name, "state")
+    place = Path(port)
+    folder = tmp_path / "folder"
+    folder.symlink_to(place.parent)
+    link, second = tmp_path / "link", tmp_path / "second"
+    link.symlink_to(place)
+    second.symlink_to(link)
+    roundabout = tmp_path / "elsewhere" / ".." / "link"
+    terminal = place.resolve()
+    for path in (link, second, folder / place.name, roundabout, terminal):
+        assert control(path, "state")["ok"], path
+    control(port, "unplug")
+    for path in (link, folder / place.name):
+        assert control(path, "state")["radars"]["radar_1"]["present"] is False
+    control(port, "plug")
+    # another folder has no such port, even by the same name
+    with pytest.raises(OSError, match="no emulator answers"):
+        control(tmp_path / "elsewhere" / place.name, "state")
 
 
 def test_a_scene_says_what_its_modules_are_and_what_is_true_of_its_people() -> None:
@@ -81,12 +96,8 @@ def test_a_scene_says_what_its_modules_are_and_what_is_true_of_its_people() -> N
         assert radar.info().order_code == "X4M300"
 
 
-def test_a_package_of_the_same_name_in_the_current_folder_is_not_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "emulator").mkdir()
-    (tmp_path / "emulator" / "__init__.py").touch()
-    monkeypatch.chdir(tmp_path)
-    with emulated_port() as port, emulator("serve", "--bare") as served:
-        assert Path(port).exists()
+@pytest.mark.rare
+@pytest.mark.usefixtures("stranger")
+def test_a_package_of_the_same_name_in_the_current_folder_is_not_run() -> None:
+    with emulator("serve", "--bare") as served:
         assert Path(served.paths[0]).exists()
