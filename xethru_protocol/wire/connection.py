@@ -94,14 +94,14 @@ class Connection:
         Raises `LocalProtocolError` if a field does not fit its place on the wire, or if a module
         would misread the packet (`is_misread`).
         """
-        if framing is None:
-            bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
-        else:
-            bulk = framing is Framing.NO_ESCAPE
+        row = ROWS.get(type(message))  # an `UnknownMessage` has none
+        usual_bulk = row is not None and row.bulk
+        bulk = usual_bulk if framing is None else framing is Framing.NO_ESCAPE
         payload = encode(message, bulk=bulk)
         if self._is_host and not bulk and is_misread(payload):
             raise LocalProtocolError(
-                f"{ROWS[type(message)].name} has four bytes 7C in a row, or three and its "
-                "checksum; a module takes them for the start of another packet and answers no more"
+                f"{row.name if row else 'an unknown message'} has four bytes 7C in a row, or three "
+                "and its checksum; a module takes them for the start of another packet and answers "
+                "no more"
             )
         return encode_no_escape(payload) if bulk else encode_normal(payload)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -28,10 +29,18 @@ from hil_tests.unit.emulator.doubles import BareHost, ramp_device
 from hil_tests.unit.xethru_protocol.scripted import READY, ScriptedTransport
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.errors import DeviceError, ResponseTimeout
-from xethru_protocol.wire.framing import NEED_DATA, Direction, FramingFault, Packet, PacketReader
+from xethru_protocol.wire.errors import DeviceError, LocalProtocolError, ResponseTimeout
+from xethru_protocol.wire.framing import (
+    NEED_DATA,
+    Direction,
+    FramingFault,
+    Packet,
+    PacketReader,
+    is_misread,
+)
 
 SECOND = 1_000_000_000
 _WORK_NS = 20_000_000
@@ -326,9 +335,11 @@ class Line:
 
     def _torn_at(self, at: int) -> list[tuple[Sent | None, int]]:
         """Bytes of the packet that something put in at ``at`` would tear apart."""
-        if 0 < at < len(self._flight) and self._flight[at - 1][0] is self._flight[at][0]:
-            return [self._flight[at]]
-        return []
+        packet = self._flight[at][0] if at < len(self._flight) else None
+        if packet is None:
+            return []
+        is_within = self._flight[at - 1][0] is packet if at else packet.begin >= 0
+        return [self._flight[at]] if is_within else []
 
     def deliver(self, count: int) -> None:
         chunk, self._flight = self._flight[:count], self._flight[count:]
@@ -408,7 +419,11 @@ class LossyLine(RuleBasedStateMachine):
 
     @rule(message=st.sampled_from(COMMANDS) | UNKNOWN)
     def host_speaks(self, message: Any) -> None:  # noqa: ANN401 - any message
-        self.lines["to module"].send(message)
+        if is_misread(encode(message)):
+            with pytest.raises(LocalProtocolError):
+                self.lines["to module"].send(message)
+        else:
+            self.lines["to module"].send(message)
 
     @rule(line=LINES, count=st.integers(1, 400))
     def bytes_arrive(self, line: str, count: int) -> None:
@@ -442,6 +457,15 @@ class LossyLine(RuleBasedStateMachine):
             for _ in range(80):
                 line.deliver(23)
             line.check_books()
+
+
+def test_bytes_that_come_behind_the_first_of_a_packet_tear_it() -> None:
+    state = LossyLine()
+    state.module_speaks(message=m.Ack())
+    state.bytes_arrive(line="to host", count=1)
+    state.bytes_are_damaged(line="to host", kind="insert", where=0.0, byte=0x7C, count=2)
+    state.line_falls_silent(line="to host")
+    state.teardown()
 
 
 TestLossyLine = LossyLine.TestCase

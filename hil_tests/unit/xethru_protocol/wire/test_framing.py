@@ -12,6 +12,9 @@ import pytest
 from hil_tests.property.wire_streams import drain
 from hil_tests.property.wire_streams import read_all as read
 from xethru_protocol.wire import framing
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.framing import (
     MAX_NORMAL_WIRE_BYTES,
@@ -140,6 +143,17 @@ def test_packets_that_no_receiver_takes_are_refused(
         with pytest.raises(LocalProtocolError):
             frame_payload(payload)
     assert payloads(read(encode_normal(bytes(7998)))) == [bytes(7998)]
+
+
+def test_a_command_that_a_module_would_misread_is_refused() -> None:
+    unknown = m.UnknownMessage(code=0xB7, payload=b"\xb7||||")
+    known = m.X4DriverSet(setting=X4Setting.PRFDIV, value=0x7C)
+    data = m.SetFileData(file_type=0, identifier=0, offset=0, data=b"||||")
+    for message in (unknown, data):
+        with pytest.raises(LocalProtocolError):
+            Connection(Role.HOST).send(message)
+        assert Connection(Role.MODULE).send(message)
+    assert Connection(Role.HOST).send(known)
 
 
 @pytest.mark.parametrize("size", [0, 1, 7, 63, 64, 65, 1431, 5738])
