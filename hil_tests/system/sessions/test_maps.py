@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.system.recorded_session import write_shorter_scene
 from slam.app.cli import main
 from slam.library.saved_map import MapFile, load_map, save_map
 
@@ -14,15 +13,14 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def days(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with two days of one room; the second began on the map of the first."""
     folder = tmp_path_factory.mktemp("days")
-    demo = ["demo", "--scene", str(write_shorter_scene(folder)), "--lean"]
-    first = ["--seed", "5", "--out", str(folder / "one"), "--save-map", str(folder / "one.json")]
-    assert main([*demo, *first]) == 0
+    (folder / "one").symlink_to(demo / "out")
+    (folder / "one.json").symlink_to(demo / "map.json")
     second = ["--seed", "6", "--out", str(folder / "two"), "--save-map", str(folder / "two.json")]
     begins = ["--map", str(folder / "one.json"), "--start", "0", "0", "0"]
-    assert main([*demo, *second, *begins]) == 0
+    assert main(["demo", "--scene", str(demo / "short.toml"), "--lean", *second, *begins]) == 0
     return folder
 
 

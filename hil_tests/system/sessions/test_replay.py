@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from hil_tests.system.recorded_session import record_session, write_shorter_scene
+from hil_tests.system.recorded_session import record_session
 from hil_tests.unit.slam.app.sessions import Listener
 from hil_tests.unit.slam.live.session.test_state_rows import assert_same_step
 from slam.app.cli import main
@@ -25,8 +25,6 @@ from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow
 
-SEED = 5
-
 
 @dataclass(frozen=True)
 class Recorded:
@@ -35,16 +33,15 @@ class Recorded:
 
 
 @pytest.fixture(scope="module", params=["robust", pytest.param("paper", marks=pytest.mark.rare)])
-def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    folder = tmp_path_factory.mktemp("replay")
-    # a third of the short scene: enough for landmarks, and for the paper's window to be full
-    scene = write_shorter_scene(folder)
-    options = ["--scene", str(scene), "--seed", str(SEED), "--preset", request.param, "--wire"]
-    options += ["--lean"] if request.param == "paper" else []
-    assert main(["demo", *options, "--out", str(folder / "demo")]) == 0
-    return Recorded(
-        folder=folder / "demo", summary=json.loads((folder / "demo/summary.json").read_text())
-    )
+def recorded(
+    request: pytest.FixtureRequest, demo: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Recorded:
+    folder = demo / "out"
+    if request.param == "paper":  # the scene is long enough for its window to be full
+        folder = tmp_path_factory.mktemp("replay") / "out"
+        options = ["--preset", "paper", "--wire", "--lean", "--out", str(folder)]
+        assert main(["demo", "--scene", str(demo / "short.toml"), *options]) == 0
+    return Recorded(folder=folder, summary=json.loads((folder / "summary.json").read_text()))
 
 
 def test_every_number_but_the_speed_comes_again(
