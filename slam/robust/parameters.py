@@ -34,6 +34,7 @@ CONSTANTS_TAIL: Annotated[float, Origin.QUANTILE] = 0.01
 drawn from their priors."""
 MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
 """Logarithm of how many times likelier than any other an explanation must be: twenty times."""
+SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 
 
@@ -430,11 +431,15 @@ class ImagedPointRule:
     crowd_m: Annotated[float, Origin.DATA_SHEET] = 0.13
     """No single range is of a landmark while another one in view is as near in range as that: their
     pulses overlap."""
-    least_sigma_m: Annotated[float, Origin.CHOSEN] = 2e-3
-    """Least standard deviation of the range of a point; rods of `dense` have 0.4 mm, others more.
-    """
-    least_sigma_rad: Annotated[float, Origin.MEASURED] = 2.5e-3
+    sigma_m: Annotated[float, Origin.CHOSEN] = 2e-3
+    """Standard deviation of the range of a point, beside noise and wheels, until points of the run
+    show it."""
+    sigma_rad: Annotated[float, Origin.MEASURED] = 2.5e-3
     """The same of its bearing; in `dense` it is 3.0 mrad, in `lab` 2.3 mrad."""
+    prior_differences: Annotated[int, Origin.CHOSEN, "differences"] = 12
+    """Weight of these in those that the run shows, in differences of two points."""
+    differences: Annotated[int, Origin.BUDGET, "differences"] = 150
+    """Of how many of the newest differences the run's are."""
     bearing_share: Annotated[float, Origin.CHOSEN] = 3.0
     """Factor on the standard deviation of bearings: those of one passage err alike."""
     unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,7 +15,7 @@ from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.front_end.matched_filter import MatchedFilterDetector
-from slam.geometry import Rig, between, compose, has_moved
+from slam.geometry import Rig, between, compose, has_moved, transform, wrap_angles
 from slam.imaging.imager import ImagedPatch, Imager
 from slam.results import (
     Belief,
@@ -30,7 +31,12 @@ from slam.results import (
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Branches
-from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
+from slam.robust.parameters import (
+    SIGMA_PER_MEDIAN,
+    BackEndParameters,
+    ImagedPointRule,
+    RangeNoise,
+)
 from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import calibrated_motion, quarter_turn, rotation
 
@@ -285,6 +291,50 @@ class RobustSlam:
         ]
 
 
+class PointNoise:
+    """How well the points of patches repeat themselves: what no model of noise and wheels knows.
+
+    Each is compared with the point nearest to it in the newest patch of the same radar that shares
+    no frame with its own. What the two differ by is the error of both, and what the wheels did in
+    between; a body that does not answer from one place differs more. The standard deviations are
+    robust (of the median magnitude), and those of the rule count as some differences more.
+    """
+
+    def __init__(self, rule: ImagedPointRule) -> None:
+        self._rule = rule
+        self._patches: dict[int, list[ImagedPatch]] = {}  # of each radar, the newest
+        self._differences: deque[tuple[float, float]] = deque(maxlen=rule.differences)
+        self.sigma_m, self.sigma_rad = rule.sigma_m, rule.sigma_rad
+
+    def take(self, imaged: ImagedPatch) -> None:
+        """Compare the points of a patch, whose origin is on the path of those before."""
+        newest = self._patches.setdefault(imaged.patch.radar, [])
+        apart = [one for one in newest if one.patch.t_ns[-1] < imaged.patch.t_ns[0]]
+        del newest[: max(len(apart) - 1, 0)]
+        newest.append(imaged)
+        if not (apart and apart[-1].points and imaged.points):
+            return
+        before, mount = apart[-1], imaged.patch.mount
+        places = np.array([(one.x_m, one.y_m) for one in before.points])
+        seen = transform(between(imaged.patch.origin, before.patch.origin), places)
+        away = seen - (mount.x_m, mount.y_m)
+        ranges_m = np.hypot(away[:, 0], away[:, 1])
+        bearings = np.arctan2(away[:, 1], away[:, 0]) - mount.yaw_rad
+        for one in imaged.points:
+            by_range = one.range_m - ranges_m
+            by_bearing = wrap_angles(one.bearing_rad - bearings)
+            apart_m = np.hypot(by_range, one.range_m * by_bearing)
+            nearest = int(np.argmin(apart_m))
+            if apart_m[nearest] < self._rule.crowd_m:
+                self._differences.append((float(by_range[nearest]), float(by_bearing[nearest])))
+        n, prior = len(self._differences), self._rule.prior_differences
+        if n:
+            both = SIGMA_PER_MEDIAN * np.median(np.abs(np.array(self._differences)), axis=0)
+            variances = n * np.square(both) / 2.0
+            variances += prior * np.square([self._rule.sigma_m, self._rule.sigma_rad])
+            self.sigma_m, self.sigma_rad = np.sqrt(variances / (n + prior)).tolist()
+
+
 class PatchScans:
     """Points of patches as scans with bearings, each as of the newest pose.
 
@@ -298,6 +348,7 @@ class PatchScans:
         self._reported: Array | None = None
         self._path = np.zeros(3)
         self._waiting: list[ImagedPatch] = []
+        self._noise = PointNoise(rule)
 
     def take(
         self,
@@ -324,6 +375,8 @@ class PatchScans:
         """
         n = max(1, len(self._waiting) - len(self._rig.mounts) + 1)
         ready, self._waiting = self._waiting[:n], self._waiting[n:]
+        for one in ready:
+            self._noise.take(one)
         return [self._scan(one, calibration) for one in ready if one.points]
 
     def _scan(self, imaged: ImagedPatch, calibration: Array) -> RangeScan:
@@ -338,9 +391,9 @@ class PatchScans:
         spread = np.einsum("nai,nij,naj->na", axes, covariances, axes)
         # What the wheels do between the patch and the newest pose
         along, _, heading = self._wheels.step_variances(math.hypot(dx, dy), turn)
-        sigmas_m = np.maximum(np.sqrt(spread[:, 0] + along), self._rule.least_sigma_m)
+        sigmas_m = np.sqrt(spread[:, 0] + along + self._noise.sigma_m**2)
         sigmas_rad = np.sqrt(spread[:, 1] / ranges_m**2 + heading)
-        sigmas_rad = self._rule.bearing_share * np.maximum(sigmas_rad, self._rule.least_sigma_rad)
+        sigmas_rad = self._rule.bearing_share * np.hypot(sigmas_rad, self._noise.sigma_rad)
         return RangeScan(
             radar=patch.radar,
             is_patch=True,

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from slam.robust.association import Pairs
 from slam.robust.map import MERGE_SIGMA_M, apply_merge
-from slam.robust.parameters import TAIL_PROBABILITY, BackEndParameters
+from slam.robust.parameters import SIGMA_PER_MEDIAN, TAIL_PROBABILITY, BackEndParameters
 from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
 from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
 from slam.robust.state import (
@@ -23,7 +23,6 @@ from slam.robust.state import (
     State,
 )
 
-_SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 _LEAST_SHARE, _MOST_SHARE = 0.5, 50.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 _ALONE_STEPS = 8  # of the search for the place of a group of ranges, from each of its begins
@@ -229,7 +228,7 @@ def learn_noise(
     added = np.array([state.added_sigmas_m.get(id_, 0.0) for id_ in ids])
     given_m = np.sqrt(np.maximum(problem.range_sigmas_m**2 - added[at] ** 2, _LEAST_VARIANCE_M2))
     ratio = residual * problem.range_sigmas_m / given_m
-    of_all = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio)))) ** 2
+    of_all = (SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio)))) ** 2
     block = problem.range_poses // rule.keys_per_passage
     own = np.zeros(len(ids))
     for row, id_ in enumerate(ids):
@@ -237,7 +236,7 @@ def learn_noise(
         if not len(mine):
             continue
         n_passages = len(np.unique(block[mine]))
-        raw = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio[mine])))) ** 2
+        raw = (SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio[mine])))) ** 2
         believed = (n_passages * raw + rule.prior_passages * of_all) / (
             n_passages + rule.prior_passages
         )

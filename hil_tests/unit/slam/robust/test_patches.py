@@ -22,7 +22,7 @@ from slam.robust.association import RangeScan, View, antennas_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import body_point, detections_of
 from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
-from slam.robust.pipeline import PatchScans, RobustSlam, back_end_parameters
+from slam.robust.pipeline import PatchScans, PointNoise, RobustSlam, back_end_parameters
 
 Array = NDArray[np.float64]
 
@@ -104,19 +104,55 @@ def test_a_point_lies_where_it_is_from_the_newest_pose() -> None:
     # Noise: that of the point, 4 mm each way, and of the wheels between the two poses
     back = between(true[4], true[2])
     along, _, heading = WheelNoise().step_variances(math.hypot(back[0], back[1]), back[2])
-    assert scan.sigmas_m == pytest.approx((math.sqrt(16e-6 + along),))
-    across = 16e-6 / scan.ranges_m[0] ** 2
+    assert scan.sigmas_m == pytest.approx((math.sqrt(16e-6 + along + 4e-6),))
+    across = 16e-6 / scan.ranges_m[0] ** 2 + 6.25e-6
     assert scan.bearing_sigmas_rad == pytest.approx((3.0 * math.sqrt(across + heading),))
 
 
-def test_a_point_is_not_known_better_than_points_are() -> None:
+def test_a_point_is_not_known_better_than_points_repeat_themselves() -> None:
     imager = GivenPatches(lambda origin: imaged(origin, ROD, 1e-10 * np.eye(2)))
     scans, zero = PatchScans(cast("Imager", imager), RIG, WheelNoise(), RULE), np.zeros(3)
     for t_ns in range(3):
         scans.take((), {t_ns: zero}, t_ns, zero)
     (scan,) = scans.scans(zero)
-    assert scan.sigmas_m == (2e-3,)
-    assert scan.bearing_sigmas_rad == pytest.approx((7.5e-3,))
+    # Beside noise, and the least that a step of the wheels has
+    assert scan.sigmas_m == pytest.approx((2e-3,), rel=1e-4)
+    assert scan.bearing_sigmas_rad == pytest.approx((7.5e-3,), rel=1e-4)
+
+
+@pytest.mark.parametrize(("sigma_m", "sigma_rad"), [(8e-3, 0.02), (4e-4, 1e-3)])
+def test_the_noise_of_points_is_that_of_their_differences(sigma_m: float, sigma_rad: float) -> None:
+    """A rod seen from a line, each time with errors of its own; the prior's share is taken out."""
+    rng, noise = np.random.default_rng(38), PointNoise(RULE)
+    for k in range(400):
+        noise.take(seen_from_x(0.1 * (k % 8), k, rng.normal(0.0, (sigma_m, sigma_rad))))
+    weight = RULE.differences + RULE.prior_differences
+    for found, prior, true in (
+        (noise.sigma_m, RULE.sigma_m, sigma_m),
+        (noise.sigma_rad, RULE.sigma_rad, sigma_rad),
+    ):
+        own = (found**2 * weight - RULE.prior_differences * prior**2) / RULE.differences
+        # The median of 150, of which neighbours have an error in common: some 8 %
+        assert math.sqrt(own) == pytest.approx(true, rel=0.25)
+
+
+def test_patches_with_a_frame_in_common_and_other_bodies_say_nothing_of_noise() -> None:
+    for k, far in ((0, 0.0), (3, 0.2)):  # at the same time; another rod, 20 cm farther
+        noise = PointNoise(RULE)
+        noise.take(seen_from_x(0.0, 0, np.zeros(2)))
+        noise.take(seen_from_x(0.0, k, np.array([far + 0.02, 0.1])))
+        assert (noise.sigma_m, noise.sigma_rad) == (RULE.sigma_m, RULE.sigma_rad)
+
+
+def seen_from_x(x_m: float, t_ns: int, errors: Array) -> ImagedPatch:
+    """Return a patch at (x, 0) that shows the rod with an error of range and one of bearing."""
+    mount, origin = RIG.mounts[0], np.array([x_m, 0.0, 0.0])
+    away = ROD - origin[:2] - (mount.x_m, mount.y_m)
+    range_m = math.hypot(*away) + errors[0]
+    bearing_rad = math.atan2(away[1], away[0]) + errors[1]
+    toward = np.array([math.cos(bearing_rad), math.sin(bearing_rad)])
+    made = imaged(origin, range_m * toward + (mount.x_m, mount.y_m), 1e-10 * np.eye(2))
+    return replace(made, patch=replace(made.patch, t_ns=np.array([t_ns])))
 
 
 def test_patches_of_all_radars_are_taken_one_a_state() -> None:
