@@ -171,6 +171,13 @@ def _setting(text: str) -> tuple[str, tuple[str, ...]]:
     return key.strip(), named
 
 
+def _one_setting(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not (key.strip() and equals and value.strip()):
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE, not {shown(text)}")
+    return key.strip(), value.strip()
+
+
 def _add_session(parser: argparse.ArgumentParser) -> None:
     """Add the session that a command reads."""
     parser.add_argument(
@@ -191,9 +198,18 @@ def _add_out(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def _add_preset(parser: argparse.ArgumentParser) -> None:
-    """Add `--preset` of a command that runs SLAM with one of them."""
+    """Add `--preset` and `--set` of a command that runs SLAM with one of them."""
     parser.add_argument(
         "--preset", default="robust", help="settings of SLAM (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        type=_one_setting,
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="replace a setting of the preset, like robust.patches=true; may be repeated",
     )
 
 

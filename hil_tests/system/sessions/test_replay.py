@@ -32,14 +32,23 @@ class Recorded:
     summary: dict[str, object]
 
 
-@pytest.fixture(scope="module", params=["robust", pytest.param("paper", marks=pytest.mark.rare)])
+OPTIONS = {
+    "paper": ("--preset", "paper", "--wire", "--lean"),
+    "patches": ("--set", "robust.patches=true", "--wire"),
+}
+
+
+@pytest.fixture(
+    scope="module",
+    params=["robust", *(pytest.param(name, marks=pytest.mark.rare) for name in OPTIONS)],
+)
 def recorded(
     request: pytest.FixtureRequest, demo: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Recorded:
     folder = demo / "out"
-    if request.param == "paper":  # the scene is long enough for its window to be full
+    if request.param in OPTIONS:  # the scene is long enough for the window of paper to be full
         folder = tmp_path_factory.mktemp("replay") / "out"
-        options = ["--preset", "paper", "--wire", "--lean", "--out", str(folder)]
+        options = [*OPTIONS[request.param], "--out", str(folder)]
         assert main(["demo", "--scene", str(demo / "short.toml"), *options]) == 0
     return Recorded(folder=folder, summary=json.loads((folder / "summary.json").read_text()))
 

@@ -21,7 +21,7 @@ import numpy as np
 from slam.app.errors import UsageError
 from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_source
 from slam.app.publish.sinks import Publishing
-from slam.app.rig.emulated import RAW_CONFIG, versions
+from slam.app.rig.emulated import RAW_CONFIG, versions, with_settings
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.live_source import (
     LiveLog,
@@ -48,7 +48,7 @@ from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, WrappedS
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
-from slam.config import BackEnd, ConfigError, load_preset
+from slam.config import BackEnd, ConfigError, SlamConfig, load_preset
 from slam.frames import RadarFrame
 from slam.front_end.pulse import nominal_pulse
 from slam.imaging.patches import longest_spacing_m
@@ -82,6 +82,7 @@ def run_rig(
     fps: int,
     clock: str,
     duration_s: float | None,
+    settings: Sequence[tuple[str, str]] = (),
     covariance: bool = False,
     wire: bool = False,
     lean: bool = False,
@@ -102,10 +103,7 @@ def run_rig(
         A signal ended it.
     """
     rig_file = load_rig(rig)
-    try:
-        config = load_preset(preset)
-    except ConfigError as error:
-        raise UsageError(str(error)) from None
+    config = _configured(preset, settings)
     if covariance and config.back_end is not BackEnd.ROBUST:
         raise UsageError("--odometry-covariance: preset paper has a noise of its own; use robust")
     begin = map_use(config, maps)
@@ -420,3 +418,11 @@ def _rows(
 
 def _dropped_text(live: LiveSource) -> str:
     return f"  {live.ticks.n_dropped} scans dropped" if live.ticks.n_dropped else ""
+
+
+def _configured(preset: str, settings: Sequence[tuple[str, str]]) -> SlamConfig:
+    try:
+        config = load_preset(preset)
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
+    return with_settings(config, settings)

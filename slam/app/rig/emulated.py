@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -31,7 +32,7 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scen
 from emulator.x4m300 import radar_device
 from slam.app.errors import EmulatorError, UsageError
 from slam.app.rig.rig_files import rig_file_of
-from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
+from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset, override
 from slam.geometry import Rig, transform
 from slam.live.errors import AppError
 from slam.live.frame_sources import RadarLink, RecordObserver, RigSource, StreamBegins
@@ -201,6 +202,17 @@ def scene_and_config(scene: str, preset: str) -> tuple[Scene, SlamConfig]:
             "drives, such as lab"
         )
     return loaded, config
+
+
+def with_settings(config: SlamConfig, settings: Iterable[tuple[str, str]]) -> SlamConfig:
+    """Return a configuration with what `--set` names replaced: dotted keys, and values as text.
+
+    Raises UsageError if a key is not known, or its value is refused.
+    """
+    try:
+        return override(config, dict(settings))
+    except ConfigError as error:
+        raise UsageError(f"--set: {error}") from None
 
 
 def rig_of(scene: Scene) -> Rig:

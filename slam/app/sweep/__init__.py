@@ -144,6 +144,10 @@ STRESSES: Mapping[str, Stress] = {
         mount_sigma_deg=_MOUNT_SIGMA_DEG,
         offset_sigma_m=_OFFSET_SIGMA_M,
     ),
+    "pulse_x4m03_2025": Stress(
+        help="the pulse of a recorded X4M03, and nothing else of it",
+        radars={"pulse": {"like": "x4m03_2025"}},
+    ),
     **{
         f"like_{name}": Stress(help=f"modules like a recorded {module}", like=name)
         for name, module in _RECORDED.items()

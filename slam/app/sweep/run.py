@@ -23,7 +23,6 @@ from emulator.scene.rooms import MOST_ROOMS, room_of
 from emulator.scene.scene import CarriedSpec, Scene
 from emulator.scene.toml_files import TableT, is_name
 from emulator.scene.wheels import scene_odometry
-from slam.app.errors import UsageError
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -34,6 +33,7 @@ from slam.app.rig.emulated import (
     true_landmarks_m,
     versions,
     wheels_of,
+    with_settings,
 )
 from slam.app.run.runner import RunSource, execute
 from slam.app.run.summary import Summary, summarise
@@ -45,7 +45,7 @@ from slam.app.sweep.outcomes import (
     confidently_wrong,
     false_landmarks,
 )
-from slam.config import ConfigError, SlamConfig, override
+from slam.config import SlamConfig
 from slam.frames import Detection, Detector, RadarFrame
 from slam.front_end import make_detector
 from slam.library.slam import make_slam
@@ -306,13 +306,9 @@ def make_case(
     """
     loaded, config = scene_and_config(scene, preset)
     named = tuple((settings or {}).items())
-    try:
-        config = override(config, dict(named))
-    except ConfigError as error:
-        raise UsageError(f"--set: {error}") from None
     return Case(
         scene=loaded if laps is None else first_laps(loaded, laps),
-        config=config,
+        config=with_settings(config, named),
         preset=preset,
         settings=named,
         stress=stress,

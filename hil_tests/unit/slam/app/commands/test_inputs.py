@@ -159,6 +159,7 @@ def test_a_folder_that_was_there_or_holds_something_stays(
         (["benchmark", "plasa", "--data", "."], "plaza", ()),
         (["sweep", "--stress", "outlier", "--json", "x"], "outliers", ("dropped", "skew")),
         (["sweep", "--set", "detection.mim_range_m=1", "--json", "x"], "min_range_m", ("sigma",)),
+        (["demo", "--set", "robust.pathces=true"], "patches", ("sigma",)),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
 )
@@ -174,6 +175,26 @@ def test_a_typo_is_answered_by_what_was_meant(
     last = errors.splitlines()[-1]
     assert f"did you mean {meant}?" in last
     assert not any(name in last for name in others)
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [
+        ("robust.patches", "KEY=VALUE"),
+        ("=true", "KEY=VALUE"),
+        ("robust.patches=2", "robust.patches"),
+    ],
+)
+def test_a_setting_that_is_none_is_refused(
+    setting: str, named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code, printed, errors = run(capsys, "demo", "--set", setting)
+    except SystemExit as ended:
+        code, printed, errors = int(str(ended.code)), "", capsys.readouterr().err
+    assert (code, printed) == (2, "")
+    assert "--set" in errors.splitlines()[-1]
+    assert named in errors.splitlines()[-1]
 
 
 def test_a_name_that_is_like_no_other_lists_all(capsys: pytest.CaptureFixture[str]) -> None:

@@ -234,6 +234,16 @@ def test_modules_like_recorded_ones_have_their_tables_and_slam_the_same_rig(name
     assert stressed_scene(lab, STRESSES[CLEAN], 4) == lab
 
 
+def test_modules_have_the_pulse_of_a_recorded_one_alone() -> None:
+    lab = load_scene("lab")
+    scene = stressed_scene(lab, STRESSES["pulse_x4m03_2025"], 4)
+    for radar in scene.radars:
+        assert radar.pulse.model_dump().items() >= RECORDED["x4m03_2025"]["pulse"].items()
+    for table in ("noise", "leakage", "jitter"):
+        assert getattr(scene, table) == getattr(lab, table)
+    assert rig_of(scene) == rig_of(lab)
+
+
 def test_mounts_are_off_by_5_mm_per_axis_and_1_degree() -> None:
     lab = load_scene("lab")
     errors = np.array(
