@@ -182,7 +182,8 @@ def test_frames_through_driver_and_device_in_process(
     benchmark: BenchmarkFixture, downconversion: bool
 ) -> None:
     driver, _ = lab_radar(Pace.ASAP)
-    driver.configure_raw(RawConfig(downconversion=downconversion))
-    driver.start(5.0)
-    benchmark(lambda: sum(1 for _ in driver.frames(320)))
+    with driver:
+        driver.configure_raw(RawConfig(downconversion=downconversion))
+        driver.start(5.0)
+        benchmark(lambda: sum(1 for _ in driver.frames(320)))
     benchmark.extra_info["frames"] = 320

@@ -241,6 +241,15 @@ def test_faults_of_a_stream_are_counted(kind: str, faulty_line: FaultyLine) -> N
         sound.forget()
 
 
+@pytest.mark.parametrize(("bins", "injected"), [(0, 0), (1, 1), (2, 1)])
+def test_a_frame_may_shrink_to_one_bin(bins: int, injected: int, faulty_line: FaultyLine) -> None:
+    radar = faulty_line.streaming(FPS)
+    n_bins = radar.read_frame().geometry.n_bins
+    with fault(faulty_line.device, "wrong_bin_count", more=bins - n_bins) as injection:
+        list(radar.frames(20))
+    assert injection.injected == radar.frames_discarded == injected
+
+
 def test_flips_that_cancel_pass_the_checksum(faulty_line: FaultyLine) -> None:
     radar = faulty_line.radar()
     asked = m.X4DriverGet(setting=X4Setting.FRAMEAREA)

@@ -97,3 +97,8 @@ def test_the_smallest_leg_still_takes_time() -> None:
     path = drive([(0, 0), (1e-310, 0), (1, 0)], speed_mps=10, turn_rate_rad_per_s=60)
     assert (np.diff(path.knot_times_ns) > 0).all()
     assert np.isfinite(path.poses(np.arange(5, dtype=np.int64))).all()
+
+
+def test_a_turn_that_takes_no_time_takes_one_nanosecond() -> None:
+    path = drive([(0, 0), (1, 0), (1, 1)], speed_mps=1, turn_rate_rad_per_s=1e12)
+    assert np.diff(path.knot_times_ns).tolist() == [SECOND, 1, SECOND]
