@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from emulator.echo.paths import direct_reflections, viewpoint
 from emulator.echo.people import person_scatterer
-from emulator.scene.people import PersonSpec, chest_displacement_m, positions_m
+from emulator.scene.people import PersonSpec, chest_displacement_m, moves, positions_m
 from emulator.scene.scene import load_scene
 from hil_tests.unit.emulator.rooms import radar_at
 
@@ -99,3 +99,12 @@ def test_the_visitor_is_somebody_who_comes_when_the_noise_map_is_made() -> None:
     (visitor,) = scene.people
     assert visitor.enters_s > 120
     assert len(scene.radars) == 2
+
+
+@pytest.mark.parametrize(
+    ("walk", "walking"), [("once", [True, True, False]), ("to_and_fro", [True] * 3)]
+)
+def test_one_who_walks_once_moves_until_the_end_of_the_way(walk: str, walking: list[bool]) -> None:
+    """The way of 7 m takes 14 s, from 2 s on."""
+    walker = person(walk=walk, speed_mps=0.5, enters_s=2.0)
+    assert moves(walker, times(2.1, 15.9, 16.1)).tolist() == walking
