@@ -437,9 +437,9 @@ class ImagedPointRule:
     sigma_rad: Annotated[float, Origin.MEASURED] = 2.5e-3
     """The same of its bearing; in `dense` it is 3.0 mrad, in `lab` 2.3 mrad."""
     prior_differences: Annotated[int, Origin.CHOSEN, "differences"] = 12
-    """Weight of these in those that the run shows, in differences of two points."""
+    """How many differences of two points these two count as, beside those of the run."""
     differences: Annotated[int, Origin.BUDGET, "differences"] = 150
-    """Of how many of the newest differences the run's are."""
+    """Of how many of the newest differences of the run the median is taken."""
     bearing_share: Annotated[float, Origin.CHOSEN] = 3.0
     """Factor on the standard deviation of bearings: those of one passage err alike."""
     unmapped_per_m2: Annotated[float, Origin.CHOSEN] = 1.0

@@ -292,17 +292,18 @@ class RobustSlam:
 
 
 class PointNoise:
-    """How well the points of patches repeat themselves: what no model of noise and wheels knows.
+    """Standard deviations of the points of patches, learned from how the points repeat.
 
-    Each is compared with the point nearest to it in the newest patch of the same radar that shares
-    no frame with its own. What the two differ by is the error of both, and what the wheels did in
-    between; a body that does not answer from one place differs more. The standard deviations are
-    robust (of the median magnitude), and those of the rule count as some differences more.
+    Each point is compared with the nearest one in the newest earlier patch of the same radar that
+    shares no frame with its own. The two differ by the errors of both and by those of the wheels in
+    between; they differ more if the body does not answer from one place, which no model of noise
+    and wheels contains. ``sigma_m`` and ``sigma_rad`` are those of a single point, from the median
+    magnitude of the newest differences; the rule's own values count as some further differences.
     """
 
     def __init__(self, rule: ImagedPointRule) -> None:
         self._rule = rule
-        self._patches: dict[int, list[ImagedPatch]] = {}  # of each radar, the newest
+        self._patches: dict[int, list[ImagedPatch]] = {}  # the last one compared with, and later
         self._differences: deque[tuple[float, float]] = deque(maxlen=rule.differences)
         self.sigma_m, self.sigma_rad = rule.sigma_m, rule.sigma_rad
 
