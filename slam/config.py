@@ -515,7 +515,7 @@ def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
             tables[key] = value
             continue
         tables.setdefault(part, {})
-        if not isinstance(tables[part], dict) or not field:
+        if not isinstance(tables[part], dict) or not part or not field:
             parts = ", ".join(SlamConfig.model_fields)
             raise ConfigError(f"setting {key}: write it as part.key; parts: {parts}")
         tables[part] = {**tables[part], field: value}

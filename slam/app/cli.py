@@ -172,10 +172,10 @@ def _setting(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _one_setting(text: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not (key.strip() and equals and value.strip()):
+    key, _, value = (part.strip() for part in text.partition("="))
+    if not key or not value:
         raise argparse.ArgumentTypeError(f"must be KEY=VALUE, not {shown(text)}")
-    return key.strip(), value.strip()
+    return key, value
 
 
 def _add_session(parser: argparse.ArgumentParser) -> None:

@@ -26,7 +26,7 @@ from slam.app.rig.emulated import (
     true_landmarks_m,
     versions,
     wheels_of,
-    with_settings,
+    with_settings_in_use,
 )
 from slam.app.run.maps import MapOptions, MapSaver, map_use
 from slam.app.run.output import RunProgress, note, print_progress
@@ -82,7 +82,7 @@ def run_demo(
     driven until then is recorded, mapped and summed up.
     """
     loaded, config = scene_and_config(scene, preset)
-    config = with_settings(config, settings)
+    config = with_settings_in_use(config, settings)
     begin = map_use(config, maps)
     with ExitStack() as held:
         hold_folder(out, held)

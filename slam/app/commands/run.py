@@ -21,7 +21,7 @@ import numpy as np
 from slam.app.errors import UsageError
 from slam.app.odometry.live import LineSource, LiveOdometry, SourceKind, parse_source
 from slam.app.publish.sinks import Publishing
-from slam.app.rig.emulated import RAW_CONFIG, versions, with_settings
+from slam.app.rig.emulated import RAW_CONFIG, versions, with_settings_in_use
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.live_source import (
     LiveLog,
@@ -425,4 +425,4 @@ def _configured(preset: str, settings: Sequence[tuple[str, str]]) -> SlamConfig:
         config = load_preset(preset)
     except ConfigError as error:
         raise UsageError(str(error)) from None
-    return with_settings(config, settings)
+    return with_settings_in_use(config, settings)

@@ -10,7 +10,7 @@ import pytest
 from emulator.scene.toml_files import shipped_names
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.slam.app.sessions import odometry, run, session_info, write_session
-from slam.app.cli import _COMMANDS
+from slam.app.cli import _COMMANDS, main
 from slam.app.run.result_files import hold_folder
 from slam.app.session.writer import SessionLog
 from slam.live.errors import AppError
@@ -178,23 +178,34 @@ def test_a_typo_is_answered_by_what_was_meant(
 
 
 @pytest.mark.parametrize(
-    ("setting", "named"),
+    ("options", "named"),
     [
-        ("robust.patches", "KEY=VALUE"),
-        ("=true", "KEY=VALUE"),
-        ("robust.patches=2", "robust.patches"),
+        (["--set", "robust.patches"], "KEY=VALUE"),
+        (["--set", "=true"], "KEY=VALUE"),
+        (["--set", "robust.patches= "], "KEY=VALUE"),
+        (["--set", ".patches=true"], ".patches"),
+        (["--set", "robust.patches=2"], "robust.patches"),
+        (["--set", "detection.min_range_m=-1"], "detection.min_range_m"),
+        (["--set", "window.size=1", "--set", "window.size=2"], "window.size"),
+        (["--set", "robust.patches=true", "--preset", "paper"], "robust.patches"),
+        (["--set", "robust.patches=true", "--set", "back_end=paper"], "robust.patches"),
+        (["--set", "association.gate=1"], "association.gate"),
     ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_a_setting_that_is_none_is_refused(
-    setting: str, named: str, capsys: pytest.CaptureFixture[str]
+def test_a_wrong_setting_is_refused_before_anything_is_written(
+    options: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     try:
-        code, printed, errors = run(capsys, "demo", "--set", setting)
+        code = main(["demo", "--out", str(tmp_path / "out"), *options])
     except SystemExit as ended:
-        code, printed, errors = int(str(ended.code)), "", capsys.readouterr().err
+        code = int(str(ended.code))
+    printed, errors = capsys.readouterr()
     assert (code, printed) == (2, "")
-    assert "--set" in errors.splitlines()[-1]
-    assert named in errors.splitlines()[-1]
+    last = errors.splitlines()[-1]
+    assert "--set" in last
+    assert named in last
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_name_that_is_like_no_other_lists_all(capsys: pytest.CaptureFixture[str]) -> None:
