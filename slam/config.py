@@ -429,6 +429,12 @@ class SlamConfig(_ConfigTable):
     back_end: BackEnd = BackEnd.PAPER
 
 
+UNUSED_PARTS: Mapping[BackEnd, tuple[str, ...]] = {
+    BackEnd.PAPER: ("robust",),
+    BackEnd.ROBUST: ("clustering", "motion", "observation", "association"),
+}
+"""Parts of a configuration that a back end does not read."""
+
 # The top level of a preset file holds the values of this environment (paper, Table I).
 BASE_ENVIRONMENT = "lab"
 

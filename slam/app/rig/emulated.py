@@ -32,7 +32,15 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scen
 from emulator.x4m300 import radar_device
 from slam.app.errors import EmulatorError, UsageError
 from slam.app.rig.rig_files import rig_file_of
-from slam.config import BackEnd, ConfigError, SlamConfig, WheelNoise, load_preset, override
+from slam.config import (
+    UNUSED_PARTS,
+    BackEnd,
+    ConfigError,
+    SlamConfig,
+    WheelNoise,
+    load_preset,
+    override,
+)
 from slam.geometry import Rig, transform
 from slam.live.errors import AppError
 from slam.live.frame_sources import RadarLink, RecordObserver, RigSource, StreamBegins
@@ -46,11 +54,6 @@ from xethru_protocol.wire.x4 import real_frame_rate
 
 READY_LIMIT_S = 30.0
 _POLL_S = 0.2
-# Parts of a configuration that a back end does not read
-_UNUSED_PARTS = {
-    BackEnd.PAPER: ("robust",),
-    BackEnd.ROBUST: ("clustering", "motion", "observation", "association"),
-}
 END_LIMIT_S = 3.0
 
 
@@ -229,7 +232,7 @@ def with_settings_in_use(config: SlamConfig, settings: Sequence[tuple[str, str]]
     for key in keys:
         if keys.count(key) > 1:
             raise UsageError(f"--set {key}: is given more than once; leave all but one out")
-        if key.partition(".")[0] in _UNUSED_PARTS[replaced.back_end]:
+        if key.partition(".")[0] in UNUSED_PARTS[replaced.back_end]:
             (other,) = set(BackEnd) - {replaced.back_end}
             raise UsageError(
                 f"--set {key}: back end {replaced.back_end} does not use it; leave it out, or take "

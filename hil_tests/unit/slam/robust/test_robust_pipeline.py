@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.rig.emulated import scene_and_config, wheels_of
-from slam.config import RobustConfig, SlamConfig, WheelNoise, load_preset, override
+from slam.config import UNUSED_PARTS, RobustConfig, SlamConfig, WheelNoise, load_preset, override
 from slam.frames import Detection, RadarFrame
 from slam.geometry import between, compose, paper_rig, transform
 from slam.library.evaluation import nees_pose
@@ -265,6 +265,25 @@ def test_a_front_end_of_ones_own_gets_the_range_offset_of_each_radar(preset: str
     (result,) = slam.step([frame(TICK_NS, 2), frame(TICK_NS, 1)], straight, TICK_NS)
     assert [found.radar for found in result.detections] == [2, 1]
     assert [found.range_m for found in result.detections] == pytest.approx([0.68, 0.69])
+
+
+@pytest.mark.parametrize("preset", ["paper", "robust"])
+def test_parts_that_a_back_end_does_not_use_may_be_missing(preset: str) -> None:
+    config, rng = load_preset(preset), np.random.default_rng(38)
+    without = config.model_copy(update=dict.fromkeys(UNUSED_PARTS[config.back_end]))
+    poses = []
+    for each in (config, without):
+        slam = make_slam(each, RIG, WheelNoise())
+        for t_ns in range(0, 40 * TICK_NS, TICK_NS):
+            radars = range(len(RIG.mounts))
+            seen = [found for radar in radars for found in echoes(straight(t_ns), radar, t_ns)]
+            rows = slam.step_detections(seen, straight, t_ns)
+            poses += [row.belief.pose for row in rows[-1:]]
+        samples = rng.normal(0.0, 5e-4, 200).astype(np.float32)
+        slam.step([frame_of(samples, radar=0, t_ns=t_ns + TICK_NS)], straight, t_ns + TICK_NS)
+    n = len(poses) // 2
+    assert n > 0
+    assert np.array_equal(poses[:n], poses[n:])
 
 
 def test_a_map_without_walls_has_none() -> None:
