@@ -136,12 +136,25 @@ def test_the_noise_of_points_is_that_of_their_differences(sigma_m: float, sigma_
         assert math.sqrt(own) == pytest.approx(true, rel=0.25)
 
 
-def test_patches_with_a_frame_in_common_and_other_bodies_say_nothing_of_noise() -> None:
-    for k, far in ((0, 0.0), (3, 0.2)):  # at the same time; another rod, 20 cm farther
-        noise = PointNoise(RULE)
-        noise.take(seen_from_x(0.0, 0, np.zeros(2)))
-        noise.take(seen_from_x(0.0, k, np.array([far + 0.02, 0.1])))
-        assert (noise.sigma_m, noise.sigma_rad) == (RULE.sigma_m, RULE.sigma_rad)
+@pytest.mark.parametrize(("t_ns", "farther_m", "radar"), [(0, 0.0, 0), (3, 0.2, 0), (3, 0.0, 1)])
+def test_a_frame_in_common_another_body_or_another_radar_says_nothing_of_noise(
+    t_ns: int, farther_m: float, radar: int
+) -> None:
+    noise = PointNoise(RULE)
+    noise.take(seen_from_x(0.0, 0, np.zeros(2)))
+    other = seen_from_x(0.0, t_ns, np.array([farther_m + 0.02, 0.1]))
+    noise.take(replace(other, patch=replace(other.patch, radar=radar)))
+    assert (noise.sigma_m, noise.sigma_rad) == (RULE.sigma_m, RULE.sigma_rad)
+
+
+def test_one_point_seen_again_elsewhere_is_a_difference() -> None:
+    noise = PointNoise(RULE)
+    noise.take(seen_from_x(0.0, 0, np.zeros(2)))
+    noise.take(seen_from_x(0.0, 3, np.array([0.02, 0.1])))
+    # A median of one: 1.4826 times the difference, that of two errors of equal variance
+    own, prior = 0.5 * (1.4826 * 0.02) ** 2, RULE.prior_differences * RULE.sigma_m**2
+    expected = math.sqrt((own + prior) / (1 + RULE.prior_differences))
+    assert noise.sigma_m == pytest.approx(expected)
 
 
 def seen_from_x(x_m: float, t_ns: int, errors: Array) -> ImagedPatch:
