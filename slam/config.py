@@ -405,9 +405,10 @@ class RobustConfig(_ConfigTable):
     """Ranges of nothing that stands there, per radar and frame."""
     wheel_walk_per_sqrt_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
     """How far the wheels' calibration wanders per root of a metre, in its standard deviations."""
-    patches: bool = False
-    """Whether points of coherent images (`slam.imaging`) are detections beside single ranges. Then
-    they alone begin landmarks that are points."""
+    patches: bool = True
+    """Whether points of coherent images (`slam.imaging`) are detections beside single ranges, where
+    frames come in and this project's front end takes them. Then they alone begin landmarks that are
+    points."""
 
     @property
     def field_of_view_rad(self) -> float:

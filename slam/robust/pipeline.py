@@ -67,23 +67,19 @@ class RobustSlam:
     ) -> None:
         self.config = config
         self.rig = rig
-        parameters = back_end_parameters(config, wheels, rules)
-        self._on_map = on_map
-        self._branches = Branches(rig, parameters, on_map)
+        self._wheels, self._rules, self._on_map = wheels, rules, on_map
+        self._branches = self._begun(has_patches=False)
         # What is reported of a map that stays as it is
         self._fixed: tuple[Belief, Array] | None = None
         if on_map is not None and on_map.is_fixed:
             begin = self._branches.map
             self._fixed = belief_of(begin), begin.wall_spans_m()
         self._detector = detector or make_detector(config, rig)
+        # Whoever replaces the front end gets what that finds, and no more
+        self._may_image = config.robust.patches and detector is None
         self._noise_at, self._noise = noise_at, np.zeros((3, 3))  # the latter at the last state
         self._least_noise = np.diag(np.square([wheels.floor_m, wheels.floor_m, wheels.floor_rad]))
         self._patches: PatchScans | None = None
-        if config.robust.patches:
-            learned = self._detector
-            pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None
-            imager, rule = Imager(config, rig, wheels, pulses), parameters.imaged
-            self._patches = PatchScans(imager, rig, wheels, rule)
         self._check = InputCheck(rig)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
@@ -95,6 +91,21 @@ class RobustSlam:
     def back_end(self) -> RobustBackEnd:
         """Return the back end that is believed now."""
         return self._branches.main
+
+    def _begun(self, *, has_patches: bool) -> Branches:
+        parameters = back_end_parameters(
+            self.config, self._wheels, self._rules, has_patches=has_patches
+        )
+        return Branches(self.rig, parameters, self._on_map)
+
+    def _begin_imaging(self) -> None:
+        """Begin anew with points of patches: only frames can be imaged, and the first step has some."""
+        learned = self._detector
+        pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None
+        imager = Imager(self.config, self.rig, self._wheels, pulses)
+        self._branches = self._begun(has_patches=True)
+        rule = self.back_end.parameters.imaged
+        self._patches = PatchScans(imager, self.rig, self._wheels, rule)
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
@@ -174,14 +185,16 @@ class RobustSlam:
     ) -> tuple[StepResult, ...]:
         pose = self._check.begin(pose_at, t_ns)
         poses = {t_ns: pose}
-        if self._patches is not None:
-            poses |= {frame.t_ns: self._check.pose(pose_at, frame.t_ns) for frame in frames}
         if self._pose is None:
-            self._accept(frames, poses, t_ns)
+            if frames and self._may_image:
+                self._begin_imaging()
+            self._accept((), poses, t_ns)
             self._pose, self._t_ns = pose, t_ns
             self._still, self._still_ns, self._stood_ns = pose, t_ns, 0
             self._noise_since(pose, t_ns)
             return ()
+        if self._patches is not None:
+            poses |= {frame.t_ns: self._check.pose(pose_at, frame.t_ns) for frame in frames}
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         window = self.config.window
         if not has_moved(self._pose, pose, window.min_distance_m, window.min_turn_rad):
@@ -407,9 +420,16 @@ class PatchScans:
 
 
 def back_end_parameters(
-    config: SlamConfig, wheels: WheelNoise, rules: BackEndParameters | None = None
+    config: SlamConfig,
+    wheels: WheelNoise,
+    rules: BackEndParameters | None = None,
+    *,
+    has_patches: bool = False,
 ) -> BackEndParameters:
-    """Return the rules, by default those of this version, with the noise that is configured."""
+    """Return the rules, by default those of this version, with the noise that is configured.
+
+    ``has_patches``: points of images come beside single ranges (`RobustConfig.patches`).
+    """
     robust, limits = config.robust, config.detection
     reach_m = limits.max_range_m - limits.min_range_m
     rules = rules or BackEndParameters()
@@ -430,8 +450,8 @@ def back_end_parameters(
             field_of_view_rad=robust.field_of_view_rad,
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m,
-            has_patches=robust.patches,
-            unmapped_per_m2=rules.imaged.unmapped_per_m2 if robust.patches else unmapped_per_m2,
+            has_patches=has_patches,
+            unmapped_per_m2=rules.imaged.unmapped_per_m2 if has_patches else unmapped_per_m2,
         ),
     )
 

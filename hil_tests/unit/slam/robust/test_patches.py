@@ -11,8 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.app.sweep.run import make_case, source_of
-from slam.config import ConfigError, RobustConfig, WheelNoise, config_from_tables, load_preset
+from slam.config import (
+    ConfigError,
+    RobustConfig,
+    WheelNoise,
+    config_from_tables,
+    load_preset,
+    override,
+)
 from slam.frames import RadarFrame
+from slam.front_end import make_detector
 from slam.geometry import between, compose, paper_rig, transform
 from slam.imaging.imager import ImagedPatch, Imager
 from slam.imaging.patches import Patch
@@ -278,14 +286,33 @@ def test_the_switch_of_a_file_is_true_or_false(value: object) -> None:
         config_from_tables({"robust": {"patches": value}}, source="x.toml")
     config = config_from_tables({"robust": {"patches": True}}, source="x.toml")
     assert config.robust.patches
-    assert not RobustConfig().patches
+    assert RobustConfig().patches
 
 
-def test_the_option_is_off_in_the_preset() -> None:
-    preset = load_preset("robust")
-    assert not preset.robust.patches
-    assert back_end_parameters(preset, WheelNoise()).ranges == replace(
-        back_end_parameters(preset, WheelNoise()).ranges, has_patches=False, unmapped_per_m2=0.02
+def images_of(slam: RobustSlam) -> bool:
+    """Return whether a pipeline takes points of images after its first frame."""
+    samples = np.zeros(300, dtype=np.float32)
+    frame = RadarFrame(
+        radar=0, t_ns=0, counter=0, samples=samples, range_start_m=0.0, bin_length_m=0.0064
+    )
+    slam.step([frame], lambda _: np.zeros(3), 0)
+    return slam.back_end.parameters.ranges.has_patches
+
+
+def test_images_are_made_of_frames_that_this_front_end_takes() -> None:
+    """Ranges alone begin landmarks themselves; so do those of another front end."""
+    preset, wheels = load_preset("robust"), WheelNoise()
+    assert images_of(RobustSlam(preset, paper_rig(), wheels))
+    off = override(preset, {"robust.patches": False})
+    assert not images_of(RobustSlam(off, paper_rig(), wheels))
+    other = make_detector(preset, paper_rig())
+    assert not images_of(RobustSlam(preset, paper_rig(), wheels, other))
+    of_ranges = RobustSlam(preset, paper_rig(), wheels)
+    of_ranges.step_detections([], lambda _: np.zeros(3), 0)
+    assert not of_ranges.back_end.parameters.ranges.has_patches
+    given = back_end_parameters(preset, wheels, has_patches=True).ranges
+    assert replace(given, has_patches=False, unmapped_per_m2=0.02) == (
+        back_end_parameters(preset, wheels).ranges
     )
 
 
