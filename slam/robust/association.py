@@ -570,7 +570,7 @@ def find_points(
         pairs=tuple(pairs),
         evidence=tuple(against_new),
         refused=tuple(refused),
-        missed=() if scan.is_patch else tuple(missed.tolist()),
+        missed=tuple(missed.tolist()),
     )
 
 

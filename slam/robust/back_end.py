@@ -165,6 +165,10 @@ class RobustBackEnd:
         # Beacons, whose ranges have labels: all labels heard, and by label those without a place
         self._heard: set[int] = set()
         self._waiting: dict[int, Waiting] = {}
+        # Radars and ids of landmarks that the radar's newest patch with them in view does not show;
+        # and by radar the pose behind its newest patch
+        self._unshown: set[tuple[int, int]] = set()
+        self._patch_poses: dict[int, int] = {}
         self._n_updates = 0
         self.evidence = 0.0
         """Nats by which what detections with bearings were taken for, once a passage, and merges of
@@ -351,6 +355,7 @@ class RobustBackEnd:
         self._motion = None
         self._unassigned.clear()
         self._tentative.clear()
+        self._unshown.clear()
         state = self.state
         state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
         for landmark_id, point_m, covariance in points:
@@ -494,7 +499,12 @@ class RobustBackEnd:
         seen, noise = self._walls.look(view(self.state, antennas), antennas), self.parameters.ranges
         if not noise.has_patches:
             return seen
-        return seen.without_crowds(noise, self.parameters.imaged.crowd_m)
+        seen = seen.without_crowds(noise, self.parameters.imaged.crowd_m)
+        rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
+        for radar, id_ in self._unshown:
+            if id_ in rows:
+                seen.off_boresight_rad[radar, rows[id_]] = math.pi
+        return seen
 
     def _count(self, known: Known) -> list[int]:
         """Count hits and misses; return landmarks surely in view and not heard, once per radar."""
@@ -701,6 +711,9 @@ class RobustBackEnd:
             self._log.add_detections(
                 landmark_id, detections_of(scan, [index], self._log.n_poses - 1, antennas, noise)
             )
+        if scan.is_patch:
+            self._trust(scan.radar, hit_ids, {ids[row] for row in found.missed} - hit_ids)
+            found = replace(found, missed=())
         # Those that are seen rarely are missed often: half of the expected hits, at most.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
         missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
@@ -719,6 +732,19 @@ class RobustBackEnd:
         if detections:
             self._place_points()
         return continued, nis, evidence, predicted
+
+    def _trust(self, radar: int, shown: set[int], hidden: set[int]) -> None:
+        """Leave out a radar's single ranges of what its newest patch does not show as a point.
+
+        What answers there is something else: the face behind an edge, or a neighbour. From the
+        whole run those since the patch before are left out; newer ones are not used while no radar
+        of the side shows it.
+        """
+        self._unshown -= {(radar, id_) for id_ in shown}
+        self._unshown |= {(radar, id_) for id_ in hidden}
+        since = self._patch_poses.get(radar, 0)
+        self._log.leave_out(radar, hidden, since)
+        self._patch_poses[radar] = self._log.n_poses
 
     def _correct_points(
         self,

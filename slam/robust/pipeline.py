@@ -391,7 +391,7 @@ class PatchScans:
         ready, self._waiting = self._waiting[:n], self._waiting[n:]
         for one in ready:
             self._noise.take(one)
-        return [self._scan(one, calibration) for one in ready if one.points]
+        return [self._scan(one, calibration) for one in ready]
 
     def _scan(self, imaged: ImagedPatch, calibration: Array) -> RangeScan:
         points, patch = imaged.points, imaged.patch
@@ -401,7 +401,7 @@ class PatchScans:
         angles = np.array([one.bearing_rad for one in points]) + patch.mount.yaw_rad
         u = np.column_stack([np.cos(angles), np.sin(angles)])
         axes = np.stack([u, quarter_turn(u)], axis=1)
-        covariances = np.array([one.covariance for one in points])
+        covariances = np.array([one.covariance for one in points]).reshape(-1, 2, 2)
         spread = np.einsum("nai,nij,naj->na", axes, covariances, axes)
         # What the wheels do between the patch and the newest pose
         along, _, heading = self._wheels.step_variances(math.hypot(dx, dy), turn)

@@ -35,6 +35,7 @@ _LEAST_SIGMA = 1e-7
 _LEAST_WAY_M = 1e-9
 # Of a feature's place [m], and of a wall's direction [rad]
 _ANYWHERE_M = 30.0
+_OF_NOTHING = -1  # in place of a landmark's id
 
 
 def _no_unknowns() -> Indices:
@@ -363,6 +364,14 @@ class RunLog:
         """Leave out all of a landmark's measurements."""
         self._names[landmark_id] = None
 
+    def leave_out(self, radar: int, landmarks: Collection[int], since: int) -> None:
+        """Leave out single ranges that a radar took of landmarks from a pose on."""
+        ranges = self._ranges.rows_to_write()
+        named = [name for id_ in landmarks for name in self._all_names(id_)]
+        bad = (ranges["radar"] == radar) & (ranges["pose"] >= since)
+        bad &= np.isnan(ranges["bearing_rad"]) & np.isin(ranges["landmark"], named)
+        ranges["landmark"][bad] = _OF_NOTHING
+
     def seen_from(self, poses: Collection[int]) -> Counter[int]:
         """Return from how many of some poses each landmark was seen with a bearing, by its id."""
         ranges = self._ranges.rows
@@ -512,8 +521,8 @@ def _rows_of(
     ids: NDArray[np.int32], names: Mapping[int, int | None], rows: Mapping[int, int]
 ) -> Indices:
     """Return the present row of each id, shape (m,), -1 for landmarks that are gone."""
-    present = np.flatnonzero(np.bincount(ids))
-    final = np.full(int(present[-1]) + 1 if len(present) else 0, -1, dtype=np.intp)
+    present = np.flatnonzero(np.bincount(ids[ids != _OF_NOTHING]))
+    final = np.full(int(present[-1]) + 2 if len(present) else 1, -1, dtype=np.intp)  # the last: -1
     for id_ in present.tolist():
         name: int | None = id_
         while name is not None and name in names:

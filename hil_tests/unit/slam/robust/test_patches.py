@@ -195,12 +195,12 @@ def test_patches_of_all_radars_are_taken_one_a_state() -> None:
     assert taken == [1, 3, 1, 1, 1]  # behind the first there are 3 and 3 more: 4 may wait
 
 
-def seen_from(pose: Array, *rods: Array) -> RangeScan:
-    """Return the scan of a patch of radar 0 that shows rods (2,) of the map from a pose."""
-    mount = RIG.mounts[0]
+def seen_from(pose: Array, *rods: Array, radar: int = 0) -> RangeScan:
+    """Return the scan of a patch of a radar that shows rods (2,) of the map from a pose."""
+    mount = RIG.mounts[radar]
     away = [transform(between(pose, np.zeros(3)), rod) - (mount.x_m, mount.y_m) for rod in rods]
     return RangeScan(
-        radar=0,
+        radar=radar,
         is_patch=True,
         ranges_m=tuple([math.hypot(*one) for one in away]),
         sigmas_m=(1e-3,) * len(rods),
@@ -242,6 +242,57 @@ def test_two_patches_make_a_landmark_with_the_single_ranges_of_before() -> None:
         back_end.predict(np.zeros(3))
         back_end.update([seen_from(pose)])
     assert back_end.reported_rows() == [0]
+
+
+def single_ranges(back_end: RobustBackEnd, radar: int) -> set[int]:
+    """Return the poses of the single ranges of a radar that a solution over all poses takes."""
+    problem = back_end._log.problem(back_end.state, PARAMETERS)
+    taken = np.isnan(problem.range_bearings_rad) & (problem.range_radars == radar)
+    return set(back_end._log._ranges.rows["pose"][problem.range_rows[taken]].tolist())
+
+
+def test_single_ranges_of_what_patches_do_not_show_are_not_used() -> None:
+    """While a radar of the side shows it they are; in the whole run, those since the last point."""
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    used: list[set[int]] = []
+    rods: dict[int, dict[int, list[Array]]] = {
+        20: {0: [ROD]},
+        22: {0: [ROD]},
+        24: {1: [ROD]},
+        28: {1: []},
+        32: {0: []},
+        40: {0: [ROD]},
+    }
+    for number in range(45):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        patches = [seen_from(pose, *one, radar=k) for k, one in rods.get(number, {}).items()]
+        report = back_end.update([*ranges_at(pose), *patches])
+        used.append({radar for radar, _, _ in report.continued})
+        if number == 32:
+            taken = single_ranges(back_end, 0), single_ranges(back_end, 1)
+    assert used[24:33] == [{0, 1}] * 9
+    assert used[33:41] == [set()] * 8
+    assert used[41:] == [{0, 1}] * 4
+    # The pose of a number is one more. Those behind the last patches that show it, of 22 and 24:
+    assert taken[0].isdisjoint(range(24, 34))
+    assert {20, 22, 23} <= taken[0]
+    assert taken[1].isdisjoint(range(26, 30))
+    assert {24, 25, 30, 31, 32, 33} <= taken[1]
+    assert {42, 43, 44, 45} <= single_ranges(back_end, 0)
+
+
+def test_what_a_patch_has_out_of_view_is_not_doubted() -> None:
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    for number in range(30):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        patches = [seen_from(pose, ROD)] if number in (20, 22) else []
+        if number == 28:
+            away = (0.0, 0.0, math.pi)
+            patches = [replace(seen_from(pose, radar=radar), moved=away) for radar in (0, 1)]
+        report = back_end.update([*ranges_at(pose), *patches])
+    assert {radar for radar, _, _ in report.continued} == {0, 1}
 
 
 def test_what_may_be_known_waits_for_four_patches() -> None:
