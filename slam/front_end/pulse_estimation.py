@@ -269,8 +269,8 @@ class PulseEstimator:
         """Return the pulse that the frames of a radar are equalised by; None: the nominal one."""
         return self._own.get(radar) or self._before_own(radar)
 
-    def estimate(self, radar: int) -> ReceivedPulse | None:
-        """Return the last estimate of a radar's own pulse, used or not; None: too few echoes."""
+    def estimate(self, radar: int | None) -> ReceivedPulse | None:
+        """Return the last estimate of a radar's own pulse, or that of all; None: too few echoes."""
         return self._estimates.get(radar)
 
     def off_nominal(self, pulse: ReceivedPulse) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -49,6 +49,7 @@ class Imager:
     ) -> None:
         limits = config.detection
         self.point_rule = PointRule(wheels=wheels or WheelNoise())
+        self._learns = pulses is not None
         self._nominal = nominal_pulse(config.matched_filter)
         self._pulses = pulses or PulseEstimator(
             self._nominal.model, [mount.pulse for mount in rig.mounts]
@@ -74,12 +75,21 @@ class Imager:
         return tuple(self._imaged(patch) for patch in made if patch is not None)
 
     def _imaged(self, patch: Patch) -> ImagedPatch:
-        reflectors = separated(patch, self.point_rule.separation)
+        rule = self.point_rule
+        if self._learns and not self._has_learned(patch.radar):
+            # What another pulse than the nominal one leaves may look like a second echo.
+            rule = replace(rule, beside_m=rule.unlearned_beside_m)
+        reflectors = separated(patch, rule.separation)
         return ImagedPatch(
             patch=patch,
-            points=points_of(patch, reflectors, self.point_rule),
-            lines=lines_of(patch, reflectors, self.point_rule),
+            points=points_of(patch, reflectors, rule),
+            lines=lines_of(patch, reflectors, rule),
         )
+
+    def _has_learned(self, radar: int) -> bool:
+        """Return whether echoes have shown the pulse of a radar, or that it is the nominal one."""
+        pulses = self._pulses
+        return pulses.pulse(radar) is not None or pulses.estimate(None) is not None
 
     def _pulse(self, radar: int, bin_length_m: float) -> ModulePulse:
         received = self._pulses.pulse(radar)

@@ -52,6 +52,7 @@ class PointRule:
     beside_m: float = 0.12
     beside_share: float = 0.25
     beside_wall_share: float = 0.1
+    unlearned_beside_m: float = 0.18  # in place of `beside_m`, until the module's pulse is learnt
     most_fading: float = 0.4
     least_wall_share: float = 0.3  # size over that of the strongest reflector
     on_wall_share: float = 0.3

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from slam.config import SlamConfig, WheelNoise
 from slam.frames import RadarFrame
 from slam.front_end.pulse import ModulePulse, PulseModel
-from slam.geometry import FieldOfView, Mount, Rig, compose, transform
+from slam.front_end.pulse_estimation import PulseEstimator
+from slam.geometry import FieldOfView, Mount, ReceivedPulse, Rig, compose, transform
 from slam.imaging.imager import ImagedPatch, Imager
 from slam.imaging.kernels import remove_bursts
 from slam.imaging.patches import Patch, seen_from
@@ -360,10 +361,8 @@ def test_profiles_whose_echo_is_not_known_are_refused() -> None:
         patch_points(replace(patch, profiles=unknown))
 
 
-def test_an_imager_gives_the_points_of_its_patches() -> None:
-    poses = straight(60)
-    frames = of_point(poses, (0.1, 1.0)) + np.random.default_rng(10).normal(0, SIGMA, (60, N_BINS))
-    imager = Imager(SlamConfig(), Rig((MOUNT,)))
+def drive(imager: Imager, frames: Array, poses: Array) -> list[ImagedPatch]:
+    """Return the patches that an imager makes of frames (n, N_BINS), five a second."""
     imaged: list[ImagedPatch] = []
     for number, row in enumerate(frames):
         frame = RadarFrame(
@@ -376,8 +375,36 @@ def test_an_imager_gives_the_points_of_its_patches() -> None:
         )
         imaged += imager.step([frame], lambda t_ns: poses[t_ns // 200_000_000])
     assert len(imaged) >= 3
-    for each in imaged:
+    return imaged
+
+
+def test_an_imager_gives_the_points_of_its_patches() -> None:
+    poses = straight(60)
+    frames = of_point(poses, (0.1, 1.0)) + np.random.default_rng(10).normal(0, SIGMA, (60, N_BINS))
+    for each in drive(Imager(SlamConfig(), Rig((MOUNT,))), frames, poses):
         (point,) = each.points
         there = transform(each.patch.origin, places([point])[0])
         assert math.dist(there, (0.1, 1.0)) < 4e-3
         assert places(patch_points(each.patch)) == pytest.approx(places(each.points))
+
+
+class LearntNominal(PulseEstimator):
+    """An estimator to which echoes have shown that the pulse is the nominal one."""
+
+    def estimate(self, radar: int | None) -> ReceivedPulse | None:
+        return ReceivedPulse(step_m=0.04, real=(1.0,), imaginary=(0.0,), relative_error=0.01)
+
+
+def test_until_the_pulse_is_learnt_a_weak_echo_behind_a_strong_one_may_be_part_of_its_pulse() -> (
+    None
+):
+    poses = straight(60)
+    frames = of_point(poses, (0.1, 1.0)) + 0.35 * of_point(poses, (0.1, 1.15))
+    frames += np.random.default_rng(11).normal(0, SIGMA, (60, N_BINS))
+
+    def points(pulses: PulseEstimator | None) -> list[PatchPoint]:
+        imager = Imager(SlamConfig(), Rig((MOUNT,)), pulses=pulses)
+        return [one for each in drive(imager, frames, poses)[:3] for one in each.points]
+
+    assert len(points(PulseEstimator(PULSE.model))) == 3
+    assert len(points(LearntNominal(PULSE.model))) == len(points(None)) == 6
