@@ -742,8 +742,8 @@ class RobustBackEnd:
         """
         self._unshown -= {(radar, id_) for id_ in shown}
         self._unshown |= {(radar, id_) for id_ in hidden}
-        since = self._patch_poses.get(radar, 0)
-        self._log.leave_out(radar, hidden, since)
+        if hidden:
+            self._log.leave_out(radar, hidden, self._patch_poses.get(radar, 0))
         self._patch_poses[radar] = self._log.n_poses
 
     def _correct_points(
