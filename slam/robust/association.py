@@ -161,7 +161,8 @@ class View:
     """All n landmarks and behind them all w walls as all radars should see them."""
 
     ranges_m: Array  # shape (r, n + w), offsets included; negative behind a wall
-    off_boresight_rad: Array  # shape (r, n + w), in [-pi, pi)
+    # Shape (r, n + w), in [-pi, pi); infinite where no range of the radar may be the feature's
+    off_boresight_rad: Array
     directions: Array  # shape (r, n + w, 2), unit vectors u or n in the map frame
     by_feature: Array  # shape (r, n + w, 2), d(range) / d(error of the landmark or wall)
     turned: Array  # shape (r, 2, 2): rotations from the body frame of the sample to the map

@@ -503,7 +503,7 @@ class RobustBackEnd:
         rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
         for radar, id_ in self._unshown:
             if id_ in rows:
-                seen.off_boresight_rad[radar, rows[id_]] = math.pi
+                seen.off_boresight_rad[radar, rows[id_]] = math.inf
         return seen
 
     def _count(self, known: Known) -> list[int]:
@@ -737,8 +737,7 @@ class RobustBackEnd:
         """Leave out a radar's single ranges of what its newest patch does not show as a point.
 
         What answers there is something else: the face behind an edge, or a neighbour. From the
-        whole run those since the patch before are left out; newer ones are not used while no radar
-        of the side shows it.
+        whole run those since the patch before are left out; newer ones wait for a patch with it.
         """
         self._unshown -= {(radar, id_) for id_ in shown}
         self._unshown |= {(radar, id_) for id_ in hidden}

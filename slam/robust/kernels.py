@@ -277,6 +277,10 @@ def assign(
                     unheard[c, i] = False
                 reach = limits[12] * math.sqrt(prior[c, i, i] + limits[11] * limits[11])
                 count = 0
+                if off_boresight[i, n] == math.inf:  # of this radar nothing may be its
+                    count_of[n_part, place] = 0
+                    silent = False
+                    continue
                 for k in range(n_ranges):
                     away = abs(ranges[i, k] - predicted[i, n])
                     if away <= reach:
