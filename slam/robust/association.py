@@ -69,6 +69,8 @@ class RangeScan:
     # Points of a patch (`slam.imaging.patches`), beside the radar's single ranges. What is not
     # among them may be there all the same.
     is_patch: bool = False
+    # Whether points of patches of the radar come beside these single ranges
+    is_imaged: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError if a number is not finite, or missing for one of the ranges."""
@@ -175,12 +177,13 @@ class View:
             & (self.ranges_m <= noise.max_range_m + widen_m)
         )
 
-    def without_crowds(self, noise: RangeNoise, apart_m: float) -> View:
-        """Return the view without features that others in view are as near to in range as that."""
+    def without_crowds(self, radars: Sequence[int], noise: RangeNoise, apart_m: float) -> View:
+        """Return the view of some radars without what is as near in range to others in view."""
         inside = self.inside(noise, 0.0, apart_m)
         gaps = np.abs(self.ranges_m[:, :, None] - self.ranges_m[:, None, :])
         gaps[:, np.arange(gaps.shape[1]), np.arange(gaps.shape[1])] = math.inf
-        crowded = np.any((gaps < apart_m) & inside[:, None, :], axis=2)
+        crowded = np.zeros(inside.shape, dtype=np.bool_)
+        crowded[radars] = np.any((gaps < apart_m) & inside[:, None, :], axis=2)[radars]
         return replace(self, off_boresight_rad=np.where(crowded, math.pi, self.off_boresight_rad))
 
 
@@ -547,7 +550,10 @@ def find_points(
         white = prior[own][None] / np.sqrt(variances[k:, None, :, None] * variances[k:, None, None])
         is_sure = np.linalg.eigvalsh(white)[..., -1] <= most
         # A square metre is the more radians wide, the nearer it is.
-        unmapped = np.log(noise.unmapped_per_m2 * measured[k:, 0] * odds / clutter)
+        unmapped = np.log(
+            parameters.unmapped_per_m2(of_patches=scan.is_patch)
+            * (measured[k:, 0] * odds / clutter)
+        )
         new = np.maximum(0.0, unmapped)
         for one, at in enumerate(chosen.tolist()):
             if at >= len(own):

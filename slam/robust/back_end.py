@@ -165,6 +165,7 @@ class RobustBackEnd:
         # Beacons, whose ranges have labels: all labels heard, and by label those without a place
         self._heard: set[int] = set()
         self._waiting: dict[int, Waiting] = {}
+        self._imaged: set[int] = set()  # radars of which points of patches come, too
         # Radars and ids of landmarks that the radar's newest patch with them in view does not show;
         # and by radar the pose behind its newest patch
         self._unshown: set[tuple[int, int]] = set()
@@ -376,6 +377,7 @@ class RobustBackEnd:
         scans = [scan for scan in scans if not scan.is_patch]
         self._check_radars(scans)
         looks = [scan for scan in scans if scan.looks]
+        self._imaged |= {scan.radar for scan in scans if scan.is_imaged}
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
@@ -496,10 +498,10 @@ class RobustBackEnd:
 
     def _look(self, antennas: Antennas) -> View:
         """Return the view of all features of which single ranges may be."""
-        seen, noise = self._walls.look(view(self.state, antennas), antennas), self.parameters.ranges
-        if not noise.has_patches:
-            return seen
-        seen = seen.without_crowds(noise, self.parameters.imaged.crowd_m)
+        seen, rule = self._walls.look(view(self.state, antennas), antennas), self.parameters
+        imaged = sorted(self._imaged)
+        if imaged:
+            seen = seen.without_crowds(imaged, rule.ranges, rule.imaged.crowd_m)
         rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
         for radar, id_ in self._unshown:
             if id_ in rows:
@@ -705,7 +707,9 @@ class RobustBackEnd:
         continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
         hit_ids = {landmark_id for _, _, landmark_id in continued}
         for landmark_id in sorted(hit_ids):
-            self._existence.hit(landmark_id, self.parameters.frames_per_scan)
+            self._existence.hit(
+                landmark_id, self.parameters.frames_per_scan(of_patches=scan.is_patch)
+            )
         refused = [(index, ids[row]) for index, row in found.refused]
         for index, landmark_id in refused:
             self._log.add_detections(
@@ -793,8 +797,8 @@ class RobustBackEnd:
 
         Of the others it is asked which they are.
         """
-        density = self.parameters.ranges.unmapped_per_m2
         for tentative in self._tentative.take_out():
+            density = self.parameters.unmapped_per_m2(of_patches=tentative.is_of_patches)
             if tentative.label is None and tentative.misses:
                 self._tentative.keep(tentative)  # the newest scan does not hold it
                 continue
@@ -816,7 +820,7 @@ class RobustBackEnd:
         Those with labels, and those of which a scan says where they are, are not it.
         """
         beside = self._log.seen_from({one.pose for one in tentative.seen})
-        apart = self.parameters.fewest_detections
+        apart = self.parameters.fewest_detections(of_patches=tentative.is_of_patches)
         barred = {
             row
             for row, id_ in enumerate(self.state.landmark_ids)
@@ -828,15 +832,17 @@ class RobustBackEnd:
     def question(self) -> Question | None:
         """Return which of several options the first tentative landmark is that is unclear."""
         parameters = self.parameters
-        if_new, if_possible = parameters.detections_to_ask
         for tentative in self._tentative.unclear():
+            of_patches = tentative.is_of_patches
+            if_new, if_possible = parameters.detections_to_ask(of_patches=of_patches)
             if len(tentative.seen) < if_new:
                 continue
             point = self._common(tentative)
             found = self._possible(tentative, point)
             if found and len(tentative.seen) < if_possible:
                 continue
-            options = options_of(self.state, point, found, parameters.ranges.unmapped_per_m2)
+            density = parameters.unmapped_per_m2(of_patches=of_patches)
+            options = options_of(self.state, point, found, density)
             options.append(Option(evidence=0.0))
             if self._may_have_jumped(tentative):
                 rarity = math.log(parameters.relinearisation.steps_per_slip)
@@ -896,7 +902,8 @@ class RobustBackEnd:
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
-        self._existence.hit(landmark_id, len(tentative.seen) * self.parameters.frames_per_scan)
+        frames = self.parameters.frames_per_scan(of_patches=tentative.is_of_patches)
+        self._existence.hit(landmark_id, len(tentative.seen) * frames)
         self._log.add_detections(landmark_id, tentative.seen)
         if tracklet is not None:
             self._use(landmark_id, tracklet.seen)
@@ -904,7 +911,7 @@ class RobustBackEnd:
     def _ranges_of(self, tentative: TentativePoint) -> Tracklet | None:
         """Return the unassigned single ranges of what patches hold, and use them up."""
         rule = self.parameters.tracklets
-        if not self.parameters.ranges.has_patches:
+        if not tentative.is_of_patches:
             return None
         side = self._sides[self._side_of[tentative.seen[-1].radar]]
         search = Search(radars=side, window=rule.long_window, min_frames=rule.min_hits_per_radar)
@@ -933,7 +940,7 @@ class RobustBackEnd:
                 wall_id = self._walls.place(wall)
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
-            if self.parameters.ranges.has_patches:
+            if not self._imaged.isdisjoint(radars):
                 continue  # patches show points sooner, and apart from their neighbours
             search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
             if is_single:
@@ -1018,7 +1025,7 @@ class RobustBackEnd:
         ids = self.state.landmark_ids
         return any(
             self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]]
-            >= self.parameters.fewest_detections
+            >= self.parameters.fewest_detections(of_patches=bool(self._imaged))
             for kept, gone in pairs
         )
 

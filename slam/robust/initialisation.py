@@ -775,6 +775,7 @@ class PointDetection:
     sigma_m: float
     bearing_rad: float  # in the body frame of the sample
     bearing_sigma_rad: float
+    is_of_patch: bool = False
 
 
 def detections_of(
@@ -797,6 +798,7 @@ def detections_of(
             sigma_m=sigma_m,
             bearing_rad=yaw_rad + scan.bearings_rad[index],
             bearing_sigma_rad=bearing_sigma_rad,
+            is_of_patch=scan.is_patch,
         )
         for index, (sigma_m, bearing_sigma_rad) in zip(
             indices, np.sqrt(variances).tolist(), strict=True
@@ -841,6 +843,10 @@ class TentativePoint:
     @property
     def label(self) -> int | None:
         return self.seen[0].label
+
+    @property
+    def is_of_patches(self) -> bool:
+        return self.seen[0].is_of_patch
 
 
 class TentativePoints:
@@ -921,7 +927,8 @@ class TentativePoints:
     def _is_landmark(self, one: TentativePoint) -> bool:
         hits, excess = len(one.seen), self._parameters.tracklets.excess_sigmas
         is_at_rest = one.chi_square <= chi_square_limit(2 * (hits - 1), excess)
-        return hits >= self._parameters.fewest_detections and is_at_rest
+        fewest = self._parameters.fewest_detections(of_patches=one.is_of_patches)
+        return hits >= fewest and is_at_rest
 
     def _assigned(
         self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]

@@ -74,8 +74,6 @@ class RangeNoise:
     # Where targets are detected
     min_range_m: float = 0.2
     max_range_m: float = 1.5
-    # Whether points of patches (`slam.imaging`) come beside single ranges
-    has_patches: bool = False
 
     @property
     def field_of_view(self) -> FieldOfView:
@@ -464,23 +462,23 @@ class BackEndParameters:
     jumps: JumpNoise = field(default_factory=JumpNoise)
     imaged: ImagedPointRule = field(default_factory=ImagedPointRule)
 
-    @property
-    def fewest_detections(self) -> int:
+    def unmapped_per_m2(self, *, of_patches: bool) -> float:
+        """Return how many landmarks per square metre may not be in the map yet."""
+        return self.imaged.unmapped_per_m2 if of_patches else self.ranges.unmapped_per_m2
+
+    def fewest_detections(self, *, of_patches: bool) -> int:
         """Return how many detections with bearings a landmark needs at least."""
-        patches, otherwise = self.imaged.new_patches, self.tracklets.min_hits_per_radar
-        return patches if self.ranges.has_patches else otherwise
+        return self.imaged.new_patches if of_patches else self.tracklets.min_hits_per_radar
 
-    @property
-    def frames_per_scan(self) -> int:
+    def frames_per_scan(self, *, of_patches: bool) -> int:
         """Return as how many frames a scan with bearings counts for the existence of a landmark."""
-        return self.imaged.frames_per_patch if self.ranges.has_patches else 1
+        return self.imaged.frames_per_patch if of_patches else 1
 
-    @property
-    def detections_to_ask(self) -> tuple[int, int]:
+    def detections_to_ask(self, *, of_patches: bool) -> tuple[int, int]:
         """Return from how many detections with bearings on it is decided what they are of.
 
         If they are of nothing known, and if they may be.
         """
-        if not self.ranges.has_patches:
+        if not of_patches:
             return self.tracklets.min_frames, self.tracklets.min_frames
         return self.imaged.new_patches, self.imaged.unclear_patches

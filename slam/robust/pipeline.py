@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -67,19 +67,24 @@ class RobustSlam:
     ) -> None:
         self.config = config
         self.rig = rig
-        self._wheels, self._rules, self._on_map = wheels, rules, on_map
-        self._branches = self._begun(has_patches=False)
+        parameters = back_end_parameters(config, wheels, rules)
+        self._on_map = on_map
+        self._branches = Branches(rig, parameters, on_map)
         # What is reported of a map that stays as it is
         self._fixed: tuple[Belief, Array] | None = None
         if on_map is not None and on_map.is_fixed:
             begin = self._branches.map
             self._fixed = belief_of(begin), begin.wall_spans_m()
         self._detector = detector or make_detector(config, rig)
-        # Whoever replaces the front end gets what that finds, and no more
-        self._may_image = config.robust.patches and detector is None
         self._noise_at, self._noise = noise_at, np.zeros((3, 3))  # the latter at the last state
         self._least_noise = np.diag(np.square([wheels.floor_m, wheels.floor_m, wheels.floor_rad]))
         self._patches: PatchScans | None = None
+        # Whoever replaces the front end gets what that finds, and no more.
+        if config.robust.patches and detector is None:
+            learned = self._detector
+            pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None
+            imager, rule = Imager(config, rig, wheels, pulses), parameters.imaged
+            self._patches = PatchScans(imager, rig, wheels, rule)
         self._check = InputCheck(rig)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
@@ -91,21 +96,6 @@ class RobustSlam:
     def back_end(self) -> RobustBackEnd:
         """Return the back end that is believed now."""
         return self._branches.main
-
-    def _begun(self, *, has_patches: bool) -> Branches:
-        parameters = back_end_parameters(
-            self.config, self._wheels, self._rules, has_patches=has_patches
-        )
-        return Branches(self.rig, parameters, self._on_map)
-
-    def _begin_imaging(self) -> None:
-        """Begin anew with points of patches: only frames can be imaged, and the first step has some."""
-        learned = self._detector
-        pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None
-        imager = Imager(self.config, self.rig, self._wheels, pulses)
-        self._branches = self._begun(has_patches=True)
-        rule = self.back_end.parameters.imaged
-        self._patches = PatchScans(imager, self.rig, self._wheels, rule)
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
@@ -186,8 +176,6 @@ class RobustSlam:
         pose = self._check.begin(pose_at, t_ns)
         poses = {t_ns: pose}
         if self._pose is None:
-            if frames and self._may_image:
-                self._begin_imaging()
             self._accept((), poses, t_ns)
             self._pose, self._t_ns = pose, t_ns
             self._still, self._still_ns, self._stood_ns = pose, t_ns, 0
@@ -214,7 +202,8 @@ class RobustSlam:
         covariance = self._noise_since(self._pose, t_ns)
         stood_s = self._stood_ns / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
-        scans = [*self._scans(detections, sigmas_m, moved), *given]
+        imaged = {frame.radar for frame in frames} if self._patches is not None else set[int]()
+        scans = [*self._scans(detections, sigmas_m, moved, imaged), *given]
         if self._patches is not None:
             scans += self._patches.scans(self.back_end.state.calibration)
         report = branches.update(scans)
@@ -283,6 +272,7 @@ class RobustSlam:
         detections: Sequence[Detection],
         sigmas_m: Sequence[float],
         moved: Mapping[int, Array | None],
+        imaged: Collection[int],
     ) -> list[RangeScan]:
         """Return the scan of every radar with a frame, the ranges that are unfit as blurred."""
         fit: dict[int, list[tuple[float, float]]] = {radar: [] for radar in moved}
@@ -299,6 +289,7 @@ class RobustSlam:
                 sigmas_m=tuple(sigma_m for _, sigma_m in fit[radar]),
                 moved=None if motion is None else (motion[0], motion[1], motion[2]),
                 blurred_m=tuple(blurred[radar]),
+                is_imaged=radar in imaged,
             )
             for radar, motion in moved.items()
         ]
@@ -420,20 +411,12 @@ class PatchScans:
 
 
 def back_end_parameters(
-    config: SlamConfig,
-    wheels: WheelNoise,
-    rules: BackEndParameters | None = None,
-    *,
-    has_patches: bool = False,
+    config: SlamConfig, wheels: WheelNoise, rules: BackEndParameters | None = None
 ) -> BackEndParameters:
-    """Return the rules, by default those of this version, with the noise that is configured.
-
-    ``has_patches``: points of images come beside single ranges (`RobustConfig.patches`).
-    """
+    """Return the rules, by default those of this version, with the noise that is configured."""
     robust, limits = config.robust, config.detection
     reach_m = limits.max_range_m - limits.min_range_m
     rules = rules or BackEndParameters()
-    unmapped_per_m2 = RangeNoise().unmapped_per_m2
     return replace(
         rules,
         wheels=replace(wheels, walk_per_sqrt_m=robust.wheel_walk_per_sqrt_m),
@@ -450,8 +433,6 @@ def back_end_parameters(
             field_of_view_rad=robust.field_of_view_rad,
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m,
-            has_patches=has_patches,
-            unmapped_per_m2=rules.imaged.unmapped_per_m2 if has_patches else unmapped_per_m2,
         ),
     )
 

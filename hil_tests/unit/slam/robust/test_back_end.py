@@ -125,7 +125,7 @@ def test_a_range_of_uncertain_association_is_used_and_weighs_less() -> None:
     def after(**changes: float) -> tuple[bool, float, float]:
         """Return whether the range was used, how far it moved its landmark, and the NIS."""
         twin = copy.deepcopy(before)
-        ranges = replace(parameters.ranges, **changes)  # type: ignore[arg-type]  # numbers
+        ranges = replace(parameters.ranges, **changes)
         twin.parameters = replace(parameters, ranges=ranges)
         report = twin.update(with_sigmas(off, sigma_m))
         row = twin.state.landmark_ids.index(landmark_id)

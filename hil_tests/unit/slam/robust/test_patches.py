@@ -30,12 +30,12 @@ from slam.robust.association import RangeScan, View, antennas_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import body_point, detections_of
 from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
-from slam.robust.pipeline import PatchScans, PointNoise, RobustSlam, back_end_parameters
+from slam.robust.pipeline import PatchScans, PointNoise, RobustSlam
 
 Array = NDArray[np.float64]
 
 RIG = paper_rig()
-NOISE = RangeNoise(has_patches=True, unmapped_per_m2=1.0)
+NOISE = RangeNoise()
 PARAMETERS = BackEndParameters(ranges=NOISE)
 RULE = ImagedPointRule()
 ROD = np.array([0.3, 0.9])  # in view of radar 0 from about the origin
@@ -212,14 +212,15 @@ def seen_from(pose: Array, *rods: Array, radar: int = 0) -> RangeScan:
 STEP = np.array([0.01, 0.0, 0.0])
 
 
-def ranges_at(pose: Array) -> list[RangeScan]:
+def ranges_at(pose: Array, *, is_imaged: bool = True) -> list[RangeScan]:
     """Return what radars 0 and 1 measure of the rod."""
     found = []
     for radar in (0, 1):
         mount = RIG.mounts[radar]
         antenna = transform(pose, np.array([mount.x_m, mount.y_m]))
         range_m = math.hypot(*(ROD - antenna))
-        found.append(RangeScan(radar=radar, ranges_m=(range_m,), sigmas_m=(1e-3,)))
+        one = RangeScan(radar=radar, ranges_m=(range_m,), sigmas_m=(1e-3,), is_imaged=is_imaged)
+        found.append(one)
     return found
 
 
@@ -242,6 +243,18 @@ def test_two_patches_make_a_landmark_with_the_single_ranges_of_before() -> None:
         back_end.predict(np.zeros(3))
         back_end.update([seen_from(pose)])
     assert back_end.reported_rows() == [0]
+
+
+def test_radars_without_images_begin_landmarks_beside_those_with_images() -> None:
+    """Ranges that a caller gives for some mounts are enough, whatever the others see."""
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    empty = [RangeScan(radar=radar, ranges_m=(), is_imaged=True) for radar in (2, 3)]
+    for _ in range(20):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        back_end.update([*ranges_at(pose, is_imaged=False), *empty])
+    assert back_end.reported_rows() == [0]
+    np.testing.assert_allclose(back_end.state.landmarks_m[0], ROD, atol=2e-3)
 
 
 def single_ranges(back_end: RobustBackEnd, radar: int) -> set[int]:
@@ -317,7 +330,7 @@ def test_what_may_be_known_waits_for_four_patches() -> None:
 
 
 def test_ranges_of_landmarks_at_one_range_are_not_used() -> None:
-    """Of the radar that hears both, within the field of view; of the other one they are."""
+    """Of a radar with images that has both in its field of view; of others they are."""
     view = View(
         ranges_m=np.array([[0.9, 1.0, 0.95, 1.3], [0.7, 1.0, 0.9, 1.3]]),
         off_boresight_rad=np.array([[0.1, -0.2, 2.0, 0.0], [0.1, -0.2, 0.3, 0.0]]),
@@ -325,11 +338,14 @@ def test_ranges_of_landmarks_at_one_range_are_not_used() -> None:
         by_feature=np.zeros((2, 4, 2)),
         turned=np.zeros((2, 2, 2)),
     )
-    left = view.without_crowds(NOISE, 0.13)
-    is_out = left.off_boresight_rad == math.pi
-    assert is_out.tolist() == [[True, True, True, False], [False, True, True, False]]
-    kept = ~is_out
-    np.testing.assert_array_equal(left.off_boresight_rad[kept], view.off_boresight_rad[kept])
+    crowded = [[True, True, True, False], [False, True, True, False]]
+    for imaged, out in (([0, 1], crowded), ([1], [[False] * 4, crowded[1]])):
+        left = view.without_crowds(imaged, NOISE, 0.13)
+        is_out = left.off_boresight_rad == math.pi
+        assert is_out.tolist() == out
+        np.testing.assert_array_equal(
+            left.off_boresight_rad[~is_out], view.off_boresight_rad[~is_out]
+        )
 
 
 @pytest.mark.parametrize("value", ["true", 1, 1.0, "yes"])
@@ -342,30 +358,31 @@ def test_the_switch_of_a_file_is_true_or_false(value: object) -> None:
 
 
 def images_of(slam: RobustSlam) -> bool:
-    """Return whether a pipeline takes points of images after its first frame."""
+    """Return whether a pipeline images the frames that it is given."""
     samples = np.zeros(300, dtype=np.float32)
-    frame = RadarFrame(
-        radar=0, t_ns=0, counter=0, samples=samples, range_start_m=0.0, bin_length_m=0.0064
-    )
-    slam.step([frame], lambda _: np.zeros(3), 0)
-    return slam.back_end.parameters.ranges.has_patches
+    asked: list[int] = []
+
+    def pose_at(t_ns: int) -> Array:
+        asked.append(t_ns)
+        return np.array([1e-9 * t_ns, 0.0, 0.0])
+
+    for t_ns in (0, 100_000_000):
+        frame = RadarFrame(
+            radar=0, t_ns=t_ns - 7, counter=0, samples=samples, range_start_m=0.0, bin_length_m=6e-3
+        )
+        slam.step([frame], pose_at, t_ns)
+        if not t_ns:
+            assert asked == [0]  # frames at the first pose are not looked at
+    return asked.count(100_000_000 - 7) > 1  # once for its ranges, once for its image
 
 
 def test_images_are_made_of_frames_that_this_front_end_takes() -> None:
-    """Ranges alone begin landmarks themselves; so do those of another front end."""
     preset, wheels = load_preset("robust"), WheelNoise()
     assert images_of(RobustSlam(preset, paper_rig(), wheels))
     off = override(preset, {"robust.patches": False})
     assert not images_of(RobustSlam(off, paper_rig(), wheels))
     other = make_detector(preset, paper_rig())
     assert not images_of(RobustSlam(preset, paper_rig(), wheels, other))
-    of_ranges = RobustSlam(preset, paper_rig(), wheels)
-    of_ranges.step_detections([], lambda _: np.zeros(3), 0)
-    assert not of_ranges.back_end.parameters.ranges.has_patches
-    given = back_end_parameters(preset, wheels, has_patches=True).ranges
-    assert replace(given, has_patches=False, unmapped_per_m2=0.02) == (
-        back_end_parameters(preset, wheels).ranges
-    )
 
 
 def short_drive(patches: str) -> tuple[Belief, Array]:
