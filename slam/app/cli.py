@@ -209,7 +209,7 @@ def _add_preset(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="replace a setting of the preset, like robust.patches=true; may be repeated",
+        help="replace a setting of the preset, like robust.patches=false; may be repeated",
     )
 
 

@@ -34,7 +34,7 @@ class Recorded:
 
 OPTIONS = {
     "paper": ("--preset", "paper", "--wire", "--lean"),
-    "patches": ("--set", "robust.patches=true", "--wire"),
+    "ranges": ("--set", "robust.patches=false", "--wire"),
 }
 
 
