@@ -1,6 +1,7 @@
 """A recorded session comes back as it was; damaged and foreign files are one line."""
 
 import errno
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -205,6 +206,20 @@ def test_a_smoothed_run_that_is_not_finite_is_refused() -> None:
     row[2] = np.nan  # a time
     with pytest.raises(ValueError, match="not finite"):
         smoothed_of(0, row)
+
+
+@pytest.mark.parametrize("written", [None, True, False])
+def test_a_session_that_says_nothing_of_images_had_none(
+    written: bool | None, tmp_path: Path
+) -> None:
+    """Sessions of before it was a setting are replayed as they were."""
+    tables = json.loads(settings_text(load_preset("robust")))
+    del tables["robust"]["patches"]
+    if written is not None:
+        tables["robust"]["patches"] = written
+    path = tmp_path / "s.mcap"
+    SessionLog(path, replace(session_info(), config_json=json.dumps(tables))).close()
+    assert open_session(path).config.robust.patches is bool(written)
 
 
 def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:
