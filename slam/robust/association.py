@@ -163,11 +163,12 @@ class View:
     """All n landmarks and behind them all w walls as all radars should see them."""
 
     ranges_m: Array  # shape (r, n + w), offsets included; negative behind a wall
-    # Shape (r, n + w), in [-pi, pi); infinite where no range of the radar may be the feature's
-    off_boresight_rad: Array
+    off_boresight_rad: Array  # shape (r, n + w), in [-pi, pi)
     directions: Array  # shape (r, n + w, 2), unit vectors u or n in the map frame
     by_feature: Array  # shape (r, n + w, 2), d(range) / d(error of the landmark or wall)
     turned: Array  # shape (r, 2, 2): rotations from the body frame of the sample to the map
+    # Shape (r, n + w): whether no range of the radar is the feature's, whatever is predicted
+    barred: NDArray[np.bool_]
 
     def inside(self, noise: RangeNoise, widen_rad: float, widen_m: float) -> NDArray[np.bool_]:
         """Return whether each radar may have each feature in view, shape (r, n + w)."""
@@ -216,6 +217,7 @@ def view(state: State, antennas: Antennas) -> View:
         directions=directions,
         by_feature=by_feature,
         turned=turned,
+        barred=np.zeros(ranges.shape, dtype=np.bool_),
     )
 
 
@@ -302,6 +304,7 @@ def find_known(
         ranges_m,
         variances,
         blurred_m,
+        seen.barred,
         np.array(
             [
                 noise.field_of_view_rad / 2,
@@ -678,6 +681,7 @@ def predicted_ranges(
         for side, place in np.argwhere(known.of_side[:, :, 0]).tolist()
         if (row := int(known.rows[place])) < len(state.landmark_ids)
         for radar in np.flatnonzero((side_of == side) & antennas.has_frame).tolist()
+        if not seen.barred[radar, row]
     ]
     return ranges_predicted(state, seen, antennas, which)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -357,6 +357,7 @@ class RobustBackEnd:
         self._unassigned.clear()
         self._tentative.clear()
         self._unshown.clear()
+        self._patch_poses = dict.fromkeys(self._patch_poses, self._log.n_poses)
         state = self.state
         state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
         for landmark_id, point_m, covariance in points:
@@ -377,7 +378,7 @@ class RobustBackEnd:
         scans = [scan for scan in scans if not scan.is_patch]
         self._check_radars(scans)
         looks = [scan for scan in scans if scan.looks]
-        self._imaged |= {scan.radar for scan in scans if scan.is_imaged}
+        self._note_imaged(scans)
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
@@ -434,6 +435,13 @@ class RobustBackEnd:
             evidence=(*likelihoods, *evidence_of_misses, *of_patches, *of_tracklets),
         )
 
+    def _note_imaged(self, scans: Sequence[RangeScan]) -> None:
+        """Note of which radars points of patches come, too; their first patch begins now."""
+        imaged = {scan.radar for scan in scans if scan.is_imaged}
+        self._imaged = (self._imaged - {scan.radar for scan in scans}) | imaged
+        for radar in imaged:
+            self._patch_poses.setdefault(radar, self._log.n_poses - 1)
+
     def _check_radars(self, scans: Sequence[RangeScan]) -> None:
         radars = {scan.radar for scan in scans}
         if len(radars) < len(scans) or max(radars, default=0) >= len(self.rig.mounts):
@@ -478,6 +486,7 @@ class RobustBackEnd:
 
         def find(state: State, parameters: BackEndParameters) -> tuple[View, Known]:
             seen, excluded = view(state, antennas), [*beacons, *walls]
+            self._bar(seen)
             return seen, find_known(
                 state, seen, scans, self._side_of, parameters, beacons=excluded, sure_m=sure_m
             )
@@ -502,11 +511,14 @@ class RobustBackEnd:
         imaged = sorted(self._imaged)
         if imaged:
             seen = seen.without_crowds(imaged, rule.ranges, rule.imaged.crowd_m)
+        self._bar(seen)
+        return seen
+
+    def _bar(self, seen: View) -> None:
+        """Bar from a view the landmarks that the newest patches of the radars do not show."""
         rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
         for radar, id_ in self._unshown:
-            if id_ in rows:
-                seen.off_boresight_rad[radar, rows[id_]] = math.inf
-        return seen
+            seen.barred[radar, rows[id_]] = True
 
     def _count(self, known: Known) -> list[int]:
         """Count hits and misses; return landmarks surely in view and not heard, once per radar."""
@@ -716,7 +728,7 @@ class RobustBackEnd:
                 landmark_id, detections_of(scan, [index], self._log.n_poses - 1, antennas, noise)
             )
         if scan.is_patch:
-            self._trust(scan.radar, hit_ids, {ids[row] for row in found.missed} - hit_ids)
+            self._note_shown(scan.radar, hit_ids, {ids[row] for row in found.missed} - hit_ids)
             found = replace(found, missed=())
         # Those that are seen rarely are missed often: half of the expected hits, at most.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
@@ -737,17 +749,21 @@ class RobustBackEnd:
             self._place_points()
         return continued, nis, evidence, predicted
 
-    def _trust(self, radar: int, shown: set[int], hidden: set[int]) -> None:
+    def _note_shown(self, radar: int, hit: set[int], hidden: set[int]) -> None:
         """Leave out a radar's single ranges of what its newest patch does not show as a point.
 
         What answers there is something else: the face behind an edge, or a neighbour. From the
         whole run those since the patch before are left out; newer ones wait for a patch with it.
+        That it is missed, if nothing answers there at all, counts as ever.
         """
-        self._unshown -= {(radar, id_) for id_ in shown}
+        self._unshown -= {(radar, id_) for id_ in hit}
         self._unshown |= {(radar, id_) for id_ in hidden}
         if hidden:
             self._log.leave_out(radar, hidden, self._patch_poses.get(radar, 0))
         self._patch_poses[radar] = self._log.n_poses
+
+    def _forget_unshown(self, ids: Collection[int]) -> None:
+        self._unshown = {(radar, id_) for radar, id_ in self._unshown if id_ not in ids}
 
     def _correct_points(
         self,
@@ -940,8 +956,13 @@ class RobustBackEnd:
                 wall_id = self._walls.place(wall)
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
-            if not self._imaged.isdisjoint(radars):
-                continue  # patches show points sooner, and apart from their neighbours
+            # Patches show points sooner, and apart from their neighbours.
+            alone = [radar for radar in radars if radar not in self._imaged]
+            if not alone:
+                continue
+            if len(alone) < len(radars):
+                radars, is_single = alone, len(alone) == 1
+                guesses = point_guesses(self._unassigned, radars, self.parameters.ranges, rule)
             search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
             if is_single:
                 search = Search(
@@ -992,6 +1013,7 @@ class RobustBackEnd:
             self._existence.forget(landmark_id)
             self._log.drop(landmark_id)
         if vanished:
+            self._forget_unshown(vanished)
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
 
@@ -1045,6 +1067,7 @@ class RobustBackEnd:
             self._existence.merge(kept, gone)
             self._log.rename(gone, kept)
         merged = {gone: kept for kept, gone in ids}
+        self._forget_unshown({*merged, *merged.values()})
         self._settled = {merged.get(id_, id_) for id_ in self._settled}
         labels = self._landmark_of_label.items()
         self._landmark_of_label = {label: merged.get(id_, id_) for label, id_ in labels}

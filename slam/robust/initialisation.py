@@ -846,7 +846,7 @@ class TentativePoint:
 
     @property
     def is_of_patches(self) -> bool:
-        return self.seen[0].is_of_patch
+        return all(one.is_of_patch for one in self.seen)
 
 
 class TentativePoints:

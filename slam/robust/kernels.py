@@ -154,7 +154,7 @@ def follow(
 @kernel(
     "Tuple((f8[:,:,::1], i8[:,::1], b1[:,:,::1], b1[:,::1], f8[:,::1]))"
     "(f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], i8[::1], i8[::1], i8[::1],"
-    " f8[::1], f8[:,::1], b1[::1], i8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1])"
+    " f8[::1], f8[:,::1], b1[::1], i8[::1], f8[:,::1], f8[:,::1], f8[:,::1], b1[:,::1], f8[::1])"
 )
 def assign(
     predicted: Array,
@@ -172,6 +172,7 @@ def assign(
     ranges: Array,
     variances: Array,
     blurred: Array,
+    barred: NDArray[np.bool_],
     limits: Array,
 ) -> tuple[Array, Indices, NDArray[np.bool_], NDArray[np.bool_], Array]:
     """Return which range of each radar is of which of some landmarks, at the least cost.
@@ -180,7 +181,8 @@ def assign(
     ``rows`` (c,) are those that may be in view, ``first`` and ``widths`` (c,) their columns in the
     covariance ``block``, behind two of the position, r offsets and, if ``by_mount`` is not empty,
     2 r of the mounts; ``added`` (c,) are variances of their ranges. ``ranges``, with their
-    ``variances``, and ``blurred`` are NaN beyond those of a radar, shapes (r, k) and (r, b).
+    ``variances``, and ``blurred`` are NaN beyond those of a radar, shapes (r, k) and (r, b). What a
+    radar ranges is never taken for what is ``barred`` (r, n), but may hide that it is missed.
     ``limits`` are half the field of view and the limits of range; the angle and the length by which
     they are widened, and by which they are narrowed; the variance of a sure prediction; bounds on
     d^2 for one range and for more; cost of a range before its density; the noise of a range and how
@@ -277,14 +279,13 @@ def assign(
                     unheard[c, i] = False
                 reach = limits[12] * math.sqrt(prior[c, i, i] + limits[11] * limits[11])
                 count = 0
-                if off_boresight[i, n] == math.inf:  # of this radar nothing may be its
-                    count_of[n_part, place] = 0
-                    silent = False
-                    continue
                 for k in range(n_ranges):
                     away = abs(ranges[i, k] - predicted[i, n])
                     if away <= reach:
                         unheard[c, i] = False
+                        hidden = hidden or barred[i, n]
+                    if barred[i, n]:
+                        continue
                     if away * away <= limits[9] * (prior[c, i, i] + variances[i, k]):
                         near_of[n_part, place, count] = k
                         count += 1

@@ -79,7 +79,7 @@ class RobustSlam:
         self._noise_at, self._noise = noise_at, np.zeros((3, 3))  # the latter at the last state
         self._least_noise = np.diag(np.square([wheels.floor_m, wheels.floor_m, wheels.floor_rad]))
         self._patches: PatchScans | None = None
-        # Whoever replaces the front end gets what that finds, and no more.
+        # With a caller's detector there are no images.
         if config.robust.patches and detector is None:
             learned = self._detector
             pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None

@@ -90,7 +90,7 @@ _KINDS = {
 }
 
 
-# What sessions had that say nothing of it
+# Of sessions recorded before it was a setting
 _BEFORE_PATCHES = {"patches": False}
 _OF_A_MODULE = "a recording of one module; `xethru view` shows it, `xethru dump` prints it"
 
@@ -331,7 +331,7 @@ class RecordedSession:
             tables = json.loads(self.info.config_json)
             if isinstance(tables, dict):
                 tables = without_removed_keys(tables, str(self.path))
-                if isinstance(robust := tables.get("robust"), dict):
+                if isinstance(robust := tables.get("robust", {}), dict):
                     tables["robust"] = _BEFORE_PATCHES | robust
             return SlamConfig.model_validate(tables)
         except json.JSONDecodeError as error:

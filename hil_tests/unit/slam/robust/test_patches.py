@@ -257,6 +257,48 @@ def test_radars_without_images_begin_landmarks_beside_those_with_images() -> Non
     np.testing.assert_allclose(back_end.state.landmarks_m[0], ROD, atol=2e-3)
 
 
+def test_what_is_gone_is_deleted_although_patches_do_not_show_it_either() -> None:
+    """Nothing answers where the rod was: it is missed as without images."""
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    for number in range(30):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        patches = [seen_from(pose, ROD, radar=radar) for radar in (0, 1) if number in (10, 20)]
+        back_end.update([*ranges_at(pose), *patches])
+    assert back_end.reported_rows() == [0]
+    silent = [RangeScan(radar=radar, ranges_m=(), is_imaged=True) for radar in (0, 1)]
+    for number in range(60):
+        back_end.predict(np.zeros(3))
+        patches = [seen_from(pose, radar=radar) for radar in (0, 1) if number % 12 == 5]
+        back_end.update([*silent, *patches])
+    assert not back_end.state.landmark_ids
+
+
+def test_the_first_patch_leaves_out_no_ranges_of_before_the_images() -> None:
+    """Ranges come alone at first, then frames; the first patch does not show the rod."""
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    for number in range(40):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        patches = [seen_from(pose)] if number == 38 else []
+        back_end.update([*ranges_at(pose, is_imaged=number >= 30), *patches])
+    kept = single_ranges(back_end, 0)
+    assert len(kept) >= 28
+    assert max(kept) <= 31
+
+
+def test_a_mount_of_ranges_beside_an_imaged_one_begins_landmarks() -> None:
+    """Radars 0 and 1 look to one side; only the first has images, and shows nothing."""
+    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
+    for _ in range(45):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        first, second = ranges_at(pose)
+        back_end.update([first, replace(second, is_imaged=False)])
+    assert back_end.reported_rows() == [0]
+    np.testing.assert_allclose(back_end.state.landmarks_m[0], ROD, atol=0.02)
+
+
 def single_ranges(back_end: RobustBackEnd, radar: int) -> set[int]:
     """Return the poses of the single ranges of a radar that a solution over all poses takes."""
     problem = back_end._log.problem(back_end.state, PARAMETERS)
@@ -337,6 +379,7 @@ def test_ranges_of_landmarks_at_one_range_are_not_used() -> None:
         directions=np.zeros((2, 4, 2)),
         by_feature=np.zeros((2, 4, 2)),
         turned=np.zeros((2, 2, 2)),
+        barred=np.zeros((2, 4), dtype=np.bool_),
     )
     crowded = [[True, True, True, False], [False, True, True, False]]
     for imaged, out in (([0, 1], crowded), ([1], [[False] * 4, crowded[1]])):

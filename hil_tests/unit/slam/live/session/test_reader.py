@@ -222,6 +222,14 @@ def test_a_session_that_says_nothing_of_images_had_none(
     assert open_session(path).config.robust.patches is bool(written)
 
 
+def test_a_session_without_settings_of_the_back_end_had_no_images(tmp_path: Path) -> None:
+    tables = json.loads(settings_text(load_preset("robust")))
+    del tables["robust"]
+    path = tmp_path / "s.mcap"
+    SessionLog(path, replace(session_info(), config_json=json.dumps(tables))).close()
+    assert not open_session(path).config.robust.patches
+
+
 def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:
     sent = replace(
         session_info(),
