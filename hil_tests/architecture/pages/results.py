@@ -30,11 +30,12 @@ Some of these runs were looked at while SLAM was developed: `lab` and `classroom
 seeds 0 and 1, for the rules of walls and thick targets; and rooms 0 to 9 of the random families.
 
 `The paper's rooms`, `Random rooms` and `Hardships with points of images` were measured with this
-version, in which points of images are detections. The other tables of preset `robust` are older and
-without them, as `robust.patches=false` in their commands says. Since then, besides, carries are
-judged by all ranges, a run whose constants are implausible takes bodies for thicker, and ranges
-decide whether a sudden change of the wheels' motion is a slip; `First, do no harm` and `Modules
-like recorded ones` have that, too.
+version, in which points of images are detections, but for one thing: since then, a landmark where
+nothing answers is deleted although images do not show it either. The other tables of preset
+`robust` are older and without them, as `robust.patches=false` in their commands says. Since then,
+besides, carries are judged by all ranges, a run whose constants are implausible takes bodies for
+thicker, and ranges decide whether a sudden change of the wheels' motion is a slip; `First, do no
+harm` and `Modules like recorded ones` have that, too.
 
 What the columns mean:
 
