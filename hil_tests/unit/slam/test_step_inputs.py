@@ -222,9 +222,8 @@ SCAN = RangeScan(
     bearings_rad=(0.1, 0.2),
     bearing_sigmas_rad=(0.0, 0.01),
 )
-NUMBERS = [
-    each.name for each in fields(RangeScan) if each.name not in ("radar", "labels", "is_patch")
-]
+OTHERS = ("radar", "labels", "is_patch", "is_imaged")
+NUMBERS = [each.name for each in fields(RangeScan) if each.name not in OTHERS]
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
