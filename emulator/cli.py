@@ -272,7 +272,13 @@ def _is_same_port(path: Path, port: Path) -> bool:
     """Whether two paths lead to one link, or to one terminal; a port may be unplugged."""
 
     def places(link: Path) -> set[str]:
-        return {os.path.join(os.path.realpath(link.parent), link.name), os.path.realpath(link)}
+        # Every link on the way: the last one goes when the port is unplugged, perhaps just now.
+        found = set[str]()
+        while (place := os.path.join(os.path.realpath(link.parent), link.name)) not in found:
+            found.add(place)
+            with contextlib.suppress(OSError):
+                link = link.parent / os.readlink(place)
+        return found
 
     return not places(path).isdisjoint(places(port))
 
