@@ -457,6 +457,8 @@ REMOVED_KEYS: Mapping[str, str | float] = {
     "robust.predicted_share": 1.0,
     "trilateration.bearing": "ranges",
 }
+ADDED_KEYS: Mapping[str, bool] = {"robust.patches": False}
+"""Keys that sessions lack which were recorded before, with what was then in effect."""
 """Settings that no longer exist, with their defaults in the last version that had them."""
 _LAST_VERSION_WITH_THEM = "0.1.0"
 
@@ -555,6 +557,21 @@ def without_removed_keys(tables: Mapping[str, Any], source: str) -> dict[str, An
         if not kept[part] and part not in SlamConfig.model_fields:
             del kept[part]
     return kept
+
+
+def with_added_keys(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of a recorded configuration with those of `ADDED_KEYS` that they lack.
+
+    >>> with_added_keys({"robust": {"offset_sigma_m": 0.0}})
+    {'robust': {'patches': False, 'offset_sigma_m': 0.0}}
+    """
+    full = dict(tables)
+    for added, value in ADDED_KEYS.items():
+        part, _, field = added.partition(".")
+        table = full.get(part, {})
+        if isinstance(table, Mapping):
+            full[part] = {field: value, **table}
+    return full
 
 
 def _is_same(value: object, default: str | float) -> bool:

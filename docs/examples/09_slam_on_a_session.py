@@ -20,8 +20,6 @@ landmark at +1.73, +0.63, standard deviation 5 mm
 landmark at +1.24, -0.60, standard deviation 5 mm
 landmark at -0.64, +1.63, standard deviation 6 mm
 ```
-
-The front end stops at 1.5 m, and one of the six rods was too seldom so near.
 """
 
 import subprocess

@@ -2,7 +2,7 @@
 
 One module sees ranges without directions; the way of the robot gives them. So landmarks come later
 than with two, and the robot must pass them on more than one way: here a module that looks to the
-right on two laps of a square, one in each direction, which end where they began. It finds five of
+right on two laps of a square, one in each direction, which end where they began. It finds four of
 the six rods; its path is little better than that of the wheels. It prints
 
 ```text

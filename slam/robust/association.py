@@ -554,7 +554,7 @@ def find_points(
         is_sure = np.linalg.eigvalsh(white)[..., -1] <= most
         # A square metre is the more radians wide, the nearer it is.
         unmapped = np.log(
-            parameters.unmapped_per_m2(of_patches=scan.is_patch)
+            parameters.bearings(of_patches=scan.is_patch).unmapped_per_m2
             * (measured[k:, 0] * odds / clutter)
         )
         new = np.maximum(0.0, unmapped)

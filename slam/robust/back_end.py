@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -63,6 +63,7 @@ from slam.robust.initialisation import (
 from slam.robust.map import (
     MERGE_SIGMA_M,
     Existence,
+    Images,
     add_landmarks,
     apply_merge,
     find_merge,
@@ -165,11 +166,7 @@ class RobustBackEnd:
         # Beacons, whose ranges have labels: all labels heard, and by label those without a place
         self._heard: set[int] = set()
         self._waiting: dict[int, Waiting] = {}
-        self._imaged: set[int] = set()  # radars of which points of patches come, too
-        # Radars and ids of landmarks that the radar's newest patch with them in view does not show;
-        # and by radar the pose behind its newest patch
-        self._unshown: set[tuple[int, int]] = set()
-        self._patch_poses: dict[int, int] = {}
+        self._images = Images()
         self._n_updates = 0
         self.evidence = 0.0
         """Nats by which what detections with bearings were taken for, once a passage, and merges of
@@ -356,8 +353,7 @@ class RobustBackEnd:
         self._motion = None
         self._unassigned.clear()
         self._tentative.clear()
-        self._unshown.clear()
-        self._patch_poses = dict.fromkeys(self._patch_poses, self._log.n_poses)
+        self._images.begin_anew(self._log.n_poses)
         state = self.state
         state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
         for landmark_id, point_m, covariance in points:
@@ -378,7 +374,7 @@ class RobustBackEnd:
         scans = [scan for scan in scans if not scan.is_patch]
         self._check_radars(scans)
         looks = [scan for scan in scans if scan.looks]
-        self._note_imaged(scans)
+        self._images.take_scans(scans, self._log.n_poses - 1)
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
@@ -435,13 +431,6 @@ class RobustBackEnd:
             evidence=(*likelihoods, *evidence_of_misses, *of_patches, *of_tracklets),
         )
 
-    def _note_imaged(self, scans: Sequence[RangeScan]) -> None:
-        """Note of which radars points of patches come, too; their first patch begins now."""
-        imaged = {scan.radar for scan in scans if scan.is_imaged}
-        self._imaged = (self._imaged - {scan.radar for scan in scans}) | imaged
-        for radar in imaged:
-            self._patch_poses.setdefault(radar, self._log.n_poses - 1)
-
     def _check_radars(self, scans: Sequence[RangeScan]) -> None:
         radars = {scan.radar for scan in scans}
         if len(radars) < len(scans) or max(radars, default=0) >= len(self.rig.mounts):
@@ -486,7 +475,7 @@ class RobustBackEnd:
 
         def find(state: State, parameters: BackEndParameters) -> tuple[View, Known]:
             seen, excluded = view(state, antennas), [*beacons, *walls]
-            self._bar(seen)
+            self._images.bar(seen, self.state.landmark_ids)
             return seen, find_known(
                 state, seen, scans, self._side_of, parameters, beacons=excluded, sure_m=sure_m
             )
@@ -508,17 +497,11 @@ class RobustBackEnd:
     def _look(self, antennas: Antennas) -> View:
         """Return the view of all features of which single ranges may be."""
         seen, rule = self._walls.look(view(self.state, antennas), antennas), self.parameters
-        imaged = sorted(self._imaged)
-        if imaged:
+        if self._images.radars:
+            imaged = sorted(self._images.radars)
             seen = seen.without_crowds(imaged, rule.ranges, rule.imaged.crowd_m)
-        self._bar(seen)
+        self._images.bar(seen, self.state.landmark_ids)
         return seen
-
-    def _bar(self, seen: View) -> None:
-        """Bar from a view the landmarks that the newest patches of the radars do not show."""
-        rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
-        for radar, id_ in self._unshown:
-            seen.barred[radar, rows[id_]] = True
 
     def _count(self, known: Known) -> list[int]:
         """Count hits and misses; return landmarks surely in view and not heard, once per radar."""
@@ -718,17 +701,16 @@ class RobustBackEnd:
             free = [index for index in free if index not in used]
         continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
         hit_ids = {landmark_id for _, _, landmark_id in continued}
+        rule = self.parameters.bearings(of_patches=scan.is_patch)
         for landmark_id in sorted(hit_ids):
-            self._existence.hit(
-                landmark_id, self.parameters.frames_per_scan(of_patches=scan.is_patch)
-            )
+            self._existence.hit(landmark_id, rule.frames_per_scan)
         refused = [(index, ids[row]) for index, row in found.refused]
         for index, landmark_id in refused:
             self._log.add_detections(
                 landmark_id, detections_of(scan, [index], self._log.n_poses - 1, antennas, noise)
             )
         if scan.is_patch:
-            self._note_shown(scan.radar, hit_ids, {ids[row] for row in found.missed} - hit_ids)
+            self._take_shown(scan.radar, hit_ids, {ids[row] for row in found.missed} - hit_ids)
             found = replace(found, missed=())
         # Those that are seen rarely are missed often: half of the expected hits, at most.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
@@ -741,29 +723,18 @@ class RobustBackEnd:
         far = {index for index, _ in refused}
         free = [index for index in free if index not in far]
         detections = detections_of(scan, free, self._log.n_poses - 1, antennas, noise)
-        own_share = 1.0 - noise.common_share
-        points = [body_point(state, antennas, one, own_share) for one in detections]
+        points = [body_point(state, antennas, one, 1.0 - noise.common_share) for one in detections]
         self._tentative.take(detections, points)
         self._antennas, self._settled = antennas, hit_ids | missed
         if detections:
             self._place_points()
         return continued, nis, evidence, predicted
 
-    def _note_shown(self, radar: int, hit: set[int], hidden: set[int]) -> None:
-        """Leave out a radar's single ranges of what its newest patch does not show as a point.
-
-        What answers there is something else: the face behind an edge, or a neighbour. From the
-        whole run those since the patch before are left out; newer ones wait for a patch with it.
-        That it is missed, if nothing answers there at all, counts as ever.
-        """
-        self._unshown -= {(radar, id_) for id_ in hit}
-        self._unshown |= {(radar, id_) for id_ in hidden}
+    def _take_shown(self, radar: int, shown: set[int], hidden: set[int]) -> None:
+        """Take the ids that a patch shows and hides; leave out the single ranges of the latter."""
+        since = self._images.take_patch(radar, shown, hidden, self._log.n_poses)
         if hidden:
-            self._log.leave_out(radar, hidden, self._patch_poses.get(radar, 0))
-        self._patch_poses[radar] = self._log.n_poses
-
-    def _forget_unshown(self, ids: Collection[int]) -> None:
-        self._unshown = {(radar, id_) for radar, id_ in self._unshown if id_ not in ids}
+            self._log.leave_out(radar, hidden, since)
 
     def _correct_points(
         self,
@@ -814,7 +785,8 @@ class RobustBackEnd:
         Of the others it is asked which they are.
         """
         for tentative in self._tentative.take_out():
-            density = self.parameters.unmapped_per_m2(of_patches=tentative.is_of_patches)
+            rule = self.parameters.bearings(of_patches=tentative.is_of_patches)
+            density = rule.unmapped_per_m2
             if tentative.label is None and tentative.misses:
                 self._tentative.keep(tentative)  # the newest scan does not hold it
                 continue
@@ -836,7 +808,7 @@ class RobustBackEnd:
         Those with labels, and those of which a scan says where they are, are not it.
         """
         beside = self._log.seen_from({one.pose for one in tentative.seen})
-        apart = self.parameters.fewest_detections(of_patches=tentative.is_of_patches)
+        apart = self.parameters.bearings(of_patches=tentative.is_of_patches).fewest
         barred = {
             row
             for row, id_ in enumerate(self.state.landmark_ids)
@@ -849,16 +821,14 @@ class RobustBackEnd:
         """Return which of several options the first tentative landmark is that is unclear."""
         parameters = self.parameters
         for tentative in self._tentative.unclear():
-            of_patches = tentative.is_of_patches
-            if_new, if_possible = parameters.detections_to_ask(of_patches=of_patches)
-            if len(tentative.seen) < if_new:
+            rule = parameters.bearings(of_patches=tentative.is_of_patches)
+            if len(tentative.seen) < rule.if_new:
                 continue
             point = self._common(tentative)
             found = self._possible(tentative, point)
-            if found and len(tentative.seen) < if_possible:
+            if found and len(tentative.seen) < rule.if_possible:
                 continue
-            density = parameters.unmapped_per_m2(of_patches=of_patches)
-            options = options_of(self.state, point, found, density)
+            options = options_of(self.state, point, found, rule.unmapped_per_m2)
             options.append(Option(evidence=0.0))
             if self._may_have_jumped(tentative):
                 rarity = math.log(parameters.relinearisation.steps_per_slip)
@@ -918,8 +888,8 @@ class RobustBackEnd:
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
-        frames = self.parameters.frames_per_scan(of_patches=tentative.is_of_patches)
-        self._existence.hit(landmark_id, len(tentative.seen) * frames)
+        rule = self.parameters.bearings(of_patches=tentative.is_of_patches)
+        self._existence.hit(landmark_id, len(tentative.seen) * rule.frames_per_scan)
         self._log.add_detections(landmark_id, tentative.seen)
         if tracklet is not None:
             self._use(landmark_id, tracklet.seen)
@@ -957,7 +927,7 @@ class RobustBackEnd:
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
             # Patches show points sooner, and apart from their neighbours.
-            alone = [radar for radar in radars if radar not in self._imaged]
+            alone = [radar for radar in radars if radar not in self._images.radars]
             if not alone:
                 continue
             if len(alone) < len(radars):
@@ -1013,7 +983,7 @@ class RobustBackEnd:
             self._existence.forget(landmark_id)
             self._log.drop(landmark_id)
         if vanished:
-            self._forget_unshown(vanished)
+            self._images.forget(vanished)
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
 
@@ -1045,9 +1015,10 @@ class RobustBackEnd:
     def _are_seen_together(self, pairs: Sequence[tuple[int, int]]) -> bool:
         """Return whether scans with bearings hold both landmarks of a pair, by row."""
         ids = self.state.landmark_ids
+        # With images of any radar: what patches hold is most of what has bearings.
+        fewest = self.parameters.bearings(of_patches=bool(self._images.radars)).fewest
         return any(
-            self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]]
-            >= self.parameters.fewest_detections(of_patches=bool(self._imaged))
+            self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]] >= fewest
             for kept, gone in pairs
         )
 
@@ -1067,7 +1038,7 @@ class RobustBackEnd:
             self._existence.merge(kept, gone)
             self._log.rename(gone, kept)
         merged = {gone: kept for kept, gone in ids}
-        self._forget_unshown({*merged, *merged.values()})
+        self._images.forget({*merged, *merged.values()})
         self._settled = {merged.get(id_, id_) for id_ in self._settled}
         labels = self._landmark_of_label.items()
         self._landmark_of_label = {label: merged.get(id_, id_) for label, id_ in labels}

@@ -927,8 +927,8 @@ class TentativePoints:
     def _is_landmark(self, one: TentativePoint) -> bool:
         hits, excess = len(one.seen), self._parameters.tracklets.excess_sigmas
         is_at_rest = one.chi_square <= chi_square_limit(2 * (hits - 1), excess)
-        fewest = self._parameters.fewest_detections(of_patches=one.is_of_patches)
-        return hits >= fewest and is_at_rest
+        rule = self._parameters.bearings(of_patches=one.is_of_patches)
+        return hits >= rule.fewest and is_at_rest
 
     def _assigned(
         self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]

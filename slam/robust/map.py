@@ -19,7 +19,15 @@ from scipy.special import chdtri
 
 from slam.geometry import Rig
 from slam.results import OF_MOUNT, SavedLandmark, SavedMap, SavedRadar, SavedWall
-from slam.robust.association import Correspondence, Pairs, certain, correspondence, density_per_m2
+from slam.robust.association import (
+    Correspondence,
+    Pairs,
+    RangeScan,
+    View,
+    certain,
+    correspondence,
+    density_per_m2,
+)
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
 from slam.robust.state import HEAD_SIZE, Array, Indices, State, SymmetricMatrix, rotation
 
@@ -99,6 +107,53 @@ class Existence:
         into.n_heard += other.n_heard
         into.n_unheard += other.n_unheard
         self.forget(gone)
+
+
+class Images:
+    """Which radars have images, and which landmarks their newest patches do not show as points.
+
+    Single ranges of such a landmark are not used: something else answers, such as the face behind
+    an edge, or a neighbour. That nothing answers there counts as ever.
+    """
+
+    def __init__(self) -> None:
+        self.radars: set[int] = set()
+        self._unshown: set[tuple[int, int]] = set()  # radar, and id of a landmark
+        self._since: dict[int, int] = {}  # by radar the pose behind its newest patch
+
+    def take_scans(self, scans: Sequence[RangeScan], pose: int) -> None:
+        """Note which radars have images at a pose, by index in the log."""
+        imaged = {scan.radar for scan in scans if scan.is_imaged}
+        self.radars = (self.radars - {scan.radar for scan in scans}) | imaged
+        for radar in imaged:
+            self._since.setdefault(radar, pose)
+
+    def take_patch(self, radar: int, shown: set[int], hidden: set[int], end: int) -> int:
+        """Take the ids that a patch shows, and those in view that it does not.
+
+        ``end`` is the pose behind it; returned is the one behind the patch before: ranges since
+        then are not of what is hidden.
+        """
+        self._unshown -= {(radar, id_) for id_ in shown}
+        self._unshown |= {(radar, id_) for id_ in hidden}
+        since = self._since.get(radar, 0)
+        self._since[radar] = end
+        return since
+
+    def bar(self, seen: View, ids: Sequence[int]) -> None:
+        """Bar what is not shown from a view of landmarks with these ids."""
+        rows = {id_: row for row, id_ in enumerate(ids)}
+        for radar, id_ in self._unshown:
+            seen.barred[radar, rows[id_]] = True
+
+    def forget(self, ids: Collection[int]) -> None:
+        """Forget what is known of landmarks that are gone, or are one with another."""
+        self._unshown = {(radar, id_) for radar, id_ in self._unshown if id_ not in ids}
+
+    def begin_anew(self, pose: int) -> None:
+        """Forget all patches: from this pose on the robot is elsewhere."""
+        self._unshown.clear()
+        self._since = dict.fromkeys(self._since, pose)
 
 
 def unknowns_of(state: State, radars: Sequence[str]) -> tuple[str, ...]:

@@ -445,6 +445,18 @@ class ImagedPointRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BearingRule:
+    """When detections with bearings make a landmark; made of the other rules."""
+
+    unmapped_per_m2: float  # how many landmarks per square metre may not be in the map yet
+    frames_per_scan: int  # as how many frames a scan counts for the existence of a landmark
+    fewest: int  # detections that a landmark needs
+    # From how many detections on it is decided what they are of: if of nothing known, and if not
+    if_new: int
+    if_possible: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndParameters:
     """All parameters of the back end."""
 
@@ -462,23 +474,20 @@ class BackEndParameters:
     jumps: JumpNoise = field(default_factory=JumpNoise)
     imaged: ImagedPointRule = field(default_factory=ImagedPointRule)
 
-    def unmapped_per_m2(self, *, of_patches: bool) -> float:
-        """Return how many landmarks per square metre may not be in the map yet."""
-        return self.imaged.unmapped_per_m2 if of_patches else self.ranges.unmapped_per_m2
-
-    def fewest_detections(self, *, of_patches: bool) -> int:
-        """Return how many detections with bearings a landmark needs at least."""
-        return self.imaged.new_patches if of_patches else self.tracklets.min_hits_per_radar
-
-    def frames_per_scan(self, *, of_patches: bool) -> int:
-        """Return as how many frames a scan with bearings counts for the existence of a landmark."""
-        return self.imaged.frames_per_patch if of_patches else 1
-
-    def detections_to_ask(self, *, of_patches: bool) -> tuple[int, int]:
-        """Return from how many detections with bearings on it is decided what they are of.
-
-        If they are of nothing known, and if they may be.
-        """
-        if not of_patches:
-            return self.tracklets.min_frames, self.tracklets.min_frames
-        return self.imaged.new_patches, self.imaged.unclear_patches
+    def bearings(self, *, of_patches: bool) -> BearingRule:
+        """Return the rule for points of patches, or for detections of a sensor with bearings."""
+        if of_patches:
+            return BearingRule(
+                unmapped_per_m2=self.imaged.unmapped_per_m2,
+                frames_per_scan=self.imaged.frames_per_patch,
+                fewest=self.imaged.new_patches,
+                if_new=self.imaged.new_patches,
+                if_possible=self.imaged.unclear_patches,
+            )
+        return BearingRule(
+            unmapped_per_m2=self.ranges.unmapped_per_m2,
+            frames_per_scan=1,
+            fewest=self.tracklets.min_hits_per_radar,
+            if_new=self.tracklets.min_frames,
+            if_possible=self.tracklets.min_frames,
+        )

@@ -1,12 +1,14 @@
 """An emulated module in one line of Python, and control of it."""
 
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from emulator import control, emulated_port
+from emulator.cli import _is_same_port
 from hil_tests.device.emulator_process import emulator, open_radar
 from xethru_protocol.wire.codes import PongCode
 
@@ -58,6 +60,28 @@ def test_a_running_emulator_is_controlled_by_its_port(port: str, tmp_path: Path)
         FileNotFoundError, match=f"no emulator answers: No such file.*{tmp_path}/port"
     ):
         control(tmp_path / "port", "state")
+
+
+def test_a_link_is_of_its_port_while_that_is_being_unplugged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The port goes between the looks at the two paths."""
+    terminal, place, link = (tmp_path / name for name in ("terminal", "port", "link"))
+    terminal.touch()
+    place.symlink_to(terminal)
+    link.symlink_to(place)
+    read = os.readlink
+
+    def and_unplug(path: str) -> str:
+        target = read(path)
+        if Path(path) == place:
+            place.unlink()
+        return target
+
+    monkeypatch.setattr(os, "readlink", and_unplug)
+    assert _is_same_port(link, place)
+    assert not place.is_symlink()
+    assert _is_same_port(link, place)
 
 
 def test_any_path_to_a_port_finds_its_emulator(port: str, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
+from slam.config import ConfigError, SlamConfig, WheelNoise, with_added_keys, without_removed_keys
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Rig
 from slam.live.errors import AppError, OdometryError, refuse_pipe
@@ -90,8 +90,6 @@ _KINDS = {
 }
 
 
-# Of sessions recorded before it was a setting
-_BEFORE_PATCHES = {"patches": False}
 _OF_A_MODULE = "a recording of one module; `xethru view` shows it, `xethru dump` prints it"
 
 
@@ -330,9 +328,7 @@ class RecordedSession:
         try:
             tables = json.loads(self.info.config_json)
             if isinstance(tables, dict):
-                tables = without_removed_keys(tables, str(self.path))
-                if isinstance(robust := tables.get("robust", {}), dict):
-                    tables["robust"] = _BEFORE_PATCHES | robust
+                tables = with_added_keys(without_removed_keys(tables, str(self.path)))
             return SlamConfig.model_validate(tables)
         except json.JSONDecodeError as error:
             raise AppError(f"{self.path}: its settings cannot be read: {error}") from None

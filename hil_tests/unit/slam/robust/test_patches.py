@@ -338,7 +338,7 @@ def test_single_ranges_of_what_patches_do_not_show_are_not_used() -> None:
     assert {42, 43, 44, 45} <= single_ranges(back_end, 0)
 
 
-def test_what_a_patch_has_out_of_view_is_not_doubted() -> None:
+def test_single_ranges_of_what_a_patch_has_out_of_view_are_used() -> None:
     back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
     for number in range(30):
         back_end.predict(STEP)
