@@ -406,9 +406,9 @@ class RobustConfig(_ConfigTable):
     wheel_walk_per_sqrt_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
     """How far the wheels' calibration wanders per root of a metre, in its standard deviations."""
     patches: bool = True
-    """Whether points of coherent images (`slam.imaging`) are detections beside single ranges, where
-    frames come in and this project's front end takes them. Then they alone begin landmarks that are
-    points."""
+    """Whether points and walls of coherent images (`slam.imaging`) are detections beside single
+    ranges, where frames come in and this project's front end takes them. Then they alone begin
+    landmarks and walls."""
 
     @property
     def field_of_view_rad(self) -> float:

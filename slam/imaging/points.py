@@ -55,6 +55,8 @@ class PointRule:
     unlearned_beside_m: float = 0.18  # in place of `beside_m`, until the module's pulse is learnt
     most_fading: float = 0.4
     least_wall_share: float = 0.3  # size over that of the strongest reflector
+    # Clutter that stays for some seconds goes along with the robot, as the echo of a wall does.
+    least_wall_snr: float = 20.0
     on_wall_share: float = 0.3
     image_m: float = 0.06  # this near to where an image would be, a reflector is one
     range_floor_m: float = 1e-3
@@ -71,8 +73,8 @@ class PatchPoint:
         Body frame of the middle of the patch; of something round, its nearest surface.
     range_m, bearing_rad
         From the antenna in the middle of the patch, and off its boresight.
-    covariance
-        Shape (2, 2), of x and y [m^2].
+    sigma_m, bearing_sigma_rad
+        Standard deviations of these; their errors are independent.
     amplitude
         Its largest in the patch, at 1 m under the law of a rod, in units of the frames.
     snr
@@ -83,7 +85,8 @@ class PatchPoint:
     y_m: float
     range_m: float
     bearing_rad: float
-    covariance: Array
+    sigma_m: float
+    bearing_sigma_rad: float
     amplitude: float
     snr: float
     kind: PointKind
@@ -99,6 +102,10 @@ class PatchLine:
         Shape (2,), unit vector away from the antenna.
     distance_m
         d, from the origin of the patch.
+    range_m, bearing_rad
+        Of the foot of the perpendicular from the antenna in the middle of the patch.
+    sigma_m, bearing_sigma_rad
+        Standard deviations of these.
     ends_m
         Shape (2, 2): the feet of the perpendiculars from the first and the last antenna that saw
         it; the face may go on.
@@ -106,6 +113,10 @@ class PatchLine:
 
     normal: Array
     distance_m: float
+    range_m: float
+    bearing_rad: float
+    sigma_m: float
+    bearing_sigma_rad: float
     ends_m: Array
 
 
@@ -118,19 +129,29 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
     places = antenna + reflectors.places_m @ turn.T
     is_point = _are_points(patch, reflectors, places, rule)
     order = np.flatnonzero(is_point)[np.argsort(reflectors.range_m[is_point])]
-    return tuple(
-        PatchPoint(
-            x_m=float(places[k, 0]),
-            y_m=float(places[k, 1]),
-            range_m=float(reflectors.range_m[k]),
-            bearing_rad=float(reflectors.bearing_rad[k]),
-            covariance=_covariance(patch, reflectors, k, places[k], rule),
-            amplitude=float(reflectors.amplitude[k]),
-            snr=float(reflectors.snr[k]),
-            kind=PointKind.POINT if flat <= rule.flatness[0] else PointKind.ROUND,
+    points = []
+    for k in order.tolist():
+        lines = places[k] - aperture.antennas_m
+        lines /= np.linalg.norm(lines, axis=1, keepdims=True)
+        sigma_m, bearing_sigma_rad = _sigmas(patch, reflectors, k, lines, rule)
+        points.append(
+            PatchPoint(
+                x_m=float(places[k, 0]),
+                y_m=float(places[k, 1]),
+                range_m=float(reflectors.range_m[k]),
+                bearing_rad=float(reflectors.bearing_rad[k]),
+                sigma_m=sigma_m,
+                bearing_sigma_rad=bearing_sigma_rad,
+                amplitude=float(reflectors.amplitude[k]),
+                snr=float(reflectors.snr[k]),
+                kind=(
+                    PointKind.POINT
+                    if reflectors.flatness[k] <= rule.flatness[0]
+                    else PointKind.ROUND
+                ),
+            )
         )
-        for k, flat in zip(order.tolist(), reflectors.flatness[order].tolist(), strict=True)
-    )
+    return tuple(points)
 
 
 def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[PatchLine, ...]:
@@ -142,6 +163,7 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
     size = np.sqrt(reflectors.energy)
     is_wall = stand_out(reflectors, rule) & (reflectors.flatness > rule.flatness[2])
     is_wall &= size >= rule.least_wall_share * size.max(initial=0.0)
+    is_wall &= reflectors.snr >= rule.least_wall_snr
     for k in np.argsort(reflectors.range_m).tolist():
         if not is_wall[k]:
             continue
@@ -151,7 +173,19 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
         feet = antennas + (distance_m - antennas @ normal)[:, np.newaxis] * normal
         if in_view(patch, feet[patch.middle][np.newaxis])[0] < rule.least_in_view:
             continue
-        lines.append(PatchLine(normal=normal, distance_m=distance_m, ends_m=feet[[0, -1]]))
+        sight = np.broadcast_to(normal, antennas.shape)
+        sigma_m, bearing_sigma_rad = _sigmas(patch, reflectors, k, sight, rule)
+        lines.append(
+            PatchLine(
+                normal=normal,
+                distance_m=distance_m,
+                range_m=float(reflectors.range_m[k]),
+                bearing_rad=float(reflectors.bearing_rad[k]),
+                sigma_m=sigma_m,
+                bearing_sigma_rad=bearing_sigma_rad,
+                ends_m=feet[[0, -1]],
+            )
+        )
     return tuple(lines)
 
 
@@ -223,13 +257,14 @@ def _are_images(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
     return are
 
 
-def _covariance(
-    patch: Patch, reflectors: Reflectors, k: int, place: Array, rule: PointRule
-) -> Array:
-    """Return the covariance of a point (2, 2), body frame of the middle of the patch."""
+def _sigmas(
+    patch: Patch, reflectors: Reflectors, k: int, lines: Array, rule: PointRule
+) -> tuple[float, float]:
+    """Return the standard deviations of range [m] and bearing [rad] of a reflector.
+
+    ``lines`` (n, 2) are the directions to where it answers, at each antenna.
+    """
     profiles, antennas = patch.profiles, patch.aperture.antennas_m
-    ways = place - antennas
-    lines = ways / np.linalg.norm(ways, axis=1, keepdims=True)
     sight = lines[patch.middle]
     across = np.array([-sight[1], sight[0]])
     weights = reflectors.levels[k] ** 2
@@ -242,11 +277,7 @@ def _covariance(
     bearing = (1 / (snr * profiles.wave_number_rad_per_m * spread)) ** 2
     bearing += _wheel_variance(patch, of_range[:, np.newaxis] * lines, rule.wheels)
     bearing += rule.bearing_floor_rad**2
-    range_variance = (_PULSE_M / snr) ** 2 + rule.range_floor_m**2
-    range_m = float(reflectors.range_m[k])
-    return np.asarray(
-        range_variance * np.outer(sight, sight) + bearing * range_m**2 * np.outer(across, across)
-    )
+    return math.hypot(_PULSE_M / snr, rule.range_floor_m), math.sqrt(bearing)
 
 
 def _wheel_variance(patch: Patch, pulls: Array, wheels: WheelNoise) -> float:

@@ -66,23 +66,29 @@ class RangeScan:
     # its standard deviation, where that is known better than `RangeNoise.bearing_sigma_rad`
     bearings_rad: tuple[float, ...] | None = None
     bearing_sigmas_rad: tuple[float, ...] | None = None
-    # Points of a patch (`slam.imaging.patches`), beside the radar's single ranges. What is not
-    # among them may be there all the same.
+    # Points or walls of a patch (`slam.imaging.patches`), beside the radar's single ranges. What is
+    # not among them may be there all the same.
     is_patch: bool = False
-    # Whether points of patches of the radar come beside these single ranges
+    # Of flat faces in a patch: the stretch (from, to) along each that gave the echo, counted to the
+    # left from the foot of the perpendicular, whose range and bearing are given. None: of points
+    faces_m: tuple[tuple[float, float], ...] | None = None
+    # Whether points and walls of patches of the radar come beside these single ranges
     is_imaged: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError if a number is not finite, or missing for one of the ranges."""
         n = len(self.ranges_m)
-        for name in ("sigmas_m", "bearings_rad", "bearing_sigmas_rad", "labels"):
+        for name in ("sigmas_m", "bearings_rad", "bearing_sigmas_rad", "labels", "faces_m"):
             values = getattr(self, name)
             if values is not None and len(values) != n:
                 raise ValueError(
                     f"{len(values)} {name} of {n} ranges; there must be one for each range"
                 )
+        if self.faces_m is not None and (self.bearings_rad is None or not self.is_patch):
+            raise ValueError(f"{self}: faces_m are of a patch, and have bearings_rad")
         sigmas = (*(self.sigmas_m or ()), *(self.bearing_sigmas_rad or ()))
         numbers = (*self.ranges_m, *(self.moved or ()), *self.blurred_m, *(self.bearings_rad or ()))
+        numbers += tuple([end_m for stretch in self.faces_m or () for end_m in stretch])
         if (
             self.radar < 0
             or min(sigmas, default=0.0) < 0.0
@@ -170,8 +176,13 @@ class View:
     # Shape (r, n + w): whether no range of the radar is the feature's, whatever is predicted
     barred: NDArray[np.bool_]
 
-    def inside(self, noise: RangeNoise, widen_rad: float, widen_m: float) -> NDArray[np.bool_]:
-        """Return whether each radar may have each feature in view, shape (r, n + w)."""
+    def inside(
+        self, noise: RangeNoise, widen_rad: float | Array, widen_m: float
+    ) -> NDArray[np.bool_]:
+        """Return whether each radar may have each feature in view, shape (r, n + w).
+
+        The view is widened by as much; an angle may be given for each radar and feature.
+        """
         return (
             (np.abs(self.off_boresight_rad) <= noise.field_of_view_rad / 2 + widen_rad)
             & (self.ranges_m >= noise.min_range_m - widen_m)
@@ -490,6 +501,26 @@ class PointMatches:
     missed: tuple[int, ...]  # rows without labels surely in view, of which nothing was seen
 
 
+def _maybe_in_view(
+    state: State, seen: View, radar: int, parameters: BackEndParameters
+) -> NDArray[np.bool_]:
+    """Return which landmarks a radar may have in view, as uncertain as the pose is, (n + w,).
+
+    What a detection is of may be predicted out of view. Were it left out, its neighbour would have
+    no rival.
+    """
+    noise, rule = parameters.ranges, parameters.continuation
+    sigmas = parameters.tracklets.gate_sigmas * np.sqrt(state.pose_covariance().diagonal())
+    spread_m, spread_rad = float(np.hypot(sigmas[0], sigmas[1])), float(sigmas[2])
+    inside = seen.inside(
+        noise,
+        rule.view_margin_rad + spread_rad + np.arctan2(spread_m, np.abs(seen.ranges_m)),
+        rule.view_sigmas * noise.sigma_m + spread_m,
+    )[radar]
+    inside[len(state.landmark_ids) :] = False
+    return np.asarray(inside)
+
+
 def find_points(
     state: State,
     seen: View,
@@ -508,10 +539,9 @@ def find_points(
     any other detection for the landmark.
     """
     assert scan.bearings_rad is not None
-    noise, rule, radar = parameters.ranges, parameters.continuation, scan.radar
+    noise, tracklets, radar = parameters.ranges, parameters.tracklets, scan.radar
     free, hit, row_of_label = waiting
-    inside = seen.inside(noise, rule.view_margin_rad, rule.view_sigmas * noise.sigma_m)[radar]
-    inside[len(state.landmark_ids) :] = False
+    inside = _maybe_in_view(state, seen, radar, parameters)
     inside[list(hit)] = False
     named = {
         index: row_of_label[label]
@@ -542,7 +572,7 @@ def find_points(
     odds = noise.detection_probability / (1.0 - noise.detection_probability)
     clutter = noise.clutter_per_m / noise.field_of_view_rad
     is_free = inside[rows] & ~np.isin(rows, list(row_of_label.values()))
-    own, most = np.flatnonzero(is_free), parameters.tracklets.gate_sigmas**2
+    own, most = np.flatnonzero(is_free), tracklets.gate_sigmas**2
     if len(own) and others:
         log_n = -0.5 * (distance + np.linalg.slogdet(math.tau * S)[1])[k:, own]
         evidence = np.where(is_near[k:, own], log_n + math.log(odds / clutter), -math.inf)
@@ -565,7 +595,7 @@ def find_points(
             if is_sure[one, at] or evidence[one, at] - max(rivals) > MARGIN_NATS:
                 against_new.append(float(evidence[one, at] - unmapped[one]))
                 pairs.append((others[one], int(rows[own[at]])))
-    inset, edge = parameters.map.view_inset_m, parameters.tracklets.edge_rad
+    inset, edge = parameters.map.view_inset_m, tracklets.edge_rad
     well = seen.inside(noise, -edge, -inset)[radar, rows]
     is_known = (
         np.linalg.eigvalsh(

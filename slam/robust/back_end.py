@@ -340,6 +340,7 @@ class RobustBackEnd:
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
         self._tentative.move(motion)
+        self._walls.tentative.move(motion)
 
     def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
         """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
@@ -353,6 +354,7 @@ class RobustBackEnd:
         self._motion = None
         self._unassigned.clear()
         self._tentative.clear()
+        self._walls.tentative.clear()
         self._images.begin_anew(self._log.n_poses)
         state = self.state
         state.set_pose(pose, np.diag([_FREE_M**2, _FREE_M**2, _FREE_RAD**2]))
@@ -491,6 +493,7 @@ class RobustBackEnd:
         self._log.loosen(self._log.n_poses - 1, hidden.covariance)
         self._unassigned.clear()
         self._tentative.clear()
+        self._walls.tentative.clear()
         self._motion = motion
         return self._look(antennas)
 
@@ -646,12 +649,26 @@ class RobustBackEnd:
     def _take_patches(
         self, patches: Sequence[RangeScan], added_m: float
     ) -> list[tuple[int, float]]:
-        """Take in the points of patches one after the other; return ids and evidence."""
+        """Take in points and walls of patches one after the other; return ids and evidence."""
         found = list[tuple[int, float]]()
         for scan in patches:
+            if scan.faces_m is not None:
+                self._take_faces(scan, scan.faces_m)
+                continue
             found += self._take_points(scan, added_m)[2]
             self._decide()
         return found
+
+    def _take_faces(self, scan: RangeScan, faces_m: Sequence[tuple[float, float]]) -> None:
+        """Correct the state with the walls that a patch shows; log them, and make new ones."""
+        state, every = self.state, range(len(faces_m))
+        antennas = antennas_of(self.rig, [scan], state.calibration, state.mounts_m)
+        seen = detections_of(scan, every, self._log.n_poses - 1, antennas, self.parameters.ranges)
+        faces = list(zip(seen, faces_m, strict=True))
+        for wall_id, detections in self._walls.take(faces, antennas):
+            n_frames = len(detections) * self.parameters.imaged.frames_per_patch
+            self._existence.hit(wall_id, n_frames)
+            self._log.add_detections(wall_id, detections)
 
     def _take_points(
         self, scan: RangeScan, added_m: float
@@ -848,6 +865,7 @@ class RobustBackEnd:
             return True
         self._jumped = question.tentative.seen[0].pose
         self._tentative.forget_before(self._jumped)
+        self._walls.tentative.forget_before(self._jumped)
         self._settled = set()  # what was in view then was so from another pose
         sigmas = [parameters.jumps.sigma_m, parameters.jumps.sigma_m, parameters.jumps.sigma_rad]
         self._log.loosen(self._jumped, np.diag(np.square(sigmas)))
@@ -914,8 +932,14 @@ class RobustBackEnd:
         """
         rule, evidence = self.parameters.tracklets, list[tuple[int, float]]()
         for side in self._sides:
-            # A radar without frames for long takes no part.
-            radars = [radar for radar in side if self._silent[radar] <= rule.single_min_frames]
+            # Patches show points and walls sooner, and apart from their neighbours. A radar without
+            # frames for long takes no part.
+            radars = [
+                radar
+                for radar in side
+                if radar not in self._images.radars
+                and self._silent[radar] <= rule.single_min_frames
+            ]
             if not radars or not all(self._unassigned.newest(radar) for radar in radars):
                 continue
             is_single = len(radars) == 1
@@ -926,13 +950,6 @@ class RobustBackEnd:
                 wall_id = self._walls.place(wall)
                 if wall_id is not None:
                     self._use(wall_id, wall.seen)
-            # Patches show points sooner, and apart from their neighbours.
-            alone = [radar for radar in radars if radar not in self._images.radars]
-            if not alone:
-                continue
-            if len(alone) < len(radars):
-                radars, is_single = alone, len(alone) == 1
-                guesses = point_guesses(self._unassigned, radars, self.parameters.ranges, rule)
             search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
             if is_single:
                 search = Search(

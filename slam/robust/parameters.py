@@ -201,6 +201,8 @@ class WallRule:
     A point must fit its ranges no worse than a wall does.
     """
 
+    new_patches: Annotated[int, Origin.CHOSEN, "patches"] = 3
+    """Fewest patches that show a new wall. The next three are for radars without images."""
     min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 25
     """Fewest frames of `TrackletRule.long_window` that hit a wall."""
     min_way_m: Annotated[float, Origin.CHOSEN] = 0.25
@@ -418,7 +420,7 @@ class BranchRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImagedPointRule:
-    """How points of patches are used (`slam.imaging.patches`)."""
+    """How points and walls of patches are used (`slam.imaging.patches`)."""
 
     new_patches: Annotated[int, Origin.CHOSEN, "patches"] = 2
     """Fewest patches that hold a new landmark."""

@@ -17,6 +17,8 @@ from slam.front_end import make_detector
 from slam.front_end.matched_filter import MatchedFilterDetector
 from slam.geometry import Rig, between, compose, has_moved, transform, wrap_angles
 from slam.imaging.imager import ImagedPatch, Imager
+from slam.imaging.patches import Patch
+from slam.imaging.points import PatchLine, PatchPoint
 from slam.results import (
     Belief,
     InputCheck,
@@ -341,7 +343,7 @@ class PointNoise:
 
 
 class PatchScans:
-    """Points of patches as scans with bearings, each as of the newest pose.
+    """Points and walls of patches as scans with bearings, each as of the newest pose.
 
     The wheels' path is corrected by what is known of their calibration: an error of scale would
     turn all bearings.
@@ -374,39 +376,55 @@ class PatchScans:
         self._reported, self._path = poses[t_ns], pose_at(t_ns)
 
     def scans(self, calibration: Array) -> list[RangeScan]:
-        """Return the scan of the oldest patch that waits; several if a patch of each radar does.
+        """Return the scans of the oldest patch that waits: of its points, and of its walls.
 
-        So those of one side are taken one after the other.
+        If a patch of each radar waits there are those of several, so that patches of one side are
+        taken one after the other.
         """
         n = max(1, len(self._waiting) - len(self._rig.mounts) + 1)
         ready, self._waiting = self._waiting[:n], self._waiting[n:]
         for one in ready:
             self._noise.take(one)
-        return [self._scan(one, calibration) for one in ready]
+        return [scan for one in ready for scan in self._scans(one, calibration)]
 
-    def _scan(self, imaged: ImagedPatch, calibration: Array) -> RangeScan:
-        points, patch = imaged.points, imaged.patch
+    def _scans(self, imaged: ImagedPatch, calibration: Array) -> tuple[RangeScan, RangeScan]:
+        mount = imaged.patch.mount
+        stretches = [
+            (line.ends_m - (mount.x_m, mount.y_m)) @ quarter_turn(line.normal)
+            for line in imaged.lines
+        ]
+        faces_m = tuple([(float(one.min()), float(one.max())) for one in stretches])
+        return (
+            self._scan(imaged.patch, imaged.points, calibration),
+            self._scan(imaged.patch, imaged.lines, calibration, faces_m),
+        )
+
+    def _scan(
+        self,
+        patch: Patch,
+        found: Sequence[PatchPoint | PatchLine],
+        calibration: Array,
+        faces_m: tuple[tuple[float, float], ...] | None = None,
+    ) -> RangeScan:
         dx, dy, turn = between(self._path, patch.origin).tolist()
         s, w, _ = calibration.tolist()
-        ranges_m = np.array([one.range_m for one in points])
-        angles = np.array([one.bearing_rad for one in points]) + patch.mount.yaw_rad
-        u = np.column_stack([np.cos(angles), np.sin(angles)])
-        axes = np.stack([u, quarter_turn(u)], axis=1)
-        covariances = np.array([one.covariance for one in points]).reshape(-1, 2, 2)
-        spread = np.einsum("nai,nij,naj->na", axes, covariances, axes)
         # What the wheels do between the patch and the newest pose
         along, _, heading = self._wheels.step_variances(math.hypot(dx, dy), turn)
-        sigmas_m = np.sqrt(spread[:, 0] + along + self._noise.sigma_m**2)
-        sigmas_rad = np.sqrt(spread[:, 1] / ranges_m**2 + heading)
-        sigmas_rad = self._rule.bearing_share * np.hypot(sigmas_rad, self._noise.sigma_rad)
+        share, noise = self._rule.bearing_share, self._noise
         return RangeScan(
             radar=patch.radar,
             is_patch=True,
             moved=(dx * (1.0 + s), dy * (1.0 + s), turn * (1.0 + w)),  # as the wheels report it
-            ranges_m=tuple(ranges_m.tolist()),
-            sigmas_m=tuple(sigmas_m.tolist()),
-            bearings_rad=tuple([one.bearing_rad for one in points]),
-            bearing_sigmas_rad=tuple(sigmas_rad.tolist()),
+            ranges_m=tuple([one.range_m for one in found]),
+            sigmas_m=tuple([math.sqrt(one.sigma_m**2 + along + noise.sigma_m**2) for one in found]),
+            bearings_rad=tuple([one.bearing_rad for one in found]),
+            bearing_sigmas_rad=tuple(
+                [
+                    share * math.sqrt(one.bearing_sigma_rad**2 + heading + noise.sigma_rad**2)
+                    for one in found
+                ]
+            ),
+            faces_m=faces_m,
         )
 
 

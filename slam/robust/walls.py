@@ -1,8 +1,10 @@
-"""Walls: found among unassigned ranges, recognised, and predicted where they are known to be.
+"""Walls: shown by patches, or found among ranges; recognised, and predicted where they are known.
 
-As in :mod:`slam.robust.initialisation`, a small Kalman filter follows a guess back through the
-frames; here its state is a line (phi, d) in the newest body frame, whose range is d - n . a. The
-ranges must follow the wall's law, and the point's clearly less well.
+Patches show walls, as they show points, with range and bearing; three patches that agree make one.
+Of radars without images, walls are found among unassigned ranges, as points are
+(:mod:`slam.robust.initialisation`): a small Kalman filter follows a guess back through the frames;
+here its state is a line (phi, d) in the newest body frame, whose range is d - n . a. The ranges
+must follow the wall's law, and the point's clearly less well.
 
 A wall in the body frame, (phi_b, d_b) with noise n and known dependence D on the radars' range
 offsets, measures
@@ -23,6 +25,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
+from scipy.special import chdtri
 
 from slam.geometry import wrap_angle
 from slam.results import SavedWall
@@ -30,14 +33,21 @@ from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
     FeatureRows,
     Guess,
+    PointDetection,
     Search,
     Tracker,
     Tracklet,
     UnassignedRanges,
     certain_row,
 )
-from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
-from slam.robust.state import HEAD_SIZE, Array, State, rotation
+from slam.robust.parameters import (
+    TAIL_PROBABILITY,
+    BackEndParameters,
+    RangeNoise,
+    TrackletRule,
+    WallRule,
+)
+from slam.robust.state import HEAD_SIZE, Array, Motion, State, quarter_turn, rotation
 
 
 def wall_guesses(
@@ -212,15 +222,143 @@ def initialise_wall(state: State, seen: BodyWall) -> int:
     return state.augment_wall(np.array([phi, d]), cross, (corner + corner.T) / 2)
 
 
+Face = tuple[PointDetection, tuple[float, float]]
+"""A face of a patch: its perpendicular, and the stretch that answered (`RangeScan.faces_m`)."""
+
+
+def body_wall(state: State, antennas: Antennas, face: Face, rule: WallRule) -> BodyWall:
+    """Return where a face lies, the offset of the radar removed."""
+    detection, (first_m, last_m) = face
+    radar, layout = detection.radar, state.layout
+    phi, antenna = detection.bearing_rad + detection.turn_rad, antennas.position_m[radar]
+    n = np.array([math.cos(phi), math.sin(phi)])
+    left, range_m = quarter_turn(n), detection.range_m - float(state.offsets_m[radar])
+    by_measured = np.array([[1.0, 0.0], [float(left @ antenna), 1.0]])
+    share = max(state.range_errors.variance_share, 1.0)
+    of_range = detection.sigma_m**2 + rule.roughness_m**2
+    spread = share * np.diag([detection.bearing_sigma_rad**2, of_range])
+    along_m = np.linspace(first_m, last_m, 2 + math.floor((last_m - first_m) / rule.cell_m))
+    by_radar = np.zeros((2, state.n_fixed - HEAD_SIZE))
+    by_radar[1, radar] = -1.0
+    if layout.has_mounts:
+        mount = layout.n_radars + 2 * radar
+        by_radar[1, mount : mount + 2] = n @ rotation(detection.turn_rad)
+    return BodyWall(
+        wall=np.array([phi, range_m + float(n @ antenna)]),
+        covariance=by_measured @ spread @ by_measured.T,
+        by_offsets=by_radar,
+        feet_m=antenna + range_m * n + np.outer(along_m, left),
+    )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class TentativeWall:
+    """What may be a wall: a line in the newest body frame, and the faces that are of it."""
+
+    wall: BodyWall
+    seen: list[PointDetection]
+    misses: int = 0  # patches since the last one that showed it
+
+    def move(self, motion: Motion) -> None:
+        """Move the body frame: phi' = phi - a, d' = d - n . step, and the noise of (step, a)."""
+        before = self.wall
+        phi, d = before.wall.tolist()
+        n = np.array([math.cos(phi), math.sin(phi)])
+        by_wall = np.array([[1.0, 0.0], [-float(motion.step_m @ quarter_turn(n)), 1.0]])
+        by_motion = np.array([[0.0, 0.0, -1.0], [-n[0], -n[1], 0.0]])
+        noise = by_motion @ motion.covariance @ by_motion.T
+        self.wall = BodyWall(
+            wall=np.array([phi - motion.turn_rad, d - float(n @ motion.step_m)]),
+            covariance=by_wall @ before.covariance @ by_wall.T + noise,
+            by_offsets=by_wall @ before.by_offsets,
+            feet_m=(before.feet_m - motion.step_m) @ rotation(motion.turn_rad),
+        )
+
+    def residual(self, new: BodyWall) -> tuple[Array, Array]:
+        """Return how far a face is from it, (2,), and the covariance of that, (2, 2)."""
+        nu = new.wall - self.wall.wall
+        nu[0] = wrap_angle(float(nu[0]))
+        return nu, self.wall.covariance + new.covariance
+
+    def fuse(self, detection: PointDetection, new: BodyWall) -> None:
+        """Take in a face that is of it."""
+        before, (nu, S) = self.wall, self.residual(new)
+        K = np.linalg.solve(S, before.covariance).T
+        covariance = before.covariance - K @ before.covariance
+        self.wall = BodyWall(
+            wall=before.wall + K @ nu,
+            covariance=(covariance + covariance.T) / 2,
+            by_offsets=before.by_offsets + K @ (new.by_offsets - before.by_offsets),
+            feet_m=np.concatenate([before.feet_m, new.feet_m]),
+        )
+        self.seen.append(detection)
+
+
+class TentativeWalls:
+    """Faces of patches that are of no wall yet.
+
+    Of a cylinder or an edge a patch may show a tangent, which turns from patch to patch, so that it
+    does not agree with earlier ones.
+    """
+
+    def __init__(self, parameters: BackEndParameters) -> None:
+        self._parameters = parameters
+        self._walls: list[TentativeWall] = []
+
+    def move(self, motion: Motion) -> None:
+        for one in self._walls:
+            one.move(motion)
+
+    def clear(self) -> None:
+        self._walls = []
+
+    def forget_before(self, pose: int) -> None:
+        """Forget those that were seen before a pose, by index in the log."""
+        self._walls = [one for one in self._walls if one.seen[0].pose >= pose]
+
+    def take(self, faces: Sequence[tuple[PointDetection, BodyWall]]) -> list[TentativeWall]:
+        """Take in the faces of a patch; return those that are walls by now, and forget them."""
+        free, shown = self._walls.copy(), list[TentativeWall]()
+        for detection, wall in faces:
+            one = self._nearest(wall, free)
+            if one is None:
+                one = TentativeWall(wall=wall, seen=[detection])
+            else:
+                free.remove(one)
+                one.fuse(detection, wall)
+            one.misses = 0
+            shown.append(one)
+        for one in free:
+            one.misses += 1
+        fewest, window = self._parameters.walls.new_patches, self._parameters.tracklets.window
+        self._walls = [one for one in free if one.misses <= window]
+        self._walls += [one for one in shown if len(one.seen) < fewest]
+        return [one for one in shown if len(one.seen) >= fewest]
+
+    def _nearest(self, wall: BodyWall, among: Sequence[TentativeWall]) -> TentativeWall | None:
+        """Return the one that a face is likeliest of, None if it agrees with none."""
+        limit, most, nearest = float(chdtri(2, TAIL_PROBABILITY)), math.inf, None
+        for one in among:
+            nu, S = one.residual(wall)
+            distance = float(nu @ np.linalg.solve(S, nu))
+            cost = distance + float(np.linalg.slogdet(S)[1])
+            gaps_m = np.linalg.norm(one.wall.feet_m[:, None] - wall.feet_m, axis=2)
+            is_beside = float(gaps_m.min()) <= self._parameters.walls.reach_m
+            if distance <= limit and is_beside and cost < most:
+                most, nearest = cost, one
+        return nearest
+
+
 class WallKeeper:
     """The walls of a state."""
 
     def __init__(self, state: State, parameters: BackEndParameters) -> None:
         self._state, self._parameters, self._rule = state, parameters, parameters.walls
         self.cells = WallCells(self._rule.cell_m)
+        self.tentative = TentativeWalls(parameters)
 
     def look(self, seen: View, antennas: Antennas) -> View:
-        """Return a view without the walls that no wall tracklet has shown where they would reflect.
+        """Return a view without the walls that were not seen as walls where they would reflect.
 
         The end of a wall reflects, too, from farther on: its edge's range leaves the wall's by x^2
         / 2 r only, within the gates of single ranges for long, and would turn wall and pose.
@@ -283,6 +421,41 @@ class WallKeeper:
         search = Search(radars=radars, window=tracklets.long_window, min_frames=rule.min_frames)
         return tracker.find(guesses, unassigned, search, is_wall)
 
+    def take(
+        self, faces: Sequence[Face], antennas: Antennas
+    ) -> list[tuple[int, list[PointDetection]]]:
+        """Take in the faces of a patch; return ids of walls with those that are of them.
+
+        A face of a wall of the map corrects the state; of one wall a patch has one face at most.
+        """
+        state, rule = self._state, self._rule
+        hits, others = dict[int, list[PointDetection]](), list[Face]()
+        for face in faces:
+            wall = body_wall(state, antennas, face, rule)
+            row = match_wall(state, wall, self.cells, self._parameters)
+            if row is None:
+                others.append(face)
+            elif state.wall_ids[row] not in hits:
+                hits[self._update(row, wall)] = [face[0]]
+        found = list(hits.items())
+        new = [(face[0], body_wall(state, antennas, face, rule)) for face in others]
+        for one in self.tentative.take(new):
+            wall_id = self.place_seen(one.wall)
+            if wall_id is not None:
+                found.append((wall_id, one.seen))
+        return found
+
+    def _update(self, row: int, seen: BodyWall) -> int:
+        """Correct the state with a wall of the map that was seen again; return its id."""
+        update_with_wall(self._state, row, seen)
+        self._answered(row, seen)
+        return self._state.wall_ids[row]
+
+    def _answered(self, row: int, seen: BodyWall) -> None:
+        """Note where a wall has given echoes."""
+        places = along_wall(self._state, row, seen.in_map(self._state))
+        self.cells.add(self._state.wall_ids[row], places)
+
     def place(self, tracklet: Tracklet) -> int | None:
         """Bring a wall into the map; return its id, or None if it is too near to another one."""
         phi, d = tracklet.target
@@ -300,16 +473,13 @@ class WallKeeper:
         """Do what ``place`` does, with a wall that was seen."""
         state = self._state
         row = match_wall(state, seen, self.cells, self._parameters)
-        if row is None:
-            if is_unresolved(state, seen, self.cells, self._rule):
-                return None
-            wall_id = initialise_wall(state, seen)
-            state.added_sigmas_m[wall_id] = self._rule.roughness_m
-            row = len(state.wall_ids) - 1
-        else:
-            wall_id = state.wall_ids[row]
-            update_with_wall(state, row, seen)
-        self.cells.add(wall_id, along_wall(state, row, seen.in_map(state)))
+        if row is not None:
+            return self._update(row, seen)
+        if is_unresolved(state, seen, self.cells, self._rule):
+            return None
+        wall_id = initialise_wall(state, seen)
+        state.added_sigmas_m[wall_id] = self._rule.roughness_m
+        self._answered(len(state.wall_ids) - 1, seen)
         return wall_id
 
     def place_saved(self, wall: SavedWall, covariance: Array) -> int | None:

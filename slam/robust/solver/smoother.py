@@ -190,18 +190,22 @@ def _bearing_rows(problem: Problem, estimate: Estimate, at: Indices) -> Rows:
     away = np.column_stack([values[first], values[first + 1]]) - pose[:, :2] - arm
     square = np.maximum(np.sum(away**2, axis=1), _LEAST_RANGE_M2)
     sigmas = problem.range_bearing_sigmas_rad[at]
-    residual = np.arctan2(away[:, 1], away[:, 0]) - pose[:, 2] - turns
-    residual = wrap_angles(residual - problem.range_bearings_rad[at])
+    is_wall = problem.range_landmarks[at] >= layout.n_landmarks
+    angle = np.where(is_wall, values[first], np.arctan2(away[:, 1], away[:, 0]))
+    residual = wrap_angles(angle - pose[:, 2] - turns - problem.range_bearings_rad[at])
     g = quarter_turn(away) / (square * sigmas)[:, None]
+    g[is_wall] = 0.0
     by_heading = g[:, 0] * arm[:, 1] - g[:, 1] * arm[:, 0] - 1.0 / sigmas
     of_offset, none = layout.offsets.start + radars, np.zeros(len(at))
-    columns, by_border = [of_offset, first, first + 1], [none, *g.T]
+    columns = [of_offset, first, first + 1]
+    by_border = [none, np.where(is_wall, 1.0 / sigmas, g[:, 0]), g[:, 1]]
     if layout.has_mounts:
         ct, st = c * cm - s * sm, s * cm + c * sm
         by_mount = [-(g[:, 0] * ct + g[:, 1] * st), g[:, 0] * st - g[:, 1] * ct]
         columns, by_border = [*columns, of_mount, of_mount + 1], [*by_border, *by_mount]
     if layout.has_radii:
-        columns, by_border = [*columns, first + 2], [*by_border, none]
+        columns = [*columns, np.where(is_wall, of_offset, first + 2)]
+        by_border = [*by_border, none]
     return Rows(
         poses=problem.range_poses[at],
         residual=residual / sigmas,

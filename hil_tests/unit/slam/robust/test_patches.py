@@ -24,13 +24,14 @@ from slam.front_end import make_detector
 from slam.geometry import between, compose, paper_rig, transform
 from slam.imaging.imager import ImagedPatch, Imager
 from slam.imaging.patches import Patch
-from slam.imaging.points import PatchPoint, PointKind
+from slam.imaging.points import PatchLine, PatchPoint, PointKind
 from slam.results import Belief
-from slam.robust.association import RangeScan, View, antennas_of
+from slam.robust.association import RangeScan, View, antennas_of, find_points, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import body_point, detections_of
 from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
 from slam.robust.pipeline import PatchScans, PointNoise, RobustSlam
+from slam.robust.state import State, SymmetricMatrix
 
 Array = NDArray[np.float64]
 
@@ -54,8 +55,11 @@ class GivenPatches:
         return (self._make(pose_at(2)),) if self.n_steps == 3 else ()
 
 
-def imaged(origin: Array, rod: Array, covariance: Array) -> ImagedPatch:
-    """Return a patch of radar 0 about a pose that shows a rod, (2,) in its body frame, exactly."""
+def imaged(origin: Array, rod: Array, sigma_m: float) -> ImagedPatch:
+    """Return a patch of radar 0 about a pose that shows a rod, (2,) in its body frame, exactly.
+
+    ``sigma_m`` is the standard deviation that is stated for it, along and across the line of sight.
+    """
     mount = RIG.mounts[0]
     away = rod - (mount.x_m, mount.y_m)
     point = PatchPoint(
@@ -63,7 +67,8 @@ def imaged(origin: Array, rod: Array, covariance: Array) -> ImagedPatch:
         y_m=float(rod[1]),
         range_m=math.hypot(*away),
         bearing_rad=math.atan2(away[1], away[0]) - mount.yaw_rad,
-        covariance=covariance,
+        sigma_m=sigma_m,
+        bearing_sigma_rad=sigma_m / math.hypot(*away),
         amplitude=0.015,
         snr=30.0,
         kind=PointKind.POINT,
@@ -95,12 +100,13 @@ def test_a_point_lies_where_it_is_from_the_newest_pose() -> None:
         motion = np.array([(1 + s) * dx, (1 + s) * dy, (1 + w) * turn + kappa * way])
         reported.append(compose(reported[-1], motion))
     rod_from_2 = transform(between(true[2], np.zeros(3)), ROD)
-    imager = GivenPatches(lambda origin: imaged(origin, rod_from_2, 16e-6 * np.eye(2)))
+    imager = GivenPatches(lambda origin: imaged(origin, rod_from_2, 4e-3))
     calibration = np.array([s, w, kappa])
     scans = PatchScans(cast("Imager", imager), RIG, WheelNoise(), RULE)
     for t_ns, pose in enumerate(reported):
         scans.take((), {t_ns: pose}, t_ns, calibration)
-    (scan,) = scans.scans(calibration)
+    scan, of_walls = scans.scans(calibration)
+    assert (of_walls.ranges_m, of_walls.faces_m) == ((), ())
     assert scans.scans(calibration) == []
     assert scan.is_patch
     back_end = RobustBackEnd(RIG, PARAMETERS)
@@ -117,12 +123,44 @@ def test_a_point_lies_where_it_is_from_the_newest_pose() -> None:
     assert scan.bearing_sigmas_rad == pytest.approx((3.0 * math.sqrt(across + heading),))
 
 
-def test_a_point_is_not_known_better_than_points_repeat_themselves() -> None:
-    imager = GivenPatches(lambda origin: imaged(origin, ROD, 1e-10 * np.eye(2)))
+def test_walls_of_a_patch_are_a_scan_of_their_own_with_their_ends() -> None:
+    """A face beside radar 0, a metre ahead of it; its echo came from 0.2 m before to 0.1 m behind.
+
+    Left of the perpendicular, which points along y, is where x is negative.
+    """
+    mount = RIG.mounts[0]
+    line = PatchLine(
+        normal=np.array([0.0, 1.0]),
+        distance_m=mount.y_m + 1.0,
+        range_m=1.0,
+        bearing_rad=math.pi / 2 - mount.yaw_rad,
+        sigma_m=3e-3,
+        bearing_sigma_rad=4e-3,
+        ends_m=np.add([[-0.2, 0.0], [0.1, 0.0]], [mount.x_m, mount.y_m + 1.0]),
+    )
+    imager = GivenPatches(lambda origin: replace(imaged(origin, ROD, 4e-3), lines=(line,)))
     scans, zero = PatchScans(cast("Imager", imager), RIG, WheelNoise(), RULE), np.zeros(3)
     for t_ns in range(3):
         scans.take((), {t_ns: zero}, t_ns, zero)
-    (scan,) = scans.scans(zero)
+    of_points, of_walls = scans.scans(zero)
+    assert of_points.faces_m is None
+    assert of_points.ranges_m == pytest.approx((math.dist(ROD, (mount.x_m, mount.y_m)),))
+    assert of_walls.is_patch
+    assert (of_walls.ranges_m, of_walls.bearings_rad) == ((1.0,), (line.bearing_rad,))
+    assert of_walls.faces_m is not None
+    (ends_m,) = of_walls.faces_m
+    assert ends_m == pytest.approx((-0.1, 0.2))
+    # As of points: that of the patch, and what points of a run do not repeat by
+    assert of_walls.sigmas_m == pytest.approx((math.hypot(3e-3, 2e-3),), rel=1e-4)
+    assert of_walls.bearing_sigmas_rad == pytest.approx((3.0 * math.hypot(4e-3, 2.5e-3),), rel=1e-3)
+
+
+def test_a_point_is_not_known_better_than_points_repeat_themselves() -> None:
+    imager = GivenPatches(lambda origin: imaged(origin, ROD, 1e-5))
+    scans, zero = PatchScans(cast("Imager", imager), RIG, WheelNoise(), RULE), np.zeros(3)
+    for t_ns in range(3):
+        scans.take((), {t_ns: zero}, t_ns, zero)
+    scan, _ = scans.scans(zero)
     # Beside noise, and the least that a step of the wheels has
     assert scan.sigmas_m == pytest.approx((2e-3,), rel=1e-4)
     assert scan.bearing_sigmas_rad == pytest.approx((7.5e-3,), rel=1e-4)
@@ -172,7 +210,7 @@ def seen_from_x(x_m: float, t_ns: int, errors: Array) -> ImagedPatch:
     range_m = math.hypot(*away) + errors[0]
     bearing_rad = math.atan2(away[1], away[0]) + errors[1]
     toward = np.array([math.cos(bearing_rad), math.sin(bearing_rad)])
-    made = imaged(origin, range_m * toward + (mount.x_m, mount.y_m), 1e-10 * np.eye(2))
+    made = imaged(origin, range_m * toward + (mount.x_m, mount.y_m), 1e-5)
     return replace(made, patch=replace(made.patch, t_ns=np.array([t_ns])))
 
 
@@ -184,14 +222,14 @@ def test_patches_of_all_radars_are_taken_one_a_state() -> None:
             self, frames: Sequence[RadarFrame], pose_at: Callable[[int], Array]
         ) -> tuple[ImagedPatch, ...]:
             self.n_steps += 1
-            one = imaged(pose_at(self.n_steps - 1), ROD, 1e-6 * np.eye(2))
+            one = imaged(pose_at(self.n_steps - 1), ROD, 1e-3)
             return (one,) * {1: 4, 2: 3}.get(self.n_steps, 0)
 
     scans, zero = PatchScans(cast("Imager", AllAtOnce()), RIG, WheelNoise(), RULE), np.zeros(3)
     taken = []
     for t_ns in range(5):
         scans.take((), {t_ns: zero}, t_ns, zero)
-        taken.append(len(scans.scans(zero)))
+        taken.append(len([one for one in scans.scans(zero) if one.faces_m is None]))
     assert taken == [1, 3, 1, 1, 1]  # behind the first there are 3 and 3 more: 4 may wait
 
 
@@ -369,6 +407,25 @@ def test_what_may_be_known_waits_for_four_patches() -> None:
     first, last = counts[:3], counts[3]
     assert first == [(1, 0.03), (1, 0.04), (1, 0.05)]
     assert last != (1, 0.06)  # it is decided now, whichever way
+
+
+def test_a_landmark_that_is_predicted_out_of_view_is_a_rival() -> None:
+    """The robot is 0.12 m left of where it is believed, of 0.06 m standard deviation.
+
+    A patch shows a rod at 1.45 m, which is predicted beyond the end of the view, at 1.57; another
+    one 0.1 m before it is predicted in view, and would do with 0.02 m.
+    """
+    seen, other = np.array([-0.1, 1.77]), np.array([-0.1, 1.67])
+    scan = seen_from(np.array([0.0, 0.12, 0.0]), seen)
+    state = State((0.0,) * 3, (0.0,) * 4)
+    pairs = []
+    for marks in ((other,), (other, seen)):
+        state.landmarks_m, state.landmark_ids = np.array(marks), list(range(len(marks)))
+        state.P = SymmetricMatrix(1e-12 * np.eye(state.layout.size))
+        state.set_pose(np.zeros(3), np.diag([1e-12, 0.06**2, 1e-12]))
+        at = view(state, antennas_of(RIG, [scan], np.zeros(3)))
+        pairs.append(find_points(state, at, scan, ([0], set(), {}), PARAMETERS).pairs)
+    assert pairs == [((0, 0),), ()]
 
 
 def test_ranges_of_landmarks_at_one_range_are_not_used() -> None:

@@ -104,9 +104,10 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
     )
     # The first radar measures bearings, too.
     away = marks[np.minimum(seen, 2)] - places
-    bearings = np.arctan2(away[:, 1], away[:, 0]) - poses[keys][at, 2] - problem.range_turns
+    angles = np.where(seen == 3, math.pi / 2, np.arctan2(away[:, 1], away[:, 0]))
+    bearings = angles - poses[keys][at, 2] - problem.range_turns
     bearings += 2e-3 * rng.standard_normal(len(at))
-    bearings[(seen == 3) | (radars > 0)] = np.nan
+    bearings[radars > 0] = np.nan
     problem = replace(
         problem,
         range_bearings_rad=bearings,
@@ -208,11 +209,15 @@ def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool 
         miss = expected + v[layout.offsets.start + radar] - problem.ranges_m[i]
         result.append(np.atleast_1d(miss / problem.range_sigmas_m[i]))
         if not np.isnan(problem.range_bearings_rad[i]):
-            # Turned by what was measured, the landmark lies ahead: complex steps do not pass
-            # arctan2.
             measured = problem.range_turns[i] + problem.range_bearings_rad[i]
-            b = turn(poses[k, 2] + measured).T @ away
-            bearings.append(np.arctan(b[1] / b[0]) / problem.range_bearing_sigmas_rad[i])
+            if row < N_MARKS:
+                # Turned by what was measured, the landmark lies ahead: complex steps do not pass
+                # arctan2.
+                b = turn(poses[k, 2] + measured).T @ away
+                off = np.arctan(b[1] / b[0])
+            else:
+                off = v[layout.walls.start] - poses[k, 2] - measured
+            bearings.append(off / problem.range_bearing_sigmas_rad[i])
     return np.concatenate([*result, np.array(bearings)])
 
 

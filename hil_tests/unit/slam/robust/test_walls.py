@@ -1,6 +1,7 @@
 """Walls, corners and round objects in the robust filter: derivatives, birth, ends."""
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 
@@ -16,23 +17,28 @@ from hil_tests.unit.slam.robust.range_world import (
     true_path,
 )
 from slam.config import WheelNoise
-from slam.geometry import paper_rig
+from slam.geometry import between, compose, paper_rig, transform
 from slam.library.evaluation import nees_pose
 from slam.robust.association import Antennas, RangeScan, antennas_of, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
+    PointDetection,
     Search,
     Sightings,
     Tracker,
     Tracklet,
     UnassignedRanges,
     compare,
+    detections_of,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.state import Array, Indices, State, SymmetricMatrix, calibrated_motion, predict
 from slam.robust.walls import (
     BodyWall,
+    TentativeWalls,
     WallCells,
+    WallKeeper,
+    body_wall,
     initialise_wall,
     is_unresolved,
     match_wall,
@@ -211,6 +217,167 @@ def test_cells_tell_where_a_wall_answered() -> None:
     assert np.array(cells.spans_m(7)) == pytest.approx(np.array([[-0.1, 0.2], [0.9, 1.0]]))
     cells.forget(7)
     assert cells.spans_m(7) == []
+
+
+def faces_from(
+    pose: Array, wall: tuple[float, float], *, radar: int = 0, turned_rad: float = 0.0
+) -> RangeScan:
+    """Return the scan of a patch that shows a wall (phi, d) of the map from a pose.
+
+    Its echo came from 5 cm to either side of the perpendicular; its bearing is off by ``turned``.
+    """
+    mount, (phi, d) = paper_rig().mounts[radar], wall
+    x, y = transform(pose, np.array([mount.x_m, mount.y_m])).tolist()
+    off = math.remainder(phi - pose[2] - mount.yaw_rad, math.tau)
+    return RangeScan(
+        radar=radar,
+        is_patch=True,
+        ranges_m=(d - math.cos(phi) * x - math.sin(phi) * y,),
+        sigmas_m=(2e-3,),
+        bearings_rad=(off + turned_rad,),
+        bearing_sigmas_rad=(8e-3,),
+        faces_m=((-0.05, 0.05),),
+    )
+
+
+def faces_of(state: State, scans: Sequence[RangeScan]) -> list[tuple[PointDetection, BodyWall]]:
+    """Return the faces of scans of patches as what they measure in the body frame."""
+    noise, found = RangeNoise(), []
+    for scan in scans:
+        at = antennas_of(paper_rig(), [scan], np.zeros(3))
+        (seen,) = detections_of(scan, [0], 0, at, noise)
+        assert scan.faces_m is not None
+        found.append((seen, body_wall(state, at, (seen, scan.faces_m[0]), WallRule())))
+    return found
+
+
+def test_a_face_lies_where_the_wall_is_from_the_newest_pose() -> None:
+    """Its patch was 0.12 m and 0.1 rad ago; the wall leans, and its offset is known."""
+    state, wall = State((0.0,) * 3, OFFSETS), (1.4, 1.3)
+    state.offsets_m = np.array([0.02, 0.0, 0.0, 0.0])
+    patch, pose = np.array([0.3, -0.1, 0.2]), np.array([0.42, -0.09, 0.3])
+    scan = faces_from(patch, wall)
+    dx, dy, turn = between(pose, patch).tolist()
+    scan = replace(scan, ranges_m=(scan.ranges_m[0] + 0.02,), moved=(dx, dy, turn))
+    ((_, seen),) = faces_of(state, [scan])
+    n = np.array([math.cos(wall[0]), math.sin(wall[0])])
+    assert seen.wall == pytest.approx((wall[0] - pose[2], wall[1] - n @ pose[:2]))
+    feet = np.array([transform(pose, foot) for foot in seen.feet_m])
+    assert feet @ n == pytest.approx(np.full(len(feet), wall[1]))
+    assert math.dist(feet[0], feet[-1]) == pytest.approx(0.1)
+
+
+def test_noise_of_a_face_is_that_of_its_range_and_bearing() -> None:
+    state, scan = State((0.0,) * 3, OFFSETS, 0.004), faces_from(np.zeros(3), (1.4, 1.3))
+    ((_, seen),) = faces_of(state, [scan])
+
+    def measured(range_m: float, bearing_rad: float) -> Array:
+        one = replace(scan, ranges_m=(range_m,), bearings_rad=(bearing_rad,))
+        return faces_of(state, [one])[0][1].wall
+
+    assert scan.bearings_rad is not None
+    (r,), (b,), h = scan.ranges_m, scan.bearings_rad, 1e-6
+    by_range = (measured(r + h, b) - measured(r - h, b)) / (2 * h)
+    by_bearing = (measured(r, b + h) - measured(r, b - h)) / (2 * h)
+    # 2 mm of the range and 3 mm of roughness
+    wanted = 13e-6 * np.outer(by_range, by_range) + 64e-6 * np.outer(by_bearing, by_bearing)
+    assert seen.covariance == pytest.approx(wanted, rel=1e-6, abs=1e-15)
+    # A range that is longer by the offset is that of a wall which is nearer by it; a mount that
+    # is farther along the normal sees one that is farther.
+    phi = float(seen.wall[0])
+    assert seen.by_offsets[:, 0] == pytest.approx((0.0, -1.0))
+    assert seen.by_offsets[:, 4:6] == pytest.approx(
+        np.array([[0.0, 0.0], [math.cos(phi), math.sin(phi)]])
+    )
+
+
+TURNING = np.array([0.12, 0.01, 0.15])
+
+
+def shown_along(poses: Sequence[Array], walls: Sequence[tuple[float, float]]) -> list[int]:
+    """Return how many patches made a wall, for each pose from which one shows a wall."""
+    state, tentative, before = State((0.0,) * 3, OFFSETS), TentativeWalls(BackEndParameters()), None
+    counts = []
+    for pose, wall in zip(poses, walls, strict=True):
+        if before is not None:
+            tentative.move(calibrated_motion(between(before, pose), np.zeros(3), WheelNoise()))
+        found = tentative.take(faces_of(state, [faces_from(pose, wall)]))
+        counts += [len(one.seen) for one in found]
+        before = pose
+    return counts
+
+
+def test_three_patches_that_agree_make_a_wall() -> None:
+    poses = [np.zeros(3)]
+    for _ in range(6):
+        poses.append(compose(poses[-1], TURNING))
+    assert shown_along(poses, [(1.4, 1.5)] * 7) == [3, 3]
+
+
+def test_the_tangents_of_a_cylinder_make_none() -> None:
+    """It has a radius of 0.4 m, and is passed at 0.5 m: its normal turns by 0.13 rad a patch."""
+    poses = [np.array([0.12 * k - 0.36, 0.0, 0.0]) for k in range(7)]
+    mount, tangents = paper_rig().mounts[0], []
+    for pose in poses:
+        away = np.array([0.0, 1.1]) - pose[:2] - (mount.x_m, mount.y_m)
+        phi = math.atan2(away[1], away[0])
+        tangents.append((phi, 1.1 * math.sin(phi) - 0.4))
+    assert shown_along(poses, tangents) == []
+
+
+def test_a_wall_that_patches_no_longer_show_is_forgotten() -> None:
+    state, parameters = State((0.0,) * 3, OFFSETS), BackEndParameters()
+    one = faces_of(state, [faces_from(np.zeros(3), (1.4, 1.5))])
+    counts = []
+    for n_others in (0, parameters.tracklets.window, parameters.tracklets.window + 1):
+        tentative = TentativeWalls(parameters)
+        for faces in (one, one, *[[]] * n_others):
+            assert tentative.take(faces) == []
+        counts.append(len(tentative.take(one)))
+    assert counts == [1, 1, 0]
+
+
+def test_a_face_of_a_known_wall_tells_the_heading() -> None:
+    """The robot is sure of all but its heading, which the wall's bearing has off by 0.1 rad."""
+    state = State((0.0,) * 3, (0.0,) * 4)
+    state.walls, state.wall_ids = np.array([[math.pi / 2, 1.3]]), [0]
+    state.P = SymmetricMatrix(1e-12 * np.eye(12))
+    state.set_pose(np.zeros(3), np.diag([1e-12, 1e-12, 0.1**2]))
+    keeper = WallKeeper(state, BackEndParameters())
+    keeper.cells.add(0, np.array([0.0]))
+    scan = faces_from(np.array([0.0, 0.0, 0.1]), (math.pi / 2, 1.3))
+    at = antennas_of(paper_rig(), [scan], np.zeros(3))
+    (seen,) = detections_of(scan, [0], 0, at, RangeNoise())
+    # What is of the same wall a second time is not used.
+    assert keeper.take([(seen, (-0.15, 0.16)), (seen, (0.0, 0.0))], at) == [(0, [seen])]
+    assert len(keeper.spans_m(0)) == 1
+    assert state.heading_rad == pytest.approx(0.1, abs=2e-3)
+    # Of the bearing, of what the range says where the antenna is beside the body's origin, and of
+    # what was known before
+    mount = paper_rig().mounts[0]
+    lever_m = -mount.x_m * math.cos(0.1) + mount.y_m * math.sin(0.1)
+    information = 1 / 8e-3**2 + lever_m**2 / 13e-6 + 1 / 0.1**2
+    assert state.pose_covariance()[2, 2] == pytest.approx(1 / information, rel=1e-3)
+
+
+def test_a_robot_that_patches_show_a_wall_keeps_its_heading() -> None:
+    """Wheels turn by 10 mrad a step that they do not report; single ranges alone make no wall."""
+    back_end, pose = RobustBackEnd(paper_rig(), BackEndParameters()), np.zeros(3)
+    counts = []
+    for number in range(40):
+        pose = compose(pose, np.array([0.05, 0.0, 2e-3]))
+        back_end.predict(np.array([0.05, 0.0, 0.0]))
+        scans = [RangeScan(radar=0, ranges_m=(), is_imaged=True)]
+        if number % 2:
+            scans.append(faces_from(pose, (1.4, 1.5)))
+        back_end.update(scans)
+        counts.append(len(back_end.state.wall_ids))
+    assert counts[:5] == [0] * 5
+    assert counts[5:] == [1] * 35
+    assert abs(back_end.pose[2] - pose[2]) < 0.03
+    assert back_end.state.walls[0] == pytest.approx((1.4, 1.5), abs=0.03)
+    assert back_end.relinearise()
+    assert abs(back_end.pose[2] - pose[2]) < 0.03
 
 
 def bare_room(path: Array, rng: np.random.Generator) -> list[list[RangeScan]]:
