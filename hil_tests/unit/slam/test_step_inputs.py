@@ -222,7 +222,7 @@ SCAN = RangeScan(
     bearings_rad=(0.1, 0.2),
     bearing_sigmas_rad=(0.0, 0.01),
 )
-OTHERS = ("radar", "labels", "is_patch", "is_imaged")
+OTHERS = ("radar", "labels", "is_patch", "is_imaged", "faces_m")
 NUMBERS = [each.name for each in fields(RangeScan) if each.name not in OTHERS]
 
 
@@ -232,6 +232,24 @@ def test_every_number_of_a_scan_is_finite(name: str, value: float) -> None:
     changes: dict[str, Any] = {name: (value, *getattr(SCAN, name)[1:])}
     with pytest.raises(ValueError, match=name):
         replace(SCAN, **changes)
+
+
+FACES = replace(SCAN, is_patch=True, faces_m=((-0.1, 0.1), (0.0, 0.2)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"faces_m": ((-0.1, math.nan), (0.0, 0.2))},
+        {"faces_m": ((-0.1, 0.1),)},
+        {"is_patch": False},
+        {"bearings_rad": None},
+    ],
+    ids=str,
+)
+def test_faces_are_finite_and_of_a_patch_with_bearings(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="faces_m"):
+        replace(FACES, **changes)
 
 
 @pytest.mark.parametrize("name", ["sigmas_m", "labels", "bearings_rad", "bearing_sigmas_rad"])
