@@ -457,9 +457,9 @@ REMOVED_KEYS: Mapping[str, str | float] = {
     "robust.predicted_share": 1.0,
     "trilateration.bearing": "ranges",
 }
+"""Settings that no longer exist, with their defaults in the last version that had them."""
 ADDED_KEYS: Mapping[str, bool] = {"robust.patches": False}
 """Keys that sessions lack which were recorded before, with what was then in effect."""
-"""Settings that no longer exist, with their defaults in the last version that had them."""
 _LAST_VERSION_WITH_THEM = "0.1.0"
 
 

@@ -262,14 +262,39 @@ class UnassignedRanges:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BodyPoint:
+class BodyTarget:
+    """How well a point or a wall is known in the newest body frame."""
+
+    covariance: Array  # shape (2, 2)
+    by_offsets: Array  # shape (2, q), d(target) / d(unknowns of the radars)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BodyPoint(BodyTarget):
     """A point in the newest body frame."""
 
     point_m: Array  # shape (2,)
-    covariance: Array  # shape (2, 2)
-    by_offsets: Array  # shape (2, q), d(point) / d(unknowns of the radars)
     # shape (2,): away from where it was seen from, where the axis of a round target lies
     outward: Array | None = None
+
+
+def fused(
+    before: BodyTarget, new: BodyTarget, residual: Array
+) -> tuple[Array, Array, Array, float]:
+    """Return what a target known before becomes by one that is the same, and errs independently.
+
+    ``residual`` (2,) is the new one less the other. Returns by how much the latter moves (2,), its
+    covariance (2, 2) and by_offsets (2, q) then, and the chi-square of the residual.
+    """
+    S = before.covariance + new.covariance
+    K = np.linalg.solve(S, before.covariance).T
+    covariance = before.covariance - K @ before.covariance
+    return (
+        np.asarray(K @ residual),
+        (covariance + covariance.T) / 2,
+        before.by_offsets + K @ (new.by_offsets - before.by_offsets),
+        float(residual @ np.linalg.solve(S, residual)),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -961,15 +986,14 @@ class TentativePoints:
 
     def _fuse(self, one: TentativePoint, detection: PointDetection, point: BodyPoint) -> None:
         before = one.point
-        S = before.covariance + point.covariance
-        nu = point.point_m - before.point_m
-        K = np.linalg.solve(S, before.covariance).T
-        covariance = before.covariance - K @ before.covariance
+        change, covariance, by_offsets, chi_square = fused(
+            before, point, point.point_m - before.point_m
+        )
         one.point = BodyPoint(
-            point_m=before.point_m + K @ nu,
-            covariance=(covariance + covariance.T) / 2,
-            by_offsets=before.by_offsets + K @ (point.by_offsets - before.by_offsets),
+            point_m=before.point_m + change,
+            covariance=covariance,
+            by_offsets=by_offsets,
             outward=point.outward,
         )
-        one.chi_square += float(nu @ np.linalg.solve(S, nu))
+        one.chi_square += chi_square
         one.seen.append(detection)

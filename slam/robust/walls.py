@@ -31,6 +31,7 @@ from slam.geometry import wrap_angle
 from slam.results import SavedWall
 from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
+    BodyTarget,
     FeatureRows,
     Guess,
     PointDetection,
@@ -39,6 +40,7 @@ from slam.robust.initialisation import (
     Tracklet,
     UnassignedRanges,
     certain_row,
+    fused,
 )
 from slam.robust.parameters import (
     TAIL_PROBABILITY,
@@ -82,12 +84,10 @@ def way_along_m(tracklet: Tracklet) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BodyWall:
+class BodyWall(BodyTarget):
     """A wall in the newest body frame."""
 
     wall: Array  # shape (2,): phi [rad], d [m]
-    covariance: Array  # shape (2, 2)
-    by_offsets: Array  # shape (2, q), d(phi, d) / d(unknowns of the radars)
     feet_m: Array  # shape (k, 2), where its echoes came from
 
     def in_map(self, state: State) -> Array:
@@ -227,7 +227,11 @@ Face = tuple[PointDetection, tuple[float, float]]
 
 
 def body_wall(state: State, antennas: Antennas, face: Face, rule: WallRule) -> BodyWall:
-    """Return where a face lies, the offset of the radar removed."""
+    """Return where a face lies in the newest body frame, the offset of its radar removed.
+
+    Its noise is that of the face, of the roughness of walls, and as much larger as errors of the
+    run are alike.
+    """
     detection, (first_m, last_m) = face
     radar, layout = detection.radar, state.layout
     phi, antenna = detection.bearing_rad + detection.turn_rad, antennas.position_m[radar]
@@ -274,21 +278,19 @@ class TentativeWall:
             feet_m=(before.feet_m - motion.step_m) @ rotation(motion.turn_rad),
         )
 
-    def residual(self, new: BodyWall) -> tuple[Array, Array]:
-        """Return how far a face is from it, (2,), and the covariance of that, (2, 2)."""
-        nu = new.wall - self.wall.wall
-        nu[0] = wrap_angle(float(nu[0]))
-        return nu, self.wall.covariance + new.covariance
+    def residual(self, new: BodyWall) -> Array:
+        """Return how far a face is from it, (2,): phi [rad], d [m]."""
+        phi, d = (new.wall - self.wall.wall).tolist()
+        return np.array([wrap_angle(phi), d])
 
     def fuse(self, detection: PointDetection, new: BodyWall) -> None:
         """Take in a face that is of it."""
-        before, (nu, S) = self.wall, self.residual(new)
-        K = np.linalg.solve(S, before.covariance).T
-        covariance = before.covariance - K @ before.covariance
+        before = self.wall
+        change, covariance, by_offsets, _ = fused(before, new, self.residual(new))
         self.wall = BodyWall(
-            wall=before.wall + K @ nu,
-            covariance=(covariance + covariance.T) / 2,
-            by_offsets=before.by_offsets + K @ (new.by_offsets - before.by_offsets),
+            wall=before.wall + change,
+            covariance=covariance,
+            by_offsets=by_offsets,
             feet_m=np.concatenate([before.feet_m, new.feet_m]),
         )
         self.seen.append(detection)
@@ -339,7 +341,7 @@ class TentativeWalls:
         """Return the one that a face is likeliest of, None if it agrees with none."""
         limit, most, nearest = float(chdtri(2, TAIL_PROBABILITY)), math.inf, None
         for one in among:
-            nu, S = one.residual(wall)
+            nu, S = one.residual(wall), one.wall.covariance + wall.covariance
             distance = float(nu @ np.linalg.solve(S, nu))
             cost = distance + float(np.linalg.slogdet(S)[1])
             gaps_m = np.linalg.norm(one.wall.feet_m[:, None] - wall.feet_m, axis=2)

@@ -314,12 +314,16 @@ def test_covariance_of_a_wrong_constant_of_the_wheels_is_what_it_does(
     )
 
 
+def noise_gain() -> float:
+    """Return the standard deviation of a profile of noise of 1."""
+    profiles = ProfileFilter(PULSE, N_BINS, BIN_M).apply(noise(0, 1.0), START_M)
+    return float(np.std(profiles.values[:, 60:-60]))
+
+
 def test_snr_is_that_of_the_noise_at_its_own_range() -> None:
     # Four times as much noise beyond 1.05 m as up to there
     level = np.where(START_M + BIN_M * np.arange(N_BINS) < 1.05, SIGMA, 4 * SIGMA)
-    gain = np.std(
-        ProfileFilter(PULSE, N_BINS, BIN_M).apply(noise(0, 1.0), START_M).values[:, 60:-60]
-    )
+    gain = noise_gain()
     for place, sigma in (((0.1, 0.9), SIGMA), ((0.1, 1.6), 4 * SIGMA)):
         range_m = place[1] - 0.2
         (point,) = patch_points(patch_of(of_point(straight(), place) + noise(11, 1.0) * level))
@@ -351,7 +355,8 @@ def test_a_faint_face_is_no_wall(sigma: float, count: int) -> None:
     """Of SNR 26 and 16: clutter that goes along with the robot for a while is as faint as that."""
     frames = rf_frames(1.0 - antennas_of(straight())[:, 1], np.full(25, 0.02))
     patch = patch_of(frames + noise(3, sigma))
-    assert separated(patch, RULE.separation).snr.max() == pytest.approx(0.159 / sigma, rel=0.02)
+    expected = math.sqrt(25) * 0.02 / (noise_gain() * sigma)
+    assert separated(patch, RULE.separation).snr.max() == pytest.approx(expected, rel=0.1)
     assert len(patch_lines(patch)) == count
 
 

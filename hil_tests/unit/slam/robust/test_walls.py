@@ -219,29 +219,27 @@ def test_cells_tell_where_a_wall_answered() -> None:
     assert cells.spans_m(7) == []
 
 
-def faces_from(
-    pose: Array, wall: tuple[float, float], *, radar: int = 0, turned_rad: float = 0.0
-) -> RangeScan:
-    """Return the scan of a patch that shows a wall (phi, d) of the map from a pose.
+def faces_from(pose: Array, wall: tuple[float, float]) -> RangeScan:
+    """Return the scan of a patch of radar 0 that shows a wall (phi, d) of the map from a pose.
 
-    Its echo came from 5 cm to either side of the perpendicular; its bearing is off by ``turned``.
+    Its echo came from 5 cm to either side of the perpendicular.
     """
-    mount, (phi, d) = paper_rig().mounts[radar], wall
+    mount, (phi, d) = paper_rig().mounts[0], wall
     x, y = transform(pose, np.array([mount.x_m, mount.y_m])).tolist()
     off = math.remainder(phi - pose[2] - mount.yaw_rad, math.tau)
     return RangeScan(
-        radar=radar,
+        radar=0,
         is_patch=True,
         ranges_m=(d - math.cos(phi) * x - math.sin(phi) * y,),
         sigmas_m=(2e-3,),
-        bearings_rad=(off + turned_rad,),
+        bearings_rad=(off,),
         bearing_sigmas_rad=(8e-3,),
         faces_m=((-0.05, 0.05),),
     )
 
 
 def faces_of(state: State, scans: Sequence[RangeScan]) -> list[tuple[PointDetection, BodyWall]]:
-    """Return the faces of scans of patches as what they measure in the body frame."""
+    """Return the faces of scans of patches, and where they lie in the newest body frame."""
     noise, found = RangeNoise(), []
     for scan in scans:
         at = antennas_of(paper_rig(), [scan], np.zeros(3))
@@ -295,7 +293,7 @@ TURNING = np.array([0.12, 0.01, 0.15])
 
 
 def shown_along(poses: Sequence[Array], walls: Sequence[tuple[float, float]]) -> list[int]:
-    """Return how many patches made a wall, for each pose from which one shows a wall."""
+    """Return how many patches made each wall, when one from each pose shows a wall."""
     state, tentative, before = State((0.0,) * 3, OFFSETS), TentativeWalls(BackEndParameters()), None
     counts = []
     for pose, wall in zip(poses, walls, strict=True):
@@ -338,7 +336,7 @@ def test_a_wall_that_patches_no_longer_show_is_forgotten() -> None:
 
 
 def test_a_face_of_a_known_wall_tells_the_heading() -> None:
-    """The robot is sure of all but its heading, which the wall's bearing has off by 0.1 rad."""
+    """The robot is sure of all but its heading, which is 0.1 rad off."""
     state = State((0.0,) * 3, (0.0,) * 4)
     state.walls, state.wall_ids = np.array([[math.pi / 2, 1.3]]), [0]
     state.P = SymmetricMatrix(1e-12 * np.eye(12))
@@ -361,7 +359,7 @@ def test_a_face_of_a_known_wall_tells_the_heading() -> None:
 
 
 def test_a_robot_that_patches_show_a_wall_keeps_its_heading() -> None:
-    """Wheels turn by 10 mrad a step that they do not report; single ranges alone make no wall."""
+    """The robot turns by 2 mrad a step that its wheels do not report, 80 mrad in all."""
     back_end, pose = RobustBackEnd(paper_rig(), BackEndParameters()), np.zeros(3)
     counts = []
     for number in range(40):
