@@ -175,6 +175,15 @@ class UpdateReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LaggedPose:
+    """A pose of some metres ago, with all that was measured since: a fixed-lag smoother's."""
+
+    t_ns: int  # session time of its state
+    pose: Array  # shape (3,), [x m, y m, heading rad], map frame; the heading lies in [-pi, pi)
+    covariance: Array  # shape (3, 3), of the additive error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepResult:
     """One estimated state, and all that led to it."""
 
@@ -193,6 +202,8 @@ class StepResult:
     report: UpdateReport | None = None
     # Standard deviation of every detection in the robust back end; infinite for one left out
     range_sigmas_m: tuple[float, ...] = ()
+    # Poses of the robust back end that are final now, in time order, about one every 10 cm
+    lagged: tuple[LaggedPose, ...] = ()
 
     @property
     def is_lost(self) -> bool:

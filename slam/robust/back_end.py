@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 
@@ -87,6 +88,7 @@ from slam.robust.state import (
     HEAD_SIZE,
     Array,
     Motion,
+    PastPose,
     RangeErrors,
     State,
     calibrated_motion,
@@ -153,6 +155,12 @@ class RobustBackEnd:
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._motion: Motion | None = None  # the last one, if it is known from the wheels
+        # Reported by the wheels since the start: metres, and the same with turns, in keyframes
+        self._way_m, self._way_keys = 0.0, 0.0
+        self._is_past_due = False  # whether the newest pose is to be kept
+        self._past_ways_m: list[float] = []  # of the past poses of the state
+        self.lagged: list[PastPose] = []
+        """The past poses that became final in the newest update."""
         self._course: Course | None = None
         self.slip_probability = 0.0
         """Probability that the wheels slipped in the newest step."""
@@ -331,6 +339,7 @@ class RobustBackEnd:
         if not np.isfinite(increment).all():
             raise ValueError(f"increment is {increment}; dx, dy [m] and turn [rad] must be finite")
         wheels = self.parameters.wheels
+        self._keep_past(increment)
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
         self._log.add_motion(increment, motion, is_loose=is_loose)
         before, self._motion = self._motion, None if is_loose else motion
@@ -341,6 +350,30 @@ class RobustBackEnd:
         self._unassigned.move(motion)
         self._tentative.move(motion)
         self._walls.tentative.move(motion)
+
+    def _keep_past(self, increment: Array) -> None:
+        """Keep the pose among the past ones every few keyframes; to be called before a motion."""
+        rule, keys = self.parameters.lag, self.parameters.relinearisation
+        before = math.floor(self._way_keys / rule.every)
+        step_m, turn_rad = math.hypot(increment[0], increment[1]), abs(float(increment[2]))
+        if self._is_past_due:
+            self.state.keep_pose(self._log.n_poses - 1)
+            self._past_ways_m.append(self._way_m)
+            self._log.mark_key()
+        self._way_m += step_m
+        self._way_keys += step_m / keys.key_m + turn_rad / keys.key_rad
+        self._is_past_due = math.floor(self._way_keys / rule.every) > before
+
+    def _end_update(self) -> None:
+        """Log the pose, and marginalise the past poses that are far enough behind."""
+        self._log.set_causal(self.state.pose)
+        rule, ways_m = self.parameters.lag, self._past_ways_m
+        behind = bisect_right(ways_m, self._way_m - rule.way_m)
+        n = max(behind, len(ways_m) - rule.most)
+        self.lagged = [self.state.past_pose(k) for k in range(n)]
+        if n:
+            self.state.forget_past(n)
+            self._past_ways_m = ways_m[n:]
 
     def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
         """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
@@ -424,7 +457,7 @@ class RobustBackEnd:
                 self.relinearise()
         if decide:
             self._decide()
-        self._log.set_causal(self.state.pose)
+        self._end_update()
         return UpdateReport(
             continued=continued,
             nis=nis,

@@ -447,6 +447,19 @@ class ImagedPointRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LagRule:
+    """Which poses are corrected for some way after the robot was there."""
+
+    way_m: Annotated[float, Origin.BUDGET] = 2.0
+    """How far the robot drives until such a pose is final."""
+    every: Annotated[int, Origin.BUDGET, "keyframes"] = 2
+    """Keyframes from one such pose to the next."""
+    most: Annotated[int, Origin.BUDGET, "poses"] = 40
+    """How many such poses there are at a time; with more, as where the robot turns on the spot, the
+    oldest one is final."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BearingRule:
     """When detections with bearings make a landmark; made of the other rules."""
 
@@ -475,6 +488,7 @@ class BackEndParameters:
     branches: BranchRule = field(default_factory=BranchRule)
     jumps: JumpNoise = field(default_factory=JumpNoise)
     imaged: ImagedPointRule = field(default_factory=ImagedPointRule)
+    lag: LagRule = field(default_factory=LagRule)
 
     def bearings(self, *, of_patches: bool) -> BearingRule:
         """Return the rule for points of patches, or for detections of a sensor with bearings."""

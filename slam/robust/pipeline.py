@@ -22,6 +22,7 @@ from slam.imaging.points import PatchLine, PatchPoint
 from slam.results import (
     Belief,
     InputCheck,
+    LaggedPose,
     MapChanges,
     NoiseAt,
     PoseAt,
@@ -93,6 +94,7 @@ class RobustSlam:
         # Since when the wheels have stood at a pose, and how long they did since the last state
         self._still, self._still_ns, self._stood_ns = np.zeros(3), 0, 0
         self._stamps_ns = PackedRows(np.dtype(np.int64))  # of all states
+        self._lagged_ns = -1  # time of the newest lagged pose
 
     @property
     def back_end(self) -> RobustBackEnd:
@@ -219,8 +221,28 @@ class RobustSlam:
                 detections=detections,
                 report=report,
                 range_sigmas_m=sigmas_m,
+                lagged=self._lagged(),
             ),
         )
+
+    def _lagged(self) -> tuple[LaggedPose, ...]:
+        """Return the past poses that became final in the newest step; none while it is lost."""
+        if self._branches.is_lost:
+            return ()
+        # Pose 0 is the start, which is no state. A back end that is believed from now on may have
+        # poses that the one before has reported.
+        found = [
+            LaggedPose(
+                t_ns=int(self._stamps_ns.rows[one.number - 1]),
+                pose=one.pose,
+                covariance=one.covariance,
+            )
+            for one in self.back_end.lagged
+        ]
+        new = tuple(one for one in found if one.t_ns > self._lagged_ns)
+        if new:
+            self._lagged_ns = new[-1].t_ns
+        return new
 
     def _accept(self, frames: Sequence[RadarFrame], poses: Mapping[int, Array], t_ns: int) -> None:
         """Take a step; images take every frame, even where the robot has hardly moved."""

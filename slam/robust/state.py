@@ -6,16 +6,18 @@ antenna is from where the rig has it (m, body frame), and landmarks: axis l and 
 Errors, in the order of the covariance P::
 
     [e_th, e_p (2), e_s, e_w, e_kappa, e_b (one per radar), e_m (two per radar),
-     e_l0 (2), e_rho0, e_l1 (2), e_rho1, ..., e_w0 (2), ...]
+     e_l0 (2), e_rho0, e_l1 (2), e_rho1, ..., e_w0 (2), ..., e_q0 (2), e_psi0, ...]
     theta = theta^ + e_th,   p = Rot(e_th) p^ + V(e_th) e_p,   l = Rot(e_th) l^ + V(e_th) e_l,
     phi = phi^ + e_th + e_phi,   d = d^ + e_d,
 
 all others additive; (phi, d) is a wall, the line n . x = d with n = [cos phi, sin phi] away from
-the robot. Where the mounts, or the radii, are known, P has no rows for them. An error of the
-heading thus turns the whole map with the robot, which ranges cannot see: the linearised filter
-keeps the three unobservable directions of SLAM whatever the estimate does. Sources: Barrau and
-Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015 (arXiv 1510.06263); Zhang, Wu,
-Song, Huang, Dissanayake, IEEE RA-L 2(2), 2017.
+the robot. A past pose is a point q, as a landmark is, and a direction psi, as that of a wall is:
+what is measured later corrects it, too, which makes the filter a fixed-lag smoother (Simon,
+"Optimal State Estimation", 2006, section 9.3). Where the mounts, or the radii, are known, P has no
+rows for them. An error of the heading thus turns the whole map with the robot, which ranges cannot
+see: the linearised filter keeps the three unobservable directions of SLAM whatever the estimate
+does. Sources: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015 (arXiv
+1510.06263); Zhang, Wu, Song, Huang, Dissanayake, IEEE RA-L 2(2), 2017.
 
 With the reported increment (ux, uy, ua) and the state's (s, w, kappa)::
 
@@ -282,6 +284,7 @@ class Layout:
     n_walls: int = 0
     has_mounts: bool = False
     has_radii: bool = False
+    n_past: int = 0
 
     @property
     def offsets(self) -> slice:
@@ -313,8 +316,14 @@ class Layout:
         return slice(first, first + 2 * self.n_walls)
 
     @property
+    def past(self) -> slice:
+        """Return where the past poses are: x, y, and heading of each."""
+        first = self.walls.stop
+        return slice(first, first + 3 * self.n_past)
+
+    @property
     def size(self) -> int:
-        return int(self.walls.stop)
+        return int(self.past.stop)
 
     def first_columns(self, rows: Indices) -> Indices:
         """Return where features begin; walls are the rows from ``n_landmarks`` on."""
@@ -347,6 +356,8 @@ class State:
         "mounts_m",
         "next_id",
         "offsets_m",
+        "past",
+        "past_numbers",
         "position_m",
         "radii_m",
         "radius_sigma_m",
@@ -375,6 +386,8 @@ class State:
         self.landmark_ids: list[int] = []  # in row order; an id is never used twice
         self.walls: Array = np.zeros((0, 2))  # phi [rad], not wrapped, and d [m]
         self.wall_ids: list[int] = []  # from the same sequence as the landmarks'
+        self.past: Array = np.zeros((0, 3))  # past poses: x [m], y [m] and heading, map frame
+        self.past_numbers: list[int] = []  # which poses of the run they are, increasing
         # By id: what is added in squares to the sigmas of a feature's ranges
         self.added_sigmas_m: dict[int, float] = {}
         self.range_errors = RangeErrors()
@@ -398,6 +411,7 @@ class State:
             len(self.wall_ids),
             self.mount_sigma_m > 0.0,
             self.radius_sigma_m > 0.0,
+            len(self.past),
         )
 
     @property
@@ -445,6 +459,9 @@ class State:
         if layout.has_radii:
             self.radii_m = self.radii_m + shifts[:, 2]
         self.walls = self.walls + error[layout.walls].reshape(-1, 2) + [angle, 0.0]
+        shifts = error[layout.past].reshape(-1, 3)
+        places = self.past[:, :2] @ turn.T + shifts[:, :2] @ V.T
+        self.past = np.column_stack([places, self.past[:, 2] + angle + shifts[:, 2]])
 
     def update(self, at: Indices, H: Array, residual: Array, R: Array) -> float:
         """Correct mean and covariance with k measurements, ``residual = z - h``.
@@ -475,13 +492,7 @@ class State:
         ``cross`` (m, k) is the covariance with the rest, ``corner`` (k, k) its own, k = 3 with the
         radius and 2 without.
         """
-        self.P.grow(cross, corner)
-        if self.wall_ids:
-            k = len(corner)
-            m, n_walls = self.P.size, 2 * len(self.wall_ids)
-            order = np.arange(m)
-            order[m - n_walls - k :] = np.roll(order[m - n_walls - k :], k)
-            self.P = SymmetricMatrix(self.P.full()[np.ix_(order, order)])
+        self._insert(self.layout.landmarks.stop, cross, corner)
         self.landmarks_m = np.vstack([self.landmarks_m, point_m])
         if self.radius_sigma_m:
             self.radii_m = np.append(self.radii_m, 0.0)
@@ -491,11 +502,36 @@ class State:
 
     def augment_wall(self, wall: Array, cross: Array, corner: Array) -> int:
         """Append a wall (phi, d) and return its id; ``cross`` (m, 2), ``corner`` (2, 2)."""
-        self.P.grow(cross, corner)
+        self._insert(self.layout.walls.stop, cross, corner)
         self.walls = np.vstack([self.walls, wall])
         self.wall_ids.append(self.next_id)
         self.next_id += 1
         return self.wall_ids[-1]
+
+    def _insert(self, at: int, cross: Array, corner: Array) -> None:
+        """Let P have rows of something new, the first of them at an index."""
+        behind, k = self.P.size - at, len(corner)
+        self.P.grow(cross, corner)
+        if behind:
+            order = np.arange(self.P.size)
+            order[at:] = np.roll(order[at:], k)
+            self.P = SymmetricMatrix(self.P.full()[np.ix_(order, order)])
+
+    def keep_pose(self, number: int) -> None:
+        """Append the pose to the past ones; ``number`` says which pose of the run it is."""
+        cross, at = np.zeros((self.P.size, 3)), np.array([1, 2])
+        cross[:, :2] = self.P.columns(at)
+        corner = np.zeros((3, 3))
+        corner[:2, :2] = self.P.block(at)
+        self.P.grow(cross, corner)
+        self.past = np.vstack([self.past, self.pose])
+        self.past_numbers.append(number)
+
+    def forget_past(self, n: int) -> None:
+        """Marginalise the oldest past poses."""
+        first = self.layout.past.start
+        self.P.keep(np.delete(np.arange(self.P.size), np.arange(first, first + 3 * n)))
+        self.past, self.past_numbers = self.past[n:], self.past_numbers[n:]
 
     def remove(self, row: int) -> None:
         """Marginalise a landmark, or a wall; the covariance of the rest stays bit for bit."""
@@ -518,6 +554,17 @@ class State:
         T = np.eye(3)
         T[:2, 2] = quarter_turn(self.position_m)
         return np.asarray(T @ P @ T.T)
+
+    def past_pose(self, k: int) -> PastPose:
+        """Return the k-th oldest past pose, with the same covariance."""
+        first, place = self.layout.past.start + 3 * k, self.past[k, :2]
+        P = self.P.block(np.array([HEADING, first, first + 1, first + 2]))
+        T = np.column_stack([[*quarter_turn(place), 1.0], np.eye(3)])
+        return PastPose(
+            number=self.past_numbers[k],
+            pose=np.append(place, wrap_angle(float(self.past[k, 2]))),
+            covariance=T @ P @ T.T,
+        )
 
     def curved_covariance(self) -> Array:
         """Return what large errors of the heading add to the position's covariance (2, 2) [m^2].
@@ -589,13 +636,23 @@ class State:
         return T
 
     def turned_features(self) -> Array:
-        """Return d(features) / d(heading) as the whole map turns, in the order of their columns."""
+        """Return d(features, past poses) / d(heading) as the whole map turns, by columns."""
         landmarks = quarter_turn(self.landmarks_m)
         if self.radius_sigma_m:
             landmarks = np.column_stack([landmarks, np.zeros(len(landmarks))])
         walls = np.zeros_like(self.walls)
         walls[:, 0] = 1.0
-        return np.concatenate([landmarks.ravel(), walls.ravel()])
+        past = np.column_stack([quarter_turn(self.past[:, :2]), np.ones(len(self.past))])
+        return np.concatenate([landmarks.ravel(), walls.ravel(), past.ravel()])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PastPose:
+    """A past pose of the state, and which one of the run it is."""
+
+    number: int
+    pose: Array  # shape (3,)
+    covariance: Array  # shape (3, 3), of the additive error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -48,12 +48,14 @@ def test_a_group_is_a_row_of_its_numbers() -> None:
         "carries_in_time": 0,
     }
     smoothed = {"ate_rmse_m": {"median": 0.002, "p90": 0.003}, "ratio": {"median": 0.04}}
-    robust = paper | {"preset": "robust", "smoothed": smoothed, "carries": 4, "carries_in_time": 3}
+    lagged = {"ate_rmse_m": {"median": 0.009, "p90": 0.0095}, "ratio": {"median": 0.18}}
+    later = {"lagged": lagged, "smoothed": smoothed}
+    robust = paper | later | {"preset": "robust", "carries": 4, "carries_in_time": 3}
     numbers = "4 | 50.6 (100.0) | 25.0 (31.2) | 0.50"
     rest = "2.8 (1 of 2 in 1.2-5.5) | 1.00, - | 1 | 0"
     assert groups_table([paper, robust]).splitlines()[2:] == [
-        f"| `paper` | {numbers} | - | - | {rest} | - |",
-        f"| `robust` | {numbers} | 2.0 (3.0) | 0.04 | {rest} | 3 of 4 |",
+        f"| `paper` | {numbers} | - | - | - | {rest} | - |",
+        f"| `robust` | {numbers} | 9.0 (9.5) | 2.0 (3.0) | 0.04 | {rest} | 3 of 4 |",
     ]
 
 

@@ -64,9 +64,14 @@ class LineMaker:
             "covariance": _numbers(snapshot.pose_covariance),
             "lost": snapshot.step is not None and snapshot.step.is_lost,
         }
-        once = {"removed": [id_ for id_ in before if id_ not in self._given], "reset": is_whole}
+        lagged = () if snapshot.step is None else snapshot.step.lagged
+        once = {
+            "lagged": [[one.t_ns, *_numbers(one.pose)] for one in lagged],
+            "removed": [id_ for id_ in before if id_ not in self._given],
+            "reset": is_whole,
+        }
         for first, part in self._parts(head | once, changed):
-            rest = once if first == 0 else {"removed": [], "reset": False}
+            rest = once if first == 0 else {"lagged": [], "removed": [], "reset": False}
             yield _line(head | rest, "landmarks", part)
 
     def smoothed(self, smoothed: SmoothedRun) -> Iterator[bytes]:

@@ -34,7 +34,8 @@ from xethru_protocol.operating_system import (
 
 SESSION, VIEW, REPORT = "session.mcap", "session.rrd", "report.html"
 SMOOTHED, IMAGE = "smoothed.tum", "image.png"
-RESULTS = ("map.png", IMAGE, "summary.json", "estimate.tum", SMOOTHED, "truth.tum", "odometry.tum")
+_TRAJECTORIES = ("estimate.tum", "lagged.tum", SMOOTHED, "truth.tum", "odometry.tum")
+RESULTS = ("map.png", IMAGE, "summary.json", *_TRAJECTORIES)
 
 
 def finish(
@@ -99,13 +100,15 @@ def _write(
 
 
 def write_trajectories(out: Path, record: RunRecord) -> None:
-    """Write estimate, odometry and, if known, smoothed path and truth at the stamps of states."""
+    """Write estimate, odometry and, where there are any, lagged and smoothed poses and truth."""
     states = record.states
     paths = {"estimate": states.estimate, "odometry": states.odometry}
     if states.has_truth:
         paths["truth"] = states.truth
     for name, poses in paths.items():
         write_path(out / f"{name}.tum", states.t_ns, poses)
+    if len(record.lagged):
+        write_path(out / "lagged.tum", record.lagged_ns, record.lagged)
     if record.smoothed is not None:
         write_smoothed(out, record.smoothed)
 

@@ -197,6 +197,9 @@ class RunRecord:
     smoothed
         The newest solution over all states until then; None if there is none. That of a run which
         ended covers all its states.
+    lagged_ns, lagged
+        Shapes (m,) and (m, 3): times of the lagged poses (`slam.results.LaggedPose`), and these,
+        map frame. None of preset `paper`.
     n_frames
         Radar frames used, over all radars.
     start_ns
@@ -212,6 +215,8 @@ class RunRecord:
     wall_s: float
     start_ns: int = 0
     smoothed: SmoothedRun | None = None
+    lagged_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    lagged: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def whole_smoothed(self) -> SmoothedRun | None:
@@ -245,6 +250,7 @@ class RunRecorder(SessionObserver):
         self._covariances = PackedRows(_FLOAT, 3, 3)
         self._nis, self._nis_dof = PackedRows(_FLOAT), PackedRows(np.dtype(np.int32))
         self._lost = PackedRows(np.dtype(np.bool_))
+        self._lagged_ns, self._lagged = PackedRows(np.dtype(np.int64)), PackedRows(_FLOAT, 3)
         self._last: Snapshot | None = None
         self._smoothed: SmoothedRun | None = None
         self._start_ns: int | None = None
@@ -267,6 +273,9 @@ class RunRecorder(SessionObserver):
         self._nis.append(nis)
         self._nis_dof.append(dof)
         self._lost.append(snapshot.step is not None and snapshot.step.is_lost)
+        for one in () if snapshot.step is None else snapshot.step.lagged:
+            self._lagged_ns.append(one.t_ns)
+            self._lagged.append(one.pose)
         self._last = snapshot
 
     def on_smoothed(self, smoothed: SmoothedRun) -> None:
@@ -291,6 +300,8 @@ class RunRecorder(SessionObserver):
             start_ns=self._start_ns or 0,
             wall_s=time.monotonic() - self._started,
             smoothed=self._smoothed,
+            lagged_ns=self._lagged_ns.rows,
+            lagged=self._lagged.rows,
         )
 
     def _true_nis(self, snapshot: Snapshot) -> tuple[float, int]:

@@ -45,8 +45,10 @@ class Summary:
     paper's number, without time, and flatters; `final_error_m` is that of the last state, not
     aligned; `nees_pose` holds (time of the state [s], NEES) pairs of the unaligned pose in the
     start frame, of the last state at or before each of ten times; `nis_mean` is divided by its
-    degrees of freedom. Smoothed numbers are of the solution over the whole run at its end, None
-    where there is none; its landmarks are those of the last map, where the solution has them.
+    degrees of freedom. `lagged_ate_rmse_m` is of the poses as known two metres of travel later, the
+    last two metres left out; None of preset `paper`. Smoothed numbers are of the solution over the
+    whole run at its end, None where there is none; its landmarks are those of the last map, where
+    the solution has them.
     """
 
     scene: str
@@ -57,6 +59,7 @@ class Summary:
     duration_s: float
     realtime_factor: float
     ate_rmse_m: float
+    lagged_ate_rmse_m: float | None = None
     smoothed_ate_rmse_m: float | None = None
     ate_icp_rmse_m: float
     odometry_ate_rmse_m: float
@@ -77,10 +80,15 @@ class Summary:
         return ratio(self.ate_rmse_m, self.odometry_ate_rmse_m)
 
     @property
+    def lagged_ate_ratio(self) -> float | None:
+        return self._ratio(self.lagged_ate_rmse_m)
+
+    @property
     def smoothed_ate_ratio(self) -> float | None:
-        if self.smoothed_ate_rmse_m is None:
-            return None
-        return ratio(self.smoothed_ate_rmse_m, self.odometry_ate_rmse_m)
+        return self._ratio(self.smoothed_ate_rmse_m)
+
+    def _ratio(self, ate_rmse_m: float | None) -> float | None:
+        return None if ate_rmse_m is None else ratio(ate_rmse_m, self.odometry_ate_rmse_m)
 
     def to_json(self) -> str:
         """Return the text of summary.json: exactly these fields, no NaN."""
@@ -94,6 +102,7 @@ _FIX_DOF = 2
 _ONE_STEP = 0.1
 """Metres and radians that odometry and estimate may differ by at the first state, if they began
 together; a step is shorter than that."""
+_FEWEST_ALIGNED = 2
 _TAIL = 0.025
 """On either side of a 95 % band."""
 
@@ -220,6 +229,7 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
         duration_s=record.duration_ns / NS_PER_S,
         realtime_factor=record.duration_ns / NS_PER_S / record.wall_s,
         ate_rmse_m=ate_rmse_m(estimate[:, :2], truth_xy),
+        lagged_ate_rmse_m=_lagged_ate_rmse_m(record),
         ate_icp_rmse_m=icp_ate_rmse_m(estimate[:, :2], truth_in_map[:, :2]),
         odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
         final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
@@ -238,6 +248,14 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
             record, truth_in_map, smoothed.poses, smoothed.pose_covariances
         ),
     )
+
+
+def _lagged_ate_rmse_m(record: RunRecord) -> float | None:
+    """Return the ATE of the lagged poses, aligned by themselves; None if there are too few."""
+    if len(record.lagged) < _FEWEST_ALIGNED:
+        return None
+    rows = np.searchsorted(record.states.t_ns, record.lagged_ns)
+    return ate_rmse_m(record.lagged[:, :2], record.states.truth[rows, :2])
 
 
 def nees_at_ten_times(

@@ -26,10 +26,10 @@ def summarise_groups(runs: Sequence[SweepRun]) -> list[Group]:
     number of runs, how many beat odometry, `median` and `p90` of the errors, medians of the
     landmarks' scores, the share of runs without a duplicate, false landmarks (per run, and how many
     were claimed to be known), the mean NEES over runs (ANEES) and the mean NIS per degree of
-    freedom at each of the ten times with their 95 % bands, ATE and mean NEES of the `smoothed`
-    paths where there are any, and the same errors of the known-association bound where it was
-    computed. `ratio` is the spread of each run's ATE over its own odometry's; the counts are those
-    of `outcomes`.
+    freedom at each of the ten times with their 95 % bands, ATE of the `lagged` and ATE and mean
+    NEES of the `smoothed` paths where there are any, and the same errors of the known-association
+    bound where it was computed. `ratio` is the spread of each run's ATE over its own odometry's;
+    the counts are those of `outcomes`.
     """
     groups = dict.fromkeys(run.group for run in runs)
     return [_group([run for run in runs if run.group == group]) for group in groups]
@@ -58,6 +58,7 @@ def _group(runs: Sequence[SweepRun]) -> Group:
         "confident_false": sum(run.confident_false for run in runs),
         "realtime_factor": spread([run.realtime_factor for run in runs]),
         **_anees([run.nees_pose for run in runs]),
+        "lagged": _later("lagged", runs),
         "smoothed": _smoothed(runs),
         "nis_mean": statistics.fmean(nis) if nis else None,
         "nis_times": _nis_times(runs),
@@ -122,19 +123,27 @@ def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
 
 
 def _smoothed(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
-    """Return the numbers of the smoothed paths; None where no run has one.
+    """Return the numbers of the smoothed paths; None where no run has one."""
+    errors = _later("smoothed", runs)
+    if errors is None:
+        return None
+    nees = [run.smoothed_nees_pose for run in runs if run.smoothed_nees_pose is not None]
+    return errors | _anees(nees)
+
+
+def _later(path: str, runs: Sequence[SweepRun]) -> dict[str, Any] | None:
+    """Return the errors of "lagged" or "smoothed" paths; None where no run has one.
 
     `ratio` is the spread of each run's ATE over its own odometry's.
     """
-    ates = [run.smoothed_ate_rmse_m for run in runs if run.smoothed_ate_rmse_m is not None]
-    if not ates:
+    having = [run for run in runs if getattr(run, f"{path}_ate_rmse_m") is not None]
+    if not having:
         return None
-    ratios = [share for run in runs if (share := run.smoothed_ate_ratio) is not None]
+    shares = [min(getattr(run, f"{path}_ate_ratio"), LARGEST) for run in having]
     return {
-        "runs": len(ates),
-        "ate_rmse_m": spread(ates),
-        "ratio": spread([min(share, LARGEST) for share in ratios]),
-        **_anees([run.smoothed_nees_pose for run in runs if run.smoothed_nees_pose is not None]),
+        "runs": len(having),
+        "ate_rmse_m": spread([getattr(run, f"{path}_ate_rmse_m") for run in having]),
+        "ratio": spread(shares),
     }
 
 

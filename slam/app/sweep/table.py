@@ -108,8 +108,9 @@ def times_clean(group: Group, clean: Group, statistic: str) -> float:
     return ratio(group["ate_rmse_m"][statistic], clean["ate_rmse_m"][statistic])
 
 
-def _of_smoothed(group: Group, key: str, text: Callable[[float], str]) -> str:
-    return "-" if group["smoothed"] is None else text(group["smoothed"][key]["median"])
+def _later(path: str, key: str, text: Callable[[float], str]) -> Callable[[Group], str]:
+    """Return the column of a median of "lagged" or "smoothed" paths."""
+    return lambda group: "-" if group[path] is None else text(group[path][key]["median"])
 
 
 COLUMNS: Mapping[str, Callable[[Group], str]] = {
@@ -119,9 +120,10 @@ COLUMNS: Mapping[str, Callable[[Group], str]] = {
     "wheels": lambda group: mm_text(group["odometry_ate_rmse_m"]["median"]),
     "SLAM": lambda group: mm_text(group["ate_rmse_m"]["median"]),
     "p90": lambda group: mm_text(group["ate_rmse_m"]["p90"]),
-    "smoothed": lambda group: _of_smoothed(group, "ate_rmse_m", mm_text),
+    "lagged": _later("lagged", "ate_rmse_m", mm_text),
+    "smoothed": _later("smoothed", "ate_rmse_m", mm_text),
     "of wheels": lambda group: f"{group['ratio']['median']:.3f}",
-    "smoothed, of wheels": lambda group: _of_smoothed(group, "ratio", "{:.3f}".format),
+    "smoothed, of wheels": _later("smoothed", "ratio", "{:.3f}".format),
     "worse": lambda group: str(group["runs_above_odometry"]),
     "lost": lambda group: str(group["runs_lost"]),
     "confidently wrong": lambda group: str(group["runs_confidently_wrong"]),
@@ -139,7 +141,7 @@ COLUMNS: Mapping[str, Callable[[Group], str]] = {
 }
 """What each column shows of a group; errors, precision and recall are medians over the runs."""
 
-_ERRORS = ("SLAM", "p90", "smoothed", "of wheels", "smoothed, of wheels")
+_ERRORS = ("SLAM", "p90", "lagged", "smoothed", "of wheels", "smoothed, of wheels")
 _FAILURES = ("worse", "lost", "confidently wrong", "carries found", "mean NEES", "ANEES in band")
 CONSISTENCY_COLUMNS = (
     *("group", "seeds", "ANEES in band", "known association", "NIS in band", "mean NIS"),

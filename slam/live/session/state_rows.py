@@ -24,7 +24,8 @@ in the units and frames of `Snapshot`; an unknown truth is NaN. The row of what 
     n_rejected times: which of the fixes,
     n_continued times: radar, index of the range in its scan, landmark id,
     n_predicted times: radar, landmark id, range, variance, antenna (2), point (2),
-    n_wall_spans times: x, y of one end, x, y of the other
+    n_wall_spans times: x, y of one end, x, y of the other,
+    for each lagged pose: dt_ns, x, y, heading, covariance (9, row by row)
 
 in the units and frames of `StepResult` and `Snapshot.wall_spans_m`; dt_ns is a time less that of
 the state; what is counted by "which" counts from 0. The four numbers of the report are 0 without
@@ -59,6 +60,7 @@ from slam.results import (
     Association,
     Belief,
     Fix,
+    LaggedPose,
     Observation,
     PredictedRange,
     SmoothedRun,
@@ -114,6 +116,7 @@ _PREDICTED = _Columns(
 )
 _REPORT = _Columns(UpdateReport, "nis", "dof", "carried", "lost")
 _N_COUNTS = 7
+_LAGGED_WIDTH = 1 + POSE_SIZE + POSE_SIZE**2
 
 
 class _RowReader:
@@ -130,6 +133,10 @@ class _RowReader:
 
     def table(self, n_rows: int, width: int) -> Iterator[Iterator[float]]:
         return map(iter, self.take(n_rows, width).tolist())
+
+    @property
+    def n_left(self) -> int:
+        return len(self._row) - self._at
 
     def counts(self, n: int) -> list[int]:
         return [_count(value) for value in self.take(n).tolist()]
@@ -287,7 +294,12 @@ def step_row(step: StepResult, wall_spans_m: Array) -> Array:
         row += ids
     for one in predicted:
         row += _PREDICTED.numbers(one)
-    return np.concatenate([np.array(row, dtype=np.float64), np.ravel(wall_spans_m)])
+    lagged = [
+        part
+        for one in step.lagged
+        for part in ([one.t_ns - step.t_ns], one.pose, one.covariance.ravel())
+    ]
+    return np.concatenate([np.array(row, dtype=np.float64), np.ravel(wall_spans_m), *lagged])
 
 
 def with_step(state: Snapshot, numbers: Array) -> Snapshot:
@@ -337,6 +349,7 @@ def with_step(state: Snapshot, numbers: Array) -> Snapshot:
         for values in row.table(n_predicted, _PREDICTED.width)
     )
     spans_m = row.take(n_spans, 2, 2).copy()
+    lagged = row.take(row.n_left // _LAGGED_WIDTH, _LAGGED_WIDTH)
     row.end()
     step = StepResult(
         t_ns=state.t_ns,
@@ -351,6 +364,14 @@ def with_step(state: Snapshot, numbers: Array) -> Snapshot:
         if has_report
         else None,
         range_sigmas_m=tuple(used_m) if has_sigmas else (),
+        lagged=tuple(
+            LaggedPose(
+                t_ns=state.t_ns + int(numbers[0]),
+                pose=numbers[1:4],
+                covariance=numbers[4:].reshape(POSE_SIZE, POSE_SIZE),
+            )
+            for numbers in lagged
+        ),
     )
     return replace(state, step=step, wall_spans_m=spans_m)
 

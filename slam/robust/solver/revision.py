@@ -78,7 +78,7 @@ def adopt(
     log: RunLog, state: State, problem: Problem, solution: Solution, parameters: BackEndParameters
 ) -> None:
     """Replace the belief by a solution, and let it choose the noise of ranges."""
-    _replace(state, solution)
+    _replace(state, problem, solution, parameters)
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state, parameters)
 
@@ -295,7 +295,9 @@ def is_determined(information: Array) -> bool:
     return bool(np.all((variances > 0.0) & (variances < _UNKNOWN**2)))
 
 
-def _replace(state: State, solution: Solution) -> None:
+def _replace(
+    state: State, problem: Problem, solution: Solution, parameters: BackEndParameters
+) -> None:
     estimate, layout = solution.estimate, state.layout
     pose = estimate.poses[-1]
     state.position_m = pose[:2].copy()
@@ -310,7 +312,10 @@ def _replace(state: State, solution: Solution) -> None:
     if layout.has_radii:
         state.radii_m = landmarks[:, 2].copy()
     state.walls = values[layout.walls].reshape(-1, 2).copy()
+    keys = np.searchsorted(problem.keys, state.past_numbers)
+    state.past = estimate.poses[keys]
+    smoother = Smoother(problem, parameters.relinearisation)
     # The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...)
-    additive = np.linalg.inv(solution.information)
+    additive = smoother.joint_covariance(solution, keys)
     order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
     state.set_additive_covariance(additive[np.ix_(order, order)])

@@ -251,7 +251,7 @@ class RunLog:
         No range is referred to a keyframe through a loose step: its noise is not the wheels'.
         """
         if is_loose:
-            self._mark_key()
+            self.mark_key()
         self._is_key.append(is_loose)
         self._steps.append(increment)
         self._covariances.append(motion.covariance)
@@ -346,7 +346,7 @@ class RunLog:
         self._covariances.rows_to_write(pose - 1)[0] += covariance
         self._is_key.rows_to_write(pose - 1)[:2] = True
 
-    def _mark_key(self) -> None:
+    def mark_key(self) -> None:
         """Let the newest pose be a keyframe."""
         self._is_key.rows_to_write(self.n_poses - 1)[0] = True
 
@@ -453,7 +453,8 @@ class RunLog:
         key, place, turn = _from_keyframes(chain, keys)
         pose = ranges["pose"]
         antennas = place[pose] + _turned(ranges["antenna"], turn[pose])
-        layout, prior_mean = state.layout, np.zeros(state.layout.size)
+        layout = replace(state.layout, n_past=0)  # past poses are keyframes
+        prior_mean = np.zeros(layout.size)
         of_landmark = prior_mean[layout.landmarks].reshape(-1, layout.landmark_size)
         of_landmark[:, :2] = state.landmarks_m
         prior_mean[layout.walls] = state.walls.ravel()

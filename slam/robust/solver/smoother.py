@@ -372,15 +372,62 @@ def solve(equations: NormalEquations) -> tuple[Array, Array]:
 def covariances(left: Eliminated) -> tuple[Array, Array]:
     """Return the marginal covariances of the eliminated poses, (k, 3, 3), and of the border.
 
-    With the blocks F of the factor, pose k is -F_kk^-T F_k+1,k^T x_k+1 and noise of covariance
-    F_kk^-T F_kk^-1 while the border is known; what the border adds is A^-1 B S^-1 B^T A^-1.
+    While the border is known, each pose is the next one's times a factor, and noise; what the
+    border adds is A^-1 B S^-1 B^T A^-1.
     """
     root = np.linalg.inv(np.linalg.cholesky(left.information))
     by_border, _ = dtbtrs(left.factor, left.W @ root.T, uplo="L", trans="T")
     size = left.size
     by_border = by_border.reshape(-1, size, by_border.shape[1])[:, :3]
     chain = by_border @ by_border.transpose(0, 2, 1)
-    diagonal, lower = (np.zeros((len(chain), size, size)) for _ in range(2))
+    own, back = _from_later(left)
+    later = np.zeros((size, size))
+    for k in range(len(chain) - 1, -1, -1):
+        later = own[k] + back[k] @ later @ back[k].T
+        chain[k] += later[:3, :3]
+    return (chain + chain.transpose(0, 2, 1)) / 2, root.T @ root
+
+
+def joint_covariance(left: Eliminated, at: Indices) -> Array:
+    """Return the covariance of the border and, behind it, of some eliminated poses, in time order.
+
+    It has the shape (b + 3 k, b + 3 k). What connects two poses while the border is known passes
+    through all poses between them.
+    """
+    size, n, k = left.size, len(left.information), len(at)
+    joint = np.zeros((n + 3 * k, n + 3 * k))
+    border = joint[:n, :n] = np.linalg.inv(left.information)
+    if not k:
+        return joint
+    first = int(at[0])
+    since = slice(first * size, None)  # what comes before it does not matter to later ones
+    by_border, _ = dtbtrs(left.factor[:, since], left.W[since], uplo="L", trans="T")
+    by_border = by_border.reshape(-1, size, n)[at - first, :3].reshape(-1, n)
+    joint[n:, :n] = -by_border @ border
+    joint[:n, n:] = joint[n:, :n].T
+    joint[n:, n:] = by_border @ border @ by_border.T
+    own, back = _from_later(left)
+    row_of = {int(pose): n + 3 * row for row, pose in enumerate(at)}
+    own_now, with_later = np.zeros((size, size)), np.zeros((size, 3 * k))
+    for pose in range(len(own) - 1, first - 1, -1):
+        own_now = own[pose] + back[pose] @ own_now @ back[pose].T
+        with_later = -back[pose] @ with_later
+        if pose in row_of:
+            row = row_of[pose]
+            with_later[:, row - n : row - n + 3] = own_now[:, :3]
+            joint[row : row + 3, row:] += with_later[:3, row - n :]
+            joint[row + 3 :, row : row + 3] = joint[row : row + 3, row + 3 :].T
+    return joint
+
+
+def _from_later(left: Eliminated) -> tuple[Array, Array]:
+    """Return of each eliminated pose, the border known, noise and factor on the next pose.
+
+    With the blocks F of the factor these are F_kk^-T F_kk^-1 and F_kk^-T F_k+1,k^T, shape
+    (k, size, size) each; the pose is the negative product and the noise.
+    """
+    size, k = left.size, left.factor.shape[1] // left.size
+    diagonal, lower = (np.zeros((k, size, size)) for _ in range(2))
     for i in range(size):
         for j in range(size):
             if i >= j:
@@ -388,12 +435,7 @@ def covariances(left: Eliminated) -> tuple[Array, Array]:
             lower[:-1, i, j] = left.factor[size + i - j, j : -size or None : size]
     inverses = np.linalg.inv(diagonal)
     own = inverses.transpose(0, 2, 1) @ inverses
-    back = (lower @ inverses).transpose(0, 2, 1)
-    later = np.zeros((size, size))
-    for k in range(len(chain) - 1, -1, -1):
-        later = own[k] + back[k] @ later @ back[k].T
-        chain[k] += later[:3, :3]
-    return (chain + chain.transpose(0, 2, 1)) / 2, root.T @ root
+    return own, (lower @ inverses).transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -530,6 +572,16 @@ class Smoother:
         left = eliminate(self._equations(estimate, slips, self._rule.outlier_sigmas))
         chain, border = covariances(left)
         return np.concatenate([chain, border[None, POSE, POSE]]), border
+
+    def joint_covariance(self, solution: Solution, keys: Indices) -> Array:
+        """Return the covariance of the border and of some keyframes before the last one.
+
+        Shape (b + 3 k, b + 3 k), the keyframes in time order behind the border.
+        """
+        limit = self._rule.outlier_sigmas
+        return joint_covariance(
+            eliminate(self._equations(solution.estimate, solution.slips, limit)), keys
+        )
 
     def _motion_costs(self, residual: Array, share: float = 1.0) -> tuple[Array, Array]:
         """Return the costs of all motions, shapes (k,): of the wheels' noise, and of a slip.

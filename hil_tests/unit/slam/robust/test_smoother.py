@@ -19,6 +19,7 @@ from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.unit.slam.robust.range_world import LAB, follow, parameters_for, simulate, step_of
 from slam.config import WheelNoise
 from slam.geometry import between, compose, paper_rig
+from slam.results import SmoothedRun
 from slam.robust import kernels
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
@@ -295,6 +296,11 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(
     blocks = [dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(start.poses))]
     assert np.abs(of_keys - blocks).max() <= 1e-4 * np.abs(blocks).max()
     assert np.abs(of_border - wanted).max() <= 1e-4 * np.abs(wanted).max()
+    for some in ([1, 2, 4], [3], [], [0, 4]):
+        keys = np.array(some, dtype=np.intp)
+        at = np.concatenate([keep, (3 * keys[:, None] + np.arange(3)).ravel()])
+        joint = smoother.joint_covariance(solution, keys)
+        assert np.abs(joint - dense[np.ix_(at, at)]).max() <= 1e-4 * np.abs(wanted).max()
 
 
 def test_huber_weights_are_those_of_the_solution_itself() -> None:
@@ -398,6 +404,41 @@ def test_the_smoothed_run_leaves_the_filter_unchanged_and_is_within_a_centimetre
         for e, P in zip(errors, smoothed.pose_covariances[:, :2, :2], strict=True)
     ]
     assert np.mean(nees[20:]) < chdtri(2, 1e-3)
+
+
+def test_past_poses_are_those_of_the_solution_over_the_whole_run() -> None:
+    """After a solution they are its poses; before it, what it had before the last ranges, nearly.
+
+    The filter linearises each range once, where it was then, and weighs it once.
+    """
+    back_end = driven(330, 2e-3)
+    state = back_end.state
+    numbers = state.past_numbers.copy()
+    assert len(numbers) == len(state.past) >= 15
+
+    def solved() -> SmoothedRun:
+        smoothed = back_end.smoothed(np.arange(back_end._log.n_poses - 1))
+        assert smoothed is not None
+        return smoothed
+
+    def away() -> tuple[Array, Array]:
+        """Return how far past poses are from the solution's, in its standard deviations."""
+        poses, covariances = solved().poses, solved().pose_covariances
+        pasts = [state.past_pose(k) for k in range(len(state.past))]
+        off = np.array([one.pose - poses[one.number - 1] for one in pasts])
+        sigmas = np.array([np.sqrt(covariances[one.number - 1].diagonal()) for one in pasts])
+        own = np.array([np.sqrt(one.covariance.diagonal()) for one in pasts])
+        return np.abs(off) / sigmas, own / sigmas
+
+    off, ratio = away()
+    assert off.max() < 0.5
+    assert 0.9 < ratio.min() <= ratio.max() < 1.1
+    for _ in range(5):  # each lets the noise of ranges be learned anew
+        assert relinearise(back_end._log, state, back_end.parameters)
+    assert state.past_numbers == numbers
+    off, ratio = away()
+    assert off.max() < 1e-3
+    np.testing.assert_allclose(ratio, 1.0, atol=1e-3)
 
 
 def test_keyframes_remain_as_the_run_goes_on_and_a_loose_step_is_between_two() -> None:

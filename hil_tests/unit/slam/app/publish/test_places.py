@@ -63,6 +63,7 @@ def test_a_line_has_what_changed_since_the_one_before() -> None:
         "pose": state.estimate.tolist(),
         "covariance": [1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-5],
         "lost": False,
+        "lagged": [],
         "reset": True,
         "removed": [],
         "landmarks": [
@@ -86,6 +87,15 @@ def test_a_robot_that_is_lost_is_lost() -> None:
         step = replace(state.step, report=replace(state.step.report, lost=lost))
         (line,) = read(LineMaker("m").state(replace(state, step=step)))
         assert line["lost"] is lost
+
+
+def test_lagged_poses_are_in_the_line_of_the_state_with_which_they_are_final() -> None:
+    state = with_landmarks(1, 3000)
+    state = replace(state, step=robust_state(state.t_ns).step)
+    first, second, *others = read(LineMaker("m", MOST_BYTES).state(state))
+    pose = [0.1, -0.2, 3.0]
+    assert first["lagged"] == [[state.t_ns - 60, *pose], [state.t_ns - 40, *pose]]
+    assert all(line["lagged"] == [] for line in [second, *others])
 
 
 def test_numbers_that_json_lacks_are_null() -> None:

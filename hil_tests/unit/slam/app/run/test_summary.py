@@ -34,7 +34,7 @@ from slam.library.evaluation import LandmarkScore, ate_rmse_m
 from slam.live.errors import AppError
 from slam.live.odometry_track import Trajectory, write_tum
 from slam.live.session.description import settings_text
-from slam.results import Association, Belief, Observation, SmoothedRun, StepResult
+from slam.results import Association, Belief, LaggedPose, Observation, SmoothedRun, StepResult
 from xethru_protocol.operating_system import StopFlag
 
 N = 201
@@ -124,6 +124,38 @@ def smoothed_of(record: RunRecord, poses: np.ndarray, sigma: float) -> SmoothedR
         landmarks_m=LANDMARKS[:2] + np.array([[0.0, 0.01], [0.0, -0.01]]),
         landmark_covariances_m2=np.tile(np.eye(2) * sigma**2, (2, 1, 1)),
     )
+
+
+def test_the_lagged_error_is_of_the_poses_that_there_are_aligned_by_themselves() -> None:
+    """Every second pose but those of the end, off by a constant and by 3 mm to either side."""
+    truth = np.zeros((N, 3))
+    truth[:, 0] = np.linspace(0, 3, N)
+    belief = Belief(mean=np.zeros(3), covariance=np.eye(3))
+    off = np.zeros((N, 3))
+    off[:, 1] = 0.05 + 0.003 * np.where(np.arange(N) % 4, 1.0, -1.0)
+    results = [
+        StepResult(
+            t_ns=k * PERIOD_NS,
+            odometry_pose=pose,
+            belief=belief,
+            detections=(),
+            lagged=tuple(
+                LaggedPose(
+                    t_ns=past * PERIOD_NS, pose=truth[past] + off[past], covariance=np.eye(3)
+                )
+                for past in [k - 10]
+                if past >= 0 and past % 2 == 0
+            ),
+        )
+        for k, pose in enumerate(truth)
+    ]
+    summary = summarise(record_of(results, truth, np.zeros(3)), INFO, RIG)
+    alone = summarise(record_of(results[:11], truth[:11], np.zeros(3)), INFO, RIG)
+    assert summary is not None
+    assert alone is not None
+    assert summary.lagged_ate_rmse_m == pytest.approx(0.003, rel=1e-2)
+    assert summary.lagged_ate_ratio == math.inf
+    assert alone.lagged_ate_rmse_m is None  # a single pose has no direction
 
 
 def test_the_smoothed_numbers_are_those_of_the_smoothed_run() -> None:
@@ -452,9 +484,9 @@ SUMMARY = Summary(
 def test_the_fields_are_those_of_the_contract() -> None:
     data = json.loads(SUMMARY.to_json())
     assert " ".join(data) == (
-        "scene preset seed frames duration_s realtime_factor ate_rmse_m smoothed_ate_rmse_m "
-        "ate_icp_rmse_m odometry_ate_rmse_m final_error_m landmarks smoothed_landmarks nees_pose "
-        "smoothed_nees_pose nis_mean"
+        "scene preset seed frames duration_s realtime_factor ate_rmse_m lagged_ate_rmse_m "
+        "smoothed_ate_rmse_m ate_icp_rmse_m odometry_ate_rmse_m final_error_m landmarks "
+        "smoothed_landmarks nees_pose smoothed_nees_pose nis_mean"
     )
     assert (
         " ".join(data["landmarks"])

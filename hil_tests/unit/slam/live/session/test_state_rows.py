@@ -21,6 +21,7 @@ from slam.results import (
     Association,
     Belief,
     Fix,
+    LaggedPose,
     Observation,
     PredictedRange,
     StepResult,
@@ -66,6 +67,14 @@ def robust_state(t_ns: int = 77) -> Snapshot:
         detections=ranges(t_ns),
         report=report,
         range_sigmas_m=(math.inf, 0.003, 0.004),
+        lagged=tuple(
+            LaggedPose(
+                t_ns=t_ns - back_ns,
+                pose=np.array([0.1, -0.2, 3.0]),
+                covariance=np.diag([1e-6, 2e-6, 3e-6]) + 1e-7,
+            )
+            for back_ns in (60, 40)
+        ),
     )
     return replace(state, step=step)
 
@@ -114,6 +123,8 @@ ROBUST_ROW = [
     1, 0, 8,  1, 1, 3,
     1, 8, 0.8, 1e-4, 0.1, 0.2, 1.0, 2.0,
     0, 1, 2, 3,  4, 5, 6, 7,
+    -60, 0.1, -0.2, 3.0,  1.1e-6, 1e-7, 1e-7, 1e-7, 2.1e-6, 1e-7, 1e-7, 1e-7, 3.1e-6,
+    -40, 0.1, -0.2, 3.0,  1.1e-6, 1e-7, 1e-7, 1e-7, 2.1e-6, 1e-7, 1e-7, 1e-7, 3.1e-6,
 ]
 PAPERS_ROW = [
     3, 2, 2, 1, 0, 0, 0,  0, 0, 9,  0, 0, 0, 0,
