@@ -76,7 +76,6 @@ from slam.robust.parameters import BackEndParameters
 from slam.robust.proposals.slips import Change, Course, judge_change, move_anew
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
-    find_split,
     is_due,
     is_one,
     noisier,
@@ -101,8 +100,6 @@ from slam.robust.walls import WallKeeper
 # know of the pose it leads to; the latter set nothing.
 _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 _FREE_M, _FREE_RAD = 1.0, 1.0
-# Variance of a new landmark's place until the run is solved for with it
-_ANYWHERE_M2 = 1.0
 
 
 class RobustBackEnd:
@@ -151,7 +148,7 @@ class RobustBackEnd:
         # Ids of landmarks of the map are smaller.
         self._first_id = 0 if saved is None else saved.next_id
         prior = None if saved is None else take_map(self.state, saved, rig, start)
-        self._log = RunLog(parameters.wheels, parameters.splits.gap_poses, prior)
+        self._log = RunLog(parameters.wheels, parameters.map.gap_poses, prior)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._motion: Motion | None = None  # the last one, if it is known from the wheels
@@ -183,7 +180,7 @@ class RobustBackEnd:
         # Of the newest scan with bearings: the antennas, and the ids that it held or should have
         self._antennas = antennas_of(rig, (), np.zeros(3))
         self._settled: set[int] = set()
-        self._jumped = -parameters.splits.gap_poses - 1  # the pose that a jump led to
+        self._jumped = -parameters.map.gap_poses - 1  # the pose that a jump led to
         # By ids of landmarks in pairs: the update at which their merge was refused
         self._refused: dict[Pairs, int] = {}
 
@@ -480,23 +477,8 @@ class RobustBackEnd:
             self.answer(question, question.options[0])
 
     def relinearise(self) -> bool:
-        """Solve for all poses and replace the belief; return whether that worked.
-
-        If ranges disagree with the landmark that they were taken for, they become one of their own,
-        and all poses are solved for again.
-        """
-        if not relinearise(self._log, self.state, self.parameters):
-            return False
-        labelled = self._labelled_rows()
-        split = find_split(self._log, self.state, self.parameters, labelled)
-        if split is not None:
-            state = self.state
-            size = state.layout.landmark_size
-            cross = np.zeros((state.P.size, size))
-            landmark_id = state.augment(split.point_m, cross, _ANYWHERE_M2 * np.eye(size))
-            self._existence.hit(landmark_id, self._log.split_off(split.rows, landmark_id))
-            relinearise(self._log, self.state, self.parameters)
-        return True
+        """Solve for all poses and replace the belief; return whether that worked."""
+        return relinearise(self._log, self.state, self.parameters)
 
     def _judge_change(
         self, antennas: Antennas, scans: Sequence[RangeScan], beacons: Sequence[int]
@@ -916,7 +898,7 @@ class RobustBackEnd:
         n_known = len(self.state.landmark_ids)
         return (
             self.parameters.jumps.sigma_rad > 0.0
-            and since > self.parameters.splits.gap_poses
+            and since > self.parameters.map.gap_poses
             and n_known >= self.parameters.branches.least_landmarks
         )
 

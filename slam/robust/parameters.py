@@ -175,6 +175,8 @@ class MapRule:
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
     """Scans between two looks for landmarks that may be one, and for evidence of a carry."""
+    gap_poses: Annotated[int, Origin.CHOSEN, "scans"] = 50
+    """A landmark that has not been seen for longer is in another passage when it is seen again."""
     most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
     """How many of the likeliest merges are combined in twos."""
     neighbourhood_m: Annotated[float, Origin.CHOSEN] = NEIGHBOURHOOD_M
@@ -301,24 +303,6 @@ class NoiseRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SplitRule:
-    """When ranges of one landmark are of another one.
-
-    They are if the evidence for that exceeds `BranchRule.price_nats`, and at least half of what
-    they cost is gone where they have a place of their own.
-    """
-
-    gap_poses: Annotated[int, Origin.CHOSEN, "scans"] = 50
-    """A landmark that has not been seen for longer is in another passage when it is seen again."""
-    suspect_mean: Annotated[float, Origin.CHOSEN] = 4.0
-    """Mean squared residual from which on a group of ranges is examined; 1 is expected."""
-    fewest: Annotated[int, Origin.CHOSEN, "ranges"] = 15
-    """Fewest ranges of a group that is examined."""
-    tried_m: Annotated[float, Origin.BUDGET] = 0.2
-    """How far from the landmark, along each axis, the search for another place begins."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BranchRule:
     """When the robot may have been carried, and when that is believed."""
 
@@ -353,9 +337,8 @@ class BranchRule:
     """Price of a part of the world that looks like another one, however many landmarks it has: one
     in a thousand."""
     price_nats: Annotated[float, Origin.CHOSEN] = 20.0
-    """By how much something rare must be likelier than that it did not happen: that a passage's
-    ranges are of another landmark, or that a hypothesis is right; with so much, the question of a
-    carry is settled."""
+    """By how much something rare must be likelier than that it did not happen, as that a hypothesis
+    is right; with so much, the question of a carry is settled."""
     least_landmarks: Annotated[int, Origin.CHOSEN, "landmarks"] = 3
     """Fewest landmarks that place a map on another."""
     lost_steps: Annotated[int, Origin.BUDGET, "scans"] = 100
@@ -484,7 +467,6 @@ class BackEndParameters:
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)
     slips: SlipRule = field(default_factory=SlipRule)
     noise: NoiseRule = field(default_factory=NoiseRule)
-    splits: SplitRule = field(default_factory=SplitRule)
     branches: BranchRule = field(default_factory=BranchRule)
     jumps: JumpNoise = field(default_factory=JumpNoise)
     imaged: ImagedPointRule = field(default_factory=ImagedPointRule)

@@ -1,11 +1,11 @@
-"""What a solution over the whole run changes: the belief, the noise of ranges, and associations."""
+"""What a solution over the whole run changes, the belief and the noise of ranges, and allows."""
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtri
@@ -18,15 +18,12 @@ from slam.robust.solver.smoother import Smoother, Solution, measurement_residual
 from slam.robust.state import (
     HEAD_SIZE,
     Array,
-    Indices,
     RangeErrors,
     State,
 )
 
 _LEAST_SHARE, _MOST_SHARE = 0.5, 50.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
-_ALONE_STEPS = 8  # of the search for the place of a group of ranges, from each of its begins
-_BEGINS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
 
 
@@ -131,83 +128,6 @@ def noisier(state: State, same: Mapping[int, int]) -> dict[int, float]:
         for gone, kept in same.items()
         for id_ in (gone, kept)
     }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SplitLandmark:
-    """Ranges that are not of the landmark that they were taken for."""
-
-    rows: Indices  # of the log
-    point_m: Array  # shape (2,): where they lie, map frame
-
-
-def find_split(
-    log: RunLog, state: State, parameters: BackEndParameters, whole: Collection[int] = ()
-) -> SplitLandmark | None:
-    """Return the passage, or the landmark merged into another, that disagrees most with the rest.
-
-    The ranges of the rows ``whole`` are surely of their landmarks. To be called after a solution,
-    whose poses are taken for true: of a group of ranges of one landmark, the smaller part, the cost
-    must fall by more than chance and `BranchRule.price_nats` explain where the group has a place of
-    its own.
-    """
-    problem = log.problem(state, parameters)
-    estimate, n = log.starts(state, problem)[0], len(problem.ranges_m)
-    residual = measurement_residuals(problem, estimate).residual
-    limit, layout = parameters.relinearisation.outlier_sigmas, problem.layout
-    rule, price = parameters.splits, parameters.branches.price_nats
-    of_rows, dof = np.minimum(residual**2, limit**2), np.ones(n)
-    costs = of_rows[:n]
-    costs[problem.with_bearing] += of_rows[n:]
-    dof[problem.with_bearing] += 1.0
-    found: list[tuple[float, SplitLandmark]] = []
-    for edges in log.edges(problem.range_rows):
-        order = np.lexsort((edges, problem.range_landmarks))
-        keys = np.column_stack([problem.range_landmarks, edges])[order]
-        starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1))
-        sizes = np.diff(np.append(starts, n))
-        means = np.add.reduceat(costs[order], starts) / np.add.reduceat(dof[order], starts)
-        wholes = np.bincount(problem.range_landmarks)[keys[starts, 0]]
-        suspects = (means > rule.suspect_mean) & (sizes >= rule.fewest) & (2 * sizes <= wholes)
-        suspects &= ~np.isin(keys[starts, 0], list(whole))
-        for k in np.flatnonzero(suspects & (keys[starts, 0] < layout.n_landmarks)).tolist():
-            at = order[starts[k] : starts[k] + sizes[k]]
-            point_m, apart = _place_apart(problem, estimate, at, limit, rule.tried_m)
-            gain = (float(costs[at].sum()) - apart) / problem.variance_share
-            if gain > 2.0 * price and apart < 0.5 * float(costs[at].sum()):
-                found.append((gain, SplitLandmark(rows=problem.range_rows[at], point_m=point_m)))
-    return max(found, key=lambda pair: pair[0])[1] if found else None
-
-
-def _place_apart(
-    problem: Problem, estimate: Estimate, at: Indices, limit: float, tried_m: float
-) -> tuple[Array, float]:
-    """Return where some ranges of one landmark lie, and what they cost there, poses being known."""
-    few = replace(
-        problem,
-        **{
-            column.name: getattr(problem, column.name)[at]
-            for column in fields(Problem)
-            if column.name.startswith("range")
-        },
-    )
-    first = int(problem.layout.first_columns(problem.range_landmarks[at[:1]])[0]) - HEAD_SIZE
-    best_m, least = estimate.fixed[first : first + 2], math.inf
-    # The antennas see it from one side; where the ranges cross may lie on the other.
-    for away in tried_m * np.array(_BEGINS):
-        fixed = estimate.fixed.copy()
-        fixed[first : first + 2] += away
-        for _ in range(_ALONE_STEPS):
-            rows = measurement_residuals(few, replace(estimate, fixed=fixed))
-            J = rows.by_border[:, 1:3]
-            weight = 1.0 / np.maximum(np.abs(rows.residual), 1.0)
-            information = (J.T * weight) @ J + np.eye(2)
-            fixed[first : first + 2] -= np.linalg.solve(information, (J.T * weight) @ rows.residual)
-        residual = measurement_residuals(few, replace(estimate, fixed=fixed)).residual
-        cost = float(np.minimum(residual**2, limit**2).sum())
-        if cost < least:
-            best_m, least = fixed[first : first + 2].copy(), cost
-    return best_m, least
 
 
 def learn_noise(

@@ -72,7 +72,6 @@ class Problem:
     range_poses: Indices
     range_radars: Indices
     range_landmarks: Indices
-    range_rows: Indices  # shape (m,): which row of the log it is
     # shapes (m, 2) and (m,): antenna in the body frame of the keyframe, its mount being where the
     # rig has it, and the turn of the robot from the keyframe to the sample
     range_antennas: Array
@@ -223,15 +222,13 @@ class RunLog:
         self._is_key.append(True)
         self._causal = PackedRows(np.dtype(np.float64), 3)
         self._causal.append(start)
-        whose = [("pose", np.int32), ("landmark", np.int32), ("passage", np.int32)]
+        whose = [("pose", np.int32), ("landmark", np.int32)]
         where = [("radar", np.int16), ("antenna", np.float64, 2), ("turn_rad", np.float32)]
         measured = [("range_m", np.float64), ("sigma_m", np.float32)]
         bearing = [("bearing_rad", np.float64), ("bearing_sigma_rad", np.float32)]
         self._ranges = PackedRows(np.dtype([*whose, *where, *measured, *bearing]))
         self._names: dict[int, int | None] = {}
-        # By landmark: its newest passage, and the last pose of that
-        self._passages: dict[int, tuple[int, int]] = {}
-        self._n_passages = 0
+        self._last_seen: dict[int, int] = {}  # by landmark, the newest pose that has a range of it
         self.since_solved = 0
         """How many steps ago the trajectory was last solved for, or that was tried."""
         self._stored_pose: Array = start
@@ -292,12 +289,8 @@ class RunLog:
         ``antenna`` is in the body frame of the pose, its mount being where the rig has it, and
         ``turn_rad`` the robot's from the pose to the sample.
         """
-        passage, last = self._passages.get(landmark_id, (0, -self._gap_poses - 1))
-        if pose - last > self._gap_poses:
-            passage = self._n_passages
-            self._n_passages += 1
-        self._passages[landmark_id] = passage, max(pose, last)
-        whose = (pose, landmark_id, passage, radar)
+        self._last_seen[landmark_id] = max(pose, self._last_seen.get(landmark_id, pose))
+        whose = (pose, landmark_id, radar)
         bearing = bearing_rad, bearing_sigma_rad
         self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m, *bearing))
 
@@ -337,9 +330,9 @@ class RunLog:
 
     def is_new_passage(self, landmark_id: int) -> bool:
         """Return whether a range of a landmark now would begin a passage."""
-        known = [name for name in self._all_names(landmark_id) if name in self._passages]
+        known = [name for name in self._all_names(landmark_id) if name in self._last_seen]
         newest = self.n_poses - 1
-        return all(newest - self._passages[name][1] > self._gap_poses for name in known)
+        return all(newest - self._last_seen[name] > self._gap_poses for name in known)
 
     def loosen(self, pose: int, covariance: Array) -> None:
         """Let the step that leads to a pose have so much more noise, (3, 3), from now on."""
@@ -401,11 +394,6 @@ class RunLog:
         mine = np.isin(ranges["landmark"], list(names)) & ~np.isnan(ranges["bearing_rad"])
         return sorted(set(ranges["pose"][mine].tolist()))
 
-    def edges(self, rows: Indices) -> tuple[Indices, Indices]:
-        """Return what ranges, by row of the log, were taken for: first landmark and passage."""
-        ranges = self._ranges.rows[rows]
-        return ranges["landmark"].astype(np.intp), ranges["passage"].astype(np.intp)
-
     def ranges_of(self, landmark_id: int) -> tuple[Array, Array, Array]:
         """Return ranges (k,) by the id they were added with, noise (k,) and antennas (k, 2).
 
@@ -415,12 +403,6 @@ class RunLog:
         poses = self._causal.rows[ranges["pose"]]
         antennas = poses[:, :2] + _turned(ranges["antenna"], poses[:, 2])
         return ranges["range_m"].copy(), ranges["sigma_m"].astype(np.float64), antennas
-
-    def split_off(self, rows: Indices, landmark_id: int) -> int:
-        """Take ranges from their landmark and give them to a new one; return of how many poses."""
-        ranges = self._ranges.rows_to_write()
-        ranges["landmark"][rows] = landmark_id
-        return len(np.unique(ranges["pose"][rows]))
 
     def _keys(self, rule: RelinearisationRule) -> Indices:
         """Return which poses are keyframes; as the run goes on, those that were remain."""
@@ -442,8 +424,7 @@ class RunLog:
         names = self._names | dict(same or {})
         ranges = self._ranges.rows
         of_range = _rows_of(ranges["landmark"], names, rows)
-        range_rows = np.flatnonzero(of_range >= 0)
-        ranges, of_range = ranges[range_rows], of_range[range_rows]
+        ranges, of_range = ranges[of_range >= 0], of_range[of_range >= 0]
         sigmas_m = ranges["sigma_m"].astype(np.float64)
         if state.added_sigmas_m:
             sigmas_m = np.hypot(sigmas_m, state.feature_added_sigmas_m[of_range])
@@ -477,7 +458,6 @@ class RunLog:
             range_poses=key[pose],
             range_radars=ranges["radar"].astype(np.intp),
             range_landmarks=of_range,
-            range_rows=range_rows,
             range_antennas=antennas,
             range_turns=turn[pose] + ranges["turn_rad"],
             ranges_m=ranges["range_m"].copy(),

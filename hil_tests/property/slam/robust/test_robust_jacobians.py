@@ -217,7 +217,6 @@ def small_problem(seed: int) -> tuple[Problem, Estimate]:
         range_radars=np.array([0, 3, 1, 2]),
         range_landmarks=np.array([0, 1, 0, 1]),
         range_antennas=rng.uniform(-0.2, 0.2, (4, 2)),
-        range_rows=np.arange(4),
         range_turns=0.3 * rng.standard_normal(4),
         ranges_m=rng.uniform(0.5, 1.5, 4),
         range_sigmas_m=np.full(4, 0.01),

@@ -96,14 +96,16 @@ def with_doubled_landmark(back_end: RobustBackEnd) -> int:
     """Give the later ranges of the first landmark to a new one at its place; return its row."""
     state, log = back_end.state, back_end._log
     landmark_id = state.landmark_ids[0]
-    problem = log.problem(state, back_end.parameters)
-    rows = problem.range_rows[problem.range_landmarks == 0]
+    ranges = log._ranges.rows_to_write()
+    rows = np.flatnonzero(ranges["landmark"] == landmark_id)
+    later = rows[len(rows) // 2 :]
     size = state.layout.landmark_size
     new_id = state.augment(
         state.landmarks_m[0] + [0.002, -0.001], np.zeros((state.P.size, size)), np.eye(size)
     )
     assert new_id != landmark_id
-    back_end._existence.hit(new_id, log.split_off(rows[len(rows) // 2 :], new_id))
+    ranges["landmark"][later] = new_id
+    back_end._existence.hit(new_id, len(np.unique(ranges["pose"][later])))
     assert back_end.relinearise()
     return state.landmark_ids.index(new_id)
 

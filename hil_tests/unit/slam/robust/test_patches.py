@@ -339,9 +339,9 @@ def test_a_mount_of_ranges_beside_an_imaged_one_begins_landmarks() -> None:
 
 def single_ranges(back_end: RobustBackEnd, radar: int) -> set[int]:
     """Return the poses of the single ranges of a radar that a solution over all poses takes."""
-    problem = back_end._log.problem(back_end.state, PARAMETERS)
-    taken = np.isnan(problem.range_bearings_rad) & (problem.range_radars == radar)
-    return set(back_end._log._ranges.rows["pose"][problem.range_rows[taken]].tolist())
+    ranges, known = back_end._log._ranges.rows, back_end.state.landmark_ids
+    taken = np.isnan(ranges["bearing_rad"]) & (ranges["radar"] == radar)
+    return set(ranges["pose"][taken & np.isin(ranges["landmark"], known)].tolist())
 
 
 def test_single_ranges_of_what_patches_do_not_show_are_not_used() -> None:

@@ -23,7 +23,7 @@ from slam.results import SmoothedRun
 from slam.robust import kernels
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.parameters import BackEndParameters, RelinearisationRule, SplitRule
+from slam.robust.parameters import BackEndParameters, MapRule, RelinearisationRule
 from slam.robust.solver.revision import is_determined, relinearise
 from slam.robust.solver.run_log import (
     Estimate,
@@ -96,7 +96,6 @@ def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Proble
         range_radars=radars,
         range_landmarks=seen,
         range_antennas=m,
-        range_rows=np.arange(len(at)),
         range_turns=0.1 * rng.standard_normal(len(at)),
         ranges_m=z + 2e-3 * rng.standard_normal(len(z)),
         range_sigmas_m=np.full(len(z), 5e-3),
@@ -443,7 +442,7 @@ def test_past_poses_are_those_of_the_solution_over_the_whole_run() -> None:
 
 def test_keyframes_remain_as_the_run_goes_on_and_a_loose_step_is_between_two() -> None:
     rng = np.random.default_rng(2)
-    log, state = RunLog(WheelNoise(), SplitRule().gap_poses), State((0.01,) * 3, (0.0,) * N_RADARS)
+    log, state = RunLog(WheelNoise(), MapRule().gap_poses), State((0.01,) * 3, (0.0,) * N_RADARS)
     parameters = BackEndParameters()
     before: set[int] = set()
     for k in range(1, 120):
@@ -465,7 +464,7 @@ def test_a_range_is_the_same_from_its_keyframe_as_from_its_own_pose() -> None:
     state.mounts_m = 0.01 * np.random.default_rng(1).standard_normal((N_RADARS, 2))
     state.augment(np.array([0.3, 1.0]), np.zeros((state.P.size, 3)), np.eye(3))
     state.radii_m[0] = 0.04
-    log, wheels = RunLog(WheelNoise(), SplitRule().gap_poses), WheelNoise()
+    log, wheels = RunLog(WheelNoise(), MapRule().gap_poses), WheelNoise()
     poses = [np.zeros(3)]
     for k in range(1, 41):
         step = np.array([0.01, 0.001, 0.02])
@@ -497,7 +496,7 @@ def test_each_calibration_error_walks_in_proportion_to_its_own_deviation() -> No
     wheels = WheelNoise(
         scale_sigma=s, turn_scale_sigma=w, curvature_sigma_rad_per_m=kappa, walk_per_sqrt_m=1.0
     )
-    log, state = RunLog(wheels, SplitRule().gap_poses), State(sigmas, (0.0,) * N_RADARS)
+    log, state = RunLog(wheels, MapRule().gap_poses), State(sigmas, (0.0,) * N_RADARS)
     step = np.array([0.25, 0.0, 0.0])
     motion = calibrated_motion(step, np.zeros(3), wheels)
     log.add_motion(step, motion)
@@ -553,7 +552,7 @@ def drive_along(
 @pytest.mark.parametrize("n_ranges", [14, pytest.param(60, marks=pytest.mark.rare)])
 def test_a_range_costs_a_row_of_numbers_and_no_object(n_ranges: int) -> None:
     """A range is 46 bytes at most and a pose 129, in buffers that may be half empty."""
-    log, n_poses = RunLog(WheelNoise(), SplitRule().gap_poses), 1000
+    log, n_poses = RunLog(WheelNoise(), MapRule().gap_poses), 1000
     tracemalloc.start()
     try:
         drive_along(log, n_poses, range(n_ranges), np.random.default_rng(6))
@@ -581,26 +580,6 @@ def test_a_landmark_whose_ranges_weigh_nothing_is_unknown_and_the_rest_is_solved
     assert _is_sane(state)
     assert relinearise(log, state, back_end.parameters)
     assert _is_sane(state)
-
-
-def test_landmarks_merged_by_mistake_are_taken_apart_by_the_next_solution() -> None:
-    back_end = driven(400, 3e-3)
-    state, log = back_end.state, back_end._log
-    assert back_end.relinearise()
-    ids, places, pose = state.landmark_ids.copy(), state.landmarks_m.copy(), back_end.pose
-    ranges = log._ranges.rows_to_write()
-    by_count = sorted(ids, key=lambda id_: int(np.sum(ranges["landmark"] == id_)))
-    gone, kept = by_count[-2:]
-    log.rename(gone, kept)
-    state.remove(ids.index(gone))
-    # The first solution bends the way, the next ones are free of that.
-    assert all(back_end.relinearise() for _ in range(3))
-    assert len(state.landmark_ids) == len(ids)
-    back = state.landmarks_m[state.landmark_ids.index(max(state.landmark_ids))]
-    assert np.hypot(*(back - places[ids.index(gone)])) < 5e-3
-    still = state.landmarks_m[state.landmark_ids.index(kept)]
-    assert np.hypot(*(still - places[ids.index(kept)])) < 5e-3
-    assert np.abs(back_end.pose - pose).max() < 2e-3
 
 
 def test_information_of_rounding_alone_is_none() -> None:

@@ -146,7 +146,6 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
         range_antennas=np.array(
             [(mounts[known.radar].x_m, mounts[known.radar].y_m) for _, known in used]
         ),
-        range_rows=np.arange(len(used)),
         range_turns=np.zeros(len(used)),
         ranges_m=np.array([known.range_m for _, known in used]),
         range_sigmas_m=np.full(len(used), SIGMA_M),
