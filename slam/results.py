@@ -176,7 +176,10 @@ class UpdateReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LaggedPose:
-    """A pose of some metres ago, with all that was measured since: a fixed-lag smoother's."""
+    """A pose of some metres ago, with all that was measured since: a fixed-lag smoother's.
+
+    The covariance is the filter's; doubts of the wheels (`slam.robust.branches`) add nothing to it.
+    """
 
     t_ns: int  # session time of its state
     pose: Array  # shape (3,), [x m, y m, heading rad], map frame; the heading lies in [-pi, pi)
@@ -202,7 +205,8 @@ class StepResult:
     report: UpdateReport | None = None
     # Standard deviation of every detection in the robust back end; infinite for one left out
     range_sigmas_m: tuple[float, ...] = ()
-    # Poses of the robust back end that are final now, in time order, about one every 10 cm
+    # Poses of the robust back end that are final now, in time order: at least one every 10 cm, more
+    # where the robot turns; none of the time in which it was lost
     lagged: tuple[LaggedPose, ...] = ()
 
     @property

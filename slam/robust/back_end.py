@@ -152,12 +152,12 @@ class RobustBackEnd:
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._motion: Motion | None = None  # the last one, if it is known from the wheels
-        # Reported by the wheels since the start: metres, and the same with turns, in keyframes
+        # Way of the wheels since the start: metres, and keyframes, as `RunLog` counts them
         self._way_m, self._way_keys = 0.0, 0.0
-        self._is_past_due = False  # whether the newest pose is to be kept
+        self._keeps_pose = False  # whether the newest pose is to be a past pose
         self._past_ways_m: list[float] = []  # of the past poses of the state
         self.lagged: list[PastPose] = []
-        """The past poses that became final in the newest update."""
+        """The past poses that became final with the newest motion, with all updates before it."""
         self._course: Course | None = None
         self.slip_probability = 0.0
         """Probability that the wheels slipped in the newest step."""
@@ -176,7 +176,7 @@ class RobustBackEnd:
         self.evidence = 0.0
         """Nats by which what detections with bearings were taken for, once a passage, and merges of
         landmarks are likelier than that all is new, less what was missed. It is not revised when
-        the run is solved for, nor when a landmark is split or deleted."""
+        the run is solved for, nor when a landmark is deleted."""
         # Of the newest scan with bearings: the antennas, and the ids that it held or should have
         self._antennas = antennas_of(rig, (), np.zeros(3))
         self._settled: set[int] = set()
@@ -336,7 +336,7 @@ class RobustBackEnd:
         if not np.isfinite(increment).all():
             raise ValueError(f"increment is {increment}; dx, dy [m] and turn [rad] must be finite")
         wheels = self.parameters.wheels
-        self._keep_past(increment)
+        self._leave_pose(increment)
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
         self._log.add_motion(increment, motion, is_loose=is_loose)
         before, self._motion = self._motion, None if is_loose else motion
@@ -348,36 +348,41 @@ class RobustBackEnd:
         self._tentative.move(motion)
         self._walls.tentative.move(motion)
 
-    def _keep_past(self, increment: Array) -> None:
-        """Keep the pose among the past ones every few keyframes; to be called before a motion."""
+    def _leave_pose(self, increment: Array) -> None:
+        """Before a motion, keep the pose among the past ones if it is one of the few that are kept.
+
+        Those that the motion leaves far enough behind are final and marginalised.
+        """
         rule, keys = self.parameters.lag, self.parameters.relinearisation
-        before = math.floor(self._way_keys / rule.every)
-        step_m, turn_rad = math.hypot(increment[0], increment[1]), abs(float(increment[2]))
-        if self._is_past_due:
+        if self._keeps_pose:
             self.state.keep_pose(self._log.n_poses - 1)
             self._past_ways_m.append(self._way_m)
             self._log.mark_key()
+        before = math.floor(self._way_keys / rule.every)
+        step_m, turn_rad = math.hypot(increment[0], increment[1]), abs(float(increment[2]))
         self._way_m += step_m
         self._way_keys += step_m / keys.key_m + turn_rad / keys.key_rad
-        self._is_past_due = math.floor(self._way_keys / rule.every) > before
-
-    def _end_update(self) -> None:
-        """Log the pose, and marginalise the past poses that are far enough behind."""
-        self._log.set_causal(self.state.pose)
-        rule, ways_m = self.parameters.lag, self._past_ways_m
-        behind = bisect_right(ways_m, self._way_m - rule.way_m)
-        n = max(behind, len(ways_m) - rule.most)
+        self._keeps_pose = rule.most > 0 and math.floor(self._way_keys / rule.every) > before
+        behind = bisect_right(self._past_ways_m, self._way_m - rule.way_m)
+        n = max(behind, len(self._past_ways_m) - rule.most)
         self.lagged = [self.state.past_pose(k) for k in range(n)]
+        self._marginalise_past(n)
+
+    def _marginalise_past(self, n: int) -> None:
+        """Marginalise the oldest past poses."""
         if n:
-            self.state.forget_past(n)
-            self._past_ways_m = ways_m[n:]
+            self.state.marginalise_past(n)
+            del self._past_ways_m[:n]
 
     def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
         """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
 
         ``points`` are ids of landmarks with where they lie, (2,) [m] in the body frame of the pose,
-        and the covariances of that: the pose becomes as certain as they make it.
+        and the covariances of that: the pose becomes as certain as they make it. Past poses are
+        given up: between them and the new one the robot was lost.
         """
+        self._marginalise_past(len(self._past_ways_m))
+        self._keeps_pose = False
         increment = np.zeros(3)
         free = free_motion(_CARRIED_M, _CARRIED_RAD)
         self._log.add_motion(increment, free, is_loose=True)
@@ -454,7 +459,7 @@ class RobustBackEnd:
                 self.relinearise()
         if decide:
             self._decide()
-        self._end_update()
+        self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
             nis=nis,

@@ -337,8 +337,8 @@ class BranchRule:
     """Price of a part of the world that looks like another one, however many landmarks it has: one
     in a thousand."""
     price_nats: Annotated[float, Origin.CHOSEN] = 20.0
-    """By how much something rare must be likelier than that it did not happen, as that a hypothesis
-    is right; with so much, the question of a carry is settled."""
+    """By how much something rare, such as a hypothesis, must be likelier than that it did not
+    happen; with so much, the question of a carry is settled."""
     least_landmarks: Annotated[int, Origin.CHOSEN, "landmarks"] = 3
     """Fewest landmarks that place a map on another."""
     lost_steps: Annotated[int, Origin.BUDGET, "scans"] = 100
@@ -433,13 +433,13 @@ class ImagedPointRule:
 class LagRule:
     """Which poses are corrected for some way after the robot was there."""
 
-    way_m: Annotated[float, Origin.BUDGET] = 2.0
+    way_m: Annotated[float, Origin.CHOSEN] = 2.0
     """How far the robot drives until such a pose is final."""
     every: Annotated[int, Origin.BUDGET, "keyframes"] = 2
     """Keyframes from one such pose to the next."""
     most: Annotated[int, Origin.BUDGET, "poses"] = 40
-    """How many such poses there are at a time; with more, as where the robot turns on the spot, the
-    oldest one is final."""
+    """Most such poses at a time. Where the robot turns on the spot there would be more; then the
+    oldest is final. 0: there are none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -94,7 +94,7 @@ class RobustSlam:
         # Since when the wheels have stood at a pose, and how long they did since the last state
         self._still, self._still_ns, self._stood_ns = np.zeros(3), 0, 0
         self._stamps_ns = PackedRows(np.dtype(np.int64))  # of all states
-        self._lagged_ns = -1  # time of the newest lagged pose
+        self._last_lagged = 0  # number of the newest lagged pose that was reported
 
     @property
     def back_end(self) -> RobustBackEnd:
@@ -229,20 +229,18 @@ class RobustSlam:
         """Return the past poses that became final in the newest step; none while it is lost."""
         if self._branches.is_lost:
             return ()
-        # Pose 0 is the start, which is no state. A back end that is believed from now on may have
-        # poses that the one before has reported.
-        found = [
+        # A back end that is believed from now on may have poses that the one before has reported.
+        new = [one for one in self.back_end.lagged if one.number > self._last_lagged]
+        if new:
+            self._last_lagged = new[-1].number
+        return tuple(
             LaggedPose(
-                t_ns=int(self._stamps_ns.rows[one.number - 1]),
+                t_ns=int(self._stamps_ns.rows[one.number - 1]),  # pose 0, the start, is no state
                 pose=one.pose,
                 covariance=one.covariance,
             )
-            for one in self.back_end.lagged
-        ]
-        new = tuple(one for one in found if one.t_ns > self._lagged_ns)
-        if new:
-            self._lagged_ns = new[-1].t_ns
-        return new
+            for one in new
+        )
 
     def _accept(self, frames: Sequence[RadarFrame], poses: Mapping[int, Array], t_ns: int) -> None:
         """Take a step; images take every frame, even where the robot has hardly moved."""

@@ -9,6 +9,7 @@ Errors, in the order of the covariance P::
      e_l0 (2), e_rho0, e_l1 (2), e_rho1, ..., e_w0 (2), ..., e_q0 (2), e_psi0, ...]
     theta = theta^ + e_th,   p = Rot(e_th) p^ + V(e_th) e_p,   l = Rot(e_th) l^ + V(e_th) e_l,
     phi = phi^ + e_th + e_phi,   d = d^ + e_d,
+    q = Rot(e_th) q^ + V(e_th) e_q,   psi = psi^ + e_th + e_psi,
 
 all others additive; (phi, d) is a wall, the line n . x = d with n = [cos phi, sin phi] away from
 the robot. A past pose is a point q, as a landmark is, and a direction psi, as that of a wall is:
@@ -527,7 +528,7 @@ class State:
         self.past = np.vstack([self.past, self.pose])
         self.past_numbers.append(number)
 
-    def forget_past(self, n: int) -> None:
+    def marginalise_past(self, n: int) -> None:
         """Marginalise the oldest past poses."""
         first = self.layout.past.start
         self.P.keep(np.delete(np.arange(self.P.size), np.arange(first, first + 3 * n)))

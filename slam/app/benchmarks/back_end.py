@@ -18,6 +18,7 @@ from slam.robust.branches import Hypotheses
 from slam.robust.parameters import (
     BackEndParameters,
     JumpNoise,
+    LagRule,
     MapRule,
     RangeNoise,
     RelinearisationRule,
@@ -105,6 +106,7 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
             key_m=sensor.shift_m, shift_m=sensor.shift_m, slip_m=0.0, slip_rad=0.0
         ),
         jumps=JumpNoise(sigma_m=sensor.jump_sigma_m, sigma_rad=sensor.jump_sigma_rad),
+        lag=LagRule(most=0),  # no benchmark reports lagged poses
     )
 
 

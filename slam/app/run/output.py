@@ -209,7 +209,7 @@ def summary_rows(
             mm_text(summary.ate_rmse_m),
             f"{summary.ate_ratio:.2f} of odometry's, SE(2)-aligned, {lag}",
         ),
-        *_later_rows(summary),
+        *_lagged_and_smoothed_rows(summary),
         (
             "SLAM ATE, ICP",
             mm_text(summary.ate_icp_rmse_m),
@@ -225,22 +225,16 @@ def summary_rows(
     ]
 
 
-def _later_rows(summary: Summary) -> list[ResultRow]:
-    """Return the rows of what is known later, as far as there are such poses."""
-    rows = [
-        ("lagged ATE", summary.lagged_ate_rmse_m, summary.lagged_ate_ratio, "2 m of travel later"),
-        (
-            "smoothed ATE",
-            summary.smoothed_ate_rmse_m,
-            summary.smoothed_ate_ratio,
-            "all states solved for at the end",
-        ),
-    ]
-    return [
-        (title, mm_text(ate_m), f"{share:.2f} of odometry's, SE(2)-aligned, {when}")
-        for title, ate_m, share, when in rows
-        if share is not None
-    ]
+def _lagged_and_smoothed_rows(summary: Summary) -> list[ResultRow]:
+    """Return the rows of lagged and of smoothed poses, as far as there are such."""
+    rows, share = list[ResultRow](), summary.smoothed_ate_ratio
+    if summary.lagged_ate_rmse_m is not None:
+        note = "SE(2)-aligned, a pose every 10 cm as known 2 m later"
+        rows.append(("lagged ATE", mm_text(summary.lagged_ate_rmse_m), note))
+    if share is not None:
+        note = f"{share:.2f} of odometry's, SE(2)-aligned, all states solved for at the end"
+        rows.append(("smoothed ATE", mm_text(summary.smoothed_ate_rmse_m), note))
+    return rows
 
 
 def _landmark_rows(landmarks: LandmarkScore) -> list[ResultRow]:

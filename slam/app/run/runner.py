@@ -199,7 +199,7 @@ class RunRecord:
         ended covers all its states.
     lagged_ns, lagged
         Shapes (m,) and (m, 3): times of the lagged poses (`slam.results.LaggedPose`), and these,
-        map frame. None of preset `paper`.
+        map frame; empty of preset `paper`.
     n_frames
         Radar frames used, over all radars.
     start_ns

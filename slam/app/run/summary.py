@@ -45,10 +45,11 @@ class Summary:
     paper's number, without time, and flatters; `final_error_m` is that of the last state, not
     aligned; `nees_pose` holds (time of the state [s], NEES) pairs of the unaligned pose in the
     start frame, of the last state at or before each of ten times; `nis_mean` is divided by its
-    degrees of freedom. `lagged_ate_rmse_m` is of the poses as known two metres of travel later, the
-    last two metres left out; None of preset `paper`. Smoothed numbers are of the solution over the
-    whole run at its end, None where there is none; its landmarks are those of the last map, where
-    the solution has them.
+    degrees of freedom. `lagged_ate_rmse_m` is of the poses as known two metres of travel later,
+    aligned by themselves; the last two metres, and the time in which the robot was lost, have none.
+    It is None of preset `paper`, and of a run with few. Smoothed numbers are of the solution over
+    the whole run at its end, None where there is none; its landmarks are those of the last map,
+    where the solution has them.
     """
 
     scene: str
@@ -80,15 +81,10 @@ class Summary:
         return ratio(self.ate_rmse_m, self.odometry_ate_rmse_m)
 
     @property
-    def lagged_ate_ratio(self) -> float | None:
-        return self._ratio(self.lagged_ate_rmse_m)
-
-    @property
     def smoothed_ate_ratio(self) -> float | None:
-        return self._ratio(self.smoothed_ate_rmse_m)
-
-    def _ratio(self, ate_rmse_m: float | None) -> float | None:
-        return None if ate_rmse_m is None else ratio(ate_rmse_m, self.odometry_ate_rmse_m)
+        if self.smoothed_ate_rmse_m is None:
+            return None
+        return ratio(self.smoothed_ate_rmse_m, self.odometry_ate_rmse_m)
 
     def to_json(self) -> str:
         """Return the text of summary.json: exactly these fields, no NaN."""
@@ -102,7 +98,8 @@ _FIX_DOF = 2
 _ONE_STEP = 0.1
 """Metres and radians that odometry and estimate may differ by at the first state, if they began
 together; a step is shorter than that."""
-_FEWEST_ALIGNED = 2
+_FEWEST_ALIGNED = 10
+"""Lagged poses, of about a metre: the error of fewer would be aligned away."""
 _TAIL = 0.025
 """On either side of a 95 % band."""
 
@@ -251,7 +248,7 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
 
 
 def _lagged_ate_rmse_m(record: RunRecord) -> float | None:
-    """Return the ATE of the lagged poses, aligned by themselves; None if there are too few."""
+    """Return the ATE of the lagged poses; None if there are too few."""
     if len(record.lagged) < _FEWEST_ALIGNED:
         return None
     rows = np.searchsorted(record.states.t_ns, record.lagged_ns)

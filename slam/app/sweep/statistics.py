@@ -58,7 +58,7 @@ def _group(runs: Sequence[SweepRun]) -> Group:
         "confident_false": sum(run.confident_false for run in runs),
         "realtime_factor": spread([run.realtime_factor for run in runs]),
         **_anees([run.nees_pose for run in runs]),
-        "lagged": _later("lagged", runs),
+        "lagged": _lagged(runs),
         "smoothed": _smoothed(runs),
         "nis_mean": statistics.fmean(nis) if nis else None,
         "nis_times": _nis_times(runs),
@@ -123,28 +123,26 @@ def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
 
 
 def _smoothed(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
-    """Return the numbers of the smoothed paths; None where no run has one."""
-    errors = _later("smoothed", runs)
-    if errors is None:
-        return None
-    nees = [run.smoothed_nees_pose for run in runs if run.smoothed_nees_pose is not None]
-    return errors | _anees(nees)
-
-
-def _later(path: str, runs: Sequence[SweepRun]) -> dict[str, Any] | None:
-    """Return the errors of "lagged" or "smoothed" paths; None where no run has one.
+    """Return the numbers of the smoothed paths; None where no run has one.
 
     `ratio` is the spread of each run's ATE over its own odometry's.
     """
-    having = [run for run in runs if getattr(run, f"{path}_ate_rmse_m") is not None]
-    if not having:
+    ates = [run.smoothed_ate_rmse_m for run in runs if run.smoothed_ate_rmse_m is not None]
+    if not ates:
         return None
-    shares = [min(getattr(run, f"{path}_ate_ratio"), LARGEST) for run in having]
+    ratios = [share for run in runs if (share := run.smoothed_ate_ratio) is not None]
     return {
-        "runs": len(having),
-        "ate_rmse_m": spread([getattr(run, f"{path}_ate_rmse_m") for run in having]),
-        "ratio": spread(shares),
+        "runs": len(ates),
+        "ate_rmse_m": spread(ates),
+        "ratio": spread([min(share, LARGEST) for share in ratios]),
+        **_anees([run.smoothed_nees_pose for run in runs if run.smoothed_nees_pose is not None]),
     }
+
+
+def _lagged(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
+    """Return the numbers of the lagged poses; None where no run has them."""
+    ates = [run.lagged_ate_rmse_m for run in runs if run.lagged_ate_rmse_m is not None]
+    return {"runs": len(ates), "ate_rmse_m": spread(ates)} if ates else None
 
 
 def _bound(runs: Sequence[SweepRun]) -> dict[str, Any] | None:

@@ -294,12 +294,17 @@ def step_row(step: StepResult, wall_spans_m: Array) -> Array:
         row += ids
     for one in predicted:
         row += _PREDICTED.numbers(one)
-    lagged = [
-        part
+    parts = [np.array(row, dtype=np.float64), np.ravel(wall_spans_m), lagged_row(step)]
+    return np.concatenate(parts)
+
+
+def lagged_row(step: StepResult) -> Array:
+    """Return the end of the row of a step, its lagged poses, shape (13 k,)."""
+    rows = [
+        np.concatenate([[one.t_ns - step.t_ns], one.pose, one.covariance.ravel()])
         for one in step.lagged
-        for part in ([one.t_ns - step.t_ns], one.pose, one.covariance.ravel())
     ]
-    return np.concatenate([np.array(row, dtype=np.float64), np.ravel(wall_spans_m), *lagged])
+    return np.concatenate([np.zeros(0), *rows])
 
 
 def with_step(state: Snapshot, numbers: Array) -> Snapshot:

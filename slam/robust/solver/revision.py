@@ -1,4 +1,4 @@
-"""What a solution over the whole run changes, the belief and the noise of ranges, and allows."""
+"""What a solution over the whole run changes (belief, noise of ranges), and what it allows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from slam.robust.association import Pairs
 from slam.robust.map import MERGE_SIGMA_M, apply_merge
 from slam.robust.parameters import SIGMA_PER_MEDIAN, TAIL_PROBABILITY, BackEndParameters
 from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
-from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
+from slam.robust.solver.smoother import (
+    Smoother,
+    Solution,
+    joint_covariance,
+    measurement_residuals,
+)
 from slam.robust.state import (
     HEAD_SIZE,
     Array,
@@ -75,7 +80,7 @@ def adopt(
     log: RunLog, state: State, problem: Problem, solution: Solution, parameters: BackEndParameters
 ) -> None:
     """Replace the belief by a solution, and let it choose the noise of ranges."""
-    _replace(state, problem, solution, parameters)
+    _replace(state, problem, solution)
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state, parameters)
 
@@ -215,9 +220,7 @@ def is_determined(information: Array) -> bool:
     return bool(np.all((variances > 0.0) & (variances < _UNKNOWN**2)))
 
 
-def _replace(
-    state: State, problem: Problem, solution: Solution, parameters: BackEndParameters
-) -> None:
+def _replace(state: State, problem: Problem, solution: Solution) -> None:
     estimate, layout = solution.estimate, state.layout
     pose = estimate.poses[-1]
     state.position_m = pose[:2].copy()
@@ -234,8 +237,7 @@ def _replace(
     state.walls = values[layout.walls].reshape(-1, 2).copy()
     keys = np.searchsorted(problem.keys, state.past_numbers)
     state.past = estimate.poses[keys]
-    smoother = Smoother(problem, parameters.relinearisation)
     # The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...)
-    additive = smoother.joint_covariance(solution, keys)
+    additive = joint_covariance(solution.eliminated, keys)
     order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
     state.set_additive_covariance(additive[np.ix_(order, order)])

@@ -372,15 +372,15 @@ def solve(equations: NormalEquations) -> tuple[Array, Array]:
 def covariances(left: Eliminated) -> tuple[Array, Array]:
     """Return the marginal covariances of the eliminated poses, (k, 3, 3), and of the border.
 
-    While the border is known, each pose is the next one's times a factor, and noise; what the
-    border adds is A^-1 B S^-1 B^T A^-1.
+    Given the border they are a chain, see `_chain_given_border`; what the border adds is
+    A^-1 B S^-1 B^T A^-1.
     """
     root = np.linalg.inv(np.linalg.cholesky(left.information))
     by_border, _ = dtbtrs(left.factor, left.W @ root.T, uplo="L", trans="T")
     size = left.size
     by_border = by_border.reshape(-1, size, by_border.shape[1])[:, :3]
     chain = by_border @ by_border.transpose(0, 2, 1)
-    own, back = _from_later(left)
+    own, back = _chain_given_border(left)
     later = np.zeros((size, size))
     for k in range(len(chain) - 1, -1, -1):
         later = own[k] + back[k] @ later @ back[k].T
@@ -389,10 +389,9 @@ def covariances(left: Eliminated) -> tuple[Array, Array]:
 
 
 def joint_covariance(left: Eliminated, at: Indices) -> Array:
-    """Return the covariance of the border and, behind it, of some eliminated poses, in time order.
+    """Return the covariance of the border and, behind it, of some eliminated poses.
 
-    It has the shape (b + 3 k, b + 3 k). What connects two poses while the border is known passes
-    through all poses between them.
+    ``at`` (k,) are their indices, increasing; the shape is (b + 3 k, b + 3 k).
     """
     size, n, k = left.size, len(left.information), len(at)
     joint = np.zeros((n + 3 * k, n + 3 * k))
@@ -406,12 +405,12 @@ def joint_covariance(left: Eliminated, at: Indices) -> Array:
     joint[n:, :n] = -by_border @ border
     joint[:n, n:] = joint[n:, :n].T
     joint[n:, n:] = by_border @ border @ by_border.T
-    own, back = _from_later(left)
+    own, back = _chain_given_border(left)
     row_of = {int(pose): n + 3 * row for row, pose in enumerate(at)}
     own_now, with_later = np.zeros((size, size)), np.zeros((size, 3 * k))
     for pose in range(len(own) - 1, first - 1, -1):
         own_now = own[pose] + back[pose] @ own_now @ back[pose].T
-        with_later = -back[pose] @ with_later
+        with_later = back[pose] @ with_later
         if pose in row_of:
             row = row_of[pose]
             with_later[:, row - n : row - n + 3] = own_now[:, :3]
@@ -420,11 +419,11 @@ def joint_covariance(left: Eliminated, at: Indices) -> Array:
     return joint
 
 
-def _from_later(left: Eliminated) -> tuple[Array, Array]:
-    """Return of each eliminated pose, the border known, noise and factor on the next pose.
+def _chain_given_border(left: Eliminated) -> tuple[Array, Array]:
+    """Return the chain of eliminated poses given the border: x_k = G_k x_k+1 + noise.
 
-    With the blocks F of the factor these are F_kk^-T F_kk^-1 and F_kk^-T F_k+1,k^T, shape
-    (k, size, size) each; the pose is the negative product and the noise.
+    With the blocks F of the factor, the covariance of the noise is F_kk^-T F_kk^-1, and
+    G_k = -F_kk^-T F_k+1,k^T; shape (k, size, size) each.
     """
     size, k = left.size, left.factor.shape[1] // left.size
     diagonal, lower = (np.zeros((k, size, size)) for _ in range(2))
@@ -435,7 +434,7 @@ def _from_later(left: Eliminated) -> tuple[Array, Array]:
             lower[:-1, i, j] = left.factor[size + i - j, j : -size or None : size]
     inverses = np.linalg.inv(diagonal)
     own = inverses.transpose(0, 2, 1) @ inverses
-    return own, (lower @ inverses).transpose(0, 2, 1)
+    return own, -(lower @ inverses).transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -443,11 +442,17 @@ class Solution:
     """The least-squares estimate and its information."""
 
     estimate: Estimate
-    # shape (6 + q,) squared: the Schur complement on last pose, its calibration, and what is fixed;
-    # additive errors
-    information: Array
+    eliminated: Eliminated
     cost: float
     slips: NDArray[np.bool_]  # shape (k,): in which motions the wheels slipped
+
+    @property
+    def information(self) -> Array:
+        """Return that of last pose, its calibration, and what is fixed, (6 + q,) squared.
+
+        It is the Schur complement; errors are additive.
+        """
+        return self.eliminated.information
 
 
 class Smoother:
@@ -512,11 +517,11 @@ class Smoother:
             if decrease < tolerance and limit == rule.outlier_sigmas and not is_other:
                 break
         try:
-            information = eliminate(self._equations(estimate, slips, limit)).information
-            np.linalg.cholesky(information)
+            left = eliminate(self._equations(estimate, slips, limit))
+            np.linalg.cholesky(left.information)
         except np.linalg.LinAlgError:
             return None
-        return Solution(estimate=estimate, information=information, cost=cost, slips=slips)
+        return Solution(estimate=estimate, eliminated=left, cost=cost, slips=slips)
 
     def cost(self, estimate: Estimate, slips: NDArray[np.bool_], limit: float = math.inf) -> float:
         """Return what is to be least: Huber's costs of all measurements, capped at ``limit``.
@@ -572,16 +577,6 @@ class Smoother:
         left = eliminate(self._equations(estimate, slips, self._rule.outlier_sigmas))
         chain, border = covariances(left)
         return np.concatenate([chain, border[None, POSE, POSE]]), border
-
-    def joint_covariance(self, solution: Solution, keys: Indices) -> Array:
-        """Return the covariance of the border and of some keyframes before the last one.
-
-        Shape (b + 3 k, b + 3 k), the keyframes in time order behind the border.
-        """
-        limit = self._rule.outlier_sigmas
-        return joint_covariance(
-            eliminate(self._equations(solution.estimate, solution.slips, limit)), keys
-        )
 
     def _motion_costs(self, residual: Array, share: float = 1.0) -> tuple[Array, Array]:
         """Return the costs of all motions, shapes (k,): of the wheels' noise, and of a slip.

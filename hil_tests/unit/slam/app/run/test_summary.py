@@ -150,12 +150,11 @@ def test_the_lagged_error_is_of_the_poses_that_there_are_aligned_by_themselves()
         for k, pose in enumerate(truth)
     ]
     summary = summarise(record_of(results, truth, np.zeros(3)), INFO, RIG)
-    alone = summarise(record_of(results[:11], truth[:11], np.zeros(3)), INFO, RIG)
+    few = summarise(record_of(results[:28], truth[:28], np.zeros(3)), INFO, RIG)
     assert summary is not None
-    assert alone is not None
+    assert few is not None
     assert summary.lagged_ate_rmse_m == pytest.approx(0.003, rel=1e-2)
-    assert summary.lagged_ate_ratio == math.inf
-    assert alone.lagged_ate_rmse_m is None  # a single pose has no direction
+    assert few.lagged_ate_rmse_m is None
 
 
 def test_the_smoothed_numbers_are_those_of_the_smoothed_run() -> None:
