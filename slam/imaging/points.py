@@ -52,7 +52,9 @@ class PointRule:
     beside_m: float = 0.12
     beside_share: float = 0.25
     beside_wall_share: float = 0.1
-    unlearned_beside_m: float = 0.18  # in place of `beside_m`, until the module's pulse is learnt
+    # In place of `beside_m` and `SeparationRule.beside_share`, until the module's pulse is learnt
+    unlearned_beside_m: float = 0.18
+    unlearned_beside_share: float = 0.6
     most_fading: float = 0.4
     least_wall_share: float = 0.3  # size over that of the strongest reflector
     # Clutter that stays for some seconds goes along with the robot, as the echo of a wall does.
