@@ -2,6 +2,7 @@
 
 import math
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hil_tests.property.robust_oracles import (
     N_RADARS,
     Array,
     Rows,
+    increments,
     landmark_covariance,
     random_state,
     rows_of,
@@ -21,11 +23,18 @@ from hil_tests.property.robust_oracles import (
     values,
 )
 from slam.config import WheelNoise
-from slam.geometry import paper_rig
+from slam.geometry import compose, paper_rig
 from slam.robust.association import antennas_of, view
 from slam.robust.initialisation import BodyPoint, initialise_landmark
 from slam.robust.map import apply_merge
-from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn
+from slam.robust.state import (
+    PastPose,
+    State,
+    SymmetricMatrix,
+    calibrated_motion,
+    predict,
+    quarter_turn,
+)
 
 WHEELS = WheelNoise()
 ANTENNAS = antennas_of(paper_rig(), (), np.zeros(3))
@@ -186,6 +195,88 @@ def test_landmark_without_correlation_is_not_touched(seed: int) -> None:
     assert np.array_equal(state.landmarks_m[2], place)
     assert np.array_equal(state.P.full()[far], P[far])
     assert (state.landmarks_m[:2] != others).all()
+
+
+# --- past poses -----------------------------------------------------------------------------------
+
+
+def held(state: State, before: PastPose) -> None:
+    """Assert that the oldest past pose is what it was."""
+    after = state.past_pose(0)
+    assert after.number == before.number
+    assert np.abs(after.pose[:2] - before.pose[:2]).max() <= 1e-12
+    assert turn_between(after.pose[2], before.pose[2]) <= 1e-12
+    assert relative_error(after.covariance, before.covariance) <= 1e-9
+
+
+@few
+@given(seeds, increments)
+def test_where_the_robot_was_stays_until_something_is_measured(seed: int, increment: Array) -> None:
+    """Its additive error is that of the pose at that time, whatever the robot and the map do."""
+    state = surrounded(seed, 2)
+    state.keep_pose(7)
+    was = PastPose(number=7, pose=state.pose, covariance=state.pose_covariance())
+    held(state, was)
+    for _ in range(3):
+        go(state, increment)
+    state.keep_pose(10)
+    point = BodyPoint(
+        point_m=np.array([0.4, 0.9]), covariance=1e-4 * np.eye(2), by_offsets=np.zeros((2, 4))
+    )
+    initialise_landmark(state, point)
+    state.augment_wall(np.array([0.2, 1.4]), np.zeros((state.P.size, 2)), 0.01 * np.eye(2))
+    initialise_landmark(state, point)
+    held(state, was)
+    state.remove(1)
+    held(state, was)
+    state.marginalise_past(1)
+    newer = state.past_pose(0)
+    assert newer.number == 10
+    assert np.abs(newer.pose - state.pose)[:2].max() <= 1e-12
+    assert relative_error(newer.covariance, state.pose_covariance()) <= 1e-9
+
+
+@few
+@given(seeds, increments)
+def test_past_poses_change_nothing_else(seed: int, increment: Array) -> None:
+    with_past, without = surrounded(seed, 3), surrounded(seed, 3)
+    point = BodyPoint(
+        point_m=np.array([0.4, 0.9]), covariance=1e-4 * np.eye(2), by_offsets=np.zeros((2, 4))
+    )
+    for number, state in enumerate([with_past, without]):
+        for step in range(4):
+            if number == 0:
+                state.keep_pose(step)
+            go(state, increment)
+            see(state, step, step % 3, foreseen(state, step, step % 3) + 0.01)
+        initialise_landmark(state, point)
+        state.augment_wall(np.array([0.2, 1.4]), np.zeros((state.P.size, 2)), 0.01 * np.eye(2))
+        see(state, 2, 1, foreseen(state, 2, 1) - 0.01)
+    m = without.P.size
+    assert with_past.P.size == m + 12
+    assert apart(with_past, without) <= 1e-10
+    assert relative_error(with_past.P.full()[:m, :m], without.P.full()) <= 1e-9
+
+
+@few
+@given(seeds, increments)
+def test_a_motion_that_is_known_exactly_leads_from_the_past_pose_to_the_present_one(
+    seed: int, increment: Array
+) -> None:
+    """Whatever is measured then, to first order: both are corrected as one rigid body."""
+    state = surrounded(seed, 3)
+    P, calibration = state.P.full(), np.arange(3, 6)
+    P[calibration], P[:, calibration] = 0.0, 0.0
+    state.P = SymmetricMatrix(P)
+    state.keep_pose(0)
+    motion = calibrated_motion(increment, state.calibration, WHEELS, np.zeros((3, 3)))
+    predict(state, motion, replace(WHEELS, walk_per_sqrt_m=0.0))
+    for radar, landmark in [(0, 0), (3, 1), (1, 2)]:
+        see(state, radar, landmark, foreseen(state, radar, landmark) + 1e-4)
+    step = np.append(motion.step_m, motion.turn_rad)
+    expected = compose(state.past_pose(0).pose, step)
+    assert np.abs(expected - state.pose)[:2].max() <= 1e-7
+    assert turn_between(expected[2], state.heading_rad) <= 1e-7
 
 
 # --- frames and names -----------------------------------------------------------------------------

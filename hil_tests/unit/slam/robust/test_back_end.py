@@ -36,6 +36,41 @@ def drive(run: Run, rig: Rig) -> tuple[RobustBackEnd, Array]:
     return back_end, np.array([np.zeros(3), *path])
 
 
+def test_few_past_poses_are_kept_where_the_robot_turns_or_only_odometry_goes_on() -> None:
+    parameters = BackEndParameters()
+    rule = parameters.lag
+    turning, blind = (RobustBackEnd(paper_rig(), parameters) for _ in range(2))
+    lagged: list[int] = []
+    for _ in range(12 * rule.most):
+        turning.predict(np.array([0.0, 0.0, 0.1]))
+        turning.update([])
+        lagged += [one.number for one in turning.lagged]
+        blind.predict(np.array([0.01, 0.0, 0.0]))
+        assert len(turning.state.past) <= rule.most
+        # 2 m, one every 10 cm
+        assert len(blind.state.past) <= 21
+    # One every two keyframes of 0.1 rad, those left out that are not final yet
+    assert len(lagged) == 12 * rule.most // 2 - rule.most - 1
+    assert lagged == sorted(set(lagged))
+
+
+def test_no_past_pose_is_from_before_a_robot_was_set_down() -> None:
+    back_end = RobustBackEnd(paper_rig(), BackEndParameters())
+    numbers: list[int] = []
+    for step in range(500):
+        if step == 250:
+            back_end.set_down(np.array([3.0, 4.0, 1.0]), [])
+            assert len(back_end.state.past) == 0
+        back_end.predict(np.array([0.01, 0.0, 0.0]))
+        back_end.update([])
+        numbers += [one.number for one in back_end.lagged]
+    before = [number for number in numbers if number < 250]
+    assert before == sorted(before)
+    # 2.5 m were driven before that and after it; the last 2 m of the former are given up.
+    assert max(before) <= 50
+    assert min(number for number in numbers if number > 50) > 250
+
+
 def cut(run: Run, n_poses: int) -> Run:
     return replace(
         run,
