@@ -79,7 +79,11 @@ class Imager:
         if self._learns and not self._has_learned(patch.radar):
             # What another pulse than the nominal one leaves may look like a second echo, and to
             # take it for one moves the first: by 7 mm under the stress `pulse`, until it is learnt.
-            separation = replace(rule.separation, beside_share=rule.unlearned_beside_share)
+            separation = replace(
+                rule.separation,
+                beside_m=rule.unlearned_beside_m,
+                beside_share=rule.unlearned_beside_share,
+            )
             rule = replace(rule, beside_m=rule.unlearned_beside_m, separation=separation)
         reflectors = separated(patch, rule.separation)
         return ImagedPatch(

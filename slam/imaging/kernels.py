@@ -331,7 +331,7 @@ def refine(
 
 @kernel(
     f"Tuple((float64[:, ::1], complex128[:, ::1]))({_SIGNAL}, float64[:, ::1], float64[::1], "
-    "float64[::1], float64[:, :, ::1], float64[::1], float64[::1], int64, UniTuple(float64, 4))"
+    "float64[::1], float64[:, :, ::1], float64[::1], float64[::1], int64, UniTuple(float64, 5))"
 )
 def separate(
     signal: Signal,
@@ -342,14 +342,14 @@ def separate(
     rows_m: Array,
     bearings: Array,
     most: int,
-    limits: tuple[float, float, float, float],
+    limits: tuple[float, float, float, float, float],
 ) -> tuple[Array, Complex]:
     """Take reflectors out of profiles, the strongest first; what is left stays in ``signal``.
 
     Return range, bearing, curvature, form, energy, and curvature where it is free, of each, shape
     (k, 6), and its amplitudes (k, frames). ``limits`` are those of `SeparationRule`.
     """
-    least_over_level, least_share, beside_share, more_than_point = limits
+    least_over_level, least_share, beside_share, more_than_point, beside_m = limits
     n = track.shape[0]
     ranges, gains = np.zeros(n), np.zeros(n)
     echoes, amplitudes = np.zeros(n, dtype=np.complex128), np.zeros(n, dtype=np.complex128)
@@ -402,7 +402,8 @@ def separate(
         floor = beside_share * beside_share * energy
         if place[0] * place[2] < _WALL:
             floor *= 0.25
-        for row in range(max(0, middle - _ROWS_AWAY), min(rows_m.size, middle + _ROWS_AWAY + 1)):
+        beside = int(beside_m / row_m)
+        for row in range(max(0, middle - beside), min(rows_m.size, middle + beside + 1)):
             floors[row] = max(floors[row], floor)
         first, end = min(i, middle) - _ROWS_AWAY, max(i, middle) + _ROWS_AWAY + 1
         image_rows(signal, track, cells, first, end, image)

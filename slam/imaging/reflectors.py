@@ -87,8 +87,9 @@ class SeparationRule:
     least_over_level: float = 40.0
     # Amplitude under the law of a rod, over that of the strongest
     least_share: float = 0.1
-    # Size over that of one that was found at a range within 12 cm of it: less may be what is left
+    # Size over that of one that was found at a range within so much of it: less may be what is left
     # of that one
+    beside_m: float = 0.12
     beside_share: float = 0.2
     # What a free curvature must explain over what a point does
     more_than_point: float = 1.1
@@ -128,7 +129,13 @@ def separated(patch: Patch, rule: SeparationRule) -> Reflectors:
         rows_m,
         bearings,
         rule.most,
-        (rule.least_over_level, rule.least_share, rule.beside_share, rule.more_than_point),
+        (
+            rule.least_over_level,
+            rule.least_share,
+            rule.beside_share,
+            rule.more_than_point,
+            rule.beside_m,
+        ),
     )
     range_m, bearing_rad, _, _, energy, curvature = found.T
     # What is left, on half as many cells
