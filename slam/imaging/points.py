@@ -52,8 +52,8 @@ class PointRule:
     beside_m: float = 0.12
     beside_share: float = 0.25
     beside_wall_share: float = 0.1
-    # Until the module's pulse is learnt, in place of `beside_m`, here and in `SeparationRule`, and of
-    # `SeparationRule.beside_share`
+    # Until the module's pulse is learnt, in place of both `beside_m`, of points and of separation,
+    # and of the `beside_share` of separation
     unlearned_beside_m: float = 0.18
     unlearned_beside_share: float = 0.6
     most_fading: float = 0.4

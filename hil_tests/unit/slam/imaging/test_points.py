@@ -27,7 +27,7 @@ from slam.imaging.points import (
     points_of,
 )
 from slam.imaging.range_profiles import ProfileFilter, RangeProfiles
-from slam.imaging.reflectors import separated
+from slam.imaging.reflectors import SeparationRule, separated
 
 Array = NDArray[np.float64]
 
@@ -436,3 +436,29 @@ def test_until_the_pulse_is_learnt_a_weak_echo_behind_a_strong_one_may_be_part_o
 
     assert len(points(PulseEstimator(PULSE.model))) == 3
     assert len(points(LearntNominal(PULSE.model))) == len(points(None)) == 6
+
+
+def test_a_pulse_that_rings_is_one_reflector_where_nothing_beside_it_is_searched_for() -> None:
+    """It lies nearer to the peak of the nominal filter, where the learnt pulse has its zero."""
+    plain = of_point(straight(), (0.1, 1.0))
+    ringing = plain + 0.45 * np.roll(plain, 9, axis=1)
+    matched = PULSE.model.samples(np.zeros(1), BIN_M)[0].conj()[::-1]
+
+    def peak_bins(frame: Array) -> float:
+        level = np.log(np.abs(np.convolve(frame, matched, mode="same")))
+        at = int(level.argmax())
+        before, here, behind = level[at - 1 : at + 2].tolist()
+        return at + 0.5 * (before - behind) / (before - 2.0 * here + behind)
+
+    patch = patch_of(ringing)
+    antenna = patch.aperture.antennas_m[patch.middle]
+    moved = [
+        peak_bins(after) - peak_bins(before) for before, after in zip(plain, ringing, strict=True)
+    ]
+    peak_m = math.dist(antenna, (0.1, 1.0)) + BIN_M * float(np.median(moved))
+    alone, several = (
+        separated(patch, rule)
+        for rule in (SeparationRule(beside_m=0.18, beside_share=0.6), SeparationRule())
+    )
+    assert alone.range_m.size == 1 < several.range_m.size
+    assert abs(alone.range_m[0] - peak_m) < 2e-3 < abs(several.range_m[0] - peak_m)
