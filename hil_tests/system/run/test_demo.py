@@ -54,6 +54,7 @@ def test_stdout_is_one_table_of_simulated_numbers_and_stderr_is_progress(demo: F
     assert [line.split("  ")[0] for line in lines[2:-1]] == [
         "odometry ATE",
         "SLAM ATE",
+        "lagged ATE",
         "smoothed ATE",
         "SLAM ATE, ICP",
         "final error",
