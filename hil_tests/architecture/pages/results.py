@@ -183,7 +183,7 @@ def _sections() -> Iterator[str]:
         yield f"## {title}\n\n{text}\n"
         yield f"<!-- not run: an hour or more -->\n```console\n{commands}```\n"
         yield groups_table(sweep["groups"])
-        if "runs_harmed" in sweep["groups"][0]:
+        if _have_harm(sweep["groups"]):
             yield f"All together: {outcomes_text(_together(sweep['groups']))}.\n"
         if picture:
             yield f"![{shows}](../fixtures/pictures/{picture})\n"
@@ -193,7 +193,7 @@ def groups_table(groups: Sequence[Group]) -> str:
     """Return a table with a row per group, named by what tells the groups apart."""
     keys = [key for key in ("scene", "preset", "stress") if len({g[key] for g in groups}) > 1]
     columns = [*COLUMNS]
-    if "runs_harmed" in groups[0]:
+    if _have_harm(groups):
         columns += HARM_COLUMNS
     if any(group["carries"] for group in groups):
         columns.append(("carries found", carries_text))
@@ -203,6 +203,11 @@ def groups_table(groups: Sequence[Group]) -> str:
     ]
     titles = [title for title, _ in columns]
     return table([*keys, *titles], rows, titles)
+
+
+def _have_harm(groups: Sequence[Group]) -> bool:
+    """Return whether all groups count harmed runs; those of older sweeps do not."""
+    return all("runs_harmed" in group for group in groups)
 
 
 def _together(groups: Sequence[Group]) -> dict[str, Any]:
