@@ -448,7 +448,7 @@ def test_a_pulse_that_rings_is_one_reflector_where_nothing_beside_it_is_searched
         level = np.log(np.abs(np.convolve(frame, matched, mode="same")))
         at = int(level.argmax())
         before, here, behind = level[at - 1 : at + 2].tolist()
-        return at + 0.5 * (before - behind) / (before - 2.0 * here + behind)
+        return float(at + 0.5 * (before - behind) / (before - 2.0 * here + behind))
 
     patch = patch_of(ringing)
     antenna = patch.aperture.antennas_m[patch.middle]
