@@ -55,7 +55,7 @@ class PointRule:
     # Until the module's pulse is learnt, in place of both `beside_m`, of points and of separation,
     # and of the `beside_share` of separation
     unlearned_beside_m: float = 0.18
-    unlearned_beside_share: float = 0.6
+    unlearned_beside_share: float = 0.4
     most_fading: float = 0.4
     least_wall_share: float = 0.3  # size over that of the strongest reflector
     # Clutter that stays for some seconds goes along with the robot, as the echo of a wall does.

@@ -80,6 +80,7 @@ def test_exactly_the_promised_files(demo: Finished) -> None:
         "image.png",
         "summary.json",
         "estimate.tum",
+        "lagged.tum",
         "smoothed.tum",
         "truth.tum",
         "odometry.tum",

@@ -165,12 +165,12 @@ def test_a_signal_after_the_last_scan_costs_no_result(
     ]
     assert main(command) == 143
     assert capsys.readouterr().err.splitlines()[-1].startswith("uwb-slam: stopped by SIGTERM")
-    # Preset paper has no smoothed path.
+    # Preset paper has neither lagged poses nor a smoothed path.
     assert {path.name for path in out.iterdir()} == {
         "session.mcap",
         "session.rrd",
         *result_files.RESULTS,
-    } - {result_files.SMOOTHED}
+    } - {result_files.LAGGED, result_files.SMOOTHED}
 
 
 @pytest.mark.parametrize(

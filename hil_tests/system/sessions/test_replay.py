@@ -138,7 +138,7 @@ def test_what_led_to_every_state_is_recorded(recorded: Recorded) -> None:
     with session.open("rb") as stream:
         messages = [m for _, _, m in make_reader(stream).iter_messages(topics=["/slam/step"])]
     assert [m.log_time for m in messages] == [live.t_ns for live in listener.snapshots]
-    n_detections = 0
+    n_detections, n_lagged = 0, 0
     for message, live in zip(messages, listener.snapshots, strict=True):
         step = live.step
         assert step is not None
@@ -149,7 +149,7 @@ def test_what_led_to_every_state_is_recorded(recorded: Recorded) -> None:
         size += sum(2 * len(a.candidate_ids) for a in step.associations) + len(step.rejected)
         size += sum(f in step.fixes for o in step.observations for f in o.fixes) + 4 * n_spans
         if report is not None:
-            size += 3 * len(report.continued) + 8 * len(report.predicted)
+            size += 3 * len(report.continued) + 8 * len(report.predicted) + 13 * len(step.lagged)
             assert row[-size:][10:14].tolist() == [
                 report.nis,
                 report.dof,
@@ -166,7 +166,12 @@ def test_what_led_to_every_state_is_recorded(recorded: Recorded) -> None:
         assert ranges[:, 2].tolist() == [one.range_m for one in step.detections]
         assert tuple(ranges[:, 8].tolist()) == (step.range_sigmas_m or (0.0,) * n_own)
         n_detections += n_own
+        lagged = row[size - 13 * len(step.lagged) :].reshape(-1, 13)
+        n_lagged += len(lagged)
+        assert (live.t_ns + lagged[:, 0].astype(int)).tolist() == [one.t_ns for one in step.lagged]
+        assert lagged[:, 1:4].tolist() == [one.pose.tolist() for one in step.lagged]
     assert n_detections > 100
+    assert (n_lagged > 0) == (recorded.summary["preset"] == "robust")
     states = [r for r in open_session(session).records() if isinstance(r, Snapshot)]
     for found, live in zip(states, listener.snapshots, strict=True):
         assert found.wall_spans_m.tolist() == live.wall_spans_m.tolist()

@@ -33,8 +33,8 @@ from xethru_protocol.operating_system import (
 )
 
 SESSION, VIEW, REPORT = "session.mcap", "session.rrd", "report.html"
-SMOOTHED, IMAGE = "smoothed.tum", "image.png"
-_TRAJECTORIES = ("estimate.tum", "lagged.tum", SMOOTHED, "truth.tum", "odometry.tum")
+LAGGED, SMOOTHED, IMAGE = "lagged.tum", "smoothed.tum", "image.png"
+_TRAJECTORIES = ("estimate.tum", LAGGED, SMOOTHED, "truth.tum", "odometry.tum")
 RESULTS = ("map.png", IMAGE, "summary.json", *_TRAJECTORIES)
 
 
@@ -108,7 +108,7 @@ def write_trajectories(out: Path, record: RunRecord) -> None:
     for name, poses in paths.items():
         write_path(out / f"{name}.tum", states.t_ns, poses)
     if len(record.lagged):
-        write_path(out / "lagged.tum", record.lagged_ns, record.lagged)
+        write_path(out / LAGGED, record.lagged_ns, record.lagged)
     if record.smoothed is not None:
         write_smoothed(out, record.smoothed)
 

@@ -458,7 +458,7 @@ def test_a_pulse_that_rings_is_one_reflector_where_nothing_beside_it_is_searched
     peak_m = math.dist(antenna, (0.1, 1.0)) + BIN_M * float(np.median(moved))
     alone, several = (
         separated(patch, rule)
-        for rule in (SeparationRule(beside_m=0.18, beside_share=0.6), SeparationRule())
+        for rule in (SeparationRule(beside_m=0.18, beside_share=0.4), SeparationRule())
     )
     assert alone.range_m.size == 1 < several.range_m.size
     assert abs(alone.range_m[0] - peak_m) < 2e-3 < abs(several.range_m[0] - peak_m)
