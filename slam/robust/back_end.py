@@ -152,7 +152,8 @@ class RobustBackEnd:
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._motion: Motion | None = None  # the last one, if it is known from the wheels
-        # Way of the wheels since the start: metres, and keyframes, as `RunLog` counts them
+        # Way of the wheels since the start: metres, and keyframes, as `RunLog` counts them; where
+        # the two counts differ by rounding, `RunLog.mark_key` makes past poses keyframes
         self._way_m, self._way_keys = 0.0, 0.0
         self._keeps_pose = False  # whether the newest pose is to be a past pose
         self._past_ways_m: list[float] = []  # of the past poses of the state

@@ -228,7 +228,7 @@ def _spread_mm(spread: Mapping[str, float]) -> str:
     return f"{1e3 * spread['median']:.1f} ({1e3 * spread['p90']:.1f})"
 
 
-def _later(
+def _spread_of(
     path: str, key: str, text: Callable[[Mapping[str, float]], str]
 ) -> Callable[[Group], str]:
     """Return the column of "lagged" or "smoothed" paths; tables of older sweeps lack the former."""
@@ -246,11 +246,11 @@ COLUMNS: tuple[tuple[str, Callable[[Group], str]], ...] = (
     ("wheels", lambda group: _spread_mm(group["odometry_ate_rmse_m"])),
     ("causal", lambda group: _spread_mm(group["ate_rmse_m"])),
     ("of wheels", lambda group: share_text(group["ratio"]["median"])),
-    ("lagged", _later("lagged", "ate_rmse_m", _spread_mm)),
-    ("smoothed", _later("smoothed", "ate_rmse_m", _spread_mm)),
+    ("lagged", _spread_of("lagged", "ate_rmse_m", _spread_mm)),
+    ("smoothed", _spread_of("smoothed", "ate_rmse_m", _spread_mm)),
     (
         "smoothed, of wheels",
-        _later("smoothed", "ratio", lambda ratio: share_text(ratio["median"])),
+        _spread_of("smoothed", "ratio", lambda ratio: share_text(ratio["median"])),
     ),
     ("NEES", lambda group: f"{group['anees_mean']:.1f} ({in_band_text(group)})"),
     ("precision, recall", _scores),

@@ -47,9 +47,9 @@ class Summary:
     start frame, of the last state at or before each of ten times; `nis_mean` is divided by its
     degrees of freedom. `lagged_ate_rmse_m` is of the poses as known two metres of travel later,
     aligned by themselves; the last two metres, and the time in which the robot was lost, have none.
-    It is None of preset `paper`, and of a run with few. Smoothed numbers are of the solution over
-    the whole run at its end, None where there is none; its landmarks are those of the last map,
-    where the solution has them.
+    Preset `paper`, and a run with fewer than ten lagged poses, have None. Smoothed numbers are of
+    the solution over the whole run at its end, None where there is none; its landmarks are those of
+    the last map, where the solution has them.
     """
 
     scene: str

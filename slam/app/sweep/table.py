@@ -108,7 +108,7 @@ def times_clean(group: Group, clean: Group, statistic: str) -> float:
     return ratio(group["ate_rmse_m"][statistic], clean["ate_rmse_m"][statistic])
 
 
-def _later(path: str, key: str, text: Callable[[float], str]) -> Callable[[Group], str]:
+def _median_of(path: str, key: str, text: Callable[[float], str]) -> Callable[[Group], str]:
     """Return the column of a median of "lagged" or "smoothed" paths."""
     return lambda group: "-" if group[path] is None else text(group[path][key]["median"])
 
@@ -120,10 +120,10 @@ COLUMNS: Mapping[str, Callable[[Group], str]] = {
     "wheels": lambda group: mm_text(group["odometry_ate_rmse_m"]["median"]),
     "SLAM": lambda group: mm_text(group["ate_rmse_m"]["median"]),
     "p90": lambda group: mm_text(group["ate_rmse_m"]["p90"]),
-    "lagged": _later("lagged", "ate_rmse_m", mm_text),
-    "smoothed": _later("smoothed", "ate_rmse_m", mm_text),
+    "lagged": _median_of("lagged", "ate_rmse_m", mm_text),
+    "smoothed": _median_of("smoothed", "ate_rmse_m", mm_text),
     "of wheels": lambda group: f"{group['ratio']['median']:.3f}",
-    "smoothed, of wheels": _later("smoothed", "ratio", "{:.3f}".format),
+    "smoothed, of wheels": _median_of("smoothed", "ratio", "{:.3f}".format),
     "worse": lambda group: str(group["runs_above_odometry"]),
     "lost": lambda group: str(group["runs_lost"]),
     "confidently wrong": lambda group: str(group["runs_confidently_wrong"]),
