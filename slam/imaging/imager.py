@@ -74,6 +74,11 @@ class Imager:
         made = [self._makers[frame.radar].add(frame, pose_at(frame.t_ns)) for frame in frames]
         return tuple(self._imaged(patch) for patch in made if patch is not None)
 
+    def begin_anew(self) -> None:
+        """Let no patch hold frames of before and after now, as the way between them is unknown."""
+        for maker in self._makers:
+            maker.begin_anew()
+
     def _imaged(self, patch: Patch) -> ImagedPatch:
         rule = self.point_rule
         if self._learns and not self._has_learned(patch.radar):

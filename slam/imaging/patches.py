@@ -227,6 +227,10 @@ class PatchMaker:
         self._looks = [look for look in self._looks if look.way_m >= keep_m]
         return patch
 
+    def begin_anew(self) -> None:
+        """Forget the frames so far: the way from them to the next ones is not known."""
+        self._looks.clear()
+
     def _made(self, bin_length_m: float) -> Patch:
         looks, static = self._looks, self._static.samples
         rows = np.array([look.samples for look in looks])

@@ -274,13 +274,12 @@ def find_known(
     parameters: BackEndParameters,
     *,
     beacons: Sequence[int] = (),
-    sure_m: float | None = None,
 ) -> Known:
     """Return the likeliest one-to-one assignment of ranges without labels to landmarks.
 
     ``side_of`` (r,) is the side of each radar. Those whose ranges the prior predicts less surely
-    than ``sure_m``, by default the radars' ``sigma_m``, take no part, nor do the rows ``beacons``,
-    whose ranges have labels and which do not answer every time.
+    than the radars' ``sigma_m`` take no part, nor do the rows ``beacons``, whose ranges have labels
+    and which do not answer every time.
     """
     noise, rule, tracklets = parameters.ranges, parameters.continuation, parameters.tracklets
     ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
@@ -325,7 +324,7 @@ def find_known(
                 margin_m,
                 tracklets.edge_rad,
                 parameters.map.view_inset_m,
-                (noise.sigma_m if sure_m is None else sure_m) ** 2,
+                noise.sigma_m**2,
                 *chdtri([1, 2], TAIL_PROBABILITY),
                 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau),
                 math.hypot(noise.sigma_m, parameters.branches.model_sigma_m),

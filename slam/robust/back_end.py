@@ -73,7 +73,7 @@ from slam.robust.map import (
     take_map,
 )
 from slam.robust.parameters import BackEndParameters
-from slam.robust.proposals.slips import Change, Course, judge_change, move_anew
+from slam.robust.proposals.slips import JerkDetector
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     is_due,
@@ -151,7 +151,6 @@ class RobustBackEnd:
         self._log = RunLog(parameters.wheels, parameters.map.gap_poses, prior)
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
-        self._motion: Motion | None = None  # the last one, if it is known from the wheels
         # Way of the wheels since the start: metres, and keyframes, as `RunLog` counts them; where
         # the two counts differ by rounding, `RunLog.mark_key` makes past poses keyframes
         self._way_m, self._way_keys = 0.0, 0.0
@@ -159,9 +158,9 @@ class RobustBackEnd:
         self._past_ways_m: list[float] = []  # of the past poses of the state
         self.lagged: list[PastPose] = []
         """The past poses that became final with the newest motion, with all updates before it."""
-        self._course: Course | None = None
-        self.slip_probability = 0.0
-        """Probability that the wheels slipped in the newest step."""
+        self._jerks = JerkDetector(parameters.slips)
+        self.has_jerked = False
+        """Whether the wheels may have slipped in the steps before the newest one."""
         self._landmark_of_label: dict[int, int] = {}
         if saved is not None:
             for landmark in saved.landmarks:
@@ -327,11 +326,17 @@ class RobustBackEnd:
         )
 
     def predict(
-        self, increment: Array, covariance: Array | None = None, *, is_loose: bool = False
+        self,
+        increment: Array,
+        covariance: Array | None = None,
+        *,
+        elapsed_s: float | None = None,
+        is_loose: bool = False,
     ) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
 
-        ``covariance`` (3, 3) is its noise, where that is known better than from the wheels' model.
+        ``covariance`` (3, 3) is its noise, where that is known better than from the wheels' model;
+        ``elapsed_s`` is how long it took, and where that is not known, slips are not looked for.
         ``is_loose`` means that the robot moved in a way that the wheels did not report.
         """
         if not np.isfinite(increment).all():
@@ -340,14 +345,29 @@ class RobustBackEnd:
         self._leave_pose(increment)
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
         self._log.add_motion(increment, motion, is_loose=is_loose)
-        before, self._motion = self._motion, None if is_loose else motion
-        self._course = None
-        if before is not None and self._motion is not None:
-            self._course = Course(pose=self.state.pose, before=before, reported=motion)
-        predict(self.state, motion, wheels)
+        self._move(motion)
+        self.has_jerked = False
+        if is_loose:
+            self._jerks.begin_anew()
+        elif elapsed_s is not None:
+            self._look_for_jerk(motion, elapsed_s)
+
+    def _move(self, motion: Motion) -> None:
+        predict(self.state, motion, self.parameters.wheels)
         self._unassigned.move(motion)
         self._tentative.move(motion)
         self._walls.tentative.move(motion)
+
+    def _look_for_jerk(self, motion: Motion, elapsed_s: float) -> None:
+        """Let the pose be uncertain where the wheels may have slipped before the newest step."""
+        jerk = self._jerks.take(motion, elapsed_s)
+        if jerk is None:
+            return
+        self.has_jerked = True
+        first = self._log.n_poses - 1 - len(jerk.covariances)
+        for pose, covariance in enumerate(jerk.covariances, start=first):
+            self._log.loosen(pose, covariance)
+        self._move(jerk.since)
 
     def _leave_pose(self, increment: Array) -> None:
         """Before a motion, keep the pose among the past ones if it is one of the few that are kept.
@@ -387,7 +407,7 @@ class RobustBackEnd:
         increment = np.zeros(3)
         free = free_motion(_CARRIED_M, _CARRIED_RAD)
         self._log.add_motion(increment, free, is_loose=True)
-        self._motion = None
+        self._jerks.begin_anew()
         self._unassigned.clear()
         self._tentative.clear()
         self._walls.tentative.clear()
@@ -426,11 +446,6 @@ class RobustBackEnd:
         known = find_known(
             self.state, seen, widened, self._side_of, self.parameters, beacons=beacons
         )
-        change = self._judge_change(antennas, widened, beacons)
-        self.slip_probability = 0.0 if change is None else change.probability
-        if change is not None and change.slip is not None:
-            motion, known = change.slip
-            seen = self._slip(motion, antennas)
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
         continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
@@ -485,38 +500,6 @@ class RobustBackEnd:
     def relinearise(self) -> bool:
         """Solve for all poses and replace the belief; return whether that worked."""
         return relinearise(self._log, self.state, self.parameters)
-
-    def _judge_change(
-        self, antennas: Antennas, scans: Sequence[RangeScan], beacons: Sequence[int]
-    ) -> Change | None:
-        """Return what the ranges of landmarks say of a sudden change of the wheels' motion."""
-        if self._course is None:
-            return None
-        walls = range(len(self.state.landmark_ids), len(self.state.feature_ids))
-        # As uncertain as after a slip, all landmarks take part.
-        sure_m = self.parameters.branches.hidden_m
-
-        def find(state: State, parameters: BackEndParameters) -> tuple[View, Known]:
-            seen, excluded = view(state, antennas), [*beacons, *walls]
-            self._images.bar(seen, self.state.landmark_ids)
-            return seen, find_known(
-                state, seen, scans, self._side_of, parameters, beacons=excluded, sure_m=sure_m
-            )
-
-        return judge_change(self.state, self._course, scans, self.parameters, find)
-
-    def _slip(self, motion: Motion, antennas: Antennas) -> View:
-        """Believe another motion than the wheels reported last; return the view after it."""
-        assert self._course is not None
-        rule = self.parameters.branches
-        hidden = free_motion(rule.hidden_m, rule.hidden_rad)
-        move_anew(self.state, self._course, motion, hidden, self.parameters.wheels)
-        self._log.loosen(self._log.n_poses - 1, hidden.covariance)
-        self._unassigned.clear()
-        self._tentative.clear()
-        self._walls.tentative.clear()
-        self._motion = motion
-        return self._look(antennas)
 
     def _look(self, antennas: Antennas) -> View:
         """Return the view of all features of which single ranges may be."""

@@ -26,8 +26,8 @@ Revision
     The back end that stayed goes on beside the one that is adopted. When the advantage of the place
     is gone, and more is missed there, the adoption is taken back.
 Doubt
-    A slip (`slam.robust.proposals.slips`), believed or only possible, and a carry that is possible
-    during a stop add to the reported covariance until landmarks known before confirm the pose.
+    A carry that is possible during a stop adds to the reported covariance until landmarks known
+    before confirm the pose.
     Those that a possible motion lays on others of the map confirm nothing
     (`slam.robust.proposals.constellation.stands_out`), nor do they place a carried robot.
 
@@ -78,7 +78,7 @@ from slam.robust.proposals.constellation import (
     find_placements,
     stands_out,
 )
-from slam.robust.proposals.doubts import Doubt, doubted_covariance, seen_ranges, slipped_nats
+from slam.robust.proposals.doubts import Doubt, doubted_covariance, seen_ranges
 from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
@@ -93,6 +93,7 @@ class Step:
     scans: Sequence[RangeScan]
     next_id: int  # landmarks known before it have smaller ids
     evidence: Array  # shape (k, 2): ids and nats
+    elapsed_s: float  # how long the motion took
     # How unlikely it is that the robot was carried before it; negative where the ranges before and
     # behind a stop show that
     carry_nats: float
@@ -287,7 +288,7 @@ class Alternative:
         for number in range(self.next_step, end):
             step = steps[number]
             if number > self.since:
-                self.back_end.predict(step.increment, step.covariance)
+                self.back_end.predict(step.increment, step.covariance, elapsed_s=step.elapsed_s)
             report = self.back_end.update(step.scans, solve=self.merges)
             self.evidence.append(evidence_table(report))
             self.next_step = number + 1
@@ -349,6 +350,7 @@ class Branches:
         self._lever_m = max(math.hypot(mount.x_m, mount.y_m) for mount in rig.mounts)
         self._increment: Array | None = None
         self._covariance: Array | None = None  # of its noise, where that is known
+        self._elapsed_s = 0.0
         self._carry_nats, self._has_stood = math.inf, False
         self._snapshots: dict[int, RobustBackEnd] = {}  # by the number of the step after it
         self._carry: Carry | None = None
@@ -382,7 +384,7 @@ class Branches:
 
     @property
     def doubted_covariance(self) -> Array:
-        """Return what doubts of the wheels add to the covariance of the pose, (3, 3).
+        """Return what doubts add to the covariance of the pose, (3, 3).
 
         The map frame is that of ``main``.
         """
@@ -406,7 +408,8 @@ class Branches:
         self._has_stood = stood_s >= self._rule.stop_s
         stood_s = stood_s if self._has_stood else 0.0
         self._carry_nats = self._rule.carry_nats(elapsed_s, stood_s)
-        self.main.predict(increment, covariance)
+        self._elapsed_s = elapsed_s
+        self.main.predict(increment, covariance, elapsed_s=elapsed_s)
         if self._carry is not None:
             self._carry.moved = compose(self._carry.moved, increment)
 
@@ -427,6 +430,7 @@ class Branches:
         step = Step(
             increment=self._increment,
             scans=scans,
+            elapsed_s=self._elapsed_s,
             next_id=next_id,
             evidence=evidence_table(report),
             carry_nats=carry_nats,
@@ -443,8 +447,8 @@ class Branches:
         return replace(report, carried=carried, lost=self.is_lost)
 
     def _doubt(self, step: Step, report: UpdateReport, position_m: Array) -> None:
-        """Keep what is doubtful of the wheels, until it is confirmed."""
-        rule, slipped = self._rule, self.main.slip_probability
+        """Keep the doubt whether the robot was carried, until the pose is confirmed."""
+        rule = self._rule
         looks = self._now % self._look_every == 0
         doubts: list[Doubt] = []
         seen = seen_ranges(report, self.main.pose, rule) if self._doubts else None
@@ -457,15 +461,14 @@ class Branches:
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
-        if slipped + carried > 0.0:
-            probabilities = np.array([slipped, carried])
-            variances = [np.diag(rule.hidden_variances), np.diag(rule.lost_variances)]
+        if carried > 0.0:
+            variances = np.array(rule.lost_variances)
             newest = Doubt(
                 next_id=step.next_id,
                 position_m=position_m,
-                probabilities=probabilities,
-                covariances=probabilities[:, None, None] * variances,
-                variances=np.diag(variances[1] if carried else variances[0]),
+                probability=carried,
+                covariance=carried * np.diag(variances),
+                variances=variances,
             )
             doubts.append(newest)
         # Those with the same evidence end together: they are one, so a long run needs few.
@@ -633,16 +636,12 @@ class Branches:
         ]
         # Where the map lies, most of what is seen must be known.
         fewest, is_shown = max(rule.least_landmarks, 2 * account.n_new), carry.price_nats < 0.0
-        # After a slip that is still doubted the robot may be where it has never been, for less.
-        saved_nats = 0.0
-        if not is_shown and found is not carry.hidden:
-            saved_nats = max(found.price_nats - slipped_nats(self._doubts), 0.0)
         is_there = (
             account.n_seen > account.n_new
             and (found is carry.hidden or account.n_seen >= fewest)
             and (is_shown or account.misses - stay.misses > found.price_nats + MARGIN_NATS)
             and gains[best] > MARGIN_NATS
-            and advantage(account, elsewhere, rule) - saved_nats > MARGIN_NATS
+            and advantage(account, elsewhere, rule) > MARGIN_NATS
             and all(margin > rule.placement_nats for margin in margins)
         )
         return found if is_there and self._is_only_there(carry, found, account) else None

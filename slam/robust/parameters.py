@@ -277,15 +277,13 @@ class RelinearisationRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlipRule:
-    """When the wheels are taken to have slipped in the newest step."""
+    """When the wheels may have slipped (`slam.robust.proposals.slips`)."""
 
     steady_m: Annotated[float, Origin.CHOSEN] = 0.01
-    """Standard deviation of the change of a robot's motion from one step to the next; where the
-    wheels report more than twice as much, they may have slipped."""
+    """By how much a robot's motion may change from one step to the next; where the wheels report
+    more, and go on as before, they may have slipped."""
     steady_rad: Annotated[float, Origin.CHOSEN] = 0.02
     """The same of its turn."""
-    changes_per_slip: Annotated[float, Origin.CHOSEN] = 60.0
-    """How many of such changes there are to one slip."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -40,6 +40,7 @@ from slam.robust.parameters import (
     ImagedPointRule,
     RangeNoise,
 )
+from slam.robust.proposals.slips import MOST_STEPS
 from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import calibrated_motion, quarter_turn, rotation
 
@@ -206,6 +207,8 @@ class RobustSlam:
         covariance = self._noise_since(self._pose, t_ns)
         stood_s = self._stood_ns / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
+        if self._patches is not None and branches.main.has_jerked:
+            self._patches.begin_anew()
         imaged = {frame.radar for frame in frames} if self._patches is not None else set[int]()
         scans = [*self._scans(detections, sigmas_m, moved, imaged), *given]
         if self._patches is not None:
@@ -374,7 +377,8 @@ class PatchScans:
         # The newest pose, as reported and on the corrected path
         self._reported: Array | None = None
         self._path = np.zeros(3)
-        self._waiting: list[ImagedPatch] = []
+        self._waiting: list[tuple[int, ImagedPatch]] = []  # and the step in which it was complete
+        self._n_steps = 0
         self._noise = PointNoise(rule)
 
     def take(
@@ -392,17 +396,25 @@ class PatchScans:
             motion = calibrated_motion(between(before, poses[t_ns]), calibration, self._wheels)
             return compose(path, np.append(motion.step_m, motion.turn_rad))
 
-        self._waiting += self._imager.step(frames, pose_at)
+        self._waiting += [(self._n_steps, one) for one in self._imager.step(frames, pose_at)]
         self._reported, self._path = poses[t_ns], pose_at(t_ns)
+
+    def begin_anew(self) -> None:
+        """Forget the frames so far, and what waits: the way from there to now is not known."""
+        self._imager.begin_anew()
+        self._waiting.clear()
 
     def scans(self, calibration: Array) -> list[RangeScan]:
         """Return the scans of the oldest patch that waits: of its points, and of its walls.
 
-        If a patch of each radar waits there are those of several, so that patches of one side are
-        taken one after the other.
+        Each waits until it is known that the wheels did not slip in it. If a patch of each radar
+        could be taken there are those of several, so that patches of one side are taken one after
+        the other.
         """
-        n = max(1, len(self._waiting) - len(self._rig.mounts) + 1)
-        ready, self._waiting = self._waiting[:n], self._waiting[n:]
+        self._n_steps += 1
+        known = [one for step, one in self._waiting if step + MOST_STEPS < self._n_steps]
+        ready = known[: max(1, len(known) - len(self._rig.mounts) + 1)]
+        del self._waiting[: len(ready)]
         for one in ready:
             self._noise.take(one)
         return [scan for one in ready for scan in self._scans(one, calibration)]

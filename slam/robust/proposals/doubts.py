@@ -1,9 +1,8 @@
-"""Doubts: motions that the wheels may not have reported, until known landmarks confirm the pose.
+"""Doubts: carries that may have happened, until known landmarks confirm the pose.
 
-A slip of the wheels (`slam.robust.proposals.slips`), believed or only possible, and a carry that is
-possible during a stop add to the reported covariance. The pose itself stays where it is. A doubt
-ends when landmarks known before it fit the pose, and their ranges leave no direction of the motion
-open: two landmarks abeam of the robot say nothing of where it is along its course.
+A carry that is possible during a stop adds to the reported covariance. The pose itself stays where
+it is. A doubt ends when landmarks known before it fit the pose, and their ranges leave no direction
+of the motion open: two landmarks abeam of the robot say nothing of where it is along its course.
 """
 
 from __future__ import annotations
@@ -66,14 +65,14 @@ def _nothing() -> Array:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Doubt:
-    """Motions that the wheels may not have reported. First of a pair are slips, then carries."""
+    """Carries that the wheels did not report, if they happened."""
 
     next_id: int  # landmarks known before them have smaller ids
     position_m: Array  # shape (2,), where the newest of them may have been
-    probabilities: Array  # shape (2,), added up
-    # shape (2, 3, 3), of x, y [m] and heading for a pose at the position: each probability times
-    # the variances
-    covariances: Array
+    probability: float  # added up
+    # shape (3, 3), of x, y [m] and heading for a pose at the position: the probability times the
+    # variances, added up
+    covariance: Array
     variances: Array  # shape (3,), of x, y [m] and heading if they happened, at the position
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
     # shape (3, 3), of the ranges since about such a motion, at the position
@@ -108,16 +107,16 @@ class Doubt:
         return bool(1.0 / (1.0 + gained[0]) < rule.open_share)
 
     def at(self, position_m: Array) -> Array:
-        """Return the covariances (2, 3, 3) for a pose at a position (2,)."""
+        """Return the covariance (3, 3) for a pose at a position (2,)."""
         T = np.eye(3)
         T[:2, 2] = quarter_turn(position_m - self.position_m)
-        return np.asarray(T @ self.covariances @ T.T)
+        return np.asarray(T @ self.covariance @ T.T)
 
     def add(self, newer: Doubt) -> None:
         """Add a doubt with the same evidence; what is measured of the newer one counts."""
-        self.covariances = self.at(newer.position_m) + newer.covariances
+        self.covariance = self.at(newer.position_m) + newer.covariance
         self.variances = self.variances + newer.variances
-        self.probabilities = self.probabilities + newer.probabilities
+        self.probability += newer.probability
         self.position_m, self.information = newer.position_m, newer.information
 
     def join(self, newer: Doubt) -> None:
@@ -132,23 +131,12 @@ class Doubt:
 def doubted_covariance(doubts: Sequence[Doubt], position_m: Array) -> Array:
     """Return what doubts add to the covariance of a pose at a position (2,), (3, 3).
 
-    Of each doubt the mean motion is covered (`covered_share`). Several slips add up; a robot that
-    stopped often is no more lost than one that was carried.
+    Of each doubt the mean motion is covered (`covered_share`). A robot that stopped often is no
+    more lost than one that was carried.
     """
-    slips, carries, lost_share = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
+    carries, lost_share = np.zeros((3, 3)), 0.0
     for doubt in doubts:
-        slipped, carried = doubt.probabilities.tolist()
-        of_slips, of_carries = doubt.at(position_m)
-        if slipped > 0.0:
-            slips += of_slips * max(covered_share(min(slipped, 1.0)) / slipped, 1.0)
-        if carried > 0.0:
-            share = covered_share(min(carried, 1.0))
-            carries += of_carries * share / carried
-            lost_share += share
-    return slips + carries / max(lost_share, 1.0)
-
-
-def slipped_nats(doubts: Sequence[Doubt]) -> float:
-    """Return how unlikely a slip is where one is doubted; infinite if none is."""
-    slipped = sum(float(doubt.probabilities[0]) for doubt in doubts)
-    return -math.log(min(slipped, 1.0)) if slipped > 0.0 else math.inf
+        share = covered_share(min(doubt.probability, 1.0))
+        carries += doubt.at(position_m) * (share / doubt.probability)
+        lost_share += share
+    return carries / max(lost_share, 1.0)

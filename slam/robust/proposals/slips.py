@@ -1,105 +1,125 @@
-"""Slips of the wheels, decided when they happen.
+"""Jerks: motion that the wheels report for a step or two between steps that are alike.
 
-Where the wheels suddenly report another motion than that of the step before, either the robot made
-it, or the wheels slipped, and the robot went on as before, or stood. The ranges at the end of the
-step are compared under each of these motions. A slip that explains those of several landmarks
-better by its price and `MARGIN_NATS` is believed: the pose becomes as uncertain as after a motion
-that the wheels do not report (`BranchRule.hidden_m`, `BranchRule.hidden_rad`), and the ranges
-correct it. If not, the solution over all poses may find it. Either way a doubt remains
-(`slam.robust.proposals.doubts.Doubt`).
+A robot has inertia, so a motion that begins and ends within two steps is as likely a slip of the
+wheels as its own. The ranges at its end can hardly tell: a turn changes none, until the robot has
+driven on. So neither is decided. The pose stays as the wheels report it, and gets the mean square
+of what it may be off by, with both equally likely: half the square of the jerk, along it. Ranges
+then pull it to the one that is true, and are not refused meanwhile. The solution over all poses has
+the same noise in these steps. No image holds frames of before and after.
 
-The limits of view are widened by the difference of the motions: all are judged by the same
-landmarks.
+A pause and missing frames are no jerks: a step may be any share of the motion around it, by the
+time that it took.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
 
-from slam.config import WheelNoise
-from slam.geometry import compose
-from slam.robust.association import Known, RangeScan, View, weigh_known
-from slam.robust.parameters import MARGIN_NATS, BackEndParameters
-from slam.robust.state import Array, Motion, State, free_motion, predict
+from slam.robust.parameters import SlipRule
+from slam.robust.state import Array, Motion, quarter_turn, rotation
+
+MOST_STEPS = 2
+"""Steps of the longest jerk: a slip between two frames of different radars falls into two."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Course:
-    """A step as the wheels report it, and the motion of the step before."""
+class TimedStep:
+    """A motion that the wheels report, and how long it took."""
 
-    pose: Array  # shape (3,), before the step, map frame
-    before: Motion
-    reported: Motion
+    motion: Motion
+    elapsed_s: float
 
     @property
-    def change(self) -> tuple[float, float]:
-        """Return by how much the two motions differ, [m] and [rad]."""
-        away_m = self.reported.step_m - self.before.step_m
-        turn_rad = abs(self.reported.turn_rad - self.before.turn_rad)
-        return math.hypot(away_m[0], away_m[1]), turn_rad
+    def vector(self) -> Array:
+        """Return dx, dy [m] and turn [rad], body frame before it."""
+        return np.array([*self.motion.step_m, self.motion.turn_rad])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Change:
-    """What the ranges say of a step in which the wheels suddenly report another motion."""
+class Jerk:
+    """How uncertain a jerk leaves what the wheels report.
 
-    probability: float  # that they slipped
-    # If that is believed: the motion of the robot, and whose the ranges are after it
-    slip: tuple[Motion, Known] | None = None
-
-
-def move_anew(
-    state: State, course: Course, motion: Motion, added: Motion, wheels: WheelNoise
-) -> None:
-    """Let a state be after another motion of the step, with so much more noise."""
-    x, y, heading = compose(course.pose, np.array([*motion.step_m, motion.turn_rad])).tolist()
-    state.position_m, state.heading_rad = np.array([x, y]), heading
-    predict(state, added, wheels)
-
-
-def judge_change(
-    state: State,
-    course: Course,
-    scans: Sequence[RangeScan],
-    parameters: BackEndParameters,
-    find: Callable[[State, BackEndParameters], tuple[View, Known]],
-) -> Change | None:
-    """Return what ranges say of a sudden change of the wheels' motion; None if there is none.
-
-    ``state`` is that after the reported motion, and stays as it is. ``find`` returns what a state
-    lets the radars see, and which of the ranges are of which landmarks.
+    Attributes
+    ----------
+    covariances
+        Of each of its steps, shape (3, 3), dx, dy [m] and turn [rad] in the body frame before it:
+        to be added to the noise of the wheels.
+    since
+        No motion, with the noise of all of them in the pose after the step that follows, in its
+        body frame.
     """
-    rule, views, noise = parameters.slips, parameters.continuation, parameters.ranges
-    away_m, turn_rad = course.change
-    if away_m < 2.0 * rule.steady_m and turn_rad < 2.0 * rule.steady_rad:
+
+    covariances: tuple[Array, ...]
+    since: Motion
+
+
+class JerkDetector:
+    """Finds jerks among the steps that the wheels report, one step after they ended."""
+
+    def __init__(self, rule: SlipRule) -> None:
+        self._rule = rule
+        self._scales = np.array([rule.steady_m, rule.steady_m, rule.steady_rad])
+        self._steps: list[TimedStep] = []
+
+    def begin_anew(self) -> None:
+        """Forget the steps so far, as after a motion that the wheels did not report."""
+        self._steps = []
+
+    def take(self, motion: Motion, elapsed_s: float) -> Jerk | None:
+        """Take a step, and return the jerk that ended before it, if there was one."""
+        newest = TimedStep(motion=motion, elapsed_s=elapsed_s)
+        self._steps = [*self._steps[-MOST_STEPS - 1 :], newest]
+        for n in range(1, len(self._steps) - 1):
+            jerk = self._jerk(self._steps[-n - 2 :])
+            if jerk is not None:
+                self._steps = self._steps[-1:]
+                return jerk
         return None
-    wide = replace(
-        parameters,
-        continuation=replace(
-            views,
-            view_margin_rad=views.view_margin_rad + 2.0 * turn_rad,
-            view_sigmas=views.view_sigmas + 2.0 * away_m / noise.sigma_m,
-        ),
-    )
-    steady = free_motion(rule.steady_m, rule.steady_rad)
-    found: list[tuple[float, Motion, Known]] = []
-    for motion in (course.reported, course.before, free_motion(0.0, 0.0)):
-        other = copy.deepcopy(state)
-        move_anew(other, course, motion, steady, parameters.wheels)
-        seen, known = find(other, wide)
-        # What explains a range worse than clutter does is no evidence for it.
-        evidence = np.maximum(weigh_known(other, known, seen, scans, noise).evidence, 0.0)
-        found.append((float(evidence.sum()), motion, known))
-    reported, *others = found
-    most, motion, known = max(others, key=lambda one: one[0])
-    log_odds = most - reported[0] - math.log(rule.changes_per_slip)
-    # Ranges of one landmark alone may be another one's.
-    is_alone = len(np.unique(known.assigned[:, 2])) <= 1
-    slip = (motion, known) if log_odds > MARGIN_NATS and not is_alone else None
-    return Change(probability=float(expit(log_odds)), slip=slip)
+
+    def _jerk(self, steps: Sequence[TimedStep]) -> Jerk | None:
+        """Return what all steps but the first and the last report beyond these two."""
+        first, *between, last = steps
+        around_s = first.elapsed_s + last.elapsed_s
+        away = last.vector / last.elapsed_s - first.vector / first.elapsed_s
+        if not self._is_steady(0.5 * around_s * away):
+            return None
+        rate = (first.vector + last.vector) / around_s
+        beyond = np.array([self._beyond(step, rate) for step in between])
+        whole = beyond.sum(axis=0)
+        if self._is_steady(whole):
+            return None
+        # The same error in all of its steps: more than that of independent ones
+        share = np.sum(np.square(whole / self._scales)) / np.square(beyond / self._scales).sum()
+        # As the pose after the last step has it, whose body frame is turned and moved by that step
+        moved = (whole[:2] + whole[2] * quarter_turn(last.motion.step_m)) @ rotation(
+            last.motion.turn_rad
+        )
+        since = np.array([*moved, whole[2]])
+        return Jerk(
+            covariances=tuple([0.5 * share * np.outer(one, one) for one in beyond]),
+            since=Motion(
+                step_m=np.zeros(2),
+                turn_rad=0.0,
+                covariance=0.5 * np.outer(since, since),
+                walk_variance=0.0,
+            ),
+        )
+
+    def _beyond(self, step: TimedStep, rate: Array) -> Array:
+        """Return what a step reports beyond the share of a motion [m/s, rad/s] that is nearest."""
+        expected = rate * step.elapsed_s
+        square = float(np.sum(np.square(expected / self._scales)))
+        along = float(np.sum(step.vector * expected / self._scales**2))
+        share = min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
+        return np.asarray(step.vector - share * expected)
+
+    def _is_steady(self, change: Array) -> bool:
+        """Return whether a change of motion, dx, dy [m] and turn [rad], is an ordinary one."""
+        return (
+            math.hypot(change[0], change[1]) <= self._rule.steady_m
+            and abs(float(change[2])) <= self._rule.steady_rad
+        )
