@@ -26,18 +26,16 @@ This page is made of the sweeps in `fixtures/baselines`, and a test compares it 
 `python -m hil_tests.architecture.pages.results` writes it.
 
 Rooms and seeds from 9000 on were never looked at while SLAM was developed. `Random rooms`, `The
-paper's rooms` under preset `robust` and `Hardships with points of images` are of those, measured
-with this version but for one number: before the pulse of a module is learnt, what is weaker than .4
-of an echo beside it is not searched for, and then that was .6 (`lab` under `pulse`, seeds 0 to 2:
-6.0, 7.5 and 4.2 mm with .6, 5.6, 7.2 and 4.3 with .4). Of the runs in the other tables some were
-looked at: `lab` and `classroom` with seeds 0 to 17, 31 and 38, from which the weight of ranges was
-chosen; `corridor`, `store` and `two_rooms` with seeds 0 and 1, for the rules of walls and thick
-targets.
+paper's rooms` under preset `robust`, `Hardships with points of images` and `Rooms that deceive,
+with points of images` are of those, measured with this version. Of the runs in the other tables
+some were looked at: `lab` and `classroom` with seeds 0 to 17, 31 and 38, from which the weight of
+ranges was chosen; `corridor`, `store` and `two_rooms` with seeds 0 and 1, for the rules of walls
+and thick targets.
 
 The other tables of preset `robust` are older and without images, as `robust.patches=false` in their
-commands says. Since then, besides, carries are judged by all ranges, a run whose constants are
-implausible takes bodies for thicker, and ranges decide whether a sudden change of the wheels'
-motion is a slip; `First, do no harm` and `Modules like recorded ones` have that, too.
+commands says. Since then, besides, carries are judged by all ranges and a run whose constants are
+implausible takes bodies for thicker, which `First, do no harm` and `Modules like recorded ones`
+have, too; and a slip is no longer decided but leaves the pose uncertain, which they have not.
 
 What the columns mean:
 
@@ -120,6 +118,13 @@ SWEEPS = {
     "images": (
         "Hardships with points of images",
         "Preset `robust`, two laps, other seeds than above.",
+        "",
+        "",
+    ),
+    "deceive": (
+        "Rooms that deceive, with points of images",
+        "Preset `robust`, two laps, three rooms of each family that deceives, as they are and with "
+        "wheels that slip by 6 cm and 8 degrees (standard deviations) once a minute.",
         "",
         "",
     ),

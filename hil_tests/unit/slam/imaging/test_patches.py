@@ -126,6 +126,20 @@ def test_behind_a_long_stand_or_with_other_bins_a_patch_begins_anew() -> None:
     assert maker.add(frame_at(path[46], 90, n_bins=200), path[46]) is None
 
 
+def test_no_patch_holds_frames_of_before_and_after_it_began_anew() -> None:
+    """Two ways of 0.3 m with a turn in between that no pose tells of: each has a patch."""
+    maker = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE)
+    poses = line(0.6)
+    made = []
+    for index, pose in enumerate(poses):
+        if index == 30:
+            maker.begin_anew()
+        patch = maker.add(frame_at(pose, index), pose)
+        made += [] if patch is None else [patch]
+    spans = [np.unique(patch.t_ns // 200_000_000 < 30) for patch in made]
+    assert [span.tolist() for span in spans] == [[True], [False]]
+
+
 @pytest.mark.parametrize(("stood_ns", "n_patches"), [(20_000_000_000, 0), (19_999_999_999, 1)])
 def test_a_robot_that_stood_for_20_s_may_have_been_moved(stood_ns: int, n_patches: int) -> None:
     maker, made = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE), []

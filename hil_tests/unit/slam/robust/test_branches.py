@@ -118,7 +118,7 @@ def test_a_slip_is_taken_back() -> None:
     never = replace(
         rules,
         relinearisation=replace(rules.relinearisation, steps_per_slip=math.inf),
-        slips=replace(rules.slips, changes_per_slip=math.inf),
+        slips=replace(rules.slips, steady_m=math.inf, steady_rad=math.inf),
     )
     plain = RobustBackEnd(paper_rig(), never)
     for report in follow(branches, run.increments, run.scans):
@@ -379,6 +379,7 @@ def test_a_carry_is_dated_to_the_earliest_step_that_explains_as_much(known: Robu
         branches._steps[k] = Step(
             increment=np.zeros(3),
             scans=(),
+            elapsed_s=0.2,
             next_id=known.state.next_id,
             evidence=np.array(evidence, dtype=float).reshape(-1, 2),
             carry_nats=RULE.carry_nats(0.2, 0.0),

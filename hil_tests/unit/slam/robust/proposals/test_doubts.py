@@ -1,4 +1,4 @@
-"""What doubts of the wheels add to a covariance, and when they end."""
+"""What the doubt whether a robot was carried adds to a covariance, and when it ends."""
 
 import math
 
@@ -15,23 +15,22 @@ from slam.robust.proposals.doubts import (
     covered_share,
     doubted_covariance,
     seen_ranges,
-    slipped_nats,
 )
 
 RULE = BranchRule()
 MUCH = 2.0 * RULE.correlated_steps * RULE.most_for
-SLIP = np.diag([1e-4, 1e-4, 0.01])
+CARRY = np.diag([1e-4, 1e-4, 0.01])
 LEVER_M = 0.1
 
 
-def doubtful(x_m: float, slipped: float = 1.0, carried: float = 0.0) -> Doubt:
-    """Return a doubt at a place on the x axis: a motion of covariance SLIP, or a carry."""
+def doubtful(x_m: float, probability: float = 1.0) -> Doubt:
+    """Return a doubt at a place on the x axis: of a motion of covariance CARRY."""
     return Doubt(
         next_id=9,
         position_m=np.array([x_m, 0.0]),
-        probabilities=np.array([slipped, carried]),
-        covariances=np.array([slipped * SLIP, carried * np.diag(RULE.lost_variances)]),
-        variances=np.array(RULE.lost_variances if carried else RULE.hidden_variances),
+        probability=probability,
+        covariance=probability * CARRY,
+        variances=np.array(RULE.hidden_variances),
     )
 
 
@@ -75,32 +74,24 @@ def test_a_doubt_below_the_tail_adds_what_its_mixture_has() -> None:
 
 
 @pytest.mark.parametrize("probability", [5e-4, 0.02, 0.3, 1.0])
-def test_what_a_possible_slip_and_a_possible_carry_add(probability: float) -> None:
-    share = covered_share(probability)
-    np.testing.assert_allclose(at(doubtful(0.0, probability), 0.0), share * SLIP)
-    carry = doubtful(0.0, 0.0, probability)
-    np.testing.assert_allclose(at(carry, 0.0), share * np.diag(RULE.lost_variances))
+def test_what_a_possible_carry_adds(probability: float) -> None:
+    expected = covered_share(probability) * CARRY
+    np.testing.assert_allclose(at(doubtful(0.0, probability), 0.0), expected)
 
 
 @pytest.mark.parametrize(("n", "each"), [(1, 0.04), (3, 0.04), (3, 0.6), (10, 1.0)])
-def test_slips_add_up_and_many_stops_are_no_more_than_one_carry(n: int, each: float) -> None:
+def test_many_stops_are_no_more_than_one_carry(n: int, each: float) -> None:
     share = n * covered_share(each)
-    slips = doubted_covariance([doubtful(0.0, each) for _ in range(n)], np.zeros(2))
-    np.testing.assert_allclose(slips, share * SLIP)
-    carries = doubted_covariance([doubtful(0.0, 0.0, each) for _ in range(n)], np.zeros(2))
-    np.testing.assert_allclose(carries, min(share, 1.0) * np.diag(RULE.lost_variances))
+    carries = doubted_covariance([doubtful(0.0, each) for _ in range(n)], np.zeros(2))
+    np.testing.assert_allclose(carries, min(share, 1.0) * CARRY)
 
 
 @pytest.mark.parametrize(("n", "each"), [(3, 0.04), (3, 0.6)])
-def test_motions_that_one_doubt_holds_are_one_or_several(n: int, each: float) -> None:
-    """Their probabilities add up; where they reach 1, so do the covariances of slips."""
-    slips, carries, total = doubtful(0.0, each), doubtful(0.0, 0.0, each), n * each
+def test_the_probabilities_of_carries_that_one_doubt_holds_add_up(n: int, each: float) -> None:
+    carries = doubtful(0.0, each)
     for _ in range(n - 1):
-        slips.add(doubtful(0.0, each))
-        carries.add(doubtful(0.0, 0.0, each))
-    np.testing.assert_allclose(at(slips, 0.0), max(covered_share(min(total, 1.0)), total) * SLIP)
-    expected = covered_share(min(total, 1.0)) * np.diag(RULE.lost_variances)
-    np.testing.assert_allclose(at(carries, 0.0), expected)
+        carries.add(doubtful(0.0, each))
+    np.testing.assert_allclose(at(carries, 0.0), covered_share(min(n * each, 1.0)) * CARRY)
 
 
 def test_a_doubtful_turn_is_a_doubtful_position_far_from_it() -> None:
@@ -110,13 +101,13 @@ def test_a_doubtful_turn_is_a_doubtful_position_far_from_it() -> None:
     )
 
 
-def test_doubts_of_two_places_add_up_as_independent_ones_do() -> None:
+def test_a_carry_from_one_of_two_places_has_the_mean_of_both() -> None:
     both = doubtful(0.0)
     both.add(doubtful(1.0))
-    expected = [[2e-4, 0.0, 0.0], [0.0, 2e-4 + 0.09 + 0.04, 0.05], [0.0, 0.05, 0.02]]
-    np.testing.assert_allclose(at(both, 3.0), expected)
+    sums = np.array([[2e-4, 0.0, 0.0], [0.0, 2e-4 + 0.09 + 0.04, 0.05], [0.0, 0.05, 0.02]])
+    np.testing.assert_allclose(at(both, 3.0), sums / 2.0)
     apart = doubted_covariance([doubtful(0.0), doubtful(1.0)], np.array([3.0, 0.0]))
-    np.testing.assert_allclose(apart, expected)
+    np.testing.assert_allclose(apart, sums / 2.0)
 
 
 def test_doubts_that_are_joined_need_what_both_need() -> None:
@@ -191,11 +182,3 @@ def test_ranges_of_new_landmarks_tell_nothing_of_a_motion_before_them() -> None:
 def test_a_scan_without_ranges_of_landmarks_has_no_sightings() -> None:
     report = UpdateReport(continued=(), nis=0.0, dof=0)
     assert seen_ranges(report, np.zeros(3), RULE) is None
-
-
-@pytest.mark.parametrize(
-    ("each", "nats"), [((), math.inf), ((0.1, 0.15), math.log(4.0)), ((0.9, 0.9), 0.0)]
-)
-def test_how_unlikely_a_doubted_slip_is(each: tuple[float, ...], nats: float) -> None:
-    doubts = [doubtful(0.0, slipped) for slipped in each]
-    assert slipped_nats([*doubts, doubtful(0.0, 0.0, 1.0)]) == pytest.approx(nats)

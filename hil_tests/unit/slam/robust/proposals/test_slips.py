@@ -1,10 +1,12 @@
-"""Slips that the ranges show at once, and the doubts that others leave (`test_doubts`)."""
+"""Jerks of the wheels: what is one, what it leaves open, and that ranges then decide."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
@@ -15,16 +17,124 @@ from hil_tests.unit.slam.robust.range_world import (
     polar,
     simulate,
 )
-from slam.geometry import compose, paper_rig
-from slam.robust.back_end import RobustBackEnd
+from slam.config import WheelNoise
+from slam.geometry import between, compose, paper_rig
 from slam.robust.branches import Branches
 from slam.robust.parameters import BranchRule, SlipRule
 from slam.robust.proposals.doubts import covered_share
+from slam.robust.proposals.slips import Jerk, JerkDetector
+from slam.robust.state import calibrated_motion
 
 SIGMA_M = 3e-3
+RULE = SlipRule()
 SLIP = np.array([0.03, 0.0, math.radians(8.0)])
-PRIOR = 1.0 / (1.0 + SlipRule().changes_per_slip)
-N_CHANGES = 15  # two laps of four corners, each of which begins and, but for the last one, ends
+AHEAD = np.array([0.1, 0.0, 0.0])
+TURN = np.array([0.0, 0.0, 0.1])
+MOTIONS = st.builds(
+    lambda x, y, turn: np.array([x, y, turn]),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.5, 0.5),
+)
+CHANGES = st.builds(
+    lambda away, direction, turn: np.array(
+        [away * math.cos(direction), away * math.sin(direction), turn]
+    ),
+    st.floats(0.0, 0.49 * RULE.steady_m),
+    st.floats(0.0, math.tau),
+    st.floats(-0.49 * RULE.steady_rad, 0.49 * RULE.steady_rad),
+)
+
+
+def jerks_of(increments: Iterable[Array], took_s: Iterable[float] | None = None) -> list[Jerk]:
+    """Return the jerks of increments that took 0.2 s each, or as long as is given."""
+    detector, steps = JerkDetector(RULE), list(increments)
+    found = [
+        detector.take(calibrated_motion(step, np.zeros(3), WheelNoise()), elapsed_s)
+        for step, elapsed_s in zip(steps, took_s or [0.2] * len(steps), strict=True)
+    ]
+    return [one for one in found if one is not None]
+
+
+def chained(increments: Iterable[Array]) -> Array:
+    pose = np.zeros(3)
+    for increment in increments:
+        pose = compose(pose, increment)
+    return pose
+
+
+@pytest.mark.parametrize("parts", [(1.0,), (0.5, 0.5), (0.8, 0.2)], ids=str)
+@pytest.mark.parametrize("motion", [AHEAD, TURN, np.array([0.2, 0.05, -0.2])], ids=str)
+def test_a_jerk_leaves_the_mean_square_of_both_ways_to_drive(
+    motion: Array, parts: tuple[float, ...]
+) -> None:
+    """Either the robot made the motion, or it went on as around it: an error of half a chance.
+
+    To first order in the jerk.
+    """
+    slip = np.array([0.03, 0.01, 0.12])
+    steps = [motion + part * slip for part in parts]
+    (jerk,) = jerks_of([motion, *steps, motion])
+    reported = chained([*steps, motion])
+    went_on = chained([motion] * (len(parts) + 1))
+    error = between(reported, went_on)
+    np.testing.assert_allclose(
+        jerk.since.covariance, 0.5 * np.outer(error, error), atol=0.1 * float(error @ error)
+    )
+    assert not jerk.since.step_m.any()
+    assert jerk.since.turn_rad == 0.0
+    # The steps together may be off by as much as the jerk
+    total = sum(np.trace(one) for one in jerk.covariances)
+    np.testing.assert_allclose(total, 0.5 * float(slip @ slip), rtol=1e-6)
+
+
+@given(before=MOTIONS, after=MOTIONS, share=st.floats(0.0, 1.0))
+def test_a_motion_that_begins_or_ends_is_no_jerk(before: Array, after: Array, share: float) -> None:
+    """Of any size, also where it begins within a step."""
+    within = before + share * (after - before)
+    assert jerks_of([before] * 4 + [within] + [after] * 4) == []
+
+
+@given(motion=MOTIONS, changes=st.lists(CHANGES, min_size=4, max_size=12))
+def test_what_changes_as_a_steady_motion_does_is_no_jerk(
+    motion: Array, changes: list[Array]
+) -> None:
+    """Two steps together may differ by the limit: each change is less than half of it."""
+    assert jerks_of([motion + 0.5 * change for change in changes]) == []
+
+
+@given(motion=MOTIONS, missing=st.integers(1, 5))
+def test_missing_frames_are_no_jerk(motion: Array, missing: int) -> None:
+    n = missing + 1
+    assert (
+        jerks_of([motion] * 3 + [n * motion] + [motion] * 3, [0.2] * 3 + [0.2 * n] + [0.2] * 3)
+        == []
+    )
+
+
+@given(motion=MOTIONS, share=st.floats(0.0, 1.0), stood_s=st.floats(0.0, 60.0))
+def test_a_pause_is_no_jerk(motion: Array, share: float, stood_s: float) -> None:
+    took_s = [0.2] * 3 + [0.2 + stood_s] + [0.2] * 3
+    assert jerks_of([motion] * 3 + [share * motion] + [motion] * 3, took_s) == []
+
+
+@given(motion=MOTIONS, sign=st.sampled_from([-1.0, 1.0]))
+def test_a_turn_beyond_the_limit_is_a_jerk_once(motion: Array, sign: float) -> None:
+    turn = np.array([0.0, 0.0, sign * 1.01 * RULE.steady_rad])
+    # What turns anyway may turn less for a step: it has paused
+    motion = motion * [1.0, 1.0, 0.0]
+    assert len(jerks_of([motion] * 4 + [motion + turn] + [motion] * 4)) == 1
+
+
+def test_a_motion_that_the_wheels_did_not_report_is_no_neighbour() -> None:
+    detector, motion = JerkDetector(RULE), calibrated_motion(AHEAD, np.zeros(3), WheelNoise())
+    slipped = calibrated_motion(AHEAD + SLIP, np.zeros(3), WheelNoise())
+    assert [detector.take(one, 0.2) for one in (motion, slipped)] == [None, None]
+    detector.begin_anew()
+    assert detector.take(motion, 0.2) is None
+
+
+# --- in the back end ----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -34,23 +144,17 @@ def run() -> Run:
 
 
 def slipped(run: Run, step: int) -> Array:
-    """Return what the wheels report until a step in which they slip."""
-    increments = run.increments[: step + 1].copy()
+    """Return what the wheels report if they slip in a step."""
+    increments = run.increments.copy()
     increments[step] = compose(increments[step], SLIP)
     return increments
 
 
-def probabilities(run: Run, increments: Array) -> Iterator[tuple[RobustBackEnd, float]]:
-    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
-    for _ in follow(back_end, increments, run.scans[: len(increments)]):
-        yield back_end, back_end.slip_probability
-
-
-def straight_steps(run: Run) -> Iterator[int]:
-    """Yield the steps of the second lap that neither begin nor end near a corner."""
+def straight_steps(run: Run) -> list[int]:
+    """Return the steps of the second lap that neither begin nor end near a corner."""
     turns = np.abs(np.diff(run.poses[:, 2]))
     half = len(turns) // 2
-    yield from (k for k in range(half, len(turns) - 5) if not turns[k - 5 : k + 5].any())
+    return [k for k in range(half, len(turns) - 40) if not turns[k - 5 : k + 5].any()]
 
 
 def n_in_view(run: Run, step: int) -> int:
@@ -62,39 +166,41 @@ def n_in_view(run: Run, step: int) -> int:
     return int(found.sum())
 
 
-@pytest.mark.rare
-def test_corners_are_no_slips(run: Run) -> None:
-    found = [probability for _, probability in probabilities(run, run.increments)]
-    assert sum(probability > 0.0 for probability in found) == N_CHANGES
-    assert max(found) < 0.5
+def test_corners_are_no_jerks(run: Run) -> None:
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    for _ in follow(branches, run.increments, [[]] * len(run.increments)):
+        assert not branches.main.has_jerked
 
 
-def test_a_slip_in_sight_of_landmarks_is_believed_at_once(run: Run) -> None:
+def test_a_slip_in_sight_of_landmarks_is_corrected_by_their_ranges(run: Run) -> None:
     step = max(straight_steps(run), key=lambda k: n_in_view(run, k))
     assert n_in_view(run, step) >= 3
-    *_, (back_end, probability) = probabilities(run, slipped(run, step))
-    truth = run.poses[step + 1]
-    assert probability > 0.99
+    branches, end = Branches(paper_rig(), parameters_for(LAB, SIGMA_M)), step + 40
+    jerked = []
+    for k, _ in enumerate(follow(branches, slipped(run, step)[:end], run.scans[:end])):
+        jerked += [k] if branches.main.has_jerked else []
+        if k == step:
+            truth = run.poses[k + 1]
+            turn = math.remainder(branches.main.pose[2] - truth[2], math.tau)
+            assert abs(turn) > math.radians(6.0)  # as the wheels have it
+    assert jerked == [step + 1]
+    truth, back_end = run.poses[end], branches.main
     assert abs(math.remainder(back_end.pose[2] - truth[2], math.tau)) < math.radians(1.5)
     assert math.hypot(*(back_end.pose - truth)[:2]) < 0.02
 
 
-def test_of_a_slip_in_sight_of_nothing_the_prior_is_left(run: Run) -> None:
-    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
-    for _ in follow(branches, slipped(run, 29), [[]] * 30):
-        assert branches.main.slip_probability in (0.0, pytest.approx(PRIOR))
-    assert branches.main.slip_probability == pytest.approx(PRIOR)
-    rule = BranchRule()
-    expected = covered_share(PRIOR) * np.square([rule.hidden_m, rule.hidden_m, rule.hidden_rad])
-    np.testing.assert_allclose(branches.doubted_covariance, np.diag(expected), rtol=1e-9)
-
-
-def test_all_corners_in_sight_of_nothing_are_doubted(run: Run) -> None:
-    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
-    for _ in follow(branches, run.increments, [[]] * len(run.increments)):
-        pass
-    expected = covered_share(N_CHANGES * PRIOR) * BranchRule().hidden_rad ** 2
-    assert branches.doubted_covariance[2, 2] == pytest.approx(expected)
+def test_of_a_slip_in_sight_of_nothing_the_pose_is_that_of_the_wheels(run: Run) -> None:
+    """Its covariance has half of the square of the slip; what it has besides is of the wheels."""
+    ends = []
+    for increments in (slipped(run, 20), run.increments):
+        branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+        for _ in follow(branches, increments[:23], [[]] * 23):
+            pass
+        np.testing.assert_allclose(branches.main.pose, chained(increments[:23]), atol=1e-9)
+        ends.append(branches.main.pose_covariance)
+    added = ends[0] - ends[1]
+    assert added[2, 2] == pytest.approx(0.5 * SLIP[2] ** 2, rel=0.1)
+    assert added[0, 0] == pytest.approx(0.5 * SLIP[0] ** 2, rel=0.1)
 
 
 def test_a_stop_may_have_been_a_carry_until_landmarks_are_recognised(run: Run) -> None:
