@@ -73,7 +73,7 @@ from slam.robust.map import (
     take_map,
 )
 from slam.robust.parameters import BackEndParameters
-from slam.robust.proposals.slips import JerkDetector
+from slam.robust.proposals.slips import SlipDetector
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
     is_due,
@@ -158,8 +158,8 @@ class RobustBackEnd:
         self._past_ways_m: list[float] = []  # of the past poses of the state
         self.lagged: list[PastPose] = []
         """The past poses that became final with the newest motion, with all updates before it."""
-        self._jerks = JerkDetector(parameters.slips)
-        self.has_jerked = False
+        self._slips = SlipDetector(parameters.slips)
+        self.may_have_slipped = False
         """Whether the wheels may have slipped in the steps before the newest one."""
         self._landmark_of_label: dict[int, int] = {}
         if saved is not None:
@@ -346,11 +346,11 @@ class RobustBackEnd:
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
         self._log.add_motion(increment, motion, is_loose=is_loose)
         self._move(motion)
-        self.has_jerked = False
-        if is_loose:
-            self._jerks.begin_anew()
-        elif elapsed_s is not None:
-            self._look_for_jerk(motion, elapsed_s)
+        self.may_have_slipped = False
+        if is_loose or elapsed_s is None:
+            self._slips.begin_anew()
+        else:
+            self._look_for_slip(motion, elapsed_s)
 
     def _move(self, motion: Motion) -> None:
         predict(self.state, motion, self.parameters.wheels)
@@ -358,16 +358,22 @@ class RobustBackEnd:
         self._tentative.move(motion)
         self._walls.tentative.move(motion)
 
-    def _look_for_jerk(self, motion: Motion, elapsed_s: float) -> None:
-        """Let the pose be uncertain where the wheels may have slipped before the newest step."""
-        jerk = self._jerks.take(motion, elapsed_s)
-        if jerk is None:
+    def _look_for_slip(self, motion: Motion, elapsed_s: float) -> None:
+        """Let the pose be uncertain where the wheels may have slipped before the newest step.
+
+        Poses that were kept meanwhile are given up, and so are ranges of before.
+        """
+        slip = self._slips.take(motion, elapsed_s)
+        if slip is None:
             return
-        self.has_jerked = True
-        first = self._log.n_poses - 1 - len(jerk.covariances)
-        for pose, covariance in enumerate(jerk.covariances, start=first):
+        self.may_have_slipped = True
+        first = self._log.n_poses - 1 - len(slip.covariances)
+        for pose, covariance in enumerate(slip.covariances, start=first):
             self._log.loosen(pose, covariance)
-        self._move(jerk.since)
+        n_sure = sum(number < first for number in self.state.past_numbers)
+        self._marginalise_past(slice(n_sure, None))
+        self._move(slip.since)
+        self._unassigned.clear()
 
     def _leave_pose(self, increment: Array) -> None:
         """Before a motion, keep the pose among the past ones if it is one of the few that are kept.
@@ -387,13 +393,13 @@ class RobustBackEnd:
         behind = bisect_right(self._past_ways_m, self._way_m - rule.way_m)
         n = max(behind, len(self._past_ways_m) - rule.most)
         self.lagged = [self.state.past_pose(k) for k in range(n)]
-        self._marginalise_past(n)
+        self._marginalise_past(slice(n))
 
-    def _marginalise_past(self, n: int) -> None:
-        """Marginalise the oldest past poses."""
-        if n:
-            self.state.marginalise_past(n)
-            del self._past_ways_m[:n]
+    def _marginalise_past(self, places: slice) -> None:
+        """Marginalise some of the past poses."""
+        if self._past_ways_m[places]:
+            self.state.marginalise_past(places)
+            del self._past_ways_m[places]
 
     def set_down(self, pose: Array, points: Sequence[tuple[int, Array, Array]]) -> None:
         """Move by a step that the wheels did not measure, to a pose that lays points on landmarks.
@@ -402,12 +408,12 @@ class RobustBackEnd:
         and the covariances of that: the pose becomes as certain as they make it. Past poses are
         given up: between them and the new one the robot was lost.
         """
-        self._marginalise_past(len(self._past_ways_m))
+        self._marginalise_past(slice(None))
         self._keeps_pose = False
         increment = np.zeros(3)
         free = free_motion(_CARRIED_M, _CARRIED_RAD)
         self._log.add_motion(increment, free, is_loose=True)
-        self._jerks.begin_anew()
+        self._slips.begin_anew()
         self._unassigned.clear()
         self._tentative.clear()
         self._walls.tentative.clear()

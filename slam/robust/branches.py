@@ -552,7 +552,7 @@ class Branches:
         begin = max(kept for kept in self._snapshots if kept <= number)
         back_end = self._snapshots[begin].copy()
         for step in (self._steps[taken] for taken in range(begin, number)):
-            back_end.predict(step.increment, step.covariance)
+            back_end.predict(step.increment, step.covariance, elapsed_s=step.elapsed_s)
             back_end.update(step.scans, solve=False)
         return back_end
 
@@ -809,8 +809,9 @@ class Branches:
         """Search for a lost robot by what it sees from now on: what it saw has led nowhere."""
         if carry.base is carry.map:
             carry.base = carry.map.copy()
-        for number in range(carry.since, self._now):  # no pose of the run is missing
-            carry.base.predict(self._steps[number].increment, self._steps[number].covariance)
+        for step in (self._steps[number] for number in range(carry.since, self._now)):
+            # no pose of the run is missing
+            carry.base.predict(step.increment, step.covariance, elapsed_s=step.elapsed_s)
         if carry.is_start:
             self.main, next_id = carry.map.with_empty_map(), self.main.state.next_id
             self.main.state.next_id = next_id

@@ -279,6 +279,10 @@ class RelinearisationRule:
 class SlipRule:
     """When the wheels may have slipped (`slam.robust.proposals.slips`)."""
 
+    most_share: Annotated[float, Origin.CHOSEN] = 1.5
+    """Up to which multiple of the motion around it a step is an ordinary one: times that are a
+    little off make one step shorter and the next one longer."""
+
     steady_m: Annotated[float, Origin.CHOSEN] = 0.01
     """By how much a robot's motion may change from one step to the next; where the wheels report
     more, and go on as before, they may have slipped."""

@@ -207,7 +207,7 @@ class RobustSlam:
         covariance = self._noise_since(self._pose, t_ns)
         stood_s = self._stood_ns / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
-        if self._patches is not None and branches.main.has_jerked:
+        if self._patches is not None and branches.main.may_have_slipped:
             self._patches.begin_anew()
         imaged = {frame.radar for frame in frames} if self._patches is not None else set[int]()
         scans = [*self._scans(detections, sigmas_m, moved, imaged), *given]
@@ -336,6 +336,10 @@ class PointNoise:
         self._differences: deque[tuple[float, float]] = deque(maxlen=rule.differences)
         self.sigma_m, self.sigma_rad = rule.sigma_m, rule.sigma_rad
 
+    def begin_anew(self) -> None:
+        """Compare no patch of before with those that come: the way between them is not known."""
+        self._patches.clear()
+
     def take(self, imaged: ImagedPatch) -> None:
         """Compare the points of a patch, whose origin is on the path of those before."""
         newest = self._patches.setdefault(imaged.patch.radar, [])
@@ -402,6 +406,7 @@ class PatchScans:
     def begin_anew(self) -> None:
         """Forget the frames so far, and what waits: the way from there to now is not known."""
         self._imager.begin_anew()
+        self._noise.begin_anew()
         self._waiting.clear()
 
     def scans(self, calibration: Array) -> list[RangeScan]:

@@ -528,11 +528,13 @@ class State:
         self.past = np.vstack([self.past, self.pose])
         self.past_numbers.append(number)
 
-    def marginalise_past(self, n: int) -> None:
-        """Marginalise the oldest past poses."""
-        first = self.layout.past.start
-        self.P.keep(np.delete(np.arange(self.P.size), np.arange(first, first + 3 * n)))
-        self.past, self.past_numbers = self.past[n:], self.past_numbers[n:]
+    def marginalise_past(self, places: slice) -> None:
+        """Marginalise some of the past poses, which are in the order of the run."""
+        gone = np.arange(len(self.past))[places]
+        columns = self.layout.past.start + 3 * gone[:, None] + np.arange(3)
+        self.P.keep(np.delete(np.arange(self.P.size), columns.ravel()))
+        self.past = np.delete(self.past, gone, axis=0)
+        del self.past_numbers[places]
 
     def remove(self, row: int) -> None:
         """Marginalise a landmark, or a wall; the covariance of the rest stays bit for bit."""

@@ -1,1 +1,1 @@
-"""Other poses than those that the wheels report: after a slip, and anywhere on a map."""
+"""Other motions than those that the wheels report: slips, and carries to anywhere on a map."""

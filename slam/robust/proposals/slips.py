@@ -1,14 +1,15 @@
-"""Jerks: motion that the wheels report for a step or two between steps that are alike.
+"""Possible slips: motion that the wheels report for a step or two between steps that are alike.
 
 A robot has inertia, so a motion that begins and ends within two steps is as likely a slip of the
 wheels as its own. The ranges at its end can hardly tell: a turn changes none, until the robot has
 driven on. So neither is decided. The pose stays as the wheels report it, and gets the mean square
-of what it may be off by, with both equally likely: half the square of the jerk, along it. Ranges
+of what it may be off by, with both equally likely: half the square of that motion, along it. Ranges
 then pull it to the one that is true, and are not refused meanwhile. The solution over all poses has
 the same noise in these steps. No image holds frames of before and after.
 
-A pause and missing frames are no jerks: a step may be any share of the motion around it, by the
-time that it took.
+A pause, missing frames and times that are a little off are no slips: a step may be any share of the
+motion around it, up to half as much again, by the time that it took. So wheels that turn less than
+the robot moves are not seen.
 """
 
 from __future__ import annotations
@@ -20,28 +21,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.robust.parameters import SlipRule
-from slam.robust.state import Array, Motion, quarter_turn, rotation
+from slam.robust.state import Array, Motion
 
 MOST_STEPS = 2
-"""Steps of the longest jerk: a slip between two frames of different radars falls into two."""
+"""Steps of the longest slip: one between two samples of odometry falls into two."""
+
+Vector = tuple[float, float, float]  # dx, dy [m] and turn [rad], body frame before it
+_NONE: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TimedStep:
-    """A motion that the wheels report, and how long it took."""
-
-    motion: Motion
-    elapsed_s: float
-
-    @property
-    def vector(self) -> Array:
-        """Return dx, dy [m] and turn [rad], body frame before it."""
-        return np.array([*self.motion.step_m, self.motion.turn_rad])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Jerk:
-    """How uncertain a jerk leaves what the wheels report.
+class PossibleSlip:
+    """How uncertain a possible slip leaves what the wheels report.
 
     Attributes
     ----------
@@ -57,49 +48,55 @@ class Jerk:
     since: Motion
 
 
-class JerkDetector:
-    """Finds jerks among the steps that the wheels report, one step after they ended."""
+class SlipDetector:
+    """Finds possible slips among the steps that the wheels report, one step after they ended."""
 
     def __init__(self, rule: SlipRule) -> None:
         self._rule = rule
-        self._scales = np.array([rule.steady_m, rule.steady_m, rule.steady_rad])
-        self._steps: list[TimedStep] = []
+        self._weights = (1.0 / rule.steady_m**2, 1.0 / rule.steady_m**2, 1.0 / rule.steady_rad**2)
+        self._steps: list[tuple[Vector, float]] = []
 
     def begin_anew(self) -> None:
         """Forget the steps so far, as after a motion that the wheels did not report."""
         self._steps = []
 
-    def take(self, motion: Motion, elapsed_s: float) -> Jerk | None:
-        """Take a step, and return the jerk that ended before it, if there was one."""
-        newest = TimedStep(motion=motion, elapsed_s=elapsed_s)
-        self._steps = [*self._steps[-MOST_STEPS - 1 :], newest]
+    def take(self, motion: Motion, elapsed_s: float) -> PossibleSlip | None:
+        """Take a step, which took ``elapsed_s``; return the slip that ended before it, if any."""
+        if elapsed_s <= 0.0:  # no rate of such a step is known
+            self.begin_anew()
+            return None
+        dx, dy = motion.step_m.tolist()
+        self._steps = [*self._steps[-MOST_STEPS - 1 :], ((dx, dy, motion.turn_rad), elapsed_s)]
         for n in range(1, len(self._steps) - 1):
-            jerk = self._jerk(self._steps[-n - 2 :])
-            if jerk is not None:
+            slip = self._slip(self._steps[-n - 2 :])
+            if slip is not None:
                 self._steps = self._steps[-1:]
-                return jerk
+                return slip
         return None
 
-    def _jerk(self, steps: Sequence[TimedStep]) -> Jerk | None:
+    def _slip(self, steps: Sequence[tuple[Vector, float]]) -> PossibleSlip | None:
         """Return what all steps but the first and the last report beyond these two."""
-        first, *between, last = steps
-        around_s = first.elapsed_s + last.elapsed_s
-        away = last.vector / last.elapsed_s - first.vector / first.elapsed_s
-        if not self._is_steady(0.5 * around_s * away):
+        (first, first_s), *between, (last, last_s) = steps
+        around_s = first_s + last_s
+        change = [
+            0.5 * around_s * (after / last_s - before / first_s)
+            for before, after in zip(first, last, strict=True)
+        ]
+        if not self._is_steady(change):
             return None
-        rate = (first.vector + last.vector) / around_s
-        beyond = np.array([self._beyond(step, rate) for step in between])
-        whole = beyond.sum(axis=0)
+        rate = [(before + after) / around_s for before, after in zip(first, last, strict=True)]
+        beyond = [
+            self._beyond(step, [value * took_s for value in rate]) for step, took_s in between
+        ]
+        whole = [sum(values) for values in zip(*beyond, strict=True)]
         if self._is_steady(whole):
             return None
-        # The same error in all of its steps: more than that of independent ones
-        share = np.sum(np.square(whole / self._scales)) / np.square(beyond / self._scales).sum()
-        # As the pose after the last step has it, whose body frame is turned and moved by that step
-        moved = (whole[:2] + whole[2] * quarter_turn(last.motion.step_m)) @ rotation(
-            last.motion.turn_rad
-        )
-        since = np.array([*moved, whole[2]])
-        return Jerk(
+        # All of its steps have one error: together they are more uncertain than by separate ones
+        share = self._square(whole) / sum(self._square(one) for one in beyond)
+        since = np.zeros(3)
+        for step, one in zip([*(step for step, _ in between), last], [*beyond, _NONE], strict=True):
+            since = _after(since, step, one)
+        return PossibleSlip(
             covariances=tuple([0.5 * share * np.outer(one, one) for one in beyond]),
             since=Motion(
                 step_m=np.zeros(2),
@@ -109,17 +106,27 @@ class JerkDetector:
             ),
         )
 
-    def _beyond(self, step: TimedStep, rate: Array) -> Array:
-        """Return what a step reports beyond the share of a motion [m/s, rad/s] that is nearest."""
-        expected = rate * step.elapsed_s
-        square = float(np.sum(np.square(expected / self._scales)))
-        along = float(np.sum(step.vector * expected / self._scales**2))
-        share = min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
-        return np.asarray(step.vector - share * expected)
+    def _beyond(self, step: Vector, expected: Sequence[float]) -> Vector:
+        """Return what a step reports beyond the share of an expected motion that is nearest."""
+        square = self._square(expected)
+        products = zip(self._weights, step, expected, strict=True)
+        along = sum(weight * one * other for weight, one, other in products)
+        share = min(max(along / square, 0.0), self._rule.most_share) if square > 0.0 else 0.0
+        x, y, turn = (one - share * other for one, other in zip(step, expected, strict=True))
+        return x, y, turn
 
-    def _is_steady(self, change: Array) -> bool:
-        """Return whether a change of motion, dx, dy [m] and turn [rad], is an ordinary one."""
-        return (
-            math.hypot(change[0], change[1]) <= self._rule.steady_m
-            and abs(float(change[2])) <= self._rule.steady_rad
-        )
+    def _square(self, motion: Sequence[float]) -> float:
+        return sum(weight * value**2 for weight, value in zip(self._weights, motion, strict=True))
+
+    def _is_steady(self, change: Sequence[float]) -> bool:
+        """Return whether a change of motion is an ordinary one."""
+        away_m = math.hypot(change[0], change[1])
+        return away_m <= self._rule.steady_m and abs(change[2]) <= self._rule.steady_rad
+
+
+def _after(error: Array, step: Vector, more: Vector) -> Array:
+    """Return a small error of a pose, in its body frame, after a step that has more of it."""
+    dx, dy, turn = step
+    x, y = error[0] - error[2] * dy + more[0], error[1] + error[2] * dx + more[1]
+    c, s = math.cos(turn), math.sin(turn)
+    return np.array([c * x + s * y, c * y - s * x, error[2] + more[2]])

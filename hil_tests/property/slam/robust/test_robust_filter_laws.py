@@ -229,7 +229,7 @@ def test_where_the_robot_was_stays_until_something_is_measured(seed: int, increm
     held(state, was)
     state.remove(1)
     held(state, was)
-    state.marginalise_past(1)
+    state.marginalise_past(slice(1))
     newer = state.past_pose(0)
     assert newer.number == 10
     assert np.abs(newer.pose - state.pose)[:2].max() <= 1e-12

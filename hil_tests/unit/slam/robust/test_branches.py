@@ -118,7 +118,6 @@ def test_a_slip_is_taken_back() -> None:
     never = replace(
         rules,
         relinearisation=replace(rules.relinearisation, steps_per_slip=math.inf),
-        slips=replace(rules.slips, steady_m=math.inf, steady_rad=math.inf),
     )
     plain = RobustBackEnd(paper_rig(), never)
     for report in follow(branches, run.increments, run.scans):

@@ -18,7 +18,7 @@ from slam.library.evaluation import nees_pose
 from slam.library.slam import make_slam
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Belief, LaggedPose, PoseAt
-from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of
+from slam.robust.pipeline import PatchScans, RobustSlam, back_end_parameters, belief_of
 from slam.robust.state import rotation
 
 Array = NDArray[np.float64]
@@ -450,3 +450,17 @@ def test_noise_of_the_wheels_own_model_changes_nothing_but_roundings() -> None:
     ):
         np.testing.assert_allclose(belief.mean, expected.mean, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(belief.covariance, expected.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_images_begin_anew_where_the_wheels_may_have_slipped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One step after the slip, before the patches of that step are taken."""
+    anew: list[int] = []
+    tick = 0
+    monkeypatch.setattr(PatchScans, "begin_anew", lambda _: anew.append(tick))
+    slam, pose = robust(), np.zeros(3)
+    for tick in range(20):
+        pose = compose(pose, np.array([0.02, 0.0, 0.1 if tick == 10 else 0.0]))
+        slam.step_detections([], {tick * TICK_NS: pose}.__getitem__, tick * TICK_NS)
+    assert anew == [11]
