@@ -35,7 +35,7 @@ and thick targets.
 The other tables of preset `robust` are older and without images, as `robust.patches=false` in their
 commands says. Since then, besides, carries are judged by all ranges and a run whose constants are
 implausible takes bodies for thicker, which `First, do no harm` and `Modules like recorded ones`
-have, too; and a slip is no longer decided but leaves the pose uncertain, which they have not.
+have, too. All of them are of before slips left the pose uncertain.
 
 What the columns mean:
 
@@ -123,7 +123,7 @@ SWEEPS = {
     ),
     "deceive": (
         "Rooms that deceive, with points of images",
-        "Preset `robust`, two laps, three rooms of each family that deceives, as they are and with "
+        "Preset `robust`, two laps, two rooms of each family that deceives, as they are and with "
         "wheels that slip by 6 cm and 8 degrees (standard deviations) once a minute.",
         "",
         "",

@@ -116,7 +116,7 @@ def test_relinearisation_of_3000_poses(benchmark: BenchmarkFixture) -> None:
     run = simulate(LAB, 0, SIGMA_M, clutter=False)
     with threadpool_limits(1):
         for increment, scans in zip(run.increments[:2990], run.scans[:2990], strict=True):
-            back_end.predict(increment)
+            back_end.predict(increment, elapsed_s=0.2)
             back_end.update(scans)
         benchmark.pedantic(  # type: ignore[no-untyped-call]  # no stubs
             lambda twin: twin.relinearise(),

@@ -243,7 +243,7 @@ def test_patches_of_all_radars_are_taken_one_a_state() -> None:
 
 
 def test_what_waits_is_forgotten_with_the_way_to_it() -> None:
-    """A patch that is complete before a jerk is found may hold it; one of after is taken."""
+    """A patch that is complete before a slip is found may hold it; one of after is taken."""
     anew = []
 
     class OneAStep:
