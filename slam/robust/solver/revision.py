@@ -141,15 +141,19 @@ def learn_noise(
     """Let the residuals of a solution choose the noise of ranges, of each landmark and of all.
 
     The variance of single ranges is that of their median residual. A landmark's own is believed in
-    proportion to its passages, for ranges of one passage err alike. That shows in the sums of
-    residuals over some keyframes: had all ranges errors of their own, the variance of a sum would
-    be the number of its terms. A wall's added sigma is never less than `WallRule.roughness_m`.
+    proportion to its passages, for ranges of one passage err alike. So do those of all passages
+    that see a body from one side, on which its scattering centre depends. That shows
+    in the sums of their residuals: had all ranges errors of their own, the variance of a sum would
+    be the number of its terms. Of walls, those of some keyframes are summed. What places and radii
+    take up of the errors is allowed for. A wall's added sigma is never less than
+    `WallRule.roughness_m`.
     """
     n, rule = len(problem.ranges_m), parameters.noise
     if n < rule.fewest_ranges:
         return
     ids, at = state.feature_ids, problem.range_landmarks
-    residual = measurement_residuals(problem, estimate).residual[:n]
+    rows = measurement_residuals(problem, estimate)
+    residual, away = rows.residual[:n], rows.by_pose[:n, :2]
     added = np.array([state.added_sigmas_m.get(id_, 0.0) for id_ in ids])
     given_m = np.sqrt(np.maximum(problem.range_sigmas_m**2 - added[at] ** 2, _LEAST_VARIANCE_M2))
     ratio = residual * problem.range_sigmas_m / given_m
@@ -171,12 +175,15 @@ def learn_noise(
         state.added_sigmas_m[id_] = own[row]
     sigmas_m, most_sigmas = np.hypot(given_m, own[at]), parameters.tracklets.gate_sigmas
     white = np.clip(ratio * given_m / sigmas_m, -most_sigmas, most_sigmas)
-    groups = np.unique(block * len(ids) + at, return_inverse=True)[1]
-    sums = np.bincount(groups, white)
+    aspects = np.floor(np.arctan2(away[:, 1], away[:, 0]) / rule.aspect_rad).astype(np.intp)
+    is_point = at < state.layout.n_landmarks
+    alike = np.column_stack([at, np.where(is_point, aspects, block)])
+    sums = np.bincount(np.unique(alike, axis=0, return_inverse=True)[1].ravel(), white)
     n_groups = len(sums)
+    n_unknowns = (2 + state.layout.has_radii) * len(np.unique(at))
     share = n_groups * float(np.sum(sums**2)) / n
     share += rule.prior_groups * parameters.ranges.variance_share
-    share /= n_groups + rule.prior_groups
+    share /= max(n_groups - n_unknowns, 0) + rule.prior_groups
     share = float(np.clip(share, _LEAST_SHARE, _MOST_SHARE))
     added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
     state.range_errors = replace(state.range_errors, added_m=added_m, variance_share=share)
