@@ -140,13 +140,13 @@ def learn_noise(
 ) -> None:
     """Let the residuals of a solution choose the noise of ranges, of each landmark and of all.
 
-    The variance of single ranges is that of their median residual. A landmark's own is believed in
-    proportion to its passages, for ranges of one passage err alike. So do those of all passages
-    that see a body from one side, on which its scattering centre depends. That shows
-    in the sums of their residuals: had all ranges errors of their own, the variance of a sum would
-    be the number of its terms. Of walls, those of some keyframes are summed. What places and radii
-    take up of the errors is allowed for. A wall's added sigma is never less than
-    `WallRule.roughness_m`.
+    The variance of single ranges is that of their median residual; a landmark's own is believed in
+    proportion to its passages. A wall's added sigma is never less than `WallRule.roughness_m`.
+    Where many ranges are averaged, more must be allowed for: those that see a body from one side
+    err alike, on every lap, since its scattering centre depends on the side. The sums of their
+    residuals show it: had all ranges errors of their own, the variance of a sum would be the number
+    of its terms. Of walls those of some keyframes are summed. Errors that places and radii have
+    taken up are missing in the residuals, which counts as so many sums less.
     """
     n, rule = len(problem.ranges_m), parameters.noise
     if n < rule.fewest_ranges:

@@ -7,14 +7,17 @@ import pytest
 
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
+    echoes_of,
     follow,
     parameters_for,
+    place_landmarks,
     reported,
     scans_of,
+    true_path,
 )
 from slam.config import WheelNoise, load_preset, override
-from slam.geometry import paper_rig
-from slam.robust.association import Correspondence, Pairs
+from slam.geometry import compose, paper_rig
+from slam.robust.association import Correspondence, Pairs, RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import BodyPoint, initialise_landmark
 from slam.robust.map import Existence, find_merge, judge, named_pairs
@@ -196,6 +199,44 @@ def test_ranges_that_err_alike_move_the_pose_less() -> None:
         list(follow(back_end, increments, scans_of(poses, PLACES, rng, SIGMA_M)))
         sigmas.append(math.sqrt(back_end.pose_covariance[0, 0]))
     assert 1.0 < sigmas[1] / sigmas[0] <= 2.0
+
+
+def learned_share(laps: int, white_m: float, by_aspect_m: float) -> float:
+    """Return the share of the variance that ranges with two errors show on laps of one course.
+
+    One is of its own in each range, one is that of the side from which a body is seen: the same
+    sine on each lap. The latter's standard deviation is ``by_aspect_m``.
+    """
+    rng = np.random.default_rng(38)
+    poses, landmarks = true_path(LAB, laps), place_landmarks(LAB, rng)
+    increments, phases = reported(poses, LAB, rng, 0.0), rng.uniform(0.0, math.tau, len(landmarks))
+    ranges, seen = echoes_of(poses, landmarks, rng, white_m, 0.0)
+    for radar, mount in enumerate(paper_rig().mounts):
+        antennas = np.array(
+            [compose(pose, np.array([mount.x_m, mount.y_m, 0.0])) for pose in poses]
+        )
+        away = antennas[:, None, :2] - landmarks
+        aspects = np.arctan2(away[..., 1], away[..., 0])
+        ranges[radar] += math.sqrt(2.0) * by_aspect_m * np.sin(6.0 * aspects + phases)
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, math.hypot(white_m, by_aspect_m)))
+    scans = [
+        [
+            RangeScan(radar=radar, ranges_m=tuple(ranges[radar, k, seen[radar, k]]))
+            for radar in range(4)
+        ]
+        for k in range(1, len(poses))
+    ]
+    list(follow(back_end, increments, scans))
+    back_end.relinearise()
+    return back_end.state.range_errors.variance_share
+
+
+@pytest.mark.rare
+def test_errors_that_come_again_on_a_second_lap_weigh_twice_as_much() -> None:
+    """Two laps say of a body what one says; white ranges have the variance that they state."""
+    assert 0.6 < learned_share(1, 4e-3, 0.0) < 1.4
+    once, twice = (learned_share(laps, 1e-3, 4e-3) for laps in (1, 2))
+    assert 1.6 < twice / once < 2.4
 
 
 def test_a_miss_says_the_less_the_oftener_a_landmark_was_missed() -> None:
