@@ -299,7 +299,8 @@ class NoiseRule:
     keys_per_passage: Annotated[int, Origin.CHOSEN, "keyframes"] = 5
     """Over so many keyframes the errors of the ranges of one landmark are correlated."""
     aspect_rad: Annotated[float, Origin.CHOSEN] = 0.25
-    """Seen from within such an angle, a body errs alike, on every lap."""
+    """Seen from within such an angle, a body errs alike, on every lap; 0: on one passage only, as
+    things do whose surface is what is measured."""
     prior_passages: Annotated[int, Origin.CHOSEN, "groups"] = 5
     """Weight of the noise of all landmarks in that of one, in groups of that length."""
     prior_groups: Annotated[int, Origin.CHOSEN, "groups"] = 30

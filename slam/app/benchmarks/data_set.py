@@ -131,6 +131,8 @@ class Sensor:
     jump_sigma_m: float = 0.0
     jump_sigma_rad: float = 0.0
     range_offset_sigma_m: float = 0.0  # of the unknown constant error of all ranges
+    # Whether it is a laser or a camera: of surfaces, errors do not depend on the side
+    is_optical: bool = False
     # Share of the variance of range and bearing that is one error as long as a landmark is in view
     common_share: float = 0.0
 

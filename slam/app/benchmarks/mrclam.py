@@ -45,6 +45,7 @@ _RANGE_SHARE, _BEARING_SIGMA_RAD = 0.04, 0.02
 _LEAST_RANGE_SIGMA_M = 0.05
 
 SENSOR = Sensor(
+    is_optical=True,
     wheels=WheelNoise(
         along_m_per_sqrt_m=0.05,
         across_m_per_sqrt_m=0.02,

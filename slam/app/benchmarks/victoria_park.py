@@ -79,6 +79,7 @@ _MOST_MPS = 25.0
 """The wheels never report more than 7 m/s; the noise of two fixes adds up to 18 m/s to that."""
 
 SENSOR = Sensor(
+    is_optical=True,
     wheels=WheelNoise(
         along_m_per_sqrt_m=0.1,
         across_m_per_sqrt_m=0.1,

@@ -175,9 +175,10 @@ def learn_noise(
         state.added_sigmas_m[id_] = own[row]
     sigmas_m, most_sigmas = np.hypot(given_m, own[at]), parameters.tracklets.gate_sigmas
     white = np.clip(ratio * given_m / sigmas_m, -most_sigmas, most_sigmas)
-    aspects = np.floor(np.arctan2(away[:, 1], away[:, 0]) / rule.aspect_rad).astype(np.intp)
-    is_point = at < state.layout.n_landmarks
-    alike = np.column_stack([at, np.where(is_point, aspects, block)])
+    alike = np.column_stack([at, block])
+    if rule.aspect_rad > 0.0:
+        aspects = np.floor(np.arctan2(away[:, 1], away[:, 0]) / rule.aspect_rad)
+        alike[:, 1] = np.where(at < state.layout.n_landmarks, aspects, block)
     sums = np.bincount(np.unique(alike, axis=0, return_inverse=True)[1].ravel(), white)
     n_groups = len(sums)
     n_unknowns = (2 + state.layout.has_radii) * len(np.unique(at))
