@@ -5,7 +5,7 @@ anchor each range says what it is of; its noise is given with it. Here tag and w
 ranges are off by 5 cm, the wheels by 2 % of the way. It prints
 
 ```text
-after 24 m: wheels 24 cm off, SLAM 3 cm
+after 24 m: wheels 24 cm off, SLAM 2 cm
 anchor 101 at +4.0, +3.0 m
 anchor 102 at -3.0, +2.0 m
 anchor 103 at +2.0, -4.0 m
