@@ -104,8 +104,8 @@ SWEEPS = {
         "Nothing is set per room. The version before points of images were detections was .81 and "
         ".20 of the wheels in the same offices (causal and smoothed) and .85 and .30 in the dense "
         "rooms, and worse than the wheels in four of either ten; with pillars and people it was "
-        "about as today: .16 and .03, .17 and .06. The picture shows two rooms and a hardship before and "
-        "after preset `robust` allowed for model error.",
+        "about as today: .16 and .03, .17 and .06. The picture shows two rooms and a hardship "
+        "before and after preset `robust` allowed for model error.",
         "before_after.png",
         "Paths in pillars:1, office:3 and under wander_10, before and after",
     ),
