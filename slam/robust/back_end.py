@@ -158,7 +158,7 @@ class RobustBackEnd:
         self._past_ways_m: list[float] = []  # of the past poses of the state
         self.lagged: list[PastPose] = []
         """The past poses that became final with the newest motion, with all updates before it."""
-        self._slips = SlipDetector(parameters.slips)
+        self._slips = SlipDetector(parameters.slips, parameters.relinearisation.outlier_sigmas)
         self.may_have_slipped = False
         """Whether the wheels may have slipped in the steps before the newest one."""
         self._landmark_of_label: dict[int, int] = {}

@@ -8,8 +8,8 @@ then pull it to the one that is true, and are not refused meanwhile. The solutio
 the same noise in these steps. No image holds frames of before and after.
 
 A pause, missing frames and times that are a little off are no slips: a step may be any share of the
-motion around it, up to half as much again, by the time that it took. So wheels that turn less than
-the robot moves are not seen.
+motion around it, up to half as much again, by the time that it took. Nor is what the noise of the
+wheels explains. Wheels that turn less than the robot moves are not seen.
 """
 
 from __future__ import annotations
@@ -49,16 +49,20 @@ class PossibleSlip:
 
 
 class SlipDetector:
-    """Finds possible slips among the steps that the wheels report, one step after they ended."""
+    """Finds possible slips among the steps that the wheels report, one step after they ended.
 
-    def __init__(self, rule: SlipRule) -> None:
-        self._rule = rule
+    What is less than ``outlier_sigmas`` standard deviations of the wheels' noise is none.
+    """
+
+    def __init__(self, rule: SlipRule, outlier_sigmas: float) -> None:
+        self._rule, self._outlier_sigmas = rule, outlier_sigmas
         self._weights = (1.0 / rule.steady_m**2, 1.0 / rule.steady_m**2, 1.0 / rule.steady_rad**2)
         self._steps: list[tuple[Vector, float]] = []
+        self._variances: list[Vector] = []
 
     def begin_anew(self) -> None:
         """Forget the steps so far, as after a motion that the wheels did not report."""
-        self._steps = []
+        self._steps, self._variances = [], []
 
     def take(self, motion: Motion, elapsed_s: float) -> PossibleSlip | None:
         """Take a step, which took ``elapsed_s``; return the slip that ended before it, if any."""
@@ -67,10 +71,12 @@ class SlipDetector:
             return None
         dx, dy = motion.step_m.tolist()
         self._steps = [*self._steps[-MOST_STEPS - 1 :], ((dx, dy, motion.turn_rad), elapsed_s)]
+        of_x, of_y, of_turn = motion.covariance.diagonal().tolist()
+        self._variances = [*self._variances[-MOST_STEPS - 1 :], (of_x, of_y, of_turn)]
         for n in range(1, len(self._steps) - 1):
             slip = self._slip(self._steps[-n - 2 :])
             if slip is not None:
-                self._steps = self._steps[-1:]
+                self._steps, self._variances = self._steps[-1:], self._variances[-1:]
                 return slip
         return None
 
@@ -89,7 +95,11 @@ class SlipDetector:
             self._beyond(step, [value * took_s for value in rate]) for step, took_s in between
         ]
         whole = [sum(values) for values in zip(*beyond, strict=True)]
-        if self._is_steady(whole):
+        # The share of a step that is a little short leaves over some of its turn
+        between_s = sum(took_s for _, took_s in between)
+        reported = [sum(values) for values in zip(*(step for step, _ in between), strict=True)]
+        change = [one - value * between_s for one, value in zip(reported, rate, strict=True)]
+        if self._is_steady(whole) or self._is_steady(change):
             return None
         # All of its steps have one error: together they are more uncertain than by separate ones
         share = self._square(whole) / sum(self._square(one) for one in beyond)
@@ -120,8 +130,10 @@ class SlipDetector:
 
     def _is_steady(self, change: Sequence[float]) -> bool:
         """Return whether a change of motion is an ordinary one."""
-        away_m = math.hypot(change[0], change[1])
-        return away_m <= self._rule.steady_m and abs(change[2]) <= self._rule.steady_rad
+        x, y, turn = (sum(values) for values in zip(*self._variances, strict=True))
+        most_m = max(self._rule.steady_m, self._outlier_sigmas * math.sqrt(x + y))
+        most_rad = max(self._rule.steady_rad, self._outlier_sigmas * math.sqrt(turn))
+        return math.hypot(change[0], change[1]) <= most_m and abs(change[2]) <= most_rad
 
 
 def _after(error: Array, step: Vector, more: Vector) -> Array:

@@ -50,10 +50,15 @@ CHANGES = st.builds(
 def slips_of(
     increments: Iterable[Array], took_s: Iterable[float] | None = None
 ) -> list[PossibleSlip]:
-    """Return the possible slips of increments that took 0.2 s each, or as long as is given."""
-    detector, steps = SlipDetector(RULE), list(increments)
+    """Return the possible slips of increments that took 0.2 s each, or as long as is given.
+
+    The wheels have next to no noise.
+    """
+    detector, steps = SlipDetector(RULE, 4.0), list(increments)
     found = [
-        detector.take(calibrated_motion(step, np.zeros(3), WheelNoise()), elapsed_s)
+        detector.take(
+            calibrated_motion(step, np.zeros(3), WheelNoise(), 1e-12 * np.eye(3)), elapsed_s
+        )
         for step, elapsed_s in zip(steps, took_s or [0.2] * len(steps), strict=True)
     ]
     return [one for one in found if one is not None]
@@ -145,13 +150,24 @@ def test_a_turn_beyond_the_limit_is_a_slip_once(motion: Array, sign: float) -> N
     assert len(slips_of([motion] * 4 + [motion + turn] + [motion] * 4)) == 1
 
 
+def test_what_the_noise_of_the_wheels_explains_is_no_slip() -> None:
+    """Four steps of 6 mm noise along and across: four sigmas of all are 68 mm."""
+    covariance = np.diag([6e-3, 6e-3, 1e-4]) ** 2
+    for away_m, n_found in ((0.066, 0), (0.07, 1)):
+        detector, steps = SlipDetector(RULE, 4.0), [AHEAD] * 3
+        steps += [AHEAD + np.array([0.0, away_m, 0.0]), AHEAD, AHEAD]
+        motions = [calibrated_motion(one, np.zeros(3), WheelNoise(), covariance) for one in steps]
+        found = [detector.take(one, 0.2) for one in motions]
+        assert sum(one is not None for one in found) == n_found
+
+
 def test_two_steps_of_one_time_have_no_rate() -> None:
     assert slips_of([AHEAD, AHEAD + SLIP, AHEAD, AHEAD], [0.2, 0.2, 0.0, 0.2]) == []
     assert slips_of([AHEAD, AHEAD + SLIP, AHEAD, AHEAD], [0.2, 0.0, 0.2, 0.2]) == []
 
 
 def test_a_motion_that_the_wheels_did_not_report_is_no_neighbour() -> None:
-    detector, motion = SlipDetector(RULE), calibrated_motion(AHEAD, np.zeros(3), WheelNoise())
+    detector, motion = SlipDetector(RULE, 4.0), calibrated_motion(AHEAD, np.zeros(3), WheelNoise())
     slipped = calibrated_motion(AHEAD + SLIP, np.zeros(3), WheelNoise())
     assert [detector.take(one, 0.2) for one in (motion, slipped)] == [None, None]
     detector.begin_anew()
