@@ -57,8 +57,8 @@ class SlipDetector:
     def __init__(self, rule: SlipRule, outlier_sigmas: float) -> None:
         self._rule, self._outlier_sigmas = rule, outlier_sigmas
         self._weights = (1.0 / rule.steady_m**2, 1.0 / rule.steady_m**2, 1.0 / rule.steady_rad**2)
-        self._steps: list[tuple[Vector, float]] = []
-        self._variances: list[Vector] = []
+        self._steps: list[tuple[Vector, float]] = []  # and how long they took [s]
+        self._variances: list[Vector] = []  # of their noise
 
     def begin_anew(self) -> None:
         """Forget the steps so far, as after a motion that the wheels did not report."""
@@ -129,7 +129,7 @@ class SlipDetector:
         return sum(weight * value**2 for weight, value in zip(self._weights, motion, strict=True))
 
     def _is_steady(self, change: Sequence[float]) -> bool:
-        """Return whether a change of motion is an ordinary one."""
+        """Return whether a change, dx, dy [m] and turn [rad], is an ordinary one."""
         x, y, turn = (sum(values) for values in zip(*self._variances, strict=True))
         most_m = max(self._rule.steady_m, self._outlier_sigmas * math.sqrt(x + y))
         most_rad = max(self._rule.steady_rad, self._outlier_sigmas * math.sqrt(turn))
@@ -137,7 +137,10 @@ class SlipDetector:
 
 
 def _after(error: Array, step: Vector, more: Vector) -> Array:
-    """Return a small error of a pose, in its body frame, after a step that has more of it."""
+    """Return the error of a pose, shape (3,), dx, dy [m] and turn [rad] in its body frame.
+
+    ``error`` is that of the pose before a step, ``more`` that of the step; both are small.
+    """
     dx, dy, turn = step
     x, y = error[0] - error[2] * dy + more[0], error[1] + error[2] * dx + more[1]
     c, s = math.cos(turn), math.sin(turn)

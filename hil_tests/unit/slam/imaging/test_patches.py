@@ -127,7 +127,7 @@ def test_behind_a_long_stand_or_with_other_bins_a_patch_begins_anew() -> None:
 
 
 def test_no_patch_holds_frames_of_before_and_after_it_began_anew() -> None:
-    """Two ways of 0.3 m: each has a patch, and there is none of both."""
+    """Each half of a way of 0.6 m has a patch; no patch holds frames of both halves."""
     maker = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE)
     poses = line(0.6)
     made = []
