@@ -93,6 +93,7 @@ from slam.robust.state import (
     calibrated_motion,
     free_motion,
     predict,
+    rotation,
 )
 from slam.robust.walls import WallKeeper
 
@@ -192,6 +193,16 @@ class RobustBackEnd:
     @property
     def pose_covariance(self) -> Array:
         return self.state.pose_covariance()
+
+    @property
+    def undecided_covariance(self) -> Array:
+        """Return what the newest steps add to it where they may be a slip, (3, 3).
+
+        The filter gets that when the next step tells that they may (`slam.robust.proposals.slips`).
+        """
+        to_map = np.eye(3)
+        to_map[:2, :2] = rotation(self.state.heading_rad)
+        return np.asarray(to_map @ self._slips.undecided_covariance() @ to_map.T)
 
     @property
     def landmark_of_label(self) -> Mapping[int, int]:

@@ -384,11 +384,12 @@ class Branches:
 
     @property
     def doubted_covariance(self) -> Array:
-        """Return what doubts add to the covariance of the pose, (3, 3).
+        """Return what doubts and undecided slips add to the covariance of the pose, (3, 3).
 
         The map frame is that of ``main``.
         """
-        return doubted_covariance(self._doubts, self.main.state.position_m)
+        carries = doubted_covariance(self._doubts, self.main.state.position_m)
+        return carries + self.main.undecided_covariance
 
     def predict(
         self,

@@ -283,10 +283,10 @@ class SlipRule:
     """Up to which multiple of the motion around it a step is an ordinary one: times that are a
     little off make one step shorter and the next one longer."""
 
-    steady_m: Annotated[float, Origin.CHOSEN] = 0.01
+    steady_m: Annotated[float, Origin.CHOSEN] = 0.005
     """By how much a robot's motion may change from one step to the next; where the wheels report
     more, and go on as before, they may have slipped."""
-    steady_rad: Annotated[float, Origin.CHOSEN] = 0.02
+    steady_rad: Annotated[float, Origin.CHOSEN] = 0.01
     """The same of its turn."""
 
 

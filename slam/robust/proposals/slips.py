@@ -9,14 +9,16 @@ the same noise in these steps. No image holds frames of before and after.
 
 A pause, missing frames and times that are a little off are no slips: a step may be any share of the
 motion around it, up to half as much again, by the time that it took. Nor is what the noise of the
-wheels explains. Wheels that turn less than the robot moves are not seen.
+wheels explains. Before its first step the robot is taken to have moved as it does after it. Wheels
+that turn less than the robot moves are not seen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +30,14 @@ MOST_STEPS = 2
 
 Vector = tuple[float, float, float]  # dx, dy [m] and turn [rad], body frame before it
 _NONE: Vector = (0.0, 0.0, 0.0)
+
+
+class _Step(NamedTuple):
+    """What the wheels report of a step, how long it took, and the variances of its noise."""
+
+    motion: Vector
+    took_s: float
+    variances: Vector
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,12 +67,12 @@ class SlipDetector:
     def __init__(self, rule: SlipRule, outlier_sigmas: float) -> None:
         self._rule, self._outlier_sigmas = rule, outlier_sigmas
         self._weights = (1.0 / rule.steady_m**2, 1.0 / rule.steady_m**2, 1.0 / rule.steady_rad**2)
-        self._steps: list[tuple[Vector, float]] = []  # and how long they took [s]
-        self._variances: list[Vector] = []  # of their noise
+        # The newest steps; None stands for those before the first one, which nobody knows
+        self._steps: list[_Step | None] = [None]
 
     def begin_anew(self) -> None:
         """Forget the steps so far, as after a motion that the wheels did not report."""
-        self._steps, self._variances = [], []
+        self._steps = [None]
 
     def take(self, motion: Motion, elapsed_s: float) -> PossibleSlip | None:
         """Take a step, which took ``elapsed_s``; return the slip that ended before it, if any."""
@@ -70,42 +80,55 @@ class SlipDetector:
             self.begin_anew()
             return None
         dx, dy = motion.step_m.tolist()
-        self._steps = [*self._steps[-MOST_STEPS - 1 :], ((dx, dy, motion.turn_rad), elapsed_s)]
         of_x, of_y, of_turn = motion.covariance.diagonal().tolist()
-        self._variances = [*self._variances[-MOST_STEPS - 1 :], (of_x, of_y, of_turn)]
-        for n in range(1, len(self._steps) - 1):
-            slip = self._slip(self._steps[-n - 2 :])
+        last = _Step((dx, dy, motion.turn_rad), elapsed_s, (of_x, of_y, of_turn))
+        for first, between in self._newest():
+            slip = self._slip(first or last, between, last)
             if slip is not None:
-                self._steps, self._variances = self._steps[-1:], self._variances[-1:]
+                self._steps = [last]
                 return slip
+        self._steps = [*self._steps[-MOST_STEPS:], last]
         return None
 
-    def _slip(self, steps: Sequence[tuple[Vector, float]]) -> PossibleSlip | None:
-        """Return what all steps but the first and the last report beyond these two."""
-        (first, first_s), *between, (last, last_s) = steps
-        around_s = first_s + last_s
+    def undecided_covariance(self) -> Array:
+        """Return what the newest steps add to the covariance of the pose, (3, 3), body frame.
+
+        They may be a slip, if the robot goes on as before them; the next step tells.
+        """
+        error = np.zeros(3)
+        for first, between in self._newest():
+            if first is not None:
+                rate = [value / first.took_s for value in first.motion]
+                beyond = self._beyond(between, rate, [first, *between])
+                error = np.zeros(3) if beyond is None else _error_after(between, beyond)
+        return 0.5 * np.outer(error, error)
+
+    def _newest(self) -> Iterator[tuple[_Step | None, list[_Step]]]:
+        """Yield the newest steps that may be of one slip, fewest first, and the one before them."""
+        for n in range(1, min(MOST_STEPS, len(self._steps) - 1) + 1):
+            first, *between = self._steps[-n - 1 :]
+            yield first, [step for step in between if step is not None]
+
+    def _slip(self, first: _Step, between: Sequence[_Step], last: _Step) -> PossibleSlip | None:
+        """Return what steps report beyond the one before and the one after them."""
+        steps = [first, *between, last]
+        around_s = first.took_s + last.took_s
         change = [
-            0.5 * around_s * (after / last_s - before / first_s)
-            for before, after in zip(first, last, strict=True)
+            0.5 * around_s * (after / last.took_s - before / first.took_s)
+            for before, after in zip(first.motion, last.motion, strict=True)
         ]
-        if not self._is_steady(change):
+        if not self._is_steady(change, steps):
             return None
-        rate = [(before + after) / around_s for before, after in zip(first, last, strict=True)]
-        beyond = [
-            self._beyond(step, [value * took_s for value in rate]) for step, took_s in between
+        rate = [
+            (before + after) / around_s
+            for before, after in zip(first.motion, last.motion, strict=True)
         ]
-        whole = [sum(values) for values in zip(*beyond, strict=True)]
-        # The share of a step that is a little short leaves over some of its turn
-        between_s = sum(took_s for _, took_s in between)
-        reported = [sum(values) for values in zip(*(step for step, _ in between), strict=True)]
-        change = [one - value * between_s for one, value in zip(reported, rate, strict=True)]
-        if self._is_steady(whole) or self._is_steady(change):
+        beyond = self._beyond(between, rate, steps)
+        if beyond is None:
             return None
         # All of its steps have one error: together they are more uncertain than by separate ones
-        share = self._square(whole) / sum(self._square(one) for one in beyond)
-        since = np.zeros(3)
-        for step, one in zip([*(step for step, _ in between), last], [*beyond, _NONE], strict=True):
-            since = _after(since, step, one)
+        share = self._square(_sum(beyond)) / sum(self._square(one) for one in beyond)
+        since = _error_after([*between, last], [*beyond, _NONE])
         return PossibleSlip(
             covariances=tuple([0.5 * share * np.outer(one, one) for one in beyond]),
             since=Motion(
@@ -116,32 +139,61 @@ class SlipDetector:
             ),
         )
 
-    def _beyond(self, step: Vector, expected: Sequence[float]) -> Vector:
-        """Return what a step reports beyond the share of an expected motion that is nearest."""
+    def _beyond(
+        self, steps: Sequence[_Step], rate: Sequence[float], around: Sequence[_Step]
+    ) -> list[Vector] | None:
+        """Return what steps report beyond a rate of motion; None if that is an ordinary change.
+
+        ``around`` are all steps that the rate is of, and these.
+        """
+        expected = [[value * step.took_s for value in rate] for step in steps]
+
+        def parts(most_share: float) -> list[Vector]:
+            pairs = zip(steps, expected, strict=True)
+            return [self._off(step.motion, one, most_share) for step, one in pairs]
+
+        # The share of a step that is a little short leaves over some of its turn
+        change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
+        if any(
+            self._is_steady(one, around) for one in (_sum(parts(self._rule.most_share)), change)
+        ):
+            return None
+        return parts(1.0)
+
+    def _off(self, step: Vector, expected: Sequence[float], most_share: float) -> Vector:
+        """Return what a step has beyond the share of an expected motion that is nearest to it."""
         square = self._square(expected)
         products = zip(self._weights, step, expected, strict=True)
         along = sum(weight * one * other for weight, one, other in products)
-        share = min(max(along / square, 0.0), self._rule.most_share) if square > 0.0 else 0.0
+        share = min(max(along / square, 0.0), most_share) if square > 0.0 else 0.0
         x, y, turn = (one - share * other for one, other in zip(step, expected, strict=True))
         return x, y, turn
 
     def _square(self, motion: Sequence[float]) -> float:
         return sum(weight * value**2 for weight, value in zip(self._weights, motion, strict=True))
 
-    def _is_steady(self, change: Sequence[float]) -> bool:
-        """Return whether a change, dx, dy [m] and turn [rad], is an ordinary one."""
-        x, y, turn = (sum(values) for values in zip(*self._variances, strict=True))
+    def _is_steady(self, change: Sequence[float], steps: Sequence[_Step]) -> bool:
+        """Return whether a change among steps, dx, dy [m] and turn [rad], is an ordinary one."""
+        x, y, turn = _sum([one.variances for one in steps])
         most_m = max(self._rule.steady_m, self._outlier_sigmas * math.sqrt(x + y))
         most_rad = max(self._rule.steady_rad, self._outlier_sigmas * math.sqrt(turn))
         return math.hypot(change[0], change[1]) <= most_m and abs(change[2]) <= most_rad
 
 
-def _after(error: Array, step: Vector, more: Vector) -> Array:
-    """Return the error of a pose, shape (3,), dx, dy [m] and turn [rad] in its body frame.
+def _sum(motions: Sequence[Sequence[float]]) -> Vector:
+    x, y, turn = (sum(values) for values in zip(*motions, strict=True))
+    return x, y, turn
 
-    ``error`` is that of the pose before a step, ``more`` that of the step; both are small.
+
+def _error_after(steps: Sequence[_Step], errors: Sequence[Vector]) -> Array:
+    """Return the error of the pose after steps, shape (3,), dx, dy [m] and turn [rad].
+
+    It is in the body frame of that pose; ``errors`` are those of the steps, and small.
     """
-    dx, dy, turn = step
-    x, y = error[0] - error[2] * dy + more[0], error[1] + error[2] * dx + more[1]
-    c, s = math.cos(turn), math.sin(turn)
-    return np.array([c * x + s * y, c * y - s * x, error[2] + more[2]])
+    x, y, angle = _NONE
+    for step, more in zip(steps, errors, strict=True):
+        dx, dy, turn = step.motion
+        x, y = x - angle * dy + more[0], y + angle * dx + more[1]
+        c, s = math.cos(turn), math.sin(turn)
+        x, y, angle = c * x + s * y, c * y - s * x, angle + more[2]
+    return np.array([x, y, angle])
