@@ -301,10 +301,10 @@ class NoiseRule:
     aspect_rad: Annotated[float, Origin.CHOSEN] = 0.25
     """Seen from within such an angle, a body errs alike, on every lap; 0: on one passage only, as
     things do whose surface is what is measured."""
-    prior_passages: Annotated[int, Origin.CHOSEN, "groups"] = 5
-    """Weight of the noise of all landmarks in that of one, in groups of that length."""
-    prior_groups: Annotated[int, Origin.CHOSEN, "groups"] = 30
-    """Weight of the configured share of the variance (`RobustConfig.range_variance_share`)."""
+    prior_groups: Annotated[int, Origin.CHOSEN, "groups"] = 5
+    """Weight of what is taken for likely before, in groups: in the share of the variance, of the
+    configured one (`RobustConfig.range_variance_share`); in the noise of one landmark, of that of
+    all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
