@@ -9,8 +9,8 @@ the same noise in these steps. No image holds frames of before and after.
 
 A pause, missing frames and times that are a little off are no slips: a step may be any share of the
 motion around it, up to half as much again, by the time that it took. Nor is what the noise of the
-wheels explains. Before its first step the robot is taken to have moved as it does after it. Wheels
-that turn less than the robot moves are not seen.
+wheels explains. Before its first step the robot is taken to have moved as after it. Wheels that
+turn less than the robot moves are not seen.
 """
 
 from __future__ import annotations
@@ -107,14 +107,16 @@ class SlipDetector:
         """Yield the newest steps that may be of one slip, fewest first, and the one before them."""
         for n in range(1, min(MOST_STEPS, len(self._steps) - 1) + 1):
             first, *between = self._steps[-n - 1 :]
-            yield first, [step for step in between if step is not None]
+            if first is not None or n == 1:  # two that are alike and then end are a motion
+                yield first, [step for step in between if step is not None]
 
     def _slip(self, first: _Step, between: Sequence[_Step], last: _Step) -> PossibleSlip | None:
         """Return what steps report beyond the one before and the one after them."""
         steps = [first, *between, last]
         around_s = first.took_s + last.took_s
+        # Of a step twice as long: a steady change is then not taken for what steps lack of its mean
         change = [
-            0.5 * around_s * (after / last.took_s - before / first.took_s)
+            around_s * (after / last.took_s - before / first.took_s)
             for before, after in zip(first.motion, last.motion, strict=True)
         ]
         if not self._is_steady(change, steps):
