@@ -400,7 +400,7 @@ class RobustConfig(_ConfigTable):
     """Standard deviation of a target's radius; 0: targets are points."""
     range_variance_share: Annotated[Positive, Origin.CHOSEN] = 1.0
     """Factor on the variance of a range where many are averaged, until the ranges of the run show
-    it: those of one passage err alike."""
+    that it is larger: those of one passage err alike."""
     false_ranges_per_frame: Annotated[Positive, Origin.CHOSEN] = 0.05
     """Ranges of nothing that stands there, per radar and frame."""
     wheel_walk_per_sqrt_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0

@@ -66,7 +66,7 @@ class RangeNoise:
     # zero takes the unknowns out of the state
     mount_sigma_m: float = 0.0
     radius_sigma_m: float = 0.0
-    # `RangeErrors.variance_share` until the ranges of the run show it
+    # The least of `RangeErrors.variance_share`; what the ranges of the run show may be more
     variance_share: float = 1.0
     detection_probability: float = 0.92  # that a target in view is detected in a frame
     clutter_per_m: float = 0.15 / 1.3  # false ranges per radar, frame and metre of range

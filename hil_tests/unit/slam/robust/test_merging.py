@@ -1,6 +1,7 @@
 """Landmarks are merged where the whole run allows it, and the noise of ranges that is assumed."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -201,7 +202,7 @@ def test_ranges_that_err_alike_move_the_pose_less() -> None:
     assert 1.0 < sigmas[1] / sigmas[0] <= 2.0
 
 
-def learned_share(laps: int, white_m: float, by_aspect_m: float) -> float:
+def learned_share(laps: int, white_m: float, by_aspect_m: float, configured: float = 1.0) -> float:
     """Return the share of the variance that ranges with two errors show on laps of one course.
 
     One is of its own in each range, one is that of the side from which a body is seen: the same
@@ -218,7 +219,9 @@ def learned_share(laps: int, white_m: float, by_aspect_m: float) -> float:
         away = antennas[:, None, :2] - landmarks
         aspects = np.arctan2(away[..., 1], away[..., 0])
         ranges[radar] += math.sqrt(2.0) * by_aspect_m * np.sin(6.0 * aspects + phases)
-    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, math.hypot(white_m, by_aspect_m)))
+    parameters = parameters_for(LAB, math.hypot(white_m, by_aspect_m))
+    parameters = replace(parameters, ranges=replace(parameters.ranges, variance_share=configured))
+    back_end = RobustBackEnd(paper_rig(), parameters)
     scans = [
         [
             RangeScan(radar=radar, ranges_m=tuple(ranges[radar, k, seen[radar, k]]))
@@ -237,6 +240,12 @@ def test_errors_that_come_again_on_a_second_lap_weigh_twice_as_much() -> None:
     assert 0.6 < learned_share(1, 4e-3, 0.0) < 1.4
     once, twice = (learned_share(laps, 1e-3, 4e-3) for laps in (1, 2))
     assert 1.6 < twice / once < 2.4
+
+
+@pytest.mark.rare
+def test_what_the_solution_took_up_of_the_errors_makes_no_range_weigh_more() -> None:
+    """White ranges show a share of about 1; what is configured is the least."""
+    assert learned_share(1, 4e-3, 0.0, configured=2.5) == 2.5
 
 
 def test_a_miss_says_the_less_the_oftener_a_landmark_was_missed() -> None:
