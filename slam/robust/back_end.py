@@ -196,9 +196,10 @@ class RobustBackEnd:
 
     @property
     def undecided_covariance(self) -> Array:
-        """Return what the newest steps add to it where they may be a slip, (3, 3).
+        """Return what the newest steps add to the covariance of the pose, (3, 3), map frame.
 
-        The filter gets that when the next step tells that they may (`slam.robust.proposals.slips`).
+        They may be a slip (`slam.robust.proposals.slips`); if the next step shows that, the filter
+        adds it.
         """
         to_map = np.eye(3)
         to_map[:2, :2] = rotation(self.state.heading_rad)
@@ -219,6 +220,7 @@ class RobustBackEnd:
         """Return a back end at the origin of a map of its own, that has learned the calibration."""
         other = RobustBackEnd(self.rig, self.parameters)
         other.state.take_calibration(self.state)
+        other._slips.begin_anew()  # the robot is under way
         return other
 
     def saved_map(self) -> SavedMap:

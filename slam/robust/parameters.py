@@ -284,10 +284,13 @@ class SlipRule:
     little off make one step shorter and the next one longer."""
 
     steady_m: Annotated[float, Origin.CHOSEN] = 0.005
-    """By how much a robot's motion may change from one step to the next; where the wheels report
-    more, and go on as before, they may have slipped."""
+    """What the wheels report for a step or two beyond the motion around them is a possible slip
+    from here on."""
     steady_rad: Annotated[float, Origin.CHOSEN] = 0.01
-    """The same of its turn."""
+    """The same of the turn."""
+    recent_steps: Annotated[int, Origin.CHOSEN, "steps"] = 20
+    """Among the changes of motion of so many steps, three quarters are taken for ordinary ones:
+    wheels may count coarsely, and a heading may swing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,10 +304,10 @@ class NoiseRule:
     aspect_rad: Annotated[float, Origin.CHOSEN] = 0.25
     """Seen from within such an angle, a body errs alike, on every lap; 0: on one passage only, as
     things do whose surface is what is measured."""
-    prior_groups: Annotated[int, Origin.CHOSEN, "groups"] = 5
-    """Weight of what is taken for likely before, in groups: in the share of the variance, of the
-    configured one (`RobustConfig.range_variance_share`); in the noise of one landmark, of that of
-    all."""
+    prior_weight: Annotated[int, Origin.CHOSEN, "groups"] = 5
+    """Weight, in groups, of the configured share of the variance
+    (`RobustConfig.range_variance_share`). The noise of all landmarks has the same weight in that of
+    one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,13 +9,15 @@ the same noise in these steps. No image holds frames of before and after.
 
 A pause, missing frames and times that are a little off are no slips: a step may be any share of the
 motion around it, up to half as much again, by the time that it took. Nor is what the noise of the
-wheels explains. Before its first step the robot is taken to have moved as after it. Wheels that
-turn less than the robot moves are not seen.
+wheels explains, or what is like the changes from step to step just before, as where wheels count
+coarsely or the heading swings. Before its first step the robot is taken to have moved as after it.
+Wheels that turn less than the robot moves are not seen.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -29,7 +31,7 @@ MOST_STEPS = 2
 """Steps of the longest slip: one between two samples of odometry falls into two."""
 
 Vector = tuple[float, float, float]  # dx, dy [m] and turn [rad], body frame before it
-_NONE: Vector = (0.0, 0.0, 0.0)
+_ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class _Step(NamedTuple):
@@ -61,46 +63,62 @@ class PossibleSlip:
 class SlipDetector:
     """Finds possible slips among the steps that the wheels report, one step after they ended.
 
-    What is less than ``outlier_sigmas`` standard deviations of the wheels' noise is none.
+    What is less than ``outlier_sigmas`` standard deviations of the wheels' noise is none. Nor is
+    what is less than as many times the third quartile of the latest changes: of white noise that is
+    1.6 standard deviations, and a slip of two steps is told by the noise of four.
     """
 
     def __init__(self, rule: SlipRule, outlier_sigmas: float) -> None:
         self._rule, self._outlier_sigmas = rule, outlier_sigmas
         self._weights = (1.0 / rule.steady_m**2, 1.0 / rule.steady_m**2, 1.0 / rule.steady_rad**2)
-        # The newest steps; None stands for those before the first one, which nobody knows
+        # The newest steps; None stands for the one before the first, which is not known
         self._steps: list[_Step | None] = [None]
+        # Changes from step to step [m] and [rad], and how large three quarters of them are at most
+        nothing = [(0.0, 0.0)] * rule.recent_steps
+        self._changes: deque[tuple[float, float]] = deque(nothing, rule.recent_steps)
+        self._recent_m, self._recent_rad = 0.0, 0.0
 
     def begin_anew(self) -> None:
         """Forget the steps so far, as after a motion that the wheels did not report."""
-        self._steps = [None]
+        self._steps = []
 
     def take(self, motion: Motion, elapsed_s: float) -> PossibleSlip | None:
         """Take a step, which took ``elapsed_s``; return the slip that ended before it, if any."""
-        if elapsed_s <= 0.0:  # no rate of such a step is known
+        if not 0.0 < elapsed_s < math.inf:  # no rate of such a step is known
             self.begin_anew()
             return None
         dx, dy = motion.step_m.tolist()
         of_x, of_y, of_turn = motion.covariance.diagonal().tolist()
         last = _Step((dx, dy, motion.turn_rad), elapsed_s, (of_x, of_y, of_turn))
+        slip = None
         for first, between in self._newest():
-            slip = self._slip(first or last, between, last)
-            if slip is not None:
-                self._steps = [last]
-                return slip
-        self._steps = [*self._steps[-MOST_STEPS:], last]
-        return None
+            # Before the first step the robot is taken to have moved as after it
+            slip = slip or self._slip(first or last, between, last)
+        if self._steps and (before := self._steps[-1]) is not None:
+            self._take_change(_change(before, last, last.took_s))
+        self._steps = [last] if slip else [*self._steps[-MOST_STEPS:], last]
+        return slip
+
+    def _take_change(self, change: Vector) -> None:
+        self._changes.append((math.hypot(change[0], change[1]), abs(change[2])))
+        third_quartile = 3 * len(self._changes) // 4
+        self._recent_m, self._recent_rad = (
+            sorted(values)[third_quartile] for values in zip(*self._changes, strict=True)
+        )
 
     def undecided_covariance(self) -> Array:
         """Return what the newest steps add to the covariance of the pose, (3, 3), body frame.
 
-        They may be a slip, if the robot goes on as before them; the next step tells.
+        If the robot goes on as before them, they may be a slip. The first step of all is compared
+        with nothing yet.
         """
-        error = np.zeros(3)
+        errors = [np.zeros(3)]
         for first, between in self._newest():
             if first is not None:
                 rate = [value / first.took_s for value in first.motion]
-                beyond = self._beyond(between, rate, [first, *between])
-                error = np.zeros(3) if beyond is None else _error_after(between, beyond)
+                excess = self._excess(between, rate, [first, *between])
+                errors += [] if excess is None else [_error_after(between, excess)]
+        error = max(errors, key=lambda one: self._square(one.tolist()))
         return 0.5 * np.outer(error, error)
 
     def _newest(self) -> Iterator[tuple[_Step | None, list[_Step]]]:
@@ -112,27 +130,26 @@ class SlipDetector:
 
     def _slip(self, first: _Step, between: Sequence[_Step], last: _Step) -> PossibleSlip | None:
         """Return what steps report beyond the one before and the one after them."""
-        steps = [first, *between, last]
-        around_s = first.took_s + last.took_s
-        # Of a step twice as long: a steady change is then not taken for what steps lack of its mean
-        change = [
-            around_s * (after / last.took_s - before / first.took_s)
-            for before, after in zip(first.motion, last.motion, strict=True)
-        ]
+        steps, around_s = [first, *between, last], first.took_s + last.took_s
+        change = _change(first, last, 0.5 * around_s)
         if not self._is_steady(change, steps):
             return None
         rate = [
             (before + after) / around_s
             for before, after in zip(first.motion, last.motion, strict=True)
         ]
-        beyond = self._beyond(between, rate, steps)
-        if beyond is None:
+        excess = self._excess(between, rate, steps)
+        if excess is None:
+            return None
+        # A motion that begins or ends differs from both sides by less than they do from each other
+        whole = self._square(_sum(excess))
+        if 4.0 * self._square(change) > whole:
             return None
         # All of its steps have one error: together they are more uncertain than by separate ones
-        share = self._square(_sum(beyond)) / sum(self._square(one) for one in beyond)
-        since = _error_after([*between, last], [*beyond, _NONE])
+        share = whole / sum(self._square(one) for one in excess)
+        since = _error_after([*between, last], [*excess, _ZERO])
         return PossibleSlip(
-            covariances=tuple([0.5 * share * np.outer(one, one) for one in beyond]),
+            covariances=tuple([0.5 * share * np.outer(one, one) for one in excess]),
             since=Motion(
                 step_m=np.zeros(2),
                 turn_rad=0.0,
@@ -141,7 +158,7 @@ class SlipDetector:
             ),
         )
 
-    def _beyond(
+    def _excess(
         self, steps: Sequence[_Step], rate: Sequence[float], around: Sequence[_Step]
     ) -> list[Vector] | None:
         """Return what steps report beyond a rate of motion; None if that is an ordinary change.
@@ -149,18 +166,15 @@ class SlipDetector:
         ``around`` are all steps that the rate is of, and these.
         """
         expected = [[value * step.took_s for value in rate] for step in steps]
-
-        def parts(most_share: float) -> list[Vector]:
-            pairs = zip(steps, expected, strict=True)
-            return [self._off(step.motion, one, most_share) for step, one in pairs]
-
-        # The share of a step that is a little short leaves over some of its turn
+        by_most, beyond = (
+            [self._off(step.motion, one, most) for step, one in zip(steps, expected, strict=True)]
+            for most in (self._rule.most_share, 1.0)
+        )
+        # By its shares a step that is a little short in all would lack some of its turn
         change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
-        if any(
-            self._is_steady(one, around) for one in (_sum(parts(self._rule.most_share)), change)
-        ):
+        if any(self._is_steady(one, around) for one in (_sum(by_most), _sum(beyond), change)):
             return None
-        return parts(1.0)
+        return beyond
 
     def _off(self, step: Vector, expected: Sequence[float], most_share: float) -> Vector:
         """Return what a step has beyond the share of an expected motion that is nearest to it."""
@@ -177,8 +191,9 @@ class SlipDetector:
     def _is_steady(self, change: Sequence[float], steps: Sequence[_Step]) -> bool:
         """Return whether a change among steps, dx, dy [m] and turn [rad], is an ordinary one."""
         x, y, turn = _sum([one.variances for one in steps])
-        most_m = max(self._rule.steady_m, self._outlier_sigmas * math.sqrt(x + y))
-        most_rad = max(self._rule.steady_rad, self._outlier_sigmas * math.sqrt(turn))
+        rule, sigmas = self._rule, self._outlier_sigmas
+        most_m = max(rule.steady_m, sigmas * math.sqrt(x + y), sigmas * self._recent_m)
+        most_rad = max(rule.steady_rad, sigmas * math.sqrt(turn), sigmas * self._recent_rad)
         return math.hypot(change[0], change[1]) <= most_m and abs(change[2]) <= most_rad
 
 
@@ -187,12 +202,21 @@ def _sum(motions: Sequence[Sequence[float]]) -> Vector:
     return x, y, turn
 
 
+def _change(before: _Step, after: _Step, took_s: float) -> Vector:
+    """Return by how much the motion in a time differs between two steps."""
+    x, y, turn = (
+        took_s * (new / after.took_s - old / before.took_s)
+        for old, new in zip(before.motion, after.motion, strict=True)
+    )
+    return x, y, turn
+
+
 def _error_after(steps: Sequence[_Step], errors: Sequence[Vector]) -> Array:
     """Return the error of the pose after steps, shape (3,), dx, dy [m] and turn [rad].
 
     It is in the body frame of that pose; ``errors`` are those of the steps, and small.
     """
-    x, y, angle = _NONE
+    x, y, angle = _ZERO
     for step, more in zip(steps, errors, strict=True):
         dx, dy, turn = step.motion
         x, y = x - angle * dy + more[0], y + angle * dx + more[1]

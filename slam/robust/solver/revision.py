@@ -147,7 +147,7 @@ def learn_noise(
     residuals show it: had all ranges errors of their own, the variance of a sum would be the number
     of its terms. Of walls those of some keyframes are summed. Errors that places and radii have
     taken up are missing in the residuals, which counts as so many sums less. What poses have taken
-    up is missing, too: the share is never below the configured one.
+    up is missing, too; therefore the share is never below the configured one.
     """
     n, rule = len(problem.ranges_m), parameters.noise
     if n < rule.fewest_ranges:
@@ -167,8 +167,8 @@ def learn_noise(
             continue
         n_passages = len(np.unique(block[mine]))
         raw = (SIGMA_PER_MEDIAN * float(np.median(np.abs(ratio[mine])))) ** 2
-        believed = (n_passages * raw + rule.prior_groups * of_all) / (
-            n_passages + rule.prior_groups
+        believed = (n_passages * raw + rule.prior_weight * of_all) / (
+            n_passages + rule.prior_weight
         )
         own[row] = math.sqrt(max(believed - 1.0, 0.0)) * float(np.median(given_m[mine]))
         if id_ in state.wall_ids:
@@ -185,9 +185,9 @@ def learn_noise(
     n_unknowns = (2 + state.layout.has_radii) * len(np.unique(at))
     share = n_groups * float(np.sum(sums**2)) / n
     least = parameters.ranges.variance_share
-    share += rule.prior_groups * least
-    share /= max(n_groups - n_unknowns, 0) + rule.prior_groups
-    share = min(max(share, least), _MOST_SHARE)
+    share += rule.prior_weight * least
+    share /= max(n_groups - n_unknowns, 0) + rule.prior_weight
+    share = max(min(share, _MOST_SHARE), least)
     added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
     state.range_errors = replace(state.range_errors, added_m=added_m, variance_share=share)
 

@@ -245,6 +245,7 @@ def test_errors_that_come_again_on_a_second_lap_weigh_twice_as_much() -> None:
 @pytest.mark.rare
 def test_what_the_solution_took_up_of_the_errors_makes_no_range_weigh_more() -> None:
     """White ranges show a share of about 1; what is configured is the least."""
+    assert 0.6 < learned_share(1, 4e-3, 0.0, configured=0.5) < 1.4
     assert learned_share(1, 4e-3, 0.0, configured=2.5) == 2.5
 
 

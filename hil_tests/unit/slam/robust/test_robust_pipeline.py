@@ -137,8 +137,8 @@ def test_ranges_correct_wheels_that_report_too_much() -> None:
     def odometry(t_ns: int) -> Array:
         return straight(t_ns) * 1.02
 
-    # Or offsets, mounts, radii and errors common to the ranges of a passage may explain it. The
-    # ranges here are better than stated.
+    # Or offsets, mounts, radii and errors common to the ranges of a passage may explain it. These
+    # ranges err by less than stated, and the share of the variance is never below this one.
     names = ("offset_sigma_m", "mount_sigma_m", "radius_sigma_m")
     known = {f"robust.{name}": "0" for name in names} | {"robust.range_variance_share": "0.5"}
     calibrated = override(ROBUST, known)

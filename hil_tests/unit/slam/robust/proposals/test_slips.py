@@ -133,8 +133,43 @@ def test_a_motion_that_begins_is_undecided_until_it_has_gone_on() -> None:
     np.testing.assert_allclose(undecided, [0.0] * 3 + [square, 4.0 * square] + [0.0] * 2)
 
 
-def test_a_slip_is_undecided_until_it_has_ended() -> None:
-    """In its last step it leaves what it leaves after it, but for the frame: the step goes on."""
+def test_a_motion_that_ends_at_once_is_undecided_if_either_step_may_have_slipped() -> None:
+    """The robot stopped for a step, then moved on by one and a half steps and stopped again."""
+    detector = SlipDetector(RULE, 4.0)
+    for step in [AHEAD] * 3 + [0.0 * AHEAD, 1.5 * AHEAD]:
+        detector.take(calibrated_motion(step, np.zeros(3), WheelNoise(), 1e-12 * np.eye(3)), 0.2)
+    assert detector.undecided_covariance()[0, 0] == pytest.approx(0.5 * 0.15**2)
+
+
+def test_a_slip_while_the_robot_speeds_up() -> None:
+    steps = [AHEAD + np.array([0.0015 * k, 0.0, 0.0]) for k in range(20)]
+    steps[10] = steps[10] + np.array([0.0, 0.0, 0.1])
+    (found,) = slips_of(steps)
+    assert found.since.covariance[2, 2] == pytest.approx(0.5 * 0.1**2, rel=0.05)
+
+
+@pytest.mark.parametrize("tick_m", [1e-3, 2e-3])
+def test_wheels_that_count_coarsely_do_not_slip(tick_m: float) -> None:
+    """But for the first steps, before it shows that they do. The track is 20 cm."""
+    left_m, right_m = (
+        tick_m * np.floor(np.arange(300.0) * way_m / tick_m) for way_m in (0.0201, 0.0207)
+    )
+    left, right = np.diff(left_m), np.diff(right_m)
+    steps = [np.array([(a + b) / 2, 0.0, (b - a) / 0.2]) for a, b in zip(left, right, strict=True)]
+    assert slips_of(steps[30:]) == [] or len(slips_of(steps)) <= 2
+
+
+def test_a_heading_that_swings_is_no_slip_but_at_first() -> None:
+    swing = np.array([0.0, 0.0, 0.0055])
+    steps = [AHEAD + (-1) ** k * swing for k in range(300)]
+    assert len(slips_of(steps)) <= 3
+
+
+def test_back_and_on_again_by_as_much_leaves_nothing() -> None:
+    assert slips_of([AHEAD] * 3 + [-AHEAD, 2.0 * AHEAD] + [AHEAD] * 3) == []
+
+
+def test_a_slip_is_undecided_until_the_step_after_it() -> None:
     detector = SlipDetector(RULE, 4.0)
     for step in [AHEAD] * 3 + [AHEAD + SLIP]:
         detector.take(calibrated_motion(step, np.zeros(3), WheelNoise(), 1e-12 * np.eye(3)), 0.2)
@@ -214,6 +249,8 @@ def test_a_motion_that_the_wheels_did_not_report_is_no_neighbour() -> None:
     assert [detector.take(one, 0.2) for one in (motion, motion, slipped)] == [None] * 3
     detector.begin_anew()
     assert detector.take(motion, 0.2) is None
+    # What it was before that is not the first step of a run
+    assert detector.take(slipped, 0.2) is None
 
 
 # --- in the back end ----------------------------------------------------------------------------
@@ -319,3 +356,17 @@ def test_a_stop_may_have_been_a_carry_until_landmarks_are_recognised(run: Run) -
     covered_m = math.sqrt(covered_share(probability)) * rule.lost_position_m
     assert 0.95 * covered_m < sigmas_m[stop - 1] < 1.05 * covered_m
     assert sigmas_m[-1] < 0.1 * sigmas_m[stop - 1]
+
+
+def test_what_is_undecided_lies_along_the_newest_motion_in_the_map(run: Run) -> None:
+    """Half the square of the error, but for the noise of the step before; across the map."""
+    step = next(k for k in straight_steps(run) if abs(math.sin(run.poses[k, 2])) > 0.9)
+    back_end = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    increments = run.increments[: step + 1].copy()
+    increments[step] = compose(increments[step], SLIP)
+    for _ in follow(back_end, increments, [[]] * len(increments)):
+        pass
+    error = back_end.main.pose - chained([*increments[:step], run.increments[step]])
+    np.testing.assert_allclose(
+        back_end.main.undecided_covariance, 0.5 * np.outer(error, error), rtol=0.03, atol=1e-5
+    )
