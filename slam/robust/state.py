@@ -271,7 +271,7 @@ class RangeErrors:
 
     added_m: float = 0.0  # what is added in squares to the sigmas of ranges of no known landmark
     # By how much the variance of a range must be larger where many are averaged: those of one
-    # passage err alike
+    # passage err alike. Below 1, errors are smaller than their standard deviations
     variance_share: float = 1.0
     radius_price: float = 1.0  # share of the price of a radius that counts
 
