@@ -27,7 +27,7 @@ from slam.robust.state import (
     State,
 )
 
-_MOST_SHARE = 1000.0  # keeps `RangeErrors.variance_share` finite
+_LEAST_SHARE, _MOST_SHARE = 0.5, 1000.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
 
@@ -146,8 +146,8 @@ def learn_noise(
     err alike, on every lap, since its scattering centre depends on the side. The sums of their
     residuals show it: had all ranges errors of their own, the variance of a sum would be the number
     of its terms. Of walls those of some keyframes are summed. Errors that places and radii have
-    taken up are missing in the residuals, which counts as so many sums less. What poses have taken
-    up is missing, too; therefore the share is never below the configured one.
+    taken up are missing in the residuals, which counts as so many sums less. Poses take up what
+    changes with aspect; where bodies err so, the share is therefore never below the configured one.
     """
     n, rule = len(problem.ranges_m), parameters.noise
     if n < rule.fewest_ranges:
@@ -184,10 +184,10 @@ def learn_noise(
     n_groups = len(sums)
     n_unknowns = (2 + state.layout.has_radii) * len(np.unique(at))
     share = n_groups * float(np.sum(sums**2)) / n
-    least = parameters.ranges.variance_share
-    share += rule.prior_weight * least
+    configured = parameters.ranges.variance_share
+    share += rule.prior_weight * configured
     share /= max(n_groups - n_unknowns, 0) + rule.prior_weight
-    share = max(min(share, _MOST_SHARE), least)
+    share = max(min(share, _MOST_SHARE), configured if rule.aspect_rad > 0.0 else _LEAST_SHARE)
     added_m = math.sqrt(max(of_all - 1.0, 0.0)) * float(np.median(given_m))
     state.range_errors = replace(state.range_errors, added_m=added_m, variance_share=share)
 
