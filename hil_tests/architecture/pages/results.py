@@ -26,9 +26,8 @@ This page is made of the sweeps in `fixtures/baselines`, and a test compares it 
 `python -m hil_tests.architecture.pages.results` writes it.
 
 Rooms and seeds from 9000 on were never looked at while SLAM was developed. `Random rooms`, `The
-paper's rooms` under preset `robust` and `Hardships with points of images` are of those. The last
-and `office`, `dense` and `pillars` are measured with this version, the others just before ranges of
-one side of a body counted as alike, and `loop` before slips left the pose uncertain, too. Of the
+paper's rooms` under preset `robust` and `Hardships with points of images` are of those, and are
+measured with this version, but for `loop`, which is of before slips left the pose uncertain. Of the
 runs in the other tables some were looked at: `lab` and `classroom` with seeds 0 to 17, 31 and 38,
 from which the weight of ranges was chosen; `corridor`, `store` and `two_rooms` with seeds 0 and 1,
 for the rules of walls and thick targets.
