@@ -141,9 +141,9 @@ class SlipDetector:
         excess = self._excess(between, rate, steps)
         if excess is None:
             return None
-        # A motion that begins or ends differs from both sides by less than they do from each other
+        # Where a motion begins or ends, a step is off the mean of both by half of the change
         whole = self._square(_sum(excess))
-        if 4.0 * self._square(change) > whole:
+        if self._square([2.0 * value for value in change]) > whole:
             return None
         # All of its steps have one error: together they are more uncertain than by separate ones
         share = whole / sum(self._square(one) for one in excess)
