@@ -64,8 +64,9 @@ class SlipDetector:
     """Finds possible slips among the steps that the wheels report, one step after they ended.
 
     What is less than ``outlier_sigmas`` standard deviations of the wheels' noise is none. Nor is
-    what is less than as many times the third quartile of the latest changes: of white noise that is
-    1.6 standard deviations, and a slip of two steps is told by the noise of four.
+    what is less than as many times the third quartile of the latest changes from step to step. For
+    white noise that quartile is 1.6 standard deviations of a step; what two steps have beyond the
+    two around them has 2.
     """
 
     def __init__(self, rule: SlipRule, outlier_sigmas: float) -> None:
