@@ -93,7 +93,7 @@ from slam.robust.state import (
     calibrated_motion,
     free_motion,
     predict,
-    rotation,
+    turned_covariance,
 )
 from slam.robust.walls import WallKeeper
 
@@ -201,9 +201,7 @@ class RobustBackEnd:
         They may be a slip (`slam.robust.proposals.slips`); if the next step shows that, the filter
         adds it.
         """
-        to_map = np.eye(3)
-        to_map[:2, :2] = rotation(self.state.heading_rad)
-        return np.asarray(to_map @ self._slips.undecided_covariance() @ to_map.T)
+        return turned_covariance(self._slips.undecided_covariance(), self.state.heading_rad)
 
     @property
     def landmark_of_label(self) -> Mapping[int, int]:

@@ -42,7 +42,7 @@ from slam.robust.parameters import (
 )
 from slam.robust.proposals.slips import MOST_STEPS
 from slam.robust.solver.growing_arrays import PackedRows
-from slam.robust.state import calibrated_motion, quarter_turn, rotation
+from slam.robust.state import calibrated_motion, quarter_turn, turned_covariance
 
 Array = NDArray[np.float64]
 
@@ -266,9 +266,7 @@ class RobustSlam:
             return None
         noise = self._noise_at(t_ns)
         new, self._noise = noise - self._noise, noise
-        turned = np.eye(3)
-        turned[:2, :2] = rotation(-float(before[2]))
-        return np.asarray(turned @ new @ turned.T + self._least_noise)
+        return np.asarray(turned_covariance(new, -float(before[2])) + self._least_noise)
 
     def belief(self) -> Belief:
         """Return pose and map as they are reported now."""

@@ -249,6 +249,16 @@ def rotation(angle_rad: float) -> Array:
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
+def turned_covariance(covariance: Array, angle_rad: float) -> Array:
+    """Return a covariance (3, 3) of x, y [m] and heading [rad] in another frame.
+
+    Its own frame is turned in the other by the angle, as a body frame is in the map by its heading.
+    """
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(angle_rad)
+    return np.asarray(turn @ covariance @ turn.T)
+
+
 def left_jacobian(angle_rad: float) -> Array:
     """Return V(a) = [sin a, cos a - 1; 1 - cos a, sin a] / a, shape (2, 2)."""
     a = angle_rad

@@ -46,7 +46,7 @@ from slam.library.evaluation import ate_rmse_m
 from slam.live.errors import AppError
 from slam.live.session_records import SessionObserver, Snapshot
 from slam.robust.association import LONGEST_M, crossings
-from slam.robust.state import calibrated_motion, quarter_turn, rotation
+from slam.robust.state import calibrated_motion, quarter_turn, rotation, turned_covariance
 from xethru_protocol.optional_packages import install_command
 
 Array = NDArray[np.float64]
@@ -452,11 +452,8 @@ class _FactorGraph:
         self._calibration = self._isam.calculateEstimateVector(calibration_key)
         pose = np.array([estimate.x(), estimate.y(), estimate.theta()])
         self._poses[-1] = pose
-        turn = np.eye(3)
-        turn[:2, :2] = rotation(float(pose[2]))
         # GTSAM's error of a pose lies in the body frame.
-        covariance: Array = turn @ self._isam.marginalCovariance(self._X(step)) @ turn.T
-        return covariance
+        return turned_covariance(self._isam.marginalCovariance(self._X(step)), float(pose[2]))
 
     def _new_graph(self) -> None:
         self._graph = self._gtsam.NonlinearFactorGraph()

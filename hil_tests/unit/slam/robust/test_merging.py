@@ -206,7 +206,8 @@ def learned_share(laps: int, white_m: float, by_aspect_m: float, configured: flo
     """Return the share of the variance that ranges with two errors show on laps of one course.
 
     One is of its own in each range, one is that of the side from which a body is seen: the same
-    sine on each lap. The latter's standard deviation is ``by_aspect_m``.
+    sine on each lap. The latter's standard deviation is ``by_aspect_m``. What is configured
+    is the share before.
     """
     rng = np.random.default_rng(38)
     poses, landmarks = true_path(LAB, laps), place_landmarks(LAB, rng)
