@@ -162,29 +162,37 @@ class LandmarkScore:
     true: int | None
     observable: int | None
     estimated: int
-    # Share of the estimates that match a true landmark one to one within 0.15 m, and share of the
-    # observable landmarks that are matched; None where the denominator is 0
+    # Share of the estimates that match a true landmark or a corner one to one within 0.15 m, and
+    # share of the observable landmarks that are matched; None where the denominator is 0
     precision: float | None
     recall: float | None
-    duplicates: int  # further estimates within 0.15 m of a matched true landmark
+    duplicates: int  # further estimates within 0.15 m of a matched true landmark or corner
     rmse_m: float | None  # RMS distance of the matches; None without any
 
 
 def landmark_metrics(
-    estimated_xy: Array, true_xy: Array, alignment: Array, observable: NDArray[np.bool_]
+    estimated_xy: Array,
+    true_xy: Array,
+    alignment: Array,
+    observable: NDArray[np.bool_],
+    corners_xy: Array | None = None,
 ) -> LandmarkScore:
     """Return how well estimated landmarks (n, 2), map frame, match true ones (m, 2), world frame.
 
     ``alignment`` (3,) is the *trajectory's* (``align_se2`` of its positions): the map is not fitted
     to the landmarks it is judged by. Every true landmark may be matched; ``observable`` (m,) marks
-    those that must be (``observable_landmarks``): only they count in recall.
+    those that must be (``observable_landmarks``): only they count in recall. ``corners_xy`` (k, 2)
+    are ends and corners of walls and boxes, which echo like points: each may be matched, too.
     """
     n, m = len(estimated_xy), len(true_xy)
-    if n and m:
+    if corners_xy is not None:
+        true_xy = np.concatenate([true_xy, corners_xy])
+        observable = np.concatenate([observable, np.zeros(len(corners_xy), dtype=np.bool_)])
+    if n and len(true_xy):
         placed = transform(alignment, estimated_xy)
         distances = np.linalg.norm(placed[:, None, :] - true_xy[None, :, :], axis=2)
     else:
-        distances = np.empty((n, m))
+        distances = np.empty((n, len(true_xy)))
     close = distances <= LANDMARK_MATCH_M
     # First as many matches as possible, then the least total distance.
     rows, columns = linear_sum_assignment(np.where(close, distances, 1e6))

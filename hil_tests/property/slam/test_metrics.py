@@ -276,6 +276,21 @@ def test_a_true_landmark_that_need_not_be_found_is_no_false_one_and_not_in_recal
     assert (score.precision, score.recall) == (1.0, 0.5)
 
 
+def test_a_corner_may_be_a_landmark_once_and_need_not_be_one() -> None:
+    corners = np.array([[4.0, 4.0], [4.0, 5.0]])
+    estimated = np.array([[0.0, 0.0], [4.0, 4.05], [4.0, 4.1], [6.0, 6.0]])
+    score = landmark_metrics(estimated, TRUE, HERE, ALL, corners)
+    assert (score.true, score.observable, score.duplicates) == (3, 3, 1)
+    assert (score.precision, score.recall) == (0.5, pytest.approx(1 / 3))
+    assert score.rmse_m == pytest.approx(0.05 / math.sqrt(2))
+    # Where there are no corners, nothing is other than without them.
+    assert landmark_metrics(estimated, TRUE, HERE, ALL, np.zeros((0, 2))) == landmark_metrics(
+        estimated, TRUE, HERE, ALL
+    )
+    only = landmark_metrics(corners, np.zeros((0, 2)), HERE, np.zeros(0, dtype=bool), corners)
+    assert (only.true, only.precision, only.recall) == (0, 1.0, None)
+
+
 apart = st.sets(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=6).map(
     lambda cells: np.array(sorted(cells), dtype=np.float64).reshape(-1, 2)
 )

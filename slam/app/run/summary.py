@@ -200,7 +200,7 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     """Compute summary.json's numbers; None if no state was estimated or the truth is unknown.
 
     `rig` holds the mounts that SLAM uses; they and the settings in `info` decide which true
-    landmarks count in recall.
+    landmarks count in recall. In precision count the corners of walls and boxes, too.
     """
     states, last = record.states, record.last
     if last is None or not states.has_truth:
@@ -210,10 +210,11 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     truth_in_map = np.array([between(record.world_from_map, pose) for pose in states.truth])
     estimate, odometry = states.estimate, states.odometry
     observable = observable_landmarks(rig, states.truth, true_landmarks_m, info.field_of_view)
+    corners_m = np.unique(np.concatenate([np.zeros((0, 2)), *info.outlines_m]), axis=0)
 
     def score(landmarks_m: NDArray[np.float64], poses: NDArray[np.float64]) -> LandmarkScore:
         alignment = align_se2(poses[:, :2], truth_xy)
-        score = landmark_metrics(landmarks_m, true_landmarks_m, alignment, observable)
+        score = landmark_metrics(landmarks_m, true_landmarks_m, alignment, observable, corners_m)
         if info.simulated or len(true_landmarks_m):
             return score
         return replace(score, true=None, observable=None, precision=None, recall=None)
