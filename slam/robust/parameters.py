@@ -91,6 +91,7 @@ class JumpNoise:
     # Standard deviations along each axis, and of the turn; zero: there is no such motion
     sigma_m: float = 0.0
     sigma_rad: float = 0.0
+    steps_per_jump: float = 100.0  # how many steps of the robot there are to one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -247,19 +248,6 @@ class RelinearisationRule:
     """Most steps of one solution."""
     outlier_sigmas: Annotated[float, Origin.QUANTILE] = 4.0
     """Ranges further off than this are left out: of normal errors one in 16000."""
-    slip_m: Annotated[float, Origin.CHOSEN] = 0.015
-    """Standard deviation of a slip along and across the way; that of the stress `slip`."""
-    slip_rad: Annotated[float, Origin.CHOSEN] = math.radians(2.0)
-    """Standard deviation of a slip's turn; that of the stress `slip`."""
-    steps_per_slip: Annotated[float, Origin.CHOSEN, "steps"] = 100.0
-    """How many steps of the robot there are to one slip, as in the stress `slip`, or to one motion
-    that the wheels do not report."""
-    slips_from: Annotated[int, Origin.CHOSEN, "steps"] = 2
-    """Step of a solution from which on there are slips; from the next one on, outliers."""
-    first_share: Annotated[float, Origin.CHOSEN] = 0.25
-    """What share of its price a slip must gain in that step."""
-    neighbours: Annotated[int, Origin.CHOSEN, "keyframes"] = 4
-    """A new slip gains most among so many motions before and after it."""
     radius_scale_m: Annotated[float, Origin.CHOSEN] = 1e-3
     """Scale of the prior of radii; smaller ones are alike."""
 
@@ -268,11 +256,6 @@ class RelinearisationRule:
     thin are implausible."""
     nearer: Annotated[float, Origin.CHOSEN] = 0.8
     """What is left, at most, of how implausible the constants are, if that is to remain so."""
-
-    @property
-    def outliers_from(self) -> int:
-        """Return the step of a solution from which on ranges are left out: after the slips."""
-        return self.slips_from + 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -281,7 +281,8 @@ def test_a_corner_may_be_a_landmark_once_and_need_not_be_one() -> None:
     estimated = np.array([[0.0, 0.0], [4.0, 4.05], [4.0, 4.1], [6.0, 6.0]])
     score = landmark_metrics(estimated, TRUE, HERE, ALL, corners)
     assert (score.true, score.observable, score.duplicates) == (3, 3, 1)
-    assert (score.precision, score.recall) == (0.5, pytest.approx(1 / 3))
+    assert score.precision == 0.5
+    assert score.recall == pytest.approx(1 / 3)
     assert score.rmse_m == pytest.approx(0.05 / math.sqrt(2))
     # Where there are no corners, nothing is other than without them.
     assert landmark_metrics(estimated, TRUE, HERE, ALL, np.zeros((0, 2))) == landmark_metrics(

@@ -103,10 +103,7 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
         tracklets=TrackletRule(min_share=sensor.new_share),
         map=MapRule(neighbourhood_m=sensor.neighbourhood_m),
         noise=NoiseRule(aspect_rad=0.0) if sensor.is_optical else NoiseRule(),
-        # Slips of the size that the radars' robots have are left out
-        relinearisation=RelinearisationRule(
-            key_m=sensor.shift_m, shift_m=sensor.shift_m, slip_m=0.0, slip_rad=0.0
-        ),
+        relinearisation=RelinearisationRule(key_m=sensor.shift_m, shift_m=sensor.shift_m),
         jumps=JumpNoise(sigma_m=sensor.jump_sigma_m, sigma_rad=sensor.jump_sigma_rad),
         lag=LagRule(most=0),  # no benchmark reports lagged poses
     )

@@ -188,9 +188,9 @@ def _solved_with(
     other = copy.deepcopy(state)
     problem = log.problem(other, parameters, {log_id: _augmented(other, point_m)})
     smoother = Smoother(problem, parameters.relinearisation)
-    solution = smoother.solve(min(log.starts(other, problem), key=smoother.start_cost))
+    solution = smoother.solve(min(log.starts(other, problem), key=smoother.cost))
     if solution is None:
         return None
     limit = parameters.relinearisation.outlier_sigmas
-    cost = smoother.cost(solution.estimate, solution.slips, limit)
+    cost = smoother.cost(solution.estimate, limit)
     return _Candidate(point_m=point_m, problem=problem, solution=solution, cost=cost)

@@ -89,7 +89,7 @@ def _solved(
     log: RunLog, state: State, problem: Problem, parameters: BackEndParameters
 ) -> Solution | None:
     smoother = Smoother(problem, parameters.relinearisation)
-    return smoother.solve(min(log.starts(state, problem), key=smoother.start_cost))
+    return smoother.solve(min(log.starts(state, problem), key=smoother.cost))
 
 
 def is_one(log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameters) -> bool:
@@ -210,7 +210,7 @@ def solve_whole_run(
     solution = min(solutions, key=lambda each: each.cost)
     best = solution.estimate
     try:
-        of_keys, border = smoother.covariances(best, solution.slips)
+        of_keys, border = smoother.covariances(best)
     except np.linalg.LinAlgError:
         return None
     first = problem.layout.first_columns(np.arange(len(state.feature_ids)))

@@ -8,9 +8,8 @@ border is the information of the belief that replaces the filter's, so no measur
 Errors are additive here. Step lengths are halved until the cost falls. Source: square root
 smoothing, Dellaert and Kaess, IJRR 25(12), 2006, with time order instead of a search for one.
 
-Every solution weighs anew: ranges by Huber's weights, and by zero beyond a limit; and each motion
-either has the wheels' noise, or the wheels slipped in it, at a price (the mixture of two Gaussians
-by its larger part: Olson and Agarwal, IJRR 32(7), 2013).
+Every solution weighs ranges anew: by Huber's weights, and by zero beyond a limit. Where the wheels
+may have slipped, the run has the noise of that (`slam.robust.proposals.slips`).
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpbtrf, dtbtrs
 from scipy.special import chdtri
@@ -444,7 +442,6 @@ class Solution:
     estimate: Estimate
     eliminated: Eliminated
     cost: float
-    slips: NDArray[np.bool_]  # shape (k,): in which motions the wheels slipped
 
     @property
     def information(self) -> Array:
@@ -467,18 +464,10 @@ class Smoother:
         chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))
         covariances = motion_covariances(chain, problem.step_covariances)
         # W with W C W^T = I, shape (k, 3, 3)
-        factors = np.linalg.cholesky(covariances)
-        self._roots = np.asarray(np.linalg.inv(factors))
+        self._roots = np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
         walks = np.add.reduceat(problem.walks, first)
         least = _LEAST_WALK_SHARE * np.sqrt(walks.max(axis=0, initial=0.0))
         self._walk_roots = 1.0 / np.sqrt(walks + least**2 + _TINY)
-        slip = np.diag(np.square([rule.slip_m, rule.slip_m, rule.slip_rad]))
-        slipped = np.linalg.cholesky(covariances + slip)
-        self._slip_roots = np.asarray(np.linalg.inv(slipped))
-        # Twice the nats that a slip costs: it is rare, and its noise is wide
-        rarity = math.log(rule.steps_per_slip) - np.log(np.diff(problem.keys))
-        spread = np.log(np.einsum("kii->ki", slipped) / np.einsum("kii->ki", factors))
-        self._slip_price = 2.0 * (np.maximum(rarity, 0.0) + spread.sum(axis=1))
 
     def solve(self, start: Estimate, tolerance: float = _TOLERANCE) -> Solution | None:
         """Return the solution reached from a start, or None if it failed.
@@ -486,54 +475,47 @@ class Smoother:
         The search ends when the cost decreases by less than ``tolerance``.
         """
         estimate, limit, rule = start, math.inf, self._rule
-        slips = np.zeros(len(self._roots), dtype=np.bool_)
-        cost, decrease = self.cost(estimate, slips, limit), math.inf
-        for iteration in range(1, rule.iterations + 1):
-            # A slip far from where it was looks like many small ones; an outlier like a slip. And
-            # far from the solution, what is right may look like an outlier.
-            before, was = slips, limit
-            if iteration >= rule.slips_from:
-                slips = self._slips(estimate, slips, is_first=iteration == rule.slips_from)
-            is_settled = decrease <= _SETTLED_SHARE * cost or iteration > 2 * rule.outliers_from
-            if iteration >= rule.outliers_from and is_settled:
+        cost, decrease = self.cost(estimate), math.inf
+        for iteration in range(rule.iterations):
+            # Far from the solution, what is right may look like an outlier.
+            is_settled = decrease <= _SETTLED_SHARE * cost or 2 * iteration >= rule.iterations
+            if is_settled and limit != rule.outlier_sigmas:
                 limit = rule.outlier_sigmas
-            is_other = limit != was or bool(np.any(slips != before))
-            if is_other:
-                cost = self.cost(estimate, slips, limit)
+                cost, decrease = self.cost(estimate, limit), math.inf
             try:
-                change = solve(self._equations(estimate, slips, limit))
+                change = solve(self._equations(estimate, limit))
             except np.linalg.LinAlgError:
                 return None
             share, better = 1.0, estimate
             for _ in range(_HALVINGS):
                 better = _moved(estimate, change, share)
-                new_cost = self.cost(better, slips, limit)
+                new_cost = self.cost(better, limit)
                 if new_cost <= cost + _ROUNDING:
                     break
                 share *= 0.5
             else:
                 new_cost, better = cost, estimate
             decrease, cost, estimate = cost - new_cost, new_cost, better
-            if decrease < tolerance and limit == rule.outlier_sigmas and not is_other:
+            if decrease < tolerance and limit == rule.outlier_sigmas:
                 break
         try:
-            left = eliminate(self._equations(estimate, slips, limit))
+            left = eliminate(self._equations(estimate, limit))
             np.linalg.cholesky(left.information)
         except np.linalg.LinAlgError:
             return None
-        return Solution(estimate=estimate, eliminated=left, cost=cost, slips=slips)
+        return Solution(estimate=estimate, eliminated=left, cost=cost)
 
-    def cost(self, estimate: Estimate, slips: NDArray[np.bool_], limit: float = math.inf) -> float:
+    def cost(self, estimate: Estimate, limit: float = math.inf) -> float:
         """Return what is to be least: Huber's costs of all measurements, capped at ``limit``.
 
-        To these come the costs of all motions, given in which of them the wheels slipped.
+        To these come the costs of all motions.
         """
         problem = self._problem
         away = np.minimum(np.abs(measurement_residuals(problem, estimate).residual), limit)
         costs = away**2 - np.maximum(away - problem.huber_sigmas, 0.0) ** 2
         total = float(costs @ self._shares(len(costs)))
-        as_wheels, slipped = self._motion_costs(motion_residuals(problem, estimate).residual)
-        total += float(np.sum(np.where(slips, slipped, as_wheels)))
+        motions = motion_residuals(problem, estimate).whitened(self._roots)
+        total += float(np.sum(motions.residual**2))
         total += float(np.sum(self._walk_residual(estimate) ** 2))
         away, sigmas = self._from_prior(estimate)
         costs = (away / sigmas) ** 2
@@ -548,11 +530,6 @@ class Smoother:
         total += float(away @ problem.known_information @ away)
         return total + float(np.sum(costs) + np.sum((below / tau) ** 2))
 
-    def start_cost(self, estimate: Estimate) -> float:
-        """Return the cost of values to start from: any motion may be a slip."""
-        as_wheels, slipped = self._motion_costs(motion_residuals(self._problem, estimate).residual)
-        return self.cost(estimate, slipped < as_wheels)
-
     def misfit_of_constants(self, estimate: Estimate) -> float:
         """Return how implausible the constants of wheels and radars are under their priors.
 
@@ -564,7 +541,7 @@ class Smoother:
         square = float(np.sum((away[constants] / sigmas[constants]) ** 2))
         return square / float(chdtri(constants.stop - constants.start, CONSTANTS_TAIL))
 
-    def covariances(self, estimate: Estimate, slips: NDArray[np.bool_]) -> tuple[Array, Array]:
+    def covariances(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return the covariances of all keyframes (k + 1, 3, 3) and of the border at a solution.
 
         Errors are additive; residuals beyond the limit of outliers are left out.
@@ -574,36 +551,9 @@ class Smoother:
         numpy.linalg.LinAlgError
             Something is not determined.
         """
-        left = eliminate(self._equations(estimate, slips, self._rule.outlier_sigmas))
+        left = eliminate(self._equations(estimate, self._rule.outlier_sigmas))
         chain, border = covariances(left)
         return np.concatenate([chain, border[None, POSE, POSE]]), border
-
-    def _motion_costs(self, residual: Array, share: float = 1.0) -> tuple[Array, Array]:
-        """Return the costs of all motions, shapes (k,): of the wheels' noise, and of a slip.
-
-        Of the price of a slip only a share counts.
-        """
-        as_wheels = np.sum(np.einsum("kij,kj->ki", self._roots, residual) ** 2, axis=1)
-        slipped = np.sum(np.einsum("kij,kj->ki", self._slip_roots, residual) ** 2, axis=1)
-        return as_wheels, slipped + share * self._slip_price
-
-    def _slips(
-        self, estimate: Estimate, slips: NDArray[np.bool_], *, is_first: bool
-    ) -> NDArray[np.bool_]:
-        """Return in which motions the wheels slipped, given in which they did before.
-
-        A new slip is where it gains most among its neighbours: until it is named, they share it.
-        So at first it need not gain all its price.
-        """
-        residual = motion_residuals(self._problem, estimate).residual
-        share = self._rule.first_share if is_first else 1.0
-        as_wheels, slipped = self._motion_costs(residual, share)
-        gain = as_wheels - slipped
-        k, beside = len(gain), self._rule.neighbours
-        padded = np.pad(gain, beside, constant_values=-math.inf)
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * beside + 1)
-        is_most = gain >= windows[:k].max(axis=1)
-        return np.asarray((gain > 0.0) & (is_most | slips))
 
     def _walk_residual(self, estimate: Estimate) -> Array:
         if len(estimate.calibration) == 1:
@@ -639,15 +589,12 @@ class Smoother:
         shares[: len(self._problem.ranges_m)] /= self._problem.variance_share
         return shares
 
-    def _equations(
-        self, estimate: Estimate, slips: NDArray[np.bool_], limit: float
-    ) -> NormalEquations:
+    def _equations(self, estimate: Estimate, limit: float) -> NormalEquations:
         problem = self._problem
         n_border = HEAD_SIZE + len(estimate.fixed)
         size = 6 if problem.is_walking else 3
         equations = NormalEquations(len(estimate.poses) - 1, size, n_border)
-        roots = np.where(slips[:, None, None], self._slip_roots, self._roots)
-        steps = motion_residuals(problem, estimate).whitened(roots)
+        steps = motion_residuals(problem, estimate).whitened(self._roots)
         if problem.is_walking:
             equations.add_walking_steps(steps, self._walk_roots, self._walk_residual(estimate))
         else:

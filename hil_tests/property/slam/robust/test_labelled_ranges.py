@@ -44,7 +44,7 @@ PARAMETERS = BackEndParameters(
     ranges=RangeNoise(
         sigma_m=SIGMA_M, field_of_view_rad=math.tau, min_range_m=0.0, max_range_m=50.0
     ),
-    relinearisation=RelinearisationRule(steps_per_slip=math.inf, shift_m=0.1),
+    relinearisation=RelinearisationRule(shift_m=0.1),
 )
 BEACONS = {7: np.array([6.0, 4.0]), 1: np.array([-3.0, 6.0]), 42: np.array([2.0, -5.0])}
 

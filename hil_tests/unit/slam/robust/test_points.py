@@ -50,7 +50,7 @@ PARAMETERS = BackEndParameters(
     wheels=WHEELS,
     ranges=NOISE,
     map=MapRule(neighbourhood_m=3.0, view_inset_m=0.3),
-    relinearisation=RelinearisationRule(key_m=0.2, shift_m=0.2, steps_per_slip=math.inf),
+    relinearisation=RelinearisationRule(key_m=0.2, shift_m=0.2),
 )
 LAPS, STEPS = 2, 120
 
@@ -209,7 +209,7 @@ def test_a_motion_that_the_wheels_do_not_report_is_found(
 
     With hypotheses of a jump the end is where the truth is; without them it is not.
     """
-    rule = RelinearisationRule(key_m=0.2, shift_m=0.2, slip_m=0.0, slip_rad=0.0)
+    rule = RelinearisationRule(key_m=0.2, shift_m=0.2)
     hypotheses = Hypotheses(
         Rig(mounts=(MOUNT,)), replace(PARAMETERS, jumps=jumps, relinearisation=rule)
     )
