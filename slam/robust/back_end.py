@@ -372,8 +372,7 @@ class RobustBackEnd:
     def _look_for_slip(self, motion: Motion, elapsed_s: float) -> None:
         """Let the pose be uncertain where the wheels may have slipped before the newest step.
 
-        Poses that were kept meanwhile are given up, and so are ranges of before that no landmark
-        has. What was seen during the slip was assigned by poses that it made wrong.
+        Poses that were kept meanwhile are given up, and so are ranges of before.
         """
         slip = self._slips.take(motion, elapsed_s)
         if slip is None:
@@ -382,7 +381,6 @@ class RobustBackEnd:
         first = self._log.n_poses - 1 - len(slip.covariances)
         for pose, covariance in enumerate(slip.covariances, start=first):
             self._log.loosen(pose, covariance)
-        self._log.leave_out_since(first)
         n_sure = sum(number < first for number in self.state.past_numbers)
         self._marginalise_past(slice(n_sure, None))
         self._move(slip.since)

@@ -40,7 +40,6 @@ from slam.robust.parameters import (
     ImagedPointRule,
     RangeNoise,
 )
-from slam.robust.proposals.slips import MOST_STEPS
 from slam.robust.solver.growing_arrays import PackedRows
 from slam.robust.state import calibrated_motion, quarter_turn, turned_covariance
 
@@ -207,11 +206,11 @@ class RobustSlam:
         covariance = self._noise_since(self._pose, t_ns)
         stood_s = self._stood_ns / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
-        if self._patches is not None and branches.main.may_have_slipped:
-            self._patches.begin_anew()
         imaged = {frame.radar for frame in frames} if self._patches is not None else set[int]()
         scans = [*self._scans(detections, sigmas_m, moved, imaged), *given]
-        if self._patches is not None:
+        if self._patches is not None and branches.main.may_have_slipped:
+            self._patches.begin_anew()
+        elif self._patches is not None and not branches.main.undecided_covariance.any():
             scans += self._patches.scans(self.back_end.state.calibration)
         report = branches.update(scans)
         self._pose, self._t_ns, self._stood_ns = pose, t_ns, 0
@@ -379,8 +378,7 @@ class PatchScans:
         # The newest pose, as reported and on the corrected path
         self._reported: Array | None = None
         self._path = np.zeros(3)
-        self._waiting: list[tuple[int, ImagedPatch]] = []  # and the step in which it was complete
-        self._n_steps = 0
+        self._waiting: list[ImagedPatch] = []
         self._noise = PointNoise(rule)
 
     def take(
@@ -398,7 +396,7 @@ class PatchScans:
             motion = calibrated_motion(between(before, poses[t_ns]), calibration, self._wheels)
             return compose(path, np.append(motion.step_m, motion.turn_rad))
 
-        self._waiting += [(self._n_steps, one) for one in self._imager.step(frames, pose_at)]
+        self._waiting += self._imager.step(frames, pose_at)
         self._reported, self._path = poses[t_ns], pose_at(t_ns)
 
     def begin_anew(self) -> None:
@@ -410,13 +408,11 @@ class PatchScans:
     def scans(self, calibration: Array) -> list[RangeScan]:
         """Return the scans of the oldest patch that waits: of its points, and of its walls.
 
-        Each waits until it is known that the wheels did not slip in it. If a patch of each radar
-        could be taken there are those of several, so that patches of one side are taken one after
-        the other.
+        Not to be called while the newest steps may be a slip: the way from a patch to now would not
+        be known. If a patch of each radar waits there are those of several, so that patches of one
+        side are taken one after the other.
         """
-        self._n_steps += 1
-        known = [one for step, one in self._waiting if step + MOST_STEPS < self._n_steps]
-        ready = known[: max(1, len(known) - len(self._rig.mounts) + 1)]
+        ready = self._waiting[: max(1, len(self._waiting) - len(self._rig.mounts) + 1)]
         del self._waiting[: len(ready)]
         for one in ready:
             self._noise.take(one)

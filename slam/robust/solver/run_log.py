@@ -365,11 +365,6 @@ class RunLog:
         bad &= np.isnan(ranges["bearing_rad"]) & np.isin(ranges["landmark"], named)
         ranges["landmark"][bad] = _OF_NOTHING
 
-    def leave_out_since(self, pose: int) -> None:
-        """Leave out all measurements from a pose on."""
-        ranges = self._ranges.rows_to_write()
-        ranges["landmark"][ranges["pose"] >= pose] = _OF_NOTHING
-
     def seen_from(self, poses: Collection[int]) -> Counter[int]:
         """Return from how many of some poses each landmark was seen with a bearing, by its id."""
         ranges = self._ranges.rows
