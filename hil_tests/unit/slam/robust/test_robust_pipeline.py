@@ -456,12 +456,19 @@ def test_noise_of_the_wheels_own_model_changes_nothing_but_roundings() -> None:
 def test_images_begin_anew_where_the_wheels_may_have_slipped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One step after the slip, before the patches of that step are taken."""
-    anew: list[int] = []
+    """One step after the slip; of it and of that step no patch is taken."""
+    anew, taken = list[int](), list[int]()
     tick = 0
+
+    def scans(_: PatchScans, __: Array) -> list[RangeScan]:
+        taken.append(tick)
+        return []
+
     monkeypatch.setattr(PatchScans, "begin_anew", lambda _: anew.append(tick))
+    monkeypatch.setattr(PatchScans, "scans", scans)
     slam, pose = robust(), np.zeros(3)
     for tick in range(20):
         pose = compose(pose, np.array([0.02, 0.0, 0.1 if tick == 10 else 0.0]))
         slam.step_detections([], {tick * TICK_NS: pose}.__getitem__, tick * TICK_NS)
     assert anew == [11]
+    assert sorted({*range(1, 20)} - {*taken}) == [10, 11]
