@@ -18,6 +18,7 @@ from slam.library.evaluation import nees_pose
 from slam.library.slam import make_slam
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Belief, LaggedPose, PoseAt
+from slam.robust.association import RangeScan
 from slam.robust.pipeline import PatchScans, RobustSlam, back_end_parameters, belief_of
 from slam.robust.state import rotation
 
