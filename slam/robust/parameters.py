@@ -267,8 +267,8 @@ class SlipRule:
     little off make one step shorter and the next one longer."""
 
     steady_m: Annotated[float, Origin.CHOSEN] = 0.005
-    """What the wheels report for a step or two beyond the motion around them is a possible slip
-    from here on."""
+    """What the wheels report for one step or two beyond the motion around them is a possible slip
+    from here on; for three, from 1.4 times as much on."""
     steady_rad: Annotated[float, Origin.CHOSEN] = 0.01
     """The same of the turn."""
     recent_steps: Annotated[int, Origin.CHOSEN, "steps"] = 20

@@ -1,6 +1,6 @@
-"""Possible slips: motion that the wheels report for a step or two between steps that are alike.
+"""Possible slips: motion that the wheels report for up to three steps between steps that are alike.
 
-A robot has inertia, so a motion that begins and ends within two steps is as likely a slip of the
+A robot has inertia, so a motion that begins and ends within three steps is as likely a slip of the
 wheels as its own. The ranges at its end can hardly tell: a turn changes none, until the robot has
 driven on. So neither is decided. The pose stays as the wheels report it, and gets the mean square
 of what it may be off by, with both equally likely: half the square of that motion, along it. Ranges
@@ -27,11 +27,13 @@ import numpy as np
 from slam.robust.parameters import SlipRule
 from slam.robust.state import Array, Motion
 
-MOST_STEPS = 2
-"""Steps of the longest slip: one between two samples of odometry falls into two."""
+MOST_STEPS = 3
+"""Steps of the longest slip: one between two samples of odometry falls into two, and two slips that
+follow on each other into three."""
 
 Vector = tuple[float, float, float]  # dx, dy [m] and turn [rad], body frame before it
 _ZERO: Vector = (0.0, 0.0, 0.0)
+_SPREAD_OF_TWO = 2 + 2**2 / 2  # variance of what two steps have beyond the mean of two others
 
 
 class _Step(NamedTuple):
@@ -66,7 +68,7 @@ class SlipDetector:
     What is less than ``outlier_sigmas`` standard deviations of the wheels' noise is none. Nor is
     what is less than as many times the third quartile of the latest changes from step to step. For
     white noise that quartile is 1.6 standard deviations of a step; what two steps have beyond the
-    two around them has 2.
+    two around them has 2. Of more steps it may be so much more.
     """
 
     def __init__(self, rule: SlipRule, outlier_sigmas: float) -> None:
@@ -133,7 +135,7 @@ class SlipDetector:
         """Return what steps report beyond the one before and the one after them."""
         steps, around_s = [first, *between, last], first.took_s + last.took_s
         change = _change(first, last, 0.5 * around_s)
-        if not self._is_steady(change, steps):
+        if not self._is_steady(change, steps, 2.0):
             return None
         rate = [
             (before + after) / around_s
@@ -173,7 +175,10 @@ class SlipDetector:
         )
         # By its shares a step that is a little short in all would lack some of its turn
         change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
-        if any(self._is_steady(one, around) for one in (_sum(by_most), _sum(beyond), change)):
+        n = len(steps)
+        spread = n + n**2 / (len(around) - n)
+        changes = _sum(by_most), _sum(beyond), change
+        if any(self._is_steady(one, around, spread) for one in changes):
             return None
         return beyond
 
@@ -189,12 +194,20 @@ class SlipDetector:
     def _square(self, motion: Sequence[float]) -> float:
         return sum(weight * value**2 for weight, value in zip(self._weights, motion, strict=True))
 
-    def _is_steady(self, change: Sequence[float], steps: Sequence[_Step]) -> bool:
-        """Return whether a change among steps, dx, dy [m] and turn [rad], is an ordinary one."""
-        x, y, turn = _sum([one.variances for one in steps])
+    def _is_steady(self, change: Sequence[float], steps: Sequence[_Step], spread: float) -> bool:
+        """Return whether a change among steps, dx, dy [m] and turn [rad], is an ordinary one.
+
+        White noise of the steps, of variance 1, makes one of variance ``spread`` of it.
+        """
+        x, y, turn = (spread / len(steps) * one for one in _sum([one.variances for one in steps]))
         rule, sigmas = self._rule, self._outlier_sigmas
-        most_m = max(rule.steady_m, sigmas * math.sqrt(x + y), sigmas * self._recent_m)
-        most_rad = max(rule.steady_rad, sigmas * math.sqrt(turn), sigmas * self._recent_rad)
+        more = max(math.sqrt(spread / _SPREAD_OF_TWO), 1.0)
+        most_m = max(rule.steady_m, sigmas * self._recent_m) * more
+        most_rad = max(rule.steady_rad, sigmas * self._recent_rad) * more
+        most_m, most_rad = (
+            max(most_m, sigmas * math.sqrt(x + y)),
+            max(most_rad, sigmas * math.sqrt(turn)),
+        )
         return math.hypot(change[0], change[1]) <= most_m and abs(change[2]) <= most_rad
 
 

@@ -123,14 +123,24 @@ def test_a_run_may_begin_slowly(share: float) -> None:
 
 
 def test_a_motion_that_begins_is_undecided_until_it_has_gone_on() -> None:
-    """It may be a slip of two steps until a third; then it is the robot's own."""
+    """It may be a slip of three steps until a fourth; then it is the robot's own."""
     detector = SlipDetector(RULE, 4.0)
     undecided = []
-    for step in [AHEAD] * 3 + [TURN] * 4:
+    for step in [AHEAD] * 3 + [TURN] * 5:
         detector.take(calibrated_motion(step, np.zeros(3), WheelNoise(), 1e-12 * np.eye(3)), 0.2)
         undecided.append(detector.undecided_covariance()[2, 2])
     square = 0.5 * TURN[2] ** 2
-    np.testing.assert_allclose(undecided, [0.0] * 3 + [square, 4.0 * square] + [0.0] * 2)
+    expected = [0.0] * 3 + [square, 4.0 * square, 9.0 * square] + [0.0] * 2
+    np.testing.assert_allclose(undecided, expected)
+
+
+def test_two_slips_that_follow_on_each_other_are_one_of_three_steps() -> None:
+    """Each between two samples of odometry, so that the second step has a part of both."""
+    parts = [AHEAD + share * SLIP for share in (0.3, 1.1, 0.6)]
+    (found,) = slips_of([AHEAD] * 3 + parts + [AHEAD] * 2)
+    assert len(found.covariances) == 3
+    assert found.since.covariance[2, 2] == pytest.approx(0.5 * (2.0 * SLIP[2]) ** 2, rel=1e-6)
+    assert slips_of([AHEAD] * 3 + [AHEAD + 0.5 * SLIP] * 4 + [AHEAD] * 2) == []
 
 
 def test_a_motion_that_ends_at_once_is_undecided_if_either_step_may_have_slipped() -> None:
@@ -227,9 +237,9 @@ def test_a_turn_beyond_the_limit_is_a_slip_once(motion: Array, sign: float) -> N
 
 
 def test_what_the_noise_of_the_wheels_explains_is_no_slip() -> None:
-    """Three steps of 6 mm noise along and across: four sigmas of all are 59 mm."""
+    """One step against the mean of two, of 6 mm noise along and across: four sigmas are 42 mm."""
     covariance = np.diag([6e-3, 6e-3, 1e-4]) ** 2
-    for away_m, n_found in ((0.057, 0), (0.061, 1)):
+    for away_m, n_found in ((0.041, 0), (0.042, 1)):
         detector, steps = SlipDetector(RULE, 4.0), [AHEAD] * 3
         steps += [AHEAD + np.array([0.0, away_m, 0.0]), AHEAD, AHEAD]
         motions = [calibrated_motion(one, np.zeros(3), WheelNoise(), covariance) for one in steps]
