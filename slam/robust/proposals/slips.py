@@ -169,16 +169,17 @@ class SlipDetector:
         ``around`` are all steps that the rate is of, and these.
         """
         expected = [[value * step.took_s for value in rate] for step in steps]
+        n = len(steps)
+        spread = n + n**2 / (len(around) - n)
+        # By its shares a step that is a little short in all would lack some of its turn
+        change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
+        if self._is_steady(change, around, spread):
+            return None
         by_most, beyond = (
             [self._off(step.motion, one, most) for step, one in zip(steps, expected, strict=True)]
             for most in (self._rule.most_share, 1.0)
         )
-        # By its shares a step that is a little short in all would lack some of its turn
-        change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
-        n = len(steps)
-        spread = n + n**2 / (len(around) - n)
-        changes = _sum(by_most), _sum(beyond), change
-        if any(self._is_steady(one, around, spread) for one in changes):
+        if any(self._is_steady(_sum(one), around, spread) for one in (by_most, beyond)):
             return None
         return beyond
 
@@ -200,15 +201,11 @@ class SlipDetector:
         White noise of the steps, of variance 1, makes one of variance ``spread`` of it.
         """
         x, y, turn = (spread / len(steps) * one for one in _sum([one.variances for one in steps]))
-        rule, sigmas = self._rule, self._outlier_sigmas
-        more = max(math.sqrt(spread / _SPREAD_OF_TWO), 1.0)
-        most_m = max(rule.steady_m, sigmas * self._recent_m) * more
-        most_rad = max(rule.steady_rad, sigmas * self._recent_rad) * more
-        most_m, most_rad = (
-            max(most_m, sigmas * math.sqrt(x + y)),
-            max(most_rad, sigmas * math.sqrt(turn)),
-        )
-        return math.hypot(change[0], change[1]) <= most_m and abs(change[2]) <= most_rad
+        sigmas, more = self._outlier_sigmas, max(math.sqrt(spread / _SPREAD_OF_TWO), 1.0)
+        steady_m = max(self._rule.steady_m, sigmas * self._recent_m) * more
+        steady_rad = max(self._rule.steady_rad, sigmas * self._recent_rad) * more
+        is_short = math.hypot(change[0], change[1]) <= max(steady_m, sigmas * math.sqrt(x + y))
+        return is_short and abs(change[2]) <= max(steady_rad, sigmas * math.sqrt(turn))
 
 
 def _sum(motions: Sequence[Sequence[float]]) -> Vector:
