@@ -34,6 +34,7 @@ from slam.library.evaluation import LandmarkScore, ate_rmse_m
 from slam.live.errors import AppError
 from slam.live.odometry_track import Trajectory, write_tum
 from slam.live.session.description import settings_text
+from slam.live.session_records import SessionInfo
 from slam.results import Association, Belief, LaggedPose, Observation, SmoothedRun, StepResult
 from xethru_protocol.operating_system import StopFlag
 
@@ -64,7 +65,7 @@ def record_of(
     )
 
 
-def run(offset_m: float, drift: float, variance: float) -> Summary:
+def run(offset_m: float, drift: float, variance: float, info: SessionInfo = INFO) -> Summary:
     """Drive 3 m along x; the estimate is off by a constant and a share of the way in y."""
     truth = np.zeros((N, 3))
     truth[:, 0] = np.linspace(0, 3, N)
@@ -87,7 +88,7 @@ def run(offset_m: float, drift: float, variance: float) -> Summary:
             )
         )
     record = record_of(results, truth, np.zeros(3))
-    summary = summarise(record, INFO, RIG)
+    summary = summarise(record, info, RIG)
     assert summary is not None
     return summary
 
@@ -112,6 +113,16 @@ def test_landmarks_are_judged_after_the_trajectorys_alignment_and_expected_only_
     assert score.rmse_m == pytest.approx(0.0, abs=1e-9)
     # the path is right, the map is 30 mm off
     assert run(offset_m=0.0, drift=0.0, variance=0.01).landmarks.rmse_m == pytest.approx(0.03)
+
+
+def test_a_corner_of_two_walls_may_be_a_landmark_and_is_none_that_must_be_found() -> None:
+    walls = (np.array([[0.0, 2.0], LANDMARKS[1]]), np.array([LANDMARKS[1], [2.0, 4.0]]))
+    info = dataclasses.replace(INFO, true_landmarks_m=LANDMARKS[:1])
+    score = run(offset_m=0.03, drift=0.0, variance=0.01, info=info).landmarks
+    assert (score.true, score.precision, score.recall) == (1, 0.5, 1.0)
+    info = dataclasses.replace(info, outlines_m=walls)
+    score = run(offset_m=0.03, drift=0.0, variance=0.01, info=info).landmarks
+    assert (score.true, score.precision, score.recall) == (1, 1.0, 1.0)
 
 
 def smoothed_of(record: RunRecord, poses: np.ndarray, sigma: float) -> SmoothedRun:
