@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -400,32 +399,17 @@ def find_merge(
     refused: Collection[Pairs] = (),
     distinct: Collection[int] = (),
 ) -> Correspondence | None:
-    """Return the merge to be tried now, of one pair or two, or None.
+    """Return the merge of two landmarks to be tried now, or None.
 
     ``refused`` are those not to be tried, as ``named_pairs`` returns them; of the rows ``distinct``
     no two are one.
     """
     density = density_per_m2(state.landmarks_m, rule.neighbourhood_m)
-    single = [
+    merges = [
         one
         for one in _candidates(state, density, rule.neighbourhood_m)
         if not all(row in distinct for row in one.pairs[0])
     ]
-    best = _certain(state, single, refused)
-    if best is not None:
-        return best
-    likely = sorted((one for one in single if one.is_possible), key=lambda one: -one.evidence)
-    twos = [
-        judge(state, one.pairs + other.pairs, MERGE_SIGMA_M, density)
-        for one, other in combinations(likely[: rule.most_likely], 2)
-        if not one.contradicts(other)
-    ]
-    return _certain(state, twos, refused)
-
-
-def _certain(
-    state: State, merges: Sequence[Correspondence], refused: Collection[Pairs]
-) -> Correspondence | None:
     pairs = [one.pairs for one in merges]
     return certain(merges, [rows for rows in pairs if named_pairs(state, rows) in refused])
 

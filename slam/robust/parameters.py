@@ -178,8 +178,6 @@ class MapRule:
     """Scans between two looks for landmarks that may be one, and for evidence of a carry."""
     gap_poses: Annotated[int, Origin.CHOSEN, "scans"] = 50
     """A landmark that has not been seen for longer is in another passage when it is seen again."""
-    most_likely: Annotated[int, Origin.BUDGET, "merges"] = 12
-    """How many of the likeliest merges are combined in twos."""
     neighbourhood_m: Annotated[float, Origin.CHOSEN] = NEIGHBOURHOOD_M
     """Distance within which landmarks are neighbours: those that may be one, and those that count
     for the density of a map."""
