@@ -182,34 +182,46 @@ def landmark_metrics(
     ``alignment`` (3,) is the *trajectory's* (``align_se2`` of its positions): the map is not fitted
     to the landmarks it is judged by. Every true landmark may be matched; ``observable`` (m,) marks
     those that must be (``observable_landmarks``): only they count in recall. ``corners_xy`` (k, 2)
-    are ends and corners of walls and boxes, which echo like points: each may be matched, too.
+    are ends and corners of walls and boxes, which echo like points: what matches no landmark may
+    match one of those that are further than 0.15 m from every landmark.
     """
     n, m = len(estimated_xy), len(true_xy)
-    if corners_xy is not None:
-        true_xy = np.concatenate([true_xy, corners_xy])
-        observable = np.concatenate([observable, np.zeros(len(corners_xy), dtype=np.bool_)])
-    if n and len(true_xy):
-        placed = transform(alignment, estimated_xy)
-        distances = np.linalg.norm(placed[:, None, :] - true_xy[None, :, :], axis=2)
-    else:
-        distances = np.empty((n, len(true_xy)))
-    close = distances <= LANDMARK_MATCH_M
-    # First as many matches as possible, then the least total distance.
-    rows, columns = linear_sum_assignment(np.where(close, distances, 1e6))
-    kept = close[rows, columns]
-    rows, columns = rows[kept], columns[kept]
+    placed = transform(alignment, estimated_xy) if n else np.empty((0, 2))
+    distances = _distances(placed, true_xy)
+    rows, columns = _one_to_one(distances)
     others = np.setdiff1d(np.arange(n), rows)
-    matched, expected = len(rows), int(observable.sum())
-    squared = distances[rows, columns] ** 2
+    errors_m = distances[rows, columns]
+    beside = distances[others][:, columns] <= LANDMARK_MATCH_M
+    if corners_xy is not None:
+        apart = (_distances(corners_xy, true_xy) > LANDMARK_MATCH_M).all(axis=1)
+        to_corners = _distances(placed[others], corners_xy[apart])
+        corner_rows, corners = _one_to_one(to_corners)
+        errors_m = np.concatenate([errors_m, to_corners[corner_rows, corners]])
+        beside = np.hstack([beside, to_corners[:, corners] <= LANDMARK_MATCH_M])
+        beside = np.delete(beside, corner_rows, axis=0)
+    expected = int(observable.sum())
     return LandmarkScore(
         true=m,
         observable=expected,
         estimated=n,
-        precision=matched / n if n else None,
+        precision=len(errors_m) / n if n else None,
         recall=int(observable[columns].sum()) / expected if expected else None,
-        duplicates=int(close[others][:, columns].any(axis=1).sum()),
-        rmse_m=math.sqrt(float(np.mean(squared))) if matched else None,
+        duplicates=int(beside.any(axis=1).sum()),
+        rmse_m=math.sqrt(float(np.mean(errors_m**2))) if len(errors_m) else None,
     )
+
+
+def _distances(some_xy: Array, others_xy: Array) -> Array:
+    """Return the distances between points (n, 2) and others (m, 2), shape (n, m)."""
+    return np.asarray(np.linalg.norm(some_xy[:, None, :] - others_xy[None, :, :], axis=2))
+
+
+def _one_to_one(distances: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns matched within 0.15 m: as many as can be, at the least distance."""
+    close = distances <= LANDMARK_MATCH_M
+    rows, columns = linear_sum_assignment(np.where(close, distances, 1e6))
+    kept = close[rows, columns]
+    return rows[kept], columns[kept]
 
 
 def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:

@@ -869,7 +869,7 @@ class RobustBackEnd:
             options = options_of(self.state, point, found, rule.unmapped_per_m2)
             options.append(Option(evidence=0.0))
             if self._may_have_jumped(tentative):
-                rarity = math.log(parameters.jumps.steps_per_jump)
+                rarity = math.log(parameters.branches.steps_per_jump)
                 options.append(Option(evidence=-rarity, is_jump=True))
             options.sort(key=lambda one: -one.evidence)
             return Question(tentative=tentative, point=point, options=tuple(options))

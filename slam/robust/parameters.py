@@ -91,7 +91,6 @@ class JumpNoise:
     # Standard deviations along each axis, and of the turn; zero: there is no such motion
     sigma_m: float = 0.0
     sigma_rad: float = 0.0
-    steps_per_jump: float = 100.0  # how many steps of the robot there are to one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,9 +263,12 @@ class SlipRule:
     """Up to which multiple of the motion around it a step is an ordinary one: times that are a
     little off make one step shorter and the next one longer."""
 
+    most_steps: Annotated[int, Origin.CHOSEN, "steps"] = 3
+    """Steps of the longest slip: one between two samples of odometry falls into two, and two slips
+    that follow on each other into three."""
     steady_m: Annotated[float, Origin.CHOSEN] = 0.005
-    """What the wheels report for one step or two beyond the motion around them is a possible slip
-    from here on; for three, from 1.4 times as much on."""
+    """What the wheels report for one step or two beyond the motion around them may be a slip if it
+    is more than this; for three steps the limit is 1.4 times as high."""
     steady_rad: Annotated[float, Origin.CHOSEN] = 0.01
     """The same of the turn."""
     recent_steps: Annotated[int, Origin.CHOSEN, "steps"] = 20
@@ -310,6 +312,8 @@ class BranchRule:
     """Shortest stop of the wheels: one that is shorter counts as driving."""
     steps_per_hidden: Annotated[float, Origin.CHOSEN, "scans"] = 3000.0
     """How many scans there are to one motion that the wheels do not report: one in ten minutes."""
+    steps_per_jump: Annotated[float, Origin.CHOSEN, "scans"] = 100.0
+    """The same of a robot that moves so more often (`JumpNoise`)."""
     hidden_m: Annotated[float, Origin.CHOSEN] = 0.1
     """Standard deviation of such a motion, along each axis."""
     hidden_rad: Annotated[float, Origin.CHOSEN] = 0.2

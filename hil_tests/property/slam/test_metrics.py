@@ -288,6 +288,16 @@ def test_a_corner_may_be_a_landmark_once_and_need_not_be_one() -> None:
     assert landmark_metrics(estimated, TRUE, HERE, ALL, np.zeros((0, 2))) == landmark_metrics(
         estimated, TRUE, HERE, ALL
     )
+    # One within 15 cm of a landmark is none of its own, and takes no estimate from another.
+    beside = np.array([[0.1, 0.0], [1.14, 0.0], [2.0, 1.0]])
+    twice = np.vstack([TRUE, TRUE + np.array([0.01, 0.0])])
+    assert landmark_metrics(twice, TRUE, HERE, ALL, beside) == landmark_metrics(
+        twice, TRUE, HERE, ALL
+    )
+    further = np.array([[0.3, 0.0]])
+    between = landmark_metrics(np.array([[0.14, 0.0], [0.16, 0.0]]), TRUE, HERE, ALL, further)
+    assert (between.precision, between.duplicates) == (1.0, 0)
+    assert between.recall == pytest.approx(1 / 3)
     only = landmark_metrics(corners, np.zeros((0, 2)), HERE, np.zeros(0, dtype=bool), corners)
     assert (only.true, only.precision, only.recall) == (0, 1.0, None)
 

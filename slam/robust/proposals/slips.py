@@ -1,6 +1,6 @@
 """Possible slips: motion that the wheels report for up to three steps between steps that are alike.
 
-A robot has inertia, so a motion that begins and ends within three steps is as likely a slip of the
+A robot has inertia, so a motion that begins and ends within so few is as likely a slip of the
 wheels as its own. The ranges at its end can hardly tell: a turn changes none, until the robot has
 driven on. So neither is decided. The pose stays as the wheels report it, and gets the mean square
 of what it may be off by, with both equally likely: half the square of that motion, along it. Ranges
@@ -26,10 +26,6 @@ import numpy as np
 
 from slam.robust.parameters import SlipRule
 from slam.robust.state import Array, Motion
-
-MOST_STEPS = 3
-"""Steps of the longest slip: one between two samples of odometry falls into two, and two slips that
-follow on each other into three."""
 
 Vector = tuple[float, float, float]  # dx, dy [m] and turn [rad], body frame before it
 _ZERO: Vector = (0.0, 0.0, 0.0)
@@ -68,7 +64,7 @@ class SlipDetector:
     What is less than ``outlier_sigmas`` standard deviations of the wheels' noise is none. Nor is
     what is less than as many times the third quartile of the latest changes from step to step. For
     white noise that quartile is 1.6 standard deviations of a step; what two steps have beyond the
-    two around them has 2. Of more steps it may be so much more.
+    two around them has 2. The limits of more steps are higher, as the noise of their sum is.
     """
 
     def __init__(self, rule: SlipRule, outlier_sigmas: float) -> None:
@@ -99,7 +95,7 @@ class SlipDetector:
             slip = slip or self._slip(first or last, between, last)
         if self._steps and (before := self._steps[-1]) is not None:
             self._take_change(_change(before, last, last.took_s))
-        self._steps = [last] if slip else [*self._steps[-MOST_STEPS:], last]
+        self._steps = [last] if slip else [*self._steps[-self._rule.most_steps :], last]
         return slip
 
     def _take_change(self, change: Vector) -> None:
@@ -126,7 +122,7 @@ class SlipDetector:
 
     def _newest(self) -> Iterator[tuple[_Step | None, list[_Step]]]:
         """Yield the newest steps that may be of one slip, fewest first, and the one before them."""
-        for n in range(1, min(MOST_STEPS, len(self._steps) - 1) + 1):
+        for n in range(1, min(self._rule.most_steps, len(self._steps) - 1) + 1):
             first, *between = self._steps[-n - 1 :]
             if first is not None or n == 1:  # two that are alike and then end are a motion
                 yield first, [step for step in between if step is not None]
@@ -169,8 +165,7 @@ class SlipDetector:
         ``around`` are all steps that the rate is of, and these.
         """
         expected = [[value * step.took_s for value in rate] for step in steps]
-        n = len(steps)
-        spread = n + n**2 / (len(around) - n)
+        spread = len(steps) + len(steps) ** 2 / 2  # white noise, against the mean of two others
         # By its shares a step that is a little short in all would lack some of its turn
         change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
         if self._is_steady(change, around, spread):
@@ -198,12 +193,12 @@ class SlipDetector:
     def _is_steady(self, change: Sequence[float], steps: Sequence[_Step], spread: float) -> bool:
         """Return whether a change among steps, dx, dy [m] and turn [rad], is an ordinary one.
 
-        White noise of the steps, of variance 1, makes one of variance ``spread`` of it.
+        ``spread`` is the variance of the change over that of a step, for white noise.
         """
         x, y, turn = (spread / len(steps) * one for one in _sum([one.variances for one in steps]))
-        sigmas, more = self._outlier_sigmas, max(math.sqrt(spread / _SPREAD_OF_TWO), 1.0)
-        steady_m = max(self._rule.steady_m, sigmas * self._recent_m) * more
-        steady_rad = max(self._rule.steady_rad, sigmas * self._recent_rad) * more
+        sigmas, factor = self._outlier_sigmas, max(math.sqrt(spread / _SPREAD_OF_TWO), 1.0)
+        steady_m = max(self._rule.steady_m, sigmas * self._recent_m) * factor
+        steady_rad = max(self._rule.steady_rad, sigmas * self._recent_rad) * factor
         is_short = math.hypot(change[0], change[1]) <= max(steady_m, sigmas * math.sqrt(x + y))
         return is_short and abs(change[2]) <= max(steady_rad, sigmas * math.sqrt(turn))
 

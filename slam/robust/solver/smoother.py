@@ -477,11 +477,12 @@ class Smoother:
         estimate, limit, rule = start, math.inf, self._rule
         cost, decrease = self.cost(estimate), math.inf
         for iteration in range(rule.iterations):
-            # Far from the solution, what is right may look like an outlier.
-            is_settled = decrease <= _SETTLED_SHARE * cost or 2 * iteration >= rule.iterations
+            # Far from the solution, what is right may look like an outlier; but the last half of
+            # the steps is without outliers.
+            is_settled = decrease <= _SETTLED_SHARE * cost or 2 * iteration >= rule.iterations - 1
             if is_settled and limit != rule.outlier_sigmas:
                 limit = rule.outlier_sigmas
-                cost, decrease = self.cost(estimate, limit), math.inf
+                cost = self.cost(estimate, limit)
             try:
                 change = solve(self._equations(estimate, limit))
             except np.linalg.LinAlgError:

@@ -65,11 +65,17 @@ def record_of(
     )
 
 
-def run(offset_m: float, drift: float, variance: float, info: SessionInfo = INFO) -> Summary:
+def run(
+    offset_m: float,
+    drift: float,
+    variance: float,
+    info: SessionInfo = INFO,
+    found: NDArray[np.float64] = LANDMARKS[:2],
+) -> Summary:
     """Drive 3 m along x; the estimate is off by a constant and a share of the way in y."""
     truth = np.zeros((N, 3))
     truth[:, 0] = np.linspace(0, 3, N)
-    found = LANDMARKS[:2] + np.array([0.0, 0.03])
+    found = found + np.array([0.0, 0.03])
     results = []
     for k in range(N):
         pose = truth[k] + np.array([0.0, offset_m, 0.0])
@@ -123,6 +129,11 @@ def test_a_corner_of_two_walls_may_be_a_landmark_and_is_none_that_must_be_found(
     info = dataclasses.replace(info, outlines_m=walls)
     score = run(offset_m=0.03, drift=0.0, variance=0.01, info=info).landmarks
     assert (score.true, score.precision, score.recall) == (1, 1.0, 1.0)
+    # It is one corner of both walls: of two landmarks there one is false.
+    at_corner = dataclasses.replace(info, true_landmarks_m=np.array([[9.0, 9.0]]))
+    twice = np.array([LANDMARKS[1], LANDMARKS[1]])
+    score = run(offset_m=0.03, drift=0.0, variance=0.01, info=at_corner, found=twice).landmarks
+    assert (score.precision, score.duplicates) == (0.5, 1)
 
 
 def smoothed_of(record: RunRecord, poses: np.ndarray, sigma: float) -> SmoothedRun:
