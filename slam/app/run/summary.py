@@ -200,7 +200,7 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     """Compute summary.json's numbers; None if no state was estimated or the truth is unknown.
 
     `rig` holds the mounts that SLAM uses; they and the settings in `info` decide which true
-    landmarks count in recall. In precision count the corners of walls and boxes, too.
+    landmarks count in recall. Corners of walls and boxes count in precision, too.
     """
     states, last = record.states, record.last
     if last is None or not states.has_truth:

@@ -1,4 +1,4 @@
-"""A robot that slips is put right by the next solution; one that is carried away is found again."""
+"""A robot that slips is put right by ranges; one that is carried away is found again."""
 
 import math
 from collections import Counter

@@ -235,7 +235,7 @@ def test_patches_of_all_radars_are_taken_one_a_state() -> None:
 
 
 def test_what_waits_is_forgotten_with_the_way_to_it() -> None:
-    """Of those that wait before a slip is found the way is not known; one of after is taken."""
+    """A patch that waits when a slip is found is never taken; one of after it is."""
     anew = []
 
     class OneAStep:
@@ -257,6 +257,9 @@ def test_what_waits_is_forgotten_with_the_way_to_it() -> None:
             taken.append(len([one for one in scans.scans(zero) if one.faces_m is None]))
     assert taken == [1, 1, 1, 1]
     assert len(anew) == 1
+    scans.take((), {0: zero, 6: zero}, 6, zero)
+    scans.begin_anew()
+    assert scans.scans(zero) == []
 
 
 def seen_from(pose: Array, *rods: Array, radar: int = 0) -> RangeScan:

@@ -209,10 +209,7 @@ def test_a_motion_that_the_wheels_do_not_report_is_found(
 
     With hypotheses of a jump the end is where the truth is; without them it is not.
     """
-    rule = RelinearisationRule(key_m=0.2, shift_m=0.2)
-    hypotheses = Hypotheses(
-        Rig(mounts=(MOUNT,)), replace(PARAMETERS, jumps=jumps, relinearisation=rule)
-    )
+    hypotheses = Hypotheses(Rig(mounts=(MOUNT,)), replace(PARAMETERS, jumps=jumps))
     path, truth = drive(hypotheses, seed=1, jump_at=LAPS * STEPS * 2 // 3, jump_rad=0.5)
     assert least_m < math.hypot(*(path[-1, :2] - truth[-1, :2])) < most_m
 

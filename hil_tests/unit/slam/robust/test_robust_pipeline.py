@@ -457,7 +457,7 @@ def test_noise_of_the_wheels_own_model_changes_nothing_but_roundings() -> None:
 def test_images_begin_anew_where_the_wheels_may_have_slipped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One step after the slip; of it and of that step no patch is taken."""
+    """One step after the slip. In both steps no patch is taken."""
     anew, taken = list[int](), list[int]()
     tick = 0
 

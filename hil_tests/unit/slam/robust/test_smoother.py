@@ -340,6 +340,57 @@ def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
     assert packed(solution.estimate) == pytest.approx(packed(wanted.estimate), abs=1e-8)
     assert solution.information == pytest.approx(wanted.information, rel=1e-5, abs=1e-2)
     assert solution.cost == pytest.approx(wanted.cost + 4.0**2, abs=1e-6)
+    # However few steps there are, the last ones are without it.
+    for iterations in (1, 2, 3):
+        few = replace(rule, iterations=iterations)
+        quick = Smoother(replace(problem, ranges_m=ranges_m), few).solve(wanted.estimate)
+        assert quick is not None
+        assert quick.cost < solution.cost + 1.0
+
+
+def test_far_from_the_solution_no_range_is_left_out() -> None:
+    """Landmarks start 0.3 m off, so that all their ranges lie beyond the limit."""
+    problem, start = short_run(3, 0.0)
+    smoother = Smoother(problem, RelinearisationRule(iterations=40))
+    near = smoother.solve(start, tolerance=1e-14)
+    away = start.fixed.copy()
+    marks = slice(problem.layout.landmarks.start - 6, problem.layout.landmarks.stop - 6)
+    away[marks].reshape(-1, problem.layout.landmark_size)[:, :2] += 0.3
+    far = smoother.solve(replace(start, fixed=away), tolerance=1e-14)
+    assert near is not None
+    assert far is not None
+    assert packed(far.estimate) == pytest.approx(packed(near.estimate), abs=1e-6)
+    assert far.cost == pytest.approx(near.cost, abs=1e-6)
+
+
+@pytest.mark.parametrize("segment", [0, 2, 4])
+def test_a_motion_of_more_noise_takes_up_what_the_wheels_report_wrongly(segment: int) -> None:
+    problem, start = short_run(5, 0.0)
+    rule = RelinearisationRule(iterations=40, outlier_sigmas=math.inf)
+    # Known wheels: over so short a way their errors would do what a slip does.
+    sigmas = problem.prior_sigmas.copy()
+    sigmas[3:6] = 1e-3
+    sure = replace(
+        problem,
+        step_covariances=np.tile(1e-6 * np.eye(3), (N_STEPS, 1, 1)),
+        prior_sigmas=sigmas,
+        range_sigmas_m=np.full(len(problem.ranges_m), 2e-3),
+    )
+    steps, covariances = sure.steps.copy(), sure.step_covariances.copy()
+    slip, at = np.array([0.02, 0.0, math.radians(3.0)]), sure.keys[segment]
+    steps[at] += slip
+    covariances[at] += np.outer(slip, slip)
+    slipped = replace(sure, steps=steps)
+    told = replace(slipped, step_covariances=covariances)
+    right, wrong, loose = (
+        Smoother(each, rule).solve(start, tolerance=1e-13) for each in (sure, slipped, told)
+    )
+    assert right is not None
+    assert wrong is not None
+    assert loose is not None
+    true = right.estimate.poses
+    off = [np.abs(each.estimate.poses - true).max() for each in (loose, wrong)]
+    assert off[0] < 0.2 * off[1]
 
 
 def test_the_smoothed_run_leaves_the_filter_unchanged_and_is_within_a_centimetre() -> None:

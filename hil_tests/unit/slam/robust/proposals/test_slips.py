@@ -41,9 +41,9 @@ CHANGES = st.builds(
     lambda away, direction, turn: np.array(
         [away * math.cos(direction), away * math.sin(direction), turn]
     ),
-    st.floats(0.0, 0.49 * RULE.steady_m),
+    st.floats(0.0, 0.45 * RULE.steady_m),
     st.floats(0.0, math.tau),
-    st.floats(-0.49 * RULE.steady_rad, 0.49 * RULE.steady_rad),
+    st.floats(-0.45 * RULE.steady_rad, 0.45 * RULE.steady_rad),
 )
 
 
@@ -201,8 +201,28 @@ def test_a_motion_that_begins_or_ends_is_no_slip(before: Array, after: Array, sh
 def test_what_changes_as_a_steady_motion_does_is_no_slip(
     motion: Array, changes: list[Array]
 ) -> None:
-    """Two steps together may differ by the limit: each change is less than half of it."""
+    """Three steps differ by six changes at most from three like those around them."""
     assert slips_of([motion + 0.5 * change for change in changes]) == []
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("axis", [0, 2], ids=["along", "turn"])
+def test_the_limit_grows_with_the_noise_of_more_than_two_steps(n: int, axis: int) -> None:
+    """The variance of n steps against the mean of two others is n + n^2 / 2; that of two is 4."""
+    limit = [RULE.steady_m, 0.0, RULE.steady_rad][axis] * math.sqrt(max(n + n**2 / 2, 4.0) / 4.0)
+    for share, is_slip in ((0.99, False), (1.01, True)):
+        more = np.zeros(3)
+        more[axis] = share * limit / n
+        # Along the way half as much again of the motion would be an ordinary step
+        motion = TURN if axis == 0 else AHEAD
+        detector, undecided = SlipDetector(RULE, 4.0), 0.0
+        found = []
+        for step in [motion] * 3 + [motion + more] * n + [motion]:
+            undecided = detector.undecided_covariance()[axis, axis]
+            taken = calibrated_motion(step, np.zeros(3), WheelNoise(), 1e-12 * np.eye(3))
+            found.append(detector.take(taken, 0.2))
+        assert [one is not None for one in found] == [False] * (3 + n) + [is_slip]
+        assert bool(undecided) == is_slip  # before the step that showed it
 
 
 @given(motion=MOTIONS, missing=st.integers(1, 5))
