@@ -132,6 +132,11 @@ class SessionInfo:
         )
 
     @property
+    def corners_m(self) -> NDArray[np.float64]:
+        """Ends and corners of all outlines, each once, shape (k, 2) [m], world frame."""
+        return np.unique(np.concatenate([np.zeros((0, 2)), *self.outlines_m]), axis=0)
+
+    @property
     def is_world_known(self) -> bool:
         """Whether a true path may be expected: for a scene, not for a real drive."""
         return len(self.true_landmarks_m) > 0 or len(self.outlines_m) > 0

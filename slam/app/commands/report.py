@@ -558,6 +558,7 @@ def _write_landmarks(page: _Page, info: SessionInfo, last: Snapshot) -> None:
         page.note("None was found.")
         return
     points = transform(last.world_from_map, last.landmarks_m)
+    true_m = np.concatenate([info.true_landmarks_m.reshape(-1, 2), info.corners_m])
     rows = []
     for number, point, covariance in zip(
         last.landmark_ids, points, last.landmark_covariances_m2, strict=True
@@ -565,13 +566,13 @@ def _write_landmarks(page: _Page, info: SessionInfo, last: Snapshot) -> None:
         variances = np.linalg.eigvalsh(covariance)
         sigma_m = math.sqrt(max(float(variances[-1]), 0.0))
         cells = [str(number), f"{point[0]:.4f}", f"{point[1]:.4f}", f"{1e3 * sigma_m:.1f}"]
-        if len(info.true_landmarks_m):
-            off_m = float(np.linalg.norm(info.true_landmarks_m - point, axis=1).min())
+        if len(true_m):
+            off_m = float(np.linalg.norm(true_m - point, axis=1).min())
             cells.append(f"{1e3 * off_m:.1f}" if off_m <= LANDMARK_MATCH_M else "none within 150")
         rows.append(cells)
-    frame = "world" if len(info.true_landmarks_m) else "map"
+    frame = "world" if len(true_m) else "map"
     names = ["id", f"x [m, {frame}]", f"y [m, {frame}]", "largest sigma [mm]"]
-    if len(info.true_landmarks_m):
+    if len(true_m):
         names.append("to nearest truth [mm]")
     page.table(names, rows)
 

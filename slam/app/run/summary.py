@@ -210,11 +210,12 @@ def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
     truth_in_map = np.array([between(record.world_from_map, pose) for pose in states.truth])
     estimate, odometry = states.estimate, states.odometry
     observable = observable_landmarks(rig, states.truth, true_landmarks_m, info.field_of_view)
-    corners_m = np.unique(np.concatenate([np.zeros((0, 2)), *info.outlines_m]), axis=0)
 
     def score(landmarks_m: NDArray[np.float64], poses: NDArray[np.float64]) -> LandmarkScore:
         alignment = align_se2(poses[:, :2], truth_xy)
-        score = landmark_metrics(landmarks_m, true_landmarks_m, alignment, observable, corners_m)
+        score = landmark_metrics(
+            landmarks_m, true_landmarks_m, alignment, observable, info.corners_m
+        )
         if info.simulated or len(true_landmarks_m):
             return score
         return replace(score, true=None, observable=None, precision=None, recall=None)
