@@ -6,10 +6,10 @@ right on two laps of a square, one in each direction, which end where they began
 the six rods; its path is little better than that of the wheels. It prints
 
 ```text
-where it began: wheels 12 mm off, SLAM 10 mm
+where it began: wheels 12 mm off, SLAM 9 mm
 landmark at +1.74, +0.64
 landmark at +0.71, +1.63
-landmark at -0.91, +0.29
+landmark at -0.91, +0.28
 landmark at +1.25, -0.58
 ```
 """
