@@ -265,7 +265,7 @@ class SlipRule:
 
     most_steps: Annotated[int, Origin.CHOSEN, "steps"] = 3
     """Steps of the longest slip: one between two samples of odometry falls into two, and two slips
-    that follow on each other into three."""
+    that follow on each other into three, of which none is like the next one."""
     steady_m: Annotated[float, Origin.CHOSEN] = 0.005
     """What the wheels report for one step or two beyond the motion around them may be a slip if it
     is more than this; for three steps the limit is 1.4 times as high."""

@@ -7,7 +7,8 @@ of what it may be off by, with both equally likely: half the square of that moti
 then pull it to the one that is true, and are not refused meanwhile. The solution over all poses has
 the same noise in these steps. No image holds frames of before and after.
 
-A pause, missing frames and times that are a little off are no slips: a step may be any share of the
+Three steps may be two slips that follow on each other, but only if none is like the next one. A
+pause, missing frames and times that are a little off are no slips: a step may be any share of the
 motion around it, up to half as much again, by the time that it took. Nor is what the noise of the
 wheels explains, or what is like the changes from step to step just before, as where wheels count
 coarsely or the heading swings. Before its first step the robot is taken to have moved as after it.
@@ -20,6 +21,7 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -170,6 +172,11 @@ class SlipDetector:
         change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
         if self._is_steady(change, around, spread):
             return None
+        if len(steps) > 2 and any(
+            self._is_steady(_change(one, other, other.took_s), [one, other], 2.0)
+            for one, other in pairwise(steps)
+        ):
+            return None  # it kept its rate, as a motion does, and two slips do not
         by_most, beyond = (
             [self._off(step.motion, one, most) for step, one in zip(steps, expected, strict=True)]
             for most in (self._rule.most_share, 1.0)
