@@ -313,7 +313,7 @@ class BranchRule:
     steps_per_hidden: Annotated[float, Origin.CHOSEN, "scans"] = 3000.0
     """How many scans there are to one motion that the wheels do not report: one in ten minutes."""
     steps_per_jump: Annotated[float, Origin.CHOSEN, "scans"] = 100.0
-    """The same of a robot that moves so more often (`JumpNoise`)."""
+    """The same of a robot that often moves so, for which `JumpNoise` is not zero."""
     hidden_m: Annotated[float, Origin.CHOSEN] = 0.1
     """Standard deviation of such a motion, along each axis."""
     hidden_rad: Annotated[float, Origin.CHOSEN] = 0.2

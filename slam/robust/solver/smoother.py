@@ -515,8 +515,8 @@ class Smoother:
         away = np.minimum(np.abs(measurement_residuals(problem, estimate).residual), limit)
         costs = away**2 - np.maximum(away - problem.huber_sigmas, 0.0) ** 2
         total = float(costs @ self._shares(len(costs)))
-        motions = motion_residuals(problem, estimate).whitened(self._roots)
-        total += float(np.sum(motions.residual**2))
+        motions = motion_residuals(problem, estimate).residual
+        total += float(np.sum(np.einsum("kij,kj->ki", self._roots, motions) ** 2))
         total += float(np.sum(self._walk_residual(estimate) ** 2))
         away, sigmas = self._from_prior(estimate)
         costs = (away / sigmas) ** 2
