@@ -288,7 +288,7 @@ def test_a_corner_may_be_a_landmark_once_and_need_not_be_one() -> None:
     assert landmark_metrics(estimated, TRUE, HERE, ALL, np.zeros((0, 2))) == landmark_metrics(
         estimated, TRUE, HERE, ALL
     )
-    # One within 15 cm of a landmark is none of its own, and takes no estimate from another.
+    # A corner within 15 cm of a landmark changes no score.
     beside = np.array([[0.1, 0.0], [1.14, 0.0], [2.0, 1.0]])
     twice = np.vstack([TRUE, TRUE + np.array([0.01, 0.0])])
     assert landmark_metrics(twice, TRUE, HERE, ALL, beside) == landmark_metrics(

@@ -92,6 +92,16 @@ def test_silence_is_one_piece_of_a_tenth_for_all_radars() -> None:
     assert 0.55 < max(begins) <= 0.75
 
 
+def test_a_sweep_knows_the_corners_that_landmarks_may_be_of() -> None:
+    """Those of the room and of its desks, by which precision is judged."""
+    case = make_case("office:0", "robust", 0)
+    source = source_of(case)
+    source.close()
+    corners = len(case.scene.walls) + 4 * len(case.scene.objects)
+    assert corners > 4
+    assert len(source.info.corners_m) == corners  # the walls of a room share their ends
+
+
 @pytest.mark.parametrize("fps", [2, 10])
 def test_a_run_has_the_frame_rate_that_is_asked_for(fps: int) -> None:
     source = source_of(replace(make_case("lab", "paper", 0), fps=fps))
