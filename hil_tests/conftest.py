@@ -6,7 +6,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Generator
+import tempfile
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -96,6 +97,24 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 def pytest_report_collectionfinish() -> list[str]:
     left_out = "hil_tests: of an installed package the device suite runs, without a source tree"
     return [] if IN_SOURCE_TREE else [left_out]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_run_directory() -> Iterator[None]:
+    """Register emulators where only tests of this worker find them.
+
+    A driver that looks for a module that vanished opens every port it finds, and sets its rate:
+    another worker's test, whose server does not claim the port for itself, would lose its module.
+    """
+    if not IN_SOURCE_TREE:  # users may have started the emulator they test against
+        yield
+        return
+    with (
+        tempfile.TemporaryDirectory(prefix="xethru-tests-") as folder,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("XDG_RUNTIME_DIR", folder)
+        yield
 
 
 @pytest.hookimpl(wrapper=True)

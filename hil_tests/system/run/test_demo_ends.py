@@ -40,7 +40,7 @@ def running_demo(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"TMPDIR": str(temporary)},
+        env=os.environ | {"TMPDIR": str(temporary), "XDG_RUNTIME_DIR": str(temporary)},
     )
     try:
         log = out / "session.mcap"
@@ -70,9 +70,8 @@ def leftovers(temporary: Path) -> list[Path]:
     The folder by which emulators find each other may stay, and in it the card of one that was
     killed: the next emulator removes it.
     """
-    folder = f"xethru-{os.getuid()}"
-    found = [path for path in temporary.rglob("*") if path.name != folder]
-    return [path for path in found if path.parent.name != folder or path.suffix != ".json"]
+    found = [path for path in temporary.rglob("*") if path.name != "xethru"]
+    return [path for path in found if path.parent.name != "xethru" or path.suffix != ".json"]
 
 
 def finished_counters(log: Path) -> list[int]:
