@@ -285,7 +285,7 @@ def find_known(
     ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
     has_frame = np.zeros(len(side_of), dtype=np.bool_)
     has_frame[[scan.radar for scan in scans]] = True
-    margin_m = rule.view_sigmas * noise.sigma_m
+    margin_m = tracklets.gate_sigmas * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
     inside[:, list(beacons)] = False
     rows = np.flatnonzero(inside.any(axis=0))
@@ -508,13 +508,14 @@ def _maybe_in_view(
     What a detection is of may be predicted out of view. Were it left out, its neighbour would have
     no rival.
     """
-    noise, rule = parameters.ranges, parameters.continuation
-    sigmas = parameters.tracklets.gate_sigmas * np.sqrt(state.pose_covariance().diagonal())
+    noise, gate_sigmas = parameters.ranges, parameters.tracklets.gate_sigmas
+    sigmas = gate_sigmas * np.sqrt(state.pose_covariance().diagonal())
     spread_m, spread_rad = float(np.hypot(sigmas[0], sigmas[1])), float(sigmas[2])
+    margin_rad = parameters.continuation.view_margin_rad + spread_rad
     inside = seen.inside(
         noise,
-        rule.view_margin_rad + spread_rad + np.arctan2(spread_m, np.abs(seen.ranges_m)),
-        rule.view_sigmas * noise.sigma_m + spread_m,
+        margin_rad + np.arctan2(spread_m, np.abs(seen.ranges_m)),
+        gate_sigmas * noise.sigma_m + spread_m,
     )[radar]
     inside[len(state.landmark_ids) :] = False
     return np.asarray(inside)
@@ -637,51 +638,48 @@ Pairs = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Correspondence:
-    """The statement that things seen or mapped are one and the same, in pairs."""
+    """The statement that two things seen or mapped are one and the same."""
 
-    pairs: Pairs  # of keys of things
-    mahalanobis_sq: float  # of all residuals
-    evidence: float  # nats against all pairs being two things each: ln N(residuals; 0, S) - ln beta
+    pair: tuple[int, int]  # keys of things
+    mahalanobis_sq: float
+    evidence: float  # nats against their being two: ln N(residual; 0, S) - ln beta
 
     @property
     def is_possible(self) -> bool:
-        limit = float(chdtri(2 * len(self.pairs), TAIL_PROBABILITY))
-        return self.mahalanobis_sq <= limit and self.evidence > 0.0
+        return self.mahalanobis_sq <= float(chdtri(2, TAIL_PROBABILITY)) and self.evidence > 0.0
 
     def contradicts(self, other: Correspondence) -> bool:
         """Return whether not both can be true: one thing would be two others."""
-        return any(
-            mine != theirs and not set(mine).isdisjoint(theirs)
-            for mine in self.pairs
-            for theirs in other.pairs
-        )
+        return self.pair != other.pair and not set(self.pair).isdisjoint(other.pair)
 
 
-def correspondence(pairs: Pairs, residual: Array, S: Array, density: float) -> Correspondence:
-    """Judge pairs of things by their residuals (2 k,), with covariance S (2 k, 2 k).
+def correspondence(
+    pair: tuple[int, int], residual: Array, S: Array, density: float
+) -> Correspondence:
+    """Judge a pair of things by its residual (2,), with covariance S (2, 2).
 
     ``density`` is that of all things of the kind: how likely a chance neighbour is.
     """
     distance = float(residual @ np.linalg.solve(S, residual))
     log_det = float(np.linalg.slogdet(math.tau * S)[1])
-    evidence = -0.5 * (distance + log_det) - len(pairs) * math.log(density)
-    return Correspondence(pairs=pairs, mahalanobis_sq=distance, evidence=evidence)
+    evidence = -0.5 * (distance + log_det) - math.log(density)
+    return Correspondence(pair=pair, mahalanobis_sq=distance, evidence=evidence)
 
 
 def certain(
-    correspondences: Sequence[Correspondence], refused: Collection[Pairs] = ()
+    correspondences: Sequence[Correspondence], refused: Collection[tuple[int, int]] = ()
 ) -> Correspondence | None:
     """Return the likeliest of those that are possible and that nothing speaks against.
 
     That all things are new, and each correspondence that contradicts it, possible or not, must be
-    less likely by `MARGIN_NATS`. Those with the pairs ``refused`` are not returned.
+    less likely by `MARGIN_NATS`. Those of the pairs ``refused`` are not returned.
     """
     ranked = sorted(correspondences, key=lambda one: -one.evidence)
     for one in ranked:
         rivals = [other for other in ranked if other is not one and one.contradicts(other)]
         least = max([0.0, *(rival.evidence for rival in rivals)])
         is_certain = one.is_possible and one.evidence - least > MARGIN_NATS
-        if is_certain and one.pairs not in refused:
+        if is_certain and one.pair not in refused:
             return one
     return None
 

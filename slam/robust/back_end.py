@@ -523,7 +523,7 @@ class RobustBackEnd:
         seen, rule = self._walls.look(view(self.state, antennas), antennas), self.parameters
         if self._images.radars:
             imaged = sorted(self._images.radars)
-            seen = seen.without_crowds(imaged, rule.ranges, rule.imaged.crowd_m)
+            seen = seen.without_crowds(imaged, rule.ranges, rule.continuation.blur_m)
         self._images.bar(seen, self.state.landmark_ids)
         return seen
 
@@ -860,12 +860,10 @@ class RobustBackEnd:
         parameters = self.parameters
         for tentative in self._tentative.unclear():
             rule = parameters.bearings(of_patches=tentative.is_of_patches)
-            if len(tentative.seen) < rule.if_new:
+            if len(tentative.seen) < rule.if_unclear:
                 continue
             point = self._common(tentative)
             found = self._possible(tentative, point)
-            if found and len(tentative.seen) < rule.if_possible:
-                continue
             options = options_of(self.state, point, found, rule.unmapped_per_m2)
             options.append(Option(evidence=0.0))
             if self._may_have_jumped(tentative):
@@ -1045,20 +1043,17 @@ class RobustBackEnd:
         kept = self._refused.items()
         self._refused = {ids: at for ids, at in kept if now - at < rule.refused_updates}
         merge = find_merge(self.state, rule, self._refused, self._distinct_rows())
-        if merge is not None and self._are_seen_together(merge.pairs):
-            self._refused[named_pairs(self.state, merge.pairs)] = now
-        elif merge is not None and self.merge_if_possible(merge.pairs):
+        if merge is not None and self._are_seen_together(*merge.pair):
+            self._refused[named_pairs(self.state, (merge.pair,))] = now
+        elif merge is not None and self.merge_if_possible([merge.pair]):
             self.evidence += merge.evidence
 
-    def _are_seen_together(self, pairs: Sequence[tuple[int, int]]) -> bool:
-        """Return whether scans with bearings hold both landmarks of a pair, by row."""
+    def _are_seen_together(self, first: int, second: int) -> bool:
+        """Return whether scans with bearings hold both of two landmarks, by row."""
         ids = self.state.landmark_ids
         # With images of any radar: what patches hold is most of what has bearings.
         fewest = self.parameters.bearings(of_patches=bool(self._images.radars)).fewest
-        return any(
-            self._log.seen_from(self._log.poses_of(ids[kept]))[ids[gone]] >= fewest
-            for kept, gone in pairs
-        )
+        return self._log.seen_from(self._log.poses_of(ids[first]))[ids[second]] >= fewest
 
     def merge_if_possible(self, pairs: Sequence[tuple[int, int]]) -> bool:
         """Merge landmarks, rows of the older first, if the whole run allows it; return whether.

@@ -338,8 +338,7 @@ class Branches:
         self._rule = rule = parameters.branches
         saved, start = None if on_map is None else on_map.map, None
         if on_map is not None and on_map.pose is not None:
-            sigmas = np.array([rule.start_m, rule.start_m, rule.start_rad])
-            start = np.array(on_map.pose), sigmas
+            start = np.array(on_map.pose), np.array(rule.start_sigmas)
         self.main = RobustBackEnd(rig, parameters, saved, start)
         self._look_every, self._window = parameters.map.look_every, parameters.tracklets.window
         self._fewest = parameters.tracklets.min_frames

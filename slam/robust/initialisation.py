@@ -61,7 +61,6 @@ from slam.robust.parameters import (
     BackEndParameters,
     RangeNoise,
     TrackletRule,
-    chi_square_limit,
 )
 from slam.robust.state import (
     HEAD_SIZE,
@@ -349,12 +348,9 @@ def certain_row(found: Mapping[int, FeatureRows], density: float) -> int | None:
     unit of the residuals' plane (1/m^2 of points, 1/(m rad) of walls).
     """
     best = certain(
-        [
-            correspondence(((SEEN, row),), rows.residual, rows.S, density)
-            for row, rows in found.items()
-        ]
+        [correspondence((SEEN, row), rows.residual, rows.S, density) for row, rows in found.items()]
     )
-    return None if best is None else best.pairs[0][1]
+    return None if best is None else best.pair[1]
 
 
 def possible_rows(
@@ -397,7 +393,7 @@ def options_of(
     landmarks that are not in the map [1/m^2].
     """
     judged = {
-        row: correspondence(((SEEN, row),), rows.residual, rows.S, density).evidence
+        row: correspondence((SEEN, row), rows.residual, rows.S, density).evidence
         for row, rows in found.items()
     }
     limit = float(chdtri(2, TAIL_PROBABILITY))
@@ -483,7 +479,7 @@ def point_guesses(
         return _guesses_on_arcs(unassigned, radars[0], noise, rule)
     guesses = []
     spread = rule.prior_sigma_m**2 * np.eye(2)
-    limit = noise.field_of_view_rad / 2 + rule.seed_margin_rad
+    limit = noise.field_of_view_rad / 2 + rule.edge_rad
     for one, two in combinations(radars, 2):
         first, second = unassigned.antenna(one), unassigned.antenna(two)
         for a, b in product(unassigned.newest(one), unassigned.newest(two)):
@@ -621,7 +617,7 @@ class Tracker:
         )
         if self._free_covariance is not None:
             tracklet = self._with_free_radars(tracklet, guess.covariance)
-        if tracklet.chi_square > chi_square_limit(tracklet.dof, self._rule.excess_sigmas):
+        if tracklet.chi_square > float(chdtri(tracklet.dof, TAIL_PROBABILITY)):
             return None
         if float(np.linalg.eigvalsh(tracklet.covariance)[-1]) > search.most_sigma_m**2:
             return None
@@ -950,10 +946,10 @@ class TentativePoints:
         self._points = [one for one in [*waiting, *new] if one.misses <= rule.window]
 
     def _is_landmark(self, one: TentativePoint) -> bool:
-        hits, excess = len(one.seen), self._parameters.tracklets.excess_sigmas
-        is_at_rest = one.chi_square <= chi_square_limit(2 * (hits - 1), excess)
-        rule = self._parameters.bearings(of_patches=one.is_of_patches)
-        return hits >= rule.fewest and is_at_rest
+        """Return whether enough detections hit a point, and lie as one at rest lets them."""
+        hits, rule = len(one.seen), self._parameters.bearings(of_patches=one.is_of_patches)
+        limit = float(chdtri(2 * (hits - 1), TAIL_PROBABILITY))
+        return hits >= rule.fewest and one.chi_square <= limit
 
     def _assigned(
         self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]

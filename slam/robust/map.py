@@ -2,8 +2,8 @@
 
 The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
 merging after a loop bends the trajectory back, and everything correlated with it. It is proposed
-late, when one merge, or two disjoint ones together, stand out from all competitors; whether it is
-made, the solution over the whole run decides (`slam.robust.solver.revision.is_one`).
+late, when one merge stands out from all competitors; whether it is made, the solution over the
+whole run decides (`slam.robust.solver.revision.is_one`).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Existence:
 
     def miss(self, landmark_id: int, most: float = math.inf) -> None:
         """Count a frame that should have hit a landmark and did not, by no more than ``most``."""
-        self._records[landmark_id].score -= min(self._rule.miss, most)
+        self._records[landmark_id].score -= min(1.0, most)
 
     def heard(self, landmark_id: int) -> None:
         self._records[landmark_id].n_heard += 1
@@ -352,20 +352,12 @@ def saved_map_of(
     )
 
 
-def merge_rows(state: State, pairs: Pairs, sigma_m: float) -> tuple[Indices, Array, Array, Array]:
-    """Return columns, H (2 k, 4 k), residual (2 k,) and R (2 k, 2 k) of k merges of rows."""
-    at = state.landmark_columns(np.array(pairs, dtype=np.intp).ravel())
-    H = np.asarray(
-        np.kron(np.eye(len(pairs)), np.hstack([np.eye(2), -np.eye(2)])), dtype=np.float64
-    )
-    apart = [state.landmarks_m[i] - state.landmarks_m[j] for i, j in pairs]
-    return at, H, -np.concatenate(apart), sigma_m**2 * np.eye(2 * len(pairs))
-
-
-def judge(state: State, pairs: Pairs, sigma_m: float, density: float) -> Correspondence:
-    """Judge whether landmarks, by row, are one, in pairs."""
-    at, H, residual, R = merge_rows(state, pairs, sigma_m)
-    return correspondence(pairs, residual, H @ state.P.block(at) @ H.T + R, density)
+def judge(state: State, pair: tuple[int, int], sigma_m: float, density: float) -> Correspondence:
+    """Judge whether two landmarks, by row, are one."""
+    H = np.hstack([np.eye(2), -np.eye(2)])
+    P = state.P.block(state.landmark_columns(np.array(pair, dtype=np.intp)))
+    residual = state.landmarks_m[pair[1]] - state.landmarks_m[pair[0]]
+    return correspondence(pair, residual, H @ P @ H.T + sigma_m**2 * np.eye(2), density)
 
 
 def apply_merge(state: State, pairs: Pairs, sigma_m: float) -> None:
@@ -408,10 +400,10 @@ def find_merge(
     merges = [
         one
         for one in _candidates(state, density, rule.neighbourhood_m)
-        if not all(row in distinct for row in one.pairs[0])
+        if not all(row in distinct for row in one.pair)
     ]
-    pairs = [one.pairs for one in merges]
-    return certain(merges, [rows for rows in pairs if named_pairs(state, rows) in refused])
+    pairs = [one.pair for one in merges]
+    return certain(merges, [pair for pair in pairs if named_pairs(state, (pair,)) in refused])
 
 
 def _candidates(state: State, density: float, neighbourhood_m: float) -> list[Correspondence]:
@@ -424,7 +416,7 @@ def _candidates(state: State, density: float, neighbourhood_m: float) -> list[Co
     # What contradicts a possible one and comes within the margin of it is kept, too.
     limit = float(chdtri(2, TAIL_PROBABILITY)) + 2.0 * MARGIN_NATS
     return [
-        judge(state, ((first, second),), MERGE_SIGMA_M, density)
+        judge(state, (first, second), MERGE_SIGMA_M, density)
         for first, second in near[distances <= limit].tolist()
     ]
 

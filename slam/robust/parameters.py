@@ -38,11 +38,6 @@ SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its med
 NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 
 
-def chi_square_limit(dof: int, excess_sigmas: float) -> float:
-    """Return the limit that lies some standard deviations of chi-square above its mean."""
-    return dof + excess_sigmas * math.sqrt(2.0 * max(dof, 0))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeNoise:
     """How one radar of the rig measures."""
@@ -102,11 +97,9 @@ class ContinuationRule:
 
     view_margin_rad: Annotated[float, Origin.CHOSEN] = 0.25
     """How far outside the field of view a landmark may lie and still be looked for."""
-    view_sigmas: Annotated[float, Origin.CHOSEN] = 5.0
-    """How far outside the limits of range it may lie, in standard deviations of a range."""
     blur_m: Annotated[float, Origin.DATA_SHEET] = 0.12
     """Two echoes closer than this in range are hard to tell apart: the width of a pulse at half of
-    its height."""
+    its height. With images, no single range is of a landmark while another one is as near."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,16 +123,11 @@ class TrackletRule:
     drift_share: Annotated[float, Origin.CHOSEN] = 0.7
     """Share of the wheels' scale error by which a frame grows uncertain with the way back to it; a
     radian counts as `WheelNoise.walk_lever_m`."""
-    excess_sigmas: Annotated[float, Origin.QUANTILE] = 3.1
-    """How far chi-square may exceed its degrees of freedom, in its standard deviations: 99.9 % of
-    normal errors are less."""
     dof_worth: Annotated[float, Origin.CHOSEN] = 4.0
     """What one more range is worth against chi-square where tracklets compete for ranges."""
-    seed_margin_rad: Annotated[float, Origin.CHOSEN] = 0.05
-    """How far outside the field of view a first fix may lie."""
     edge_rad: Annotated[float, Origin.CHOSEN] = 0.1
-    """Half the width of the edge of the field of view: a range from further outside is no member of
-    a tracklet, and a landmark must lie further inside to be missed."""
+    """Half the width of the edge of the field of view: a first fix or a range from further outside
+    is no member of a tracklet, and a landmark must lie further inside to be missed."""
     long_window: Annotated[int, Origin.BUDGET, "frames"] = 40
     """How far back ranges are looked for of walls, and of points that only one radar sees."""
     single_min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 20
@@ -169,8 +157,9 @@ class TrackletRule:
 class MapRule:
     """When a point is a known landmark, two landmarks are one, or a landmark is none.
 
-    A landmark's existence score rises by one for every frame that hits it. It is reported when it
-    has been hit in as many frames as a new one of two radars (`TrackletRule.min_frames`).
+    A landmark's existence score rises by one for every frame that hits it, and falls by one for
+    every frame that should have hit it and did not. It is reported when it has been hit in as many
+    frames as a new one of two radars (`TrackletRule.min_frames`).
     """
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
@@ -182,8 +171,6 @@ class MapRule:
     for the density of a map."""
     refused_updates: Annotated[int, Origin.BUDGET, "scans"] = 200
     """After how many scans a merge that the run did not allow is tried again."""
-    miss: Annotated[float, Origin.CHOSEN, "hits"] = 1.5
-    """By how much a frame that should have hit a landmark, and did not, lowers its score."""
     most: Annotated[float, Origin.BUDGET, "hits"] = 20.0
     """Ceiling of the score; it limits how long a landmark stays that is there no more."""
     least: Annotated[float, Origin.BUDGET, "hits"] = -8.0
@@ -201,10 +188,9 @@ class WallRule:
     A point must fit its ranges no worse than a wall does.
     """
 
-    new_patches: Annotated[int, Origin.CHOSEN, "patches"] = 3
-    """Fewest patches that show a new wall. The next three are for radars without images."""
     min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 25
-    """Fewest frames of `TrackletRule.long_window` that hit a wall."""
+    """Fewest frames of `TrackletRule.long_window` that hit a wall, of radars without images; so are
+    the next two."""
     min_way_m: Annotated[float, Origin.CHOSEN] = 0.25
     """How far its echo must have moved along it."""
     wall_margin: Annotated[float, Origin.CHOSEN] = 30.0
@@ -326,9 +312,6 @@ class BranchRule:
     new_landmark_nats: Annotated[float, Origin.CHOSEN] = 8.0
     """Price of a new landmark: that one lies within a centimetre of a given place, where there is
     one per square metre."""
-    likeness_nats: Annotated[float, Origin.QUANTILE] = 6.9
-    """Price of a part of the world that looks like another one, however many landmarks it has: one
-    in a thousand."""
     price_nats: Annotated[float, Origin.CHOSEN] = 20.0
     """By how much something rare, such as a hypothesis, must be likelier than that it did not
     happen; with so much, the question of a carry is settled."""
@@ -370,12 +353,23 @@ class BranchRule:
     """Factor on the covariance of the points by which the robot is set down, as their ranges are
     used once more."""
     start_m: Annotated[float, Origin.CHOSEN] = 0.1
-    """Standard deviation of a start on a map that is given, along each axis: that of a robot which
-    somebody has put down by eye."""
-    start_rad: Annotated[float, Origin.CHOSEN] = 0.1
-    """The same of its heading."""
+    """Standard deviation of a start on a map that is given, along each axis and, at a metre, of its
+    heading: that of a robot which somebody has put down by eye."""
     lost_position_m: Annotated[float, Origin.CHOSEN] = 5.0
     """Standard deviation that is reported for the position while the robot is lost."""
+
+    @property
+    def likeness_nats(self) -> float:
+        """Return the price of a part of the world that looks like another one.
+
+        It does not depend on how many landmarks that has.
+        """
+        return -math.log(TAIL_PROBABILITY)
+
+    @property
+    def start_sigmas(self) -> tuple[float, float, float]:
+        """Standard deviations of a start on a map that is given: x, y [m] and heading [rad]."""
+        return self.start_m, self.start_m, self.start_m
 
     @property
     def hidden_variances(self) -> tuple[float, float, float]:
@@ -399,14 +393,9 @@ class ImagedPointRule:
     """How points and walls of patches are used (`slam.imaging.patches`)."""
 
     new_patches: Annotated[int, Origin.CHOSEN, "patches"] = 2
-    """Fewest patches that hold a new landmark."""
-    unclear_patches: Annotated[int, Origin.CHOSEN, "patches"] = 4
-    """Fewest patches that hold one which may be a landmark of the map."""
+    """Fewest patches that hold a landmark or a wall before it is decided which it is."""
     frames_per_patch: Annotated[int, Origin.CHOSEN, "frames"] = 3
     """As how many frames a patch counts for the existence of a landmark."""
-    crowd_m: Annotated[float, Origin.DATA_SHEET] = 0.13
-    """No single range is of a landmark while another one in view is as near in range as that: their
-    pulses overlap."""
     sigma_m: Annotated[float, Origin.CHOSEN] = 2e-3
     """Standard deviation of the range of a point, beside noise and wheels, until points of the run
     show it."""
@@ -442,9 +431,7 @@ class BearingRule:
     unmapped_per_m2: float  # how many landmarks per square metre may not be in the map yet
     frames_per_scan: int  # as how many frames a scan counts for the existence of a landmark
     fewest: int  # detections that a landmark needs
-    # From how many detections on it is decided what they are of: if of nothing known, and if not
-    if_new: int
-    if_possible: int
+    if_unclear: int  # from how many on it is decided what they are of, where that is not certain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -472,13 +459,11 @@ class BackEndParameters:
                 unmapped_per_m2=self.imaged.unmapped_per_m2,
                 frames_per_scan=self.imaged.frames_per_patch,
                 fewest=self.imaged.new_patches,
-                if_new=self.imaged.new_patches,
-                if_possible=self.imaged.unclear_patches,
+                if_unclear=self.imaged.new_patches,
             )
         return BearingRule(
             unmapped_per_m2=self.ranges.unmapped_per_m2,
             frames_per_scan=1,
             fewest=self.tracklets.min_hits_per_radar,
-            if_new=self.tracklets.min_frames,
-            if_possible=self.tracklets.min_frames,
+            if_unclear=self.tracklets.min_frames,
         )

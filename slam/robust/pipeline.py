@@ -37,7 +37,6 @@ from slam.robust.branches import Branches
 from slam.robust.parameters import (
     SIGMA_PER_MEDIAN,
     BackEndParameters,
-    ImagedPointRule,
     RangeNoise,
 )
 from slam.robust.solver.growing_arrays import PackedRows
@@ -86,8 +85,8 @@ class RobustSlam:
         if config.robust.patches and detector is None:
             learned = self._detector
             pulses = learned.estimator if isinstance(learned, MatchedFilterDetector) else None
-            imager, rule = Imager(config, rig, wheels, pulses), parameters.imaged
-            self._patches = PatchScans(imager, rig, wheels, rule)
+            imager = Imager(config, rig, wheels, pulses)
+            self._patches = PatchScans(imager, rig, parameters)
         self._check = InputCheck(rig)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
@@ -327,8 +326,9 @@ class PointNoise:
     magnitude of the newest differences; the rule's own values count as some further differences.
     """
 
-    def __init__(self, rule: ImagedPointRule) -> None:
-        self._rule = rule
+    def __init__(self, parameters: BackEndParameters) -> None:
+        self._rule = rule = parameters.imaged
+        self._most_apart_m = parameters.continuation.blur_m
         self._patches: dict[int, list[ImagedPatch]] = {}  # the last one compared with, and later
         self._differences: deque[tuple[float, float]] = deque(maxlen=rule.differences)
         self.sigma_m, self.sigma_rad = rule.sigma_m, rule.sigma_rad
@@ -356,7 +356,7 @@ class PointNoise:
             by_bearing = wrap_angles(one.bearing_rad - bearings)
             apart_m = np.hypot(by_range, one.range_m * by_bearing)
             nearest = int(np.argmin(apart_m))
-            if apart_m[nearest] < self._rule.crowd_m:
+            if apart_m[nearest] < self._most_apart_m:
                 self._differences.append((float(by_range[nearest]), float(by_bearing[nearest])))
         n, prior = len(self._differences), self._rule.prior_differences
         if n:
@@ -373,13 +373,14 @@ class PatchScans:
     turn all bearings.
     """
 
-    def __init__(self, imager: Imager, rig: Rig, wheels: WheelNoise, rule: ImagedPointRule) -> None:
-        self._imager, self._rig, self._wheels, self._rule = imager, rig, wheels, rule
+    def __init__(self, imager: Imager, rig: Rig, parameters: BackEndParameters) -> None:
+        self._imager, self._rig = imager, rig
+        self._wheels, self._rule = parameters.wheels, parameters.imaged
         # The newest pose, as reported and on the corrected path
         self._reported: Array | None = None
         self._path = np.zeros(3)
         self._waiting: list[ImagedPatch] = []
-        self._noise = PointNoise(rule)
+        self._noise = PointNoise(parameters)
 
     def take(
         self,

@@ -332,7 +332,7 @@ class TentativeWalls:
             shown.append(one)
         for one in free:
             one.misses += 1
-        fewest, window = self._parameters.walls.new_patches, self._parameters.tracklets.window
+        fewest, window = self._parameters.imaged.new_patches, self._parameters.tracklets.window
         self._walls = [one for one in free if one.misses <= window]
         self._walls += [one for one in shown if len(one.seen) < fewest]
         return [one for one in shown if len(one.seen) >= fewest]

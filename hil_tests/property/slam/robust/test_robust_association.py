@@ -393,17 +393,17 @@ def test_ranges_are_worth_their_density_over_that_of_false_ones(seed: int, n: in
 
 
 @few
-@given(seeds, st.integers(1, 3), st.floats(0.01, 10.0))
+@given(seeds, st.floats(0.01, 10.0))
 def test_an_identity_is_worth_its_density_over_that_of_chance_neighbours(
-    seed: int, n: int, per_m2: float
+    seed: int, per_m2: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    root = rng.standard_normal((2 * n, 2 * n))
-    S = root @ root.T + 0.1 * np.eye(2 * n)
-    residual = rng.standard_normal(2 * n)
-    judged = correspondence(tuple((k, k) for k in range(n)), residual, S, per_m2)
-    log_density = float(multivariate_normal.logpdf(residual, np.zeros(2 * n), S))
-    assert judged.evidence == pytest.approx(log_density - n * math.log(per_m2), abs=1e-9)
+    root = rng.standard_normal((2, 2))
+    S = root @ root.T + 0.1 * np.eye(2)
+    residual = rng.standard_normal(2)
+    judged = correspondence((0, 0), residual, S, per_m2)
+    log_density = float(multivariate_normal.logpdf(residual, np.zeros(2), S))
+    assert judged.evidence == pytest.approx(log_density - math.log(per_m2), abs=1e-9)
     squared = float(residual @ np.linalg.inv(S) @ residual)
     assert judged.mahalanobis_sq == pytest.approx(squared, rel=1e-9)
 

@@ -45,7 +45,7 @@ def test_a_merge_must_stand_out_from_its_rivals() -> None:
     state = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
     merge = find_merge(state, rule)
     assert merge is not None
-    assert merge.pairs == ((0, 1),)
+    assert merge.pair == (0, 1)
     # A third one as near as the second: which two are one is not certain.
     state = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [-0.03, 1.0]]))
     assert find_merge(state, rule) is None
@@ -66,7 +66,7 @@ def test_a_merge_is_made_from_the_likelihood_margin_and_the_density_on(
 ) -> None:
     state = mapped(np.array([[0.0, 1.0], [0.0, 1.0], [third_m, 1.0]]), sigma_m)
     merge = find_merge(state, MapRule())
-    assert (merge is not None and merge.pairs == ((0, 1),)) == merges
+    assert (merge is not None and merge.pair == (0, 1)) == merges
 
 
 def after_a_drive(seed: int, places: Array) -> RobustBackEnd:
@@ -131,7 +131,7 @@ def test_a_merge_that_was_refused_is_not_tried_again_at_once() -> None:
     state = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
     merge = find_merge(state, MapRule())
     assert merge is not None
-    refused = {named_pairs(state, merge.pairs)}
+    refused = {named_pairs(state, (merge.pair,))}
     assert find_merge(state, MapRule(), refused) is None
     assert find_merge(state, MapRule(), {((7, 8),)}) is not None
 
@@ -141,10 +141,10 @@ def test_a_refused_merge_hides_no_other_one() -> None:
     state = mapped(places)
     first = find_merge(state, MapRule())
     assert first is not None
-    assert first.pairs == ((0, 1),)
-    second = find_merge(state, MapRule(), {named_pairs(state, first.pairs)})
+    assert first.pair == (0, 1)
+    second = find_merge(state, MapRule(), {named_pairs(state, (first.pair,))})
     assert second is not None
-    assert second.pairs == ((2, 3),)
+    assert second.pair == (2, 3)
 
 
 def test_the_share_of_the_preset_is_where_the_back_end_begins() -> None:

@@ -15,6 +15,12 @@ from slam.library.evaluation import ate_rmse_m
 from slam.robust.association import RangeScan, antennas_of, point_view, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import Hypotheses
+from slam.robust.initialisation import (
+    BodyPoint,
+    PointDetection,
+    TentativePoint,
+    TentativePoints,
+)
 from slam.robust.parameters import (
     BackEndParameters,
     JumpNoise,
@@ -251,3 +257,33 @@ def test_the_answers_to_a_question_are_back_ends_of_their_own() -> None:
     assert len(other.state.landmark_ids) == len(back_end.state.landmark_ids) + 1
     assert other.evidence == before[2] + new.evidence
     assert not np.array_equal(back_end.pose, before[0])
+
+
+@pytest.mark.parametrize(("probability", "n_found"), [(0.9985, 1), (0.9995, 0)])
+def test_detections_that_one_in_a_thousand_points_would_give_are_of_none(
+    probability: float, n_found: int
+) -> None:
+    """Of n detections, a point at rest leaves chi-square of 2 (n - 1) degrees of freedom."""
+    n = PARAMETERS.tracklets.min_hits_per_radar
+    seen = [
+        PointDetection(
+            radar=0,
+            label=None,
+            pose=pose,
+            nominal_m=(0.0, 0.0),
+            turn_rad=0.0,
+            range_m=2.0,
+            sigma_m=0.1,
+            bearing_rad=0.0,
+            bearing_sigma_rad=0.02,
+        )
+        for pose in range(n)
+    ]
+    point = BodyPoint(
+        point_m=np.array([2.0, 0.0]), covariance=1e-4 * np.eye(2), by_offsets=np.zeros((2, 1))
+    )
+    points = TentativePoints(PARAMETERS)
+    points.keep(
+        TentativePoint(point=point, seen=seen, chi_square=float(chi2.ppf(probability, 2 * (n - 1))))
+    )
+    assert len(points.take_out()) == n_found

@@ -197,14 +197,14 @@ def test_numbers_that_differ_are_the_reason() -> None:
 def test_recorded_rules_are_taken_over_and_other_numbers_compared() -> None:
     recorded = slam_constants() | {
         "slam.robust.parameters.MapRule.refused_updates": 7,
-        "slam.robust.parameters.ContinuationRule.view_sigmas": 1.5,
+        "slam.robust.parameters.ContinuationRule.view_margin_rad": 1.5,
         "slam.robust.parameters.MapRule.gone": 7.0,
         "slam.robust.branches._IDS_APART": 9,
     }
     del recorded["slam.front_end.matched_filter._REACH"]
     rules = recorded_rules(recorded)
     assert rules.map == replace(MapRule(), refused_updates=7)
-    assert rules.continuation.view_sigmas == 1.5
+    assert rules.continuation.view_margin_rad == 1.5
     assert rules.tracklets == BackEndParameters().tracklets
     assert different_constants(recorded) == [
         "slam.front_end.matched_filter._REACH none, here 3.0",
