@@ -100,17 +100,18 @@ def pytest_report_collectionfinish() -> list[str]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _own_run_directory() -> Iterator[None]:
+def _own_run_directory(pytestconfig: pytest.Config) -> Iterator[None]:
     """Register emulators where only tests of this worker find them.
 
     A driver that looks for a module that vanished opens every port it finds, and sets its rate:
     another worker's test, whose server does not claim the port for itself, would lose its module.
     """
-    if not IN_SOURCE_TREE:  # users may have started the emulator they test against
+    # A radar that is named may be one of an emulator that the user has started.
+    if not IN_SOURCE_TREE or pytestconfig.getoption("radar", None):
         yield
         return
     with (
-        tempfile.TemporaryDirectory(prefix="xethru-tests-") as folder,
+        tempfile.TemporaryDirectory(prefix="xethru-tests-", ignore_cleanup_errors=True) as folder,
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setenv("XDG_RUNTIME_DIR", folder)

@@ -7,7 +7,7 @@ is `open_rig("robot.toml")`, times are those of `time.monotonic_ns`, and the pos
 `slam.step(scan.t_ns, robot.pose(), frames=scan)`. It prints
 
 ```text
-10 s: at +0.80, +0.51 m, 4 landmarks
+10 s: at +0.80, +0.51 m, 5 landmarks
 20 s: at -0.01, +0.80 m, 5 landmarks
 30 s: at -0.00, +0.19 m, 6 landmarks
 40 s: at +0.65, +0.80 m, 6 landmarks

@@ -61,6 +61,7 @@ from slam.robust.parameters import (
     BackEndParameters,
     RangeNoise,
     TrackletRule,
+    is_plausible,
 )
 from slam.robust.state import (
     HEAD_SIZE,
@@ -617,7 +618,7 @@ class Tracker:
         )
         if self._free_covariance is not None:
             tracklet = self._with_free_radars(tracklet, guess.covariance)
-        if tracklet.chi_square > float(chdtri(tracklet.dof, TAIL_PROBABILITY)):
+        if not is_plausible(tracklet.chi_square, tracklet.dof):
             return None
         if float(np.linalg.eigvalsh(tracklet.covariance)[-1]) > search.most_sigma_m**2:
             return None
@@ -948,8 +949,7 @@ class TentativePoints:
     def _is_landmark(self, one: TentativePoint) -> bool:
         """Return whether enough detections hit a point, and lie as one at rest lets them."""
         hits, rule = len(one.seen), self._parameters.bearings(of_patches=one.is_of_patches)
-        limit = float(chdtri(2 * (hits - 1), TAIL_PROBABILITY))
-        return hits >= rule.fewest and one.chi_square <= limit
+        return hits >= rule.fewest and is_plausible(one.chi_square, 2 * (hits - 1))
 
     def _assigned(
         self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]

@@ -24,6 +24,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from scipy.special import chdtri
+
 from slam.config import Origin, WheelNoise
 from slam.geometry import FieldOfView
 
@@ -36,6 +38,14 @@ MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
 """Logarithm of how many times likelier than any other an explanation must be: twenty times."""
 SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
+
+
+def is_plausible(chi_square: float, dof: int) -> bool:
+    """Return whether normal errors leave so large a sum of squares oftener than by a test's tail.
+
+    Where there are no degrees of freedom, it is judged as if there were one.
+    """
+    return chi_square <= float(chdtri(max(dof, 1), TAIL_PROBABILITY))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +109,8 @@ class ContinuationRule:
     """How far outside the field of view a landmark may lie and still be looked for."""
     blur_m: Annotated[float, Origin.DATA_SHEET] = 0.12
     """Two echoes closer than this in range are hard to tell apart: the width of a pulse at half of
-    its height. With images, no single range is of a landmark while another one is as near."""
+    its height. With images, no single range is of a landmark while another one in view is as near
+    in range."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +130,8 @@ class TrackletRule:
     gate_sigmas: Annotated[float, Origin.QUANTILE] = 3.0
     """How far from its prediction a range may lie, in standard deviations: 99.7 % of normal errors
     are less. Further off, it is no member of a tracklet, a landmark is missed in spite of it, and
-    it counts as this far off where noise is learned."""
+    it counts as this far off where noise is learned. As far outside the limits of range a landmark
+    may lie and still be looked for."""
     drift_share: Annotated[float, Origin.CHOSEN] = 0.7
     """Share of the wheels' scale error by which a frame grows uncertain with the way back to it; a
     radian counts as `WheelNoise.walk_lever_m`."""
@@ -157,9 +169,9 @@ class TrackletRule:
 class MapRule:
     """When a point is a known landmark, two landmarks are one, or a landmark is none.
 
-    A landmark's existence score rises by one for every frame that hits it, and falls by one for
-    every frame that should have hit it and did not. It is reported when it has been hit in as many
-    frames as a new one of two radars (`TrackletRule.min_frames`).
+    A landmark's existence score rises by one for every frame that hits it, and falls by one
+    at most for every frame that should have hit it and did not. It is reported when it has been hit
+    in as many frames as a new one of two radars (`TrackletRule.min_frames`).
     """
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
@@ -189,8 +201,8 @@ class WallRule:
     """
 
     min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 25
-    """Fewest frames of `TrackletRule.long_window` that hit a wall, of radars without images; so are
-    the next two."""
+    """Fewest frames of `TrackletRule.long_window` that hit a wall. This and the next two are for
+    radars without images."""
     min_way_m: Annotated[float, Origin.CHOSEN] = 0.25
     """How far its echo must have moved along it."""
     wall_margin: Annotated[float, Origin.CHOSEN] = 30.0
@@ -393,7 +405,7 @@ class ImagedPointRule:
     """How points and walls of patches are used (`slam.imaging.patches`)."""
 
     new_patches: Annotated[int, Origin.CHOSEN, "patches"] = 2
-    """Fewest patches that hold a landmark or a wall before it is decided which it is."""
+    """Fewest patches that begin a landmark or a wall, or decide which known landmark they show."""
     frames_per_patch: Annotated[int, Origin.CHOSEN, "frames"] = 3
     """As how many frames a patch counts for the existence of a landmark."""
     sigma_m: Annotated[float, Origin.CHOSEN] = 2e-3

@@ -1,6 +1,6 @@
 """Walls: shown by patches, or found among ranges; recognised, and predicted where they are known.
 
-Patches show walls, as they show points, with range and bearing; three patches that agree make one.
+Patches show walls, as they show points, with range and bearing; two patches that agree make one.
 Of radars without images, walls are found among unassigned ranges, as points are
 (:mod:`slam.robust.initialisation`): a small Kalman filter follows a guess back through the frames;
 here its state is a line (phi, d) in the newest body frame, whose range is d - n . a. The ranges

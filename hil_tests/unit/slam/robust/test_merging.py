@@ -218,6 +218,17 @@ def test_what_the_solution_took_up_of_the_errors_makes_no_range_weigh_more() -> 
     assert learned_share(1, 4e-3, 0.0, configured=2.5) == 2.5
 
 
+def test_a_miss_takes_what_a_hit_gives_or_less() -> None:
+    rule, existence = MapRule(), Existence(MapRule(), 9, 0.85)
+    assert rule.least == -8.0
+    existence.hit(1)
+    for _ in range(9):
+        existence.miss(1)
+    assert existence.lost() == []
+    existence.miss(1, 0.25)
+    assert existence.lost() == [1]
+
+
 def test_a_miss_says_the_less_the_oftener_a_landmark_was_missed() -> None:
     """The mean of a beta distribution: a prior of 0.85 with the weight of 20 looks."""
     rule = MapRule()

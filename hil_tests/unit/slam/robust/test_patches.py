@@ -469,7 +469,7 @@ def test_ranges_of_landmarks_at_one_range_are_not_used() -> None:
     )
     crowded = [[True, True, True, False], [False, True, True, False]]
     for imaged, out in (([0, 1], crowded), ([1], [[False] * 4, crowded[1]])):
-        left = view.without_crowds(imaged, NOISE, 0.13)
+        left = view.without_crowds(imaged, NOISE, PARAMETERS.continuation.blur_m)
         is_out = left.off_boresight_rad == math.pi
         assert is_out.tolist() == out
         np.testing.assert_array_equal(

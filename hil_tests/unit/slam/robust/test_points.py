@@ -27,6 +27,7 @@ from slam.robust.parameters import (
     MapRule,
     RangeNoise,
     RelinearisationRule,
+    is_plausible,
 )
 
 Array = NDArray[np.float64]
@@ -257,6 +258,15 @@ def test_the_answers_to_a_question_are_back_ends_of_their_own() -> None:
     assert len(other.state.landmark_ids) == len(back_end.state.landmark_ids) + 1
     assert other.evidence == before[2] + new.evidence
     assert not np.array_equal(back_end.pose, before[0])
+
+
+@pytest.mark.parametrize("dof", [1, 2, 7, 40])
+def test_one_sum_of_squares_in_a_thousand_is_not_plausible(dof: int) -> None:
+    limit = float(chi2.isf(1e-3, dof))
+    assert is_plausible(limit - 1e-6, dof)
+    assert not is_plausible(limit + 1e-6, dof)
+    assert is_plausible(0.0, 0)
+    assert not is_plausible(limit + 100.0, 0)
 
 
 @pytest.mark.parametrize(("probability", "n_found"), [(0.9985, 1), (0.9995, 0)])
