@@ -14,6 +14,7 @@ import pytest
 
 from hil_tests.paths import NO_SHARED_DATA, shared_data
 from hil_tests.patience import seconds
+from hil_tests.plugin.options import CHOICES
 
 HERE = Path(__file__).parent
 IN_SOURCE_TREE = (HERE.parent / "pyproject.toml").exists()
@@ -106,8 +107,9 @@ def _own_run_directory(pytestconfig: pytest.Config) -> Iterator[None]:
     A driver that looks for a module that vanished opens every port it finds, and sets its rate:
     another worker's test, whose server does not claim the port for itself, would lose its module.
     """
-    # A radar that is named may be one of an emulator that the user has started.
-    if not IN_SOURCE_TREE or pytestconfig.getoption("radar", None):
+    choices = pytestconfig.stash.get(CHOICES, None)
+    # A radar that is chosen may be one of an emulator that the user has started.
+    if not IN_SOURCE_TREE or (choices is not None and choices.chosen):
         yield
         return
     with (
