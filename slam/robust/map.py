@@ -61,7 +61,7 @@ class Existence:
 
     def miss(self, landmark_id: int, most: float = math.inf) -> None:
         """Count a frame that should have hit a landmark and did not, by no more than ``most``."""
-        self._records[landmark_id].score -= min(1.0, most)
+        self._records[landmark_id].score -= min(self._rule.miss, most)
 
     def heard(self, landmark_id: int) -> None:
         self._records[landmark_id].n_heard += 1

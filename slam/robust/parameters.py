@@ -169,9 +169,9 @@ class TrackletRule:
 class MapRule:
     """When a point is a known landmark, two landmarks are one, or a landmark is none.
 
-    A landmark's existence score rises by one for every frame that hits it, and falls by one
-    at most for every frame that should have hit it and did not. It is reported when it has been hit
-    in as many frames as a new one of two radars (`TrackletRule.min_frames`).
+    A landmark's existence score rises by one for every frame that hits it, and falls for
+    every frame that should have hit it and did not. It is reported when it has been hit in as many
+    frames as a new one of two radars (`TrackletRule.min_frames`).
     """
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
@@ -183,6 +183,9 @@ class MapRule:
     for the density of a map."""
     refused_updates: Annotated[int, Origin.BUDGET, "scans"] = 200
     """After how many scans a merge that the run did not allow is tried again."""
+    miss: Annotated[float, Origin.CHOSEN, "hits"] = 1.5
+    """By how much, at most, a frame that should have hit a landmark, and did not, lowers its score.
+    With 1, what has moved since a map was made may stay on it for a lap."""
     most: Annotated[float, Origin.BUDGET, "hits"] = 20.0
     """Ceiling of the score; it limits how long a landmark stays that is there no more."""
     least: Annotated[float, Origin.BUDGET, "hits"] = -8.0

@@ -218,11 +218,11 @@ def test_what_the_solution_took_up_of_the_errors_makes_no_range_weigh_more() -> 
     assert learned_share(1, 4e-3, 0.0, configured=2.5) == 2.5
 
 
-def test_a_miss_takes_what_a_hit_gives_or_less() -> None:
+def test_a_landmark_is_lost_after_misses_of_one_and_a_half_hits_or_less() -> None:
     rule, existence = MapRule(), Existence(MapRule(), 9, 0.85)
-    assert rule.least == -8.0
+    assert (rule.least, rule.miss) == (-8.0, 1.5)
     existence.hit(1)
-    for _ in range(9):
+    for _ in range(6):
         existence.miss(1)
     assert existence.lost() == []
     existence.miss(1, 0.25)

@@ -52,7 +52,7 @@ def test_every_number_that_a_module_of_slam_names_is_collected(file: Path) -> No
 
 def test_the_numbers_are_those_of_the_source() -> None:
     found = slam_constants()
-    assert found["slam.robust.parameters.MapRule.most"] == 20.0
+    assert found["slam.robust.parameters.MapRule.miss"] == 1.5
     assert found["slam.robust.parameters.TAIL_PROBABILITY"] == 1e-3
     assert found["slam.robust.state.POSITION"] == [1, 3]
     assert found["slam.config.WheelNoise.along_m_per_sqrt_m"] == 2e-3
