@@ -37,7 +37,13 @@ from scipy.special import chdtri
 from slam.geometry import Rig, wrap_angles
 from slam.results import PredictedRange
 from slam.robust import kernels
-from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, BackEndParameters, RangeNoise
+from slam.robust.parameters import (
+    MARGIN_NATS,
+    TAIL_PROBABILITY,
+    BackEndParameters,
+    RangeNoise,
+    is_plausible,
+)
 from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end reports.
@@ -646,7 +652,7 @@ class Correspondence:
 
     @property
     def is_possible(self) -> bool:
-        return self.mahalanobis_sq <= float(chdtri(2, TAIL_PROBABILITY)) and self.evidence > 0.0
+        return is_plausible(self.mahalanobis_sq, 2) and self.evidence > 0.0
 
     def contradicts(self, other: Correspondence) -> bool:
         """Return whether not both can be true: one thing would be two others."""

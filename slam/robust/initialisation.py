@@ -358,10 +358,9 @@ def possible_rows(
     state: State, point: BodyPoint, others: Collection[int], parameters: BackEndParameters
 ) -> dict[int, FeatureRows]:
     """Return the landmarks whose gate a point passes, by row; the rows ``others`` are not it."""
-    limit = float(chdtri(2, TAIL_PROBABILITY))
     near = near_rows(state, point, parameters.map.neighbourhood_m).tolist()
     found = {row: point_rows(state, row, point) for row in near if row not in others}
-    return {row: rows for row, rows in found.items() if rows.mahalanobis_sq <= limit}
+    return {row: rows for row, rows in found.items() if is_plausible(rows.mahalanobis_sq, 2)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -41,9 +41,9 @@ NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 
 
 def is_plausible(chi_square: float, dof: int) -> bool:
-    """Return whether normal errors leave so large a sum of squares oftener than by a test's tail.
+    """Return whether chi-square is at most its quantile for `TAIL_PROBABILITY`.
 
-    Where there are no degrees of freedom, it is judged as if there were one.
+    With no degrees of freedom it is judged as with one.
     """
     return chi_square <= float(chdtri(max(dof, 1), TAIL_PROBABILITY))
 
@@ -169,9 +169,9 @@ class TrackletRule:
 class MapRule:
     """When a point is a known landmark, two landmarks are one, or a landmark is none.
 
-    A landmark's existence score rises by one for every frame that hits it, and falls for
-    every frame that should have hit it and did not. It is reported when it has been hit in as many
-    frames as a new one of two radars (`TrackletRule.min_frames`).
+    A landmark's existence score rises by one for every frame that hits it, and falls for every
+    frame that should have hit it and did not. It is reported when it has been hit in as many frames
+    as a new one of two radars (`TrackletRule.min_frames`).
     """
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5

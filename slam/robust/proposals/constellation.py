@@ -27,7 +27,7 @@ from scipy.special import chdtri
 
 from slam.geometry import align_se2, compose, transform
 from slam.robust.association import Pairs, density_per_m2
-from slam.robust.parameters import NEIGHBOURHOOD_M, TAIL_PROBABILITY, BranchRule
+from slam.robust.parameters import NEIGHBOURHOOD_M, TAIL_PROBABILITY, BranchRule, is_plausible
 from slam.robust.state import HEADING, Array, Indices, State, quarter_turn, rotation
 
 # Steps of the alignment of two sets of landmarks, the change that ends them, and a variance [m^2]
@@ -206,7 +206,7 @@ def _judged(here: Constellation, there: Constellation, pairs: Pairs) -> Placemen
         motion, residual, S, N = _aligned(here, there, pairs)
         S_inverse = np.linalg.inv(S)
         distance = float(residual @ S_inverse @ residual)
-        if distance <= chdtri(max(2 * len(pairs) - 3, 1), TAIL_PROBABILITY):
+        if is_plausible(distance, 2 * len(pairs) - 3):
             information = N.T @ S_inverse @ N
             log_det = float(np.linalg.slogdet(math.tau * S)[1])
             log_det += float(np.linalg.slogdet(information / math.tau)[1])

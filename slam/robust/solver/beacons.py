@@ -17,9 +17,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
-from slam.robust.parameters import TAIL_PROBABILITY, BackEndParameters
+from slam.robust.parameters import BackEndParameters, is_plausible
 from slam.robust.solver.revision import adopt, is_determined
 from slam.robust.solver.run_log import Problem, RunLog
 from slam.robust.solver.smoother import Smoother, Solution, measurement_residuals
@@ -144,7 +143,7 @@ def initialise_beacon(
     covariance, seen = best.covariances()
     for other in candidates:
         away = other.place_m - best.place_m
-        is_same = away @ np.linalg.solve(covariance, away) <= chdtri(2, TAIL_PROBABILITY)
+        is_same = is_plausible(float(away @ np.linalg.solve(covariance, away)), 2)
         if not is_same and other.cost - best.cost < 2.0 * parameters.branches.price_nats:
             return None
     spread_m2 = float(np.linalg.eigvalsh(seen)[-1])

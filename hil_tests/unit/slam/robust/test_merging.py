@@ -219,7 +219,8 @@ def test_what_the_solution_took_up_of_the_errors_makes_no_range_weigh_more() -> 
 
 
 def test_a_landmark_is_lost_after_misses_of_one_and_a_half_hits_or_less() -> None:
-    rule, existence = MapRule(), Existence(MapRule(), 9, 0.85)
+    rule = MapRule()
+    existence = Existence(rule, 9, 0.85)
     assert (rule.least, rule.miss) == (-8.0, 1.5)
     existence.hit(1)
     for _ in range(6):
