@@ -11,8 +11,10 @@ PYTEST := $(BIN)/python -m pytest
 demo: $(VENV)/installed-view
 	$(BIN)/uwb-slam demo --out out/demo
 
-# One process more than cores: many tests wait for a pty.
-ON_ALL_CORES := -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') --dist worksteal
+# One process more than cores: many tests wait for a pty. The tests of a file stay in one process, so
+# that what they share is made once; the order is kept, which has long files first and short ones last.
+ON_ALL_CORES := -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') \
+	--dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/installed-test
 	$(PYTEST) $(ON_ALL_CORES)
