@@ -70,8 +70,12 @@ def is_readable_after_repair(path: Path, *, with_rosbags: bool = True) -> list[t
 
 @pytest.mark.parametrize(
     "n_places",
-    [30, pytest.param(None, marks=[pytest.mark.thorough, pytest.mark.timeout(1800)])],
-    ids=["some", "all"],
+    [
+        12,
+        pytest.param(30, marks=pytest.mark.rare),
+        pytest.param(None, marks=[pytest.mark.thorough, pytest.mark.timeout(1800)]),
+    ],
+    ids=["few", "some", "all"],
 )
 def test_a_damaged_byte_in_the_head_loses_nothing(
     whole: bytes, tmp_path: Path, n_places: int | None

@@ -173,7 +173,11 @@ def test_a_signal_after_the_last_scan_costs_no_result(
 
 
 @pytest.mark.parametrize(
-    ("has_emulator", "which", "code"), [(False, signal.SIGINT, 130), (True, signal.SIGTERM, 143)]
+    ("has_emulator", "which", "code"),
+    [
+        (False, signal.SIGINT, 130),
+        pytest.param(True, signal.SIGTERM, 143, marks=pytest.mark.rare),
+    ],
 )
 def test_a_signal_while_it_starts(
     tmp_path: Path, has_emulator: bool, which: signal.Signals, code: int
