@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from emulator.chip import Pace
 from emulator.chip.chip import CaptureSettings
 from emulator.x4m300 import REALTIME_BLOCK, Device, radar_device
+from hil_tests.property.examples import examples
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, SensorMode
@@ -167,7 +168,7 @@ class ProfileTurns(RuleBasedStateMachine):
 
 TestProfileTurns = pytest.mark.slow(ProfileTurns.TestCase)
 TestProfileTurns.settings = settings(
-    max_examples=40,
+    max_examples=examples(16, 40),
     stateful_step_count=16,
     deadline=None,
     phases=(Phase.explicit, Phase.reuse, Phase.generate),  # a shrunk sequence takes minutes

@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
+from hil_tests.property.examples import examples
 from hil_tests.unit.slam.app.session.mcap_files import chunks_of, records_of
 from hil_tests.unit.slam.app.sessions import SlowClock, scan, session_info, snapshot
 from slam.app.session.repair import KEPT_SUFFIX, repair
@@ -116,7 +117,7 @@ def test_a_cut_at_any_byte_leaves_a_prefix(
     assert longest == len(everything)
 
 
-@settings(max_examples=30, suppress_health_check=NO_CHECK)
+@settings(max_examples=examples(15, 30), suppress_health_check=NO_CHECK)
 @given(data=st.data())
 def test_repair_makes_what_every_program_opens(
     whole: Content, tmp_path: Path, data: st.DataObject
@@ -145,7 +146,7 @@ def test_repair_makes_what_every_program_opens(
     assert {found.name for found in tmp_path.iterdir()} == {path.name, kept.name}
 
 
-@settings(max_examples=40, suppress_health_check=NO_CHECK)
+@settings(max_examples=examples(15, 40), suppress_health_check=NO_CHECK)
 @given(share=st.floats(0, 1), garbage=st.binary(min_size=1, max_size=40))
 def test_damage_in_the_middle_loses_the_chunk_it_is_in(
     whole: Content, tmp_path: Path, share: float, garbage: bytes
@@ -238,7 +239,7 @@ def test_ros_types_survive(whole: Content, tmp_path: Path) -> None:
     assert (t_ns, len(message.data)) == (0, N_BINS)  # type: ignore[attr-defined]  # made at run time
 
 
-@settings(max_examples=60, suppress_health_check=NO_CHECK)
+@settings(max_examples=examples(25, 60), suppress_health_check=NO_CHECK)
 @given(data=st.data())
 def test_any_bytes_are_one_line_or_messages(
     whole: Content, tmp_path: Path, data: st.DataObject

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hil_tests.property.examples import examples
 from hil_tests.property.message_strategies import messages, of_type
 from xethru_protocol.wire import fields
 from xethru_protocol.wire.codec import (
@@ -48,7 +49,7 @@ def test_every_row_survives_the_wire(cls: type[Message], data: st.DataObject, bu
 PREFIXES = st.sampled_from([b"", *COMMANDS.types, *RESPONSES.types])
 
 
-@settings(max_examples=1000)
+@settings(max_examples=examples(300, 1000))
 @given(PREFIXES, st.binary(max_size=80))
 def test_any_payload_is_some_message(prefix: bytes, rest: bytes) -> None:
     payload = prefix + rest
@@ -65,7 +66,7 @@ def test_any_payload_is_some_message(prefix: bytes, rest: bytes) -> None:
             assert encode(decode(encode(message))) == encode(message)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(100, 300))
 @given(messages())
 def test_short_payloads_are_never_misread(message: Any) -> None:  # noqa: ANN401 - any row
     """What is cut is unknown, or the same message with nothing in it that was not sent."""

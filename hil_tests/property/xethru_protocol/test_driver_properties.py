@@ -24,6 +24,7 @@ from hil_tests.property.device_model import (
     ModuleModel,
     Verdict,
 )
+from hil_tests.property.examples import examples
 from hil_tests.property.wire_streams import oracle
 from hil_tests.unit.emulator.doubles import BareHost, ramp_device
 from hil_tests.unit.xethru_protocol.scripted import READY, ScriptedTransport
@@ -87,7 +88,7 @@ def stalls(draw: st.DrawFn) -> list[tuple[int, int]]:
     ]
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=examples(60, 150))
 # the module stalls a second time with PONGs still due
 @example([(0, 4 * SECOND), (3 * SECOND, 12 * SECOND)], set(), ["ping"] * 6 + ["set"] * 2)
 @given(
@@ -252,7 +253,9 @@ class DeviceMachine(RuleBasedStateMachine):
             self.expect(m.OutputGetControl(feature=feature), verdict, m.ReplyInt(values=(bits,)))
 
 
-DeviceMachine.TestCase.settings = hypothesis_settings(max_examples=25, stateful_step_count=40)
+DeviceMachine.TestCase.settings = hypothesis_settings(
+    max_examples=examples(12, 25), stateful_step_count=40
+)
 TestDeviceMachine = DeviceMachine.TestCase
 
 
@@ -469,4 +472,6 @@ def test_bytes_that_come_behind_the_first_of_a_packet_tear_it() -> None:
 
 
 TestLossyLine = LossyLine.TestCase
-TestLossyLine.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestLossyLine.settings = settings(
+    max_examples=examples(25, 60), stateful_step_count=30, deadline=None
+)

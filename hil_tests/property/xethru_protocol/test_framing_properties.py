@@ -6,6 +6,7 @@ from unittest import mock
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from hil_tests.property.examples import examples
 from hil_tests.property.wire_streams import STREAMS, oracle, packets, read_all
 from xethru_protocol.wire import framing
 from xethru_protocol.wire.framing import FramingFault, Packet, encode_no_escape, encode_normal
@@ -28,7 +29,7 @@ def packets_in(found: list[Packet | FramingFault]) -> list[tuple[int, bytes]]:
     return [(item.offset, item.payload) for item in found if isinstance(item, Packet)]
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(120, 400))
 @given(STREAMS, st.data())
 @example(b"\x01" + b"\x7c" * 12 + b"\x09", None)  # found when a run of 7C was reported twice
 def test_any_chunking_gives_the_same_events(stream: bytes, data: st.DataObject | None) -> None:
@@ -39,13 +40,13 @@ def test_any_chunking_gives_the_same_events(stream: bytes, data: st.DataObject |
         assert read_all(stream, cuts, ended=ended) == whole
 
 
-@settings(max_examples=600)
+@settings(max_examples=examples(180, 600))
 @given(STREAMS)
 def test_packets_are_those_of_the_rescan_rule(stream: bytes) -> None:
     assert packets_in(read_all(stream)) == oracle(stream)
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(120, 400))
 @given(STREAMS, st.integers(2, 70), st.lists(st.integers(0, 300), max_size=3))
 def test_marking_terminators_in_windows_changes_nothing(
     stream: bytes, size: int, cuts: list[int]
@@ -55,7 +56,7 @@ def test_marking_terminators_in_windows_changes_nothing(
         assert read_all(stream, [cut for cut in cuts if cut < len(stream)], ended=True) == expected
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(100, 300))
 @given(
     st.lists(st.sampled_from([0x10, 0x7D, 0x7E, 0x7F]), max_size=60).map(bytes),
     st.integers(2, 20),

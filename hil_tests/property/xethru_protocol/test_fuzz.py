@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hil_tests.property.examples import examples
 from hil_tests.property.fuzz_corpus import corpus
 from hil_tests.property.wire_streams import STREAMS, drain, oracle, read_all
 from xethru_protocol.wire.connection import Connection, Role
@@ -120,7 +121,7 @@ def test_intact_answers_survive(name: str, acks: int) -> None:
     assert [isinstance(item, Packet) and item.payload for item in found].count(b"\x10") == acks
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(100, 300))
 @given(STREAMS | NASTY | st.binary(max_size=300), st.lists(st.integers(0, 400), max_size=5))
 def test_books_balance_for_any_bytes_in_any_chunks(stream: bytes, cuts: list[int]) -> None:
     for direction in Direction:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from hil_tests.property.examples import examples
 from hil_tests.property.message_strategies import messages, of_type
 from hil_tests.unit.xethru_protocol.recordings.messages import MS
 from xethru_protocol.recordings import (
@@ -54,7 +55,7 @@ def stored_messages(draw: st.DrawFn) -> list[tuple[m.Response, int | None]]:
     return [(message, time * MS) for message, time in zip(kept, times, strict=True)]
 
 
-@settings(deadline=None, max_examples=80)
+@settings(deadline=None, max_examples=examples(40, 80))
 @given(
     timed=stored_messages(),
     limit=st.none() | st.integers(1, 3),
@@ -75,7 +76,7 @@ def test_vendor_directories_give_back_what_was_written(
             assert payloads(list(read_recording(path))) == payloads(timed)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(30, 60))
 @given(
     timed=stored_messages(),
     files=st.none() | st.integers(1, 3),
@@ -140,7 +141,7 @@ def timed_messages(draw: st.DrawFn) -> list[tuple[m.Response, int | None]]:
     return list(zip(drawn, stamps, strict=True))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(30, 60))
 @given(timed_messages())
 def test_mcap_and_captures_give_back_what_was_written(
     timed: list[tuple[m.Response, int | None]],
@@ -230,7 +231,7 @@ def _read(
     return payloads(found), []
 
 
-@settings(deadline=None, max_examples=120)
+@settings(deadline=None, max_examples=examples(40, 120))
 @given(at=st.integers(0, 2**16), to=st.binary(min_size=1, max_size=8), cut=st.booleans())
 @example(at=0x1D, to=b"\xff" * 8, cut=False)
 @example(at=0x55, to=b"\xff" * 4, cut=False)

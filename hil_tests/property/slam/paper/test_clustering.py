@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from hil_tests.property.examples import examples
 from hil_tests.unit.slam.simulation import at_rest
 from slam.config import (
     ClusterCount,
@@ -68,7 +69,7 @@ def partition(labels: NDArray[np.int64], core: Sequence[int]) -> list[set[int]]:
     return sorted(groups.values(), key=min)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(100, 300))
 @given(clouds, st.integers(1, 10))
 def test_labels_follow_the_definition_on_core_points_and_noise(points: Array, count: int) -> None:
     config = ClusteringConfig(min_observations=count)
@@ -105,7 +106,7 @@ def distances(points: Array) -> Array:
     return np.hypot(offsets[..., 0], offsets[..., 1])
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(100, 300))
 @given(clouds, st.integers(2, 10))
 def test_a_border_point_is_in_the_cluster_of_a_core_neighbour(points: Array, count: int) -> None:
     assert_border_points_belong_to_a_core_neighbour(
