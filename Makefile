@@ -11,18 +11,18 @@ PYTEST := $(BIN)/python -m pytest
 demo: $(VENV)/installed-view
 	$(BIN)/uwb-slam demo --out out/demo
 
-# One process more than cores: many tests wait for a pty. The tests of a file stay in one process, so
-# that what they share is made once; the order is kept, which has long files first and short ones last.
-ON_ALL_CORES := -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') \
-	--dist loadfile --no-loadscope-reorder
+# One process more than cores: many tests wait for a pty.
+ON_ALL_CORES := -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)')
 
+# The tests of a file stay in one process, so that what they share is made once. The order is kept, which
+# has files with long tests first and short ones last.
 test: $(VENV)/installed-test
-	$(PYTEST) $(ON_ALL_CORES)
+	$(PYTEST) $(ON_ALL_CORES) --dist loadfile --no-loadscope-reorder
 
 # What the default suite shows of one case only, because it takes long and seldom breaks: after a change
 # of documents, of sweeps, benchmarks or the plugin, and before a push.
 test-rare: $(VENV)/installed-test
-	$(PYTEST) $(ON_ALL_CORES) -m 'rare and not thorough'
+	$(PYTEST) $(ON_ALL_CORES) --dist worksteal -m 'rare and not thorough'
 
 # About a minute: the bytes of the protocol, the driver and the mathematics of SLAM.
 test-quick: $(VENV)/installed-test
