@@ -27,8 +27,10 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
             # a third of the short scene: enough for landmarks
             options = ["--scene", str(write_shorter_scene(folder)), "--seed", "5", "--wire"]
             options += ["--save-map", str(folder / "map.json"), "--out", str(folder / "out")]
-            with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as err:
-                command = [sys.executable, "-m", "slam.app.cli", "demo", *options]
-                subprocess.run(command, stdout=out, stderr=err, check=True)
+            command = [sys.executable, "-m", "slam.app.cli", "demo", *options]
+            process = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert process.returncode == 0, process.stderr
+            (folder / "stdout").write_text(process.stdout)
+            (folder / "stderr").write_text(process.stderr)
             done.touch()
     return folder
