@@ -5,12 +5,10 @@ One item per line; times in seconds, metres, radians, covariances as upper trian
     VERTEX_SE2   time pose x y heading            true pose
     VERTEX_XY    landmark x y                     true place
     EDGE_SE2     time pose pose dx dy turn  c11 c12 c13 c22 c23 c33
-    EDGE_SE2_XY  time pose landmark x y  c11 c12 c22
     EDGE_RANGE   time pose landmark range variance
 
-Names are a letter and a number; those of landmarks begin with L. Graphs in three dimensions and
-priors are refused. Format: the files of PyFactorGraph and
-CORA, Marine Robotics Group.
+Names are a letter and a number; those of landmarks begin with L. Lines of other kinds are refused.
+Format: the files of PyFactorGraph and CORA, Marine Robotics Group.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ from pathlib import Path
 import numpy as np
 
 from slam.app.benchmarks.data_set import (
-    Array,
     DataSet,
     LandmarkMeasurement,
     Positions,
@@ -45,11 +42,8 @@ _COLUMNS = {
     "VERTEX_SE2": "[time] [pose] x y heading",
     "VERTEX_XY": "[landmark] x y",
     "EDGE_SE2": "[time] [pose] [pose] dx dy turn c11 c12 c13 c22 c23 c33",
-    "EDGE_SE2_XY": "[time] [pose] [landmark] x y c11 c12 c22",
     "EDGE_RANGE": "[time] [pose] [landmark] range variance",
 }
-_MEASURED = {"EDGE_SE2": 3, "EDGE_SE2_XY": 2, "EDGE_RANGE": 1}
-"""How many values come before the covariance."""
 
 SENSOR = Sensor(
     wheels=WheelNoise(
@@ -96,7 +90,7 @@ def read_run(path: Path) -> Run:
     odometry: list[TableRow] = []
     seen: dict[str, list[LandmarkMeasurement]] = defaultdict(list)
     for row in rows:
-        if row.kind not in _MEASURED:
+        if not row.kind.startswith("EDGE"):
             continue
         time, first, second = row.names
         _stamp_ns(row, time)
@@ -110,13 +104,14 @@ def read_run(path: Path) -> Run:
                     if is_there
                     else f"no line defines {shown(name)}"
                 )
-        covariance = matrix_of(row.values[_MEASURED[row.kind] :])
-        if np.linalg.eigvalsh(covariance).min() <= 0.0:
-            raise row.error("its covariance is not positive")
         if row.kind == "EDGE_SE2":
             odometry.append(row)
-        else:
-            seen[first].append(_observation(row, covariance))
+            continue
+        range_m, variance = row.values
+        if variance <= 0.0:
+            raise row.error("its variance is not positive")
+        label, sigma_m = int(second[1:]), math.sqrt(variance)
+        seen[first].append(LandmarkMeasurement(range_m=range_m, range_sigma_m=sigma_m, label=label))
     if not odometry:
         raise AppError(f"{path}: holds no EDGE_SE2; a drive has odometry")
     names = [odometry[0].names[1], *(row.names[2] for row in odometry)]
@@ -157,31 +152,3 @@ def _stamp_ns(row: TableRow, word: str) -> int:
     except ValueError as error:
         raise row.error(error) from None
     return round(Decimal(word) * NS_PER_S)
-
-
-def _observation(row: TableRow, covariance: Array) -> LandmarkMeasurement:
-    label = int(row.names[2][1:])
-    if row.kind == "EDGE_RANGE":
-        range_m, variance = row.values
-        return LandmarkMeasurement(range_m=range_m, range_sigma_m=math.sqrt(variance), label=label)
-    x, y, *_ = row.values
-    r = math.hypot(x, y)
-    if r == 0.0:
-        raise row.error(f"{row.names[1]} sees {row.names[2]} where it is itself")
-    G = np.array([[x / r, y / r], [-y / r**2, x / r**2]])
-    range_variance, bearing_variance = np.diag(G @ covariance @ G.T).tolist()
-    return LandmarkMeasurement(
-        range_m=r,
-        range_sigma_m=math.sqrt(range_variance),
-        bearing_rad=math.atan2(y, x),
-        bearing_sigma_rad=math.sqrt(bearing_variance),
-        label=label,
-    )
-
-
-def matrix_of(triangle: Sequence[float]) -> Array:
-    """Return the symmetric matrix of an upper triangle of 1, 3 or 6 numbers, row by row."""
-    size = {1: 1, 3: 2, 6: 3}[len(triangle)]
-    matrix = np.zeros((size, size))
-    matrix[np.triu_indices(size)] = triangle
-    return np.asarray(matrix + np.triu(matrix, 1).T)
