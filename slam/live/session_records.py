@@ -332,3 +332,25 @@ class SessionObserver:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+class PassingObserver(SessionObserver):
+    """Passes every event on to `give`, with the name of the method that got it."""
+
+    def on_scan(self, scan: Scan) -> None:
+        self.give("on_scan", scan)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        self.give("on_snapshot", snapshot)
+
+    def on_smoothed(self, smoothed: SmoothedRun) -> None:
+        self.give("on_smoothed", smoothed)
+
+    def on_image(self, image: RadarImage) -> None:
+        self.give("on_image", image)
+
+    def on_log(self, line: LogLine) -> None:
+        self.give("on_log", line)
+
+    def give(self, method: str, event: object) -> None:
+        raise NotImplementedError

@@ -22,18 +22,17 @@ from slam.app.run.radar_image import (
     path_of,
     session_image,
 )
+from slam.app.run.replay import play_states
 from slam.app.run.result_files import IMAGE, hold_folder, remove_earlier
-from slam.app.run.runner import RunRecord, RunRecorder
 from slam.front_end.pulse import PulseModel
 from slam.geometry import Mount
 from slam.imaging.back_projection import Grid
 from slam.imaging.patches import RecordedFrame
 from slam.imaging.room import RoomImage
 from slam.live.errors import AppError, OdometryError
-from slam.live.odometry_track import OdometryTrack, TumSample, read_tum
+from slam.live.odometry_track import read_tum
 from slam.live.session.reader import RecordedSession, begins_with, open_session
-from slam.live.session_records import SessionInfo, Snapshot
-from slam.results import SmoothedRun
+from slam.live.session_records import SessionInfo
 from xethru_protocol.operating_system import StopFlag, written_whole
 from xethru_protocol.recordings.loading import load
 from xethru_protocol.recordings.mcap import MAGIC
@@ -89,7 +88,10 @@ def run_image(
             if mount or rig or frame_area_m:
                 raise UsageError(f"{source}: a session has mounts and frame areas of its own")
             info = session.info
-            along = given or path_of(*_states(session), info, path)
+            along = given
+            if along is None:
+                record = play_states(session, [], stop)
+                along = path_of(record, session.odometry(), info, path)
             image = session_image(session, along, room(along), reach_m=reach_m)
         else:
             frames = _recorded_frames(source, frame_area_m)
@@ -156,19 +158,6 @@ def _session_at(source: Path, stop: StopFlag) -> RecordedSession | None:
         if not load(source, lambda _: None).radars:
             raise
         return None
-
-
-def _states(session: RecordedSession) -> tuple[RunRecord, OdometryTrack]:
-    """Read the states, the last smoothed run and the odometry of a session."""
-    recorder, samples = RunRecorder(np.empty((0, 2))), []
-    for one in session.records():
-        if isinstance(one, Snapshot):
-            recorder.on_snapshot(one)
-        elif isinstance(one, SmoothedRun):
-            recorder.on_smoothed(one)
-        elif isinstance(one, TumSample):
-            samples.append(one)
-    return recorder.record(), OdometryTrack(samples)
 
 
 def _mount(source: Path, mount: Sequence[float] | None, rig: str | None) -> Mount:

@@ -74,11 +74,8 @@ class Ros2Sink(Sink):
             self._writers[name](pack_array(FLOAT_ARRAY, frame.samples))
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        last, self._last = self._last, snapshot
-        twist = cdr.NO_TWIST
-        if last is not None:
-            dt_ns = snapshot.t_ns - last.t_ns
-            twist = self._wheels.twist(last.odometry, snapshot.odometry, dt_ns)
+        self._last = snapshot
+        twist = self._wheels.twist(snapshot.t_ns, snapshot.odometry)
         t_ns, covariance = self._ros_ns(snapshot.t_ns), snapshot.pose_covariance
         # that of a state which lags the newest scan is as good for that
         self._write_transform(max(self._newest_ns, self._tf_ns + 1))

@@ -17,15 +17,7 @@ from uuid import uuid4
 from slam.app.errors import UsageError
 from slam.app.publish import SINKS
 from slam.live.errors import AppError
-from slam.live.session_records import (
-    LogLine,
-    RadarImage,
-    Scan,
-    SessionInfo,
-    SessionObserver,
-    Snapshot,
-)
-from slam.results import SmoothedRun
+from slam.live.session_records import PassingObserver, SessionInfo, SessionObserver
 from xethru_protocol.validation import choices, shown
 
 MOST_EVENTS = 256
@@ -175,7 +167,7 @@ class QueuedSink:
             self.warnings.append(f"--publish {self.spec}: {text}")
 
 
-class Publishing(SessionObserver):
+class Publishing(PassingObserver):
     """The sinks of a run, which are opened here; gives them events, from `begin` on.
 
     `specs` are a SINK of the command line each. `takes_stdout`: one writes to standard output.
@@ -210,21 +202,6 @@ class Publishing(SessionObserver):
         for each in self.queued:
             each.begin(info, start_ns, map_id)
 
-    def on_scan(self, scan: Scan) -> None:
-        self._put("on_scan", scan)
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        self._put("on_snapshot", snapshot)
-
-    def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        self._put("on_smoothed", smoothed)
-
-    def on_image(self, image: RadarImage) -> None:
-        self._put("on_image", image)
-
-    def on_log(self, line: LogLine) -> None:
-        self._put("on_log", line)
-
     def close(self) -> None:
         """End all sinks; doing so again does nothing."""
         if self._is_closed:
@@ -245,7 +222,7 @@ class Publishing(SessionObserver):
             rows.append((f"to {each.spec.partition(':')[0]}", f"{each.n_sent}", note))
         return rows
 
-    def _put(self, method: str, event: object) -> None:
+    def give(self, method: str, event: object) -> None:
         if self._is_closed:  # as for the radar image of the end of a run
             return
         for each in self.queued:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, fields
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from slam.app.errors import naming
 from slam.app.publish.sinks import Publishing
 from slam.app.run.maps import MapSaver, MapSummary, map_rows, map_summary
-from slam.app.run.output import ResultRow, print_result
+from slam.app.run.output import ResultRow, print_result, write_json
 from slam.app.run.runner import RunRecord, RunSource
 from slam.app.run.summary import Summary, summarise
 from slam.library.evaluation import LandmarkScore
@@ -83,11 +82,10 @@ def _write(
     on_map: MapSummary | None,
 ) -> None:
     stop.check()
-    text = summary.to_json() if summary else _summary_without_truth(info, record)
+    numbers = summary.numbers() if summary else _numbers_without_truth(info, record)
     if on_map is not None:
-        text = json.dumps(json.loads(text) | {"map": asdict(on_map)}, indent=2, allow_nan=False)
-    with naming(path := out / "summary.json"), written_whole(path) as fresh:
-        fresh.write_text(text + "\n", encoding="ascii")
+        numbers["map"] = asdict(on_map)
+    write_json(out / "summary.json", numbers)
     write_trajectories(out, record)
     stop.check()
     if record.last is not None:
@@ -123,8 +121,8 @@ def write_path(path: Path, t_ns: NDArray[np.int64], poses: NDArray[np.float64]) 
         write_tum(fresh, Trajectory(stamps_ns=t_ns, poses=poses))
 
 
-def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
-    """Return the text of summary.json with null for everything that needs the truth."""
+def _numbers_without_truth(info: SessionInfo, record: RunRecord) -> dict[str, object]:
+    """Return the numbers of summary.json with None for everything that needs the truth."""
     duration_s = record.duration_ns / NS_PER_S
     n_landmarks = 0 if record.last is None else len(record.last.landmark_ids)
     unknown: dict[str, object] = {row.name: None for row in fields(Summary)}
@@ -138,7 +136,7 @@ def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
         "realtime_factor": duration_s / record.wall_s,
         "landmarks": {row.name: None for row in fields(LandmarkScore)} | {"estimated": n_landmarks},
     }
-    return json.dumps(unknown | known, indent=2, allow_nan=False)
+    return unknown | known
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -86,11 +85,11 @@ class Summary:
             return None
         return ratio(self.smoothed_ate_rmse_m, self.odometry_ate_rmse_m)
 
-    def to_json(self) -> str:
-        """Return the text of summary.json: exactly these fields, no NaN."""
-        fields = asdict(self)
-        del fields["nis_times"]
-        return json.dumps(fields, indent=2, allow_nan=False)
+    def numbers(self) -> dict[str, object]:
+        """Return what summary.json holds."""
+        numbers = asdict(self)
+        del numbers["nis_times"]
+        return numbers
 
 
 POSE_DOF = 3

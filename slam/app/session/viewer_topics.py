@@ -1,23 +1,7 @@
 """What other programs draw of a session: B-scans, paths, ellipses, walls, beams, ranges.
 
 Nothing here is read back: it is made of what the session holds anyway, for programs that draw
-neither float arrays nor covariances. Topics:
-
-`/radar/<name>/bscan` and a latched `/radar/<name>/bscan/axes`
-    Envelope of the newest frames, at reduced range resolution; see `_Bscan`.
-`/radar/<name>/range`
-    The strongest detection of every state.
-`/estimate/pose`, `/estimate/odometry`
-    The estimate with its covariance, and with the wheels' velocity.
-`/odom/path`, `/estimate/path`, `/truth/path` and each with `_points`
-    The same path as poses and as a point cloud. The wheels' one is in the map frame, as if the
-    wheels had been right until the first state.
-`/slam/smoothed_path`, `/slam/smoothed_path_points`, `/slam/smoothed_landmarks`
-    The solution over all states, where there is one: as poses, as points; and its landmarks.
-`/landmarks/markers`
-    Landmarks, their 95 % ellipses, and the stretches of wall that answered.
-`/scene`, `/fields_of_view`
-    Latched: true walls and landmarks, if known; the beams of the radars.
+neither float arrays nor covariances. docs/sessions.md has the topics.
 """
 
 from __future__ import annotations
@@ -123,13 +107,11 @@ class Drawings:
                 self._bscans[frame.radar].add(frame)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        t_ns, last = snapshot.t_ns, self._last
+        t_ns = snapshot.t_ns
         if self._map_from_odom is None:
             start = between(snapshot.odometry, np.zeros(3))
             self._map_from_odom = compose(snapshot.estimate, start)
-        twist = cdr.NO_TWIST
-        if last is not None:
-            twist = self._wheels.twist(last.odometry, snapshot.odometry, t_ns - last.t_ns)
+        twist = self._wheels.twist(t_ns, snapshot.odometry)
         self._last = snapshot
         covariance = snapshot.pose_covariance
         pose = cdr.pose_with_covariance(t_ns, "map", snapshot.estimate, covariance)
@@ -313,7 +295,7 @@ def _scene(info: SessionInfo) -> list[Marker]:
 
 
 class WheelMotion:
-    """Velocity by the wheels between two poses, with the errors that SLAM assumes of them.
+    """Velocity by the wheels from pose to pose, with the errors that SLAM assumes of them.
 
     `errors` are the fields of `WheelNoise`; without them the covariance is zero, which in ROS means
     unknown.
@@ -321,13 +303,15 @@ class WheelMotion:
 
     def __init__(self, errors: Mapping[str, float]) -> None:
         self._noise = WheelNoise(**errors) if errors else None
+        self._newest: tuple[int, Array] | None = None
 
-    def twist(self, before: Array, after: Array, dt_ns: int) -> cdr.Twist:
-        """Return the constant velocity that leads from one pose (3,) to the other in a time."""
-        if dt_ns <= 0:
+    def twist(self, t_ns: int, pose: Array) -> cdr.Twist:
+        """Return the constant velocity that leads to a pose (3,) from that of the last call."""
+        before, self._newest = self._newest, (t_ns, pose)
+        if before is None or t_ns <= before[0]:
             return cdr.NO_TWIST
-        dt_s = dt_ns / NS_PER_S
-        dx, dy, turn = between(before, after).tolist()
+        dt_s = (t_ns - before[0]) / NS_PER_S
+        dx, dy, turn = between(before[1], pose).tolist()
         # along an arc of constant curvature: a pose is the exponential of its twist
         half = turn / 2.0
         stretch = half / math.tan(half) if abs(half) > 1e-9 else 1.0

@@ -227,16 +227,9 @@ class _SessionFile(Topics):
 class SessionLog(SessionObserver):
     """Writes a session as it happens, into a file or into other topics.
 
-    Topics: latched `/session/info`, the table of the run (`session_table`), which is also a
-    metadata record; `/radar/<name>/frame` with the frame counter in the record's sequence number
-    and a latched `/radar/<name>/info` (JSON), `/radar/<name>/stream` before the first frame of
-    every stream but number 0; `/scan` after the frames of each scan, with their counters and the
-    true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`,
-    `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`state_row`),
-    `/slam/step`, what led to each (`step_row`); `/slam/smoothed`, the solution over all states, at
-    the end and when it was asked for (`smoothed_row`); where there are such, the radar image so
-    far in `/image`, raw bytes in `/radar/<name>/rx` and `tx`, and ranges that another program found
-    in `/radar/<name>/detections`.
+    docs/sessions.md has the topics. A frame's counter is the record's sequence number;
+    `/radar/<name>/stream` precedes the first frame of every stream but number 0, and `/scan` or
+    `/scan_unused` follow the frames of a scan.
 
     Parameters
     ----------
@@ -301,7 +294,6 @@ class SessionLog(SessionObserver):
         self._file.write("/tf_static", start_ns, cdr.transforms(start_ns, self._placements))
         self._wheels = WheelMotion(info.wheels)
         self._has_covariance = info.odometry_covariance
-        self._wheels_at: tuple[int, NDArray[np.float64]] | None = None
         self._drawings = Drawings(self._file, info, start_ns) if drawn else None
         self._file.end_head()
 
@@ -342,11 +334,7 @@ class SessionLog(SessionObserver):
 
     def on_odometry(self, sample: TumSample) -> None:
         t_ns, pose = sample.t_ns, np.array([sample.x_m, sample.y_m, sample.heading_rad])
-        twist = cdr.NO_TWIST
-        if self._wheels_at is not None:
-            earlier_ns, earlier = self._wheels_at
-            twist = self._wheels.twist(earlier, pose, t_ns - earlier_ns)
-        self._wheels_at = t_ns, pose
+        twist = self._wheels.twist(t_ns, pose)
         if self._has_covariance:
             twist = replace(twist, covariance=symmetric(sample.velocity_covariance))
         self._file.write("/odom", t_ns, cdr.wheel_odometry(sample, twist))

@@ -17,15 +17,7 @@ from urllib.parse import urlsplit
 from slam.app.run.output import note
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.live.errors import AppError
-from slam.live.session_records import (
-    LogLine,
-    RadarImage,
-    Scan,
-    SessionInfo,
-    SessionObserver,
-    Snapshot,
-)
-from slam.results import SmoothedRun
+from slam.live.session_records import PassingObserver, Scan, SessionInfo, SessionObserver
 from xethru_protocol.cli.live import viewer
 from xethru_protocol.cli.live.viewer import HERE, ViewerKind
 from xethru_protocol.operating_system import StopFlag
@@ -138,7 +130,7 @@ class LiveView:
             time.sleep(_VIEW_POLL_S)
 
 
-class _WhileWatched(SessionObserver):
+class _WhileWatched(PassingObserver):
     """Passes everything on until the viewer has ended."""
 
     def __init__(self, view: SessionObserver, has_ended: Callable[[], bool]) -> None:
@@ -149,24 +141,11 @@ class _WhileWatched(SessionObserver):
         if self._is_watched and self._has_ended():
             self._is_watched = False
             note("the viewer was closed; the run goes on without it")
-        if self._is_watched:
-            self._view.on_scan(scan)
+        super().on_scan(scan)
 
-    def on_snapshot(self, snapshot: Snapshot) -> None:
+    def give(self, method: str, event: object) -> None:
         if self._is_watched:
-            self._view.on_snapshot(snapshot)
-
-    def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        if self._is_watched:
-            self._view.on_smoothed(smoothed)
-
-    def on_image(self, image: RadarImage) -> None:
-        if self._is_watched:
-            self._view.on_image(image)
-
-    def on_log(self, line: LogLine) -> None:
-        if self._is_watched:
-            self._view.on_log(line)
+            getattr(self._view, method)(event)
 
     def close(self) -> None:
         self._view.close()
