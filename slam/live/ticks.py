@@ -198,16 +198,7 @@ class Coverage(Protocol):
 
 
 class TickAssembler:
-    """Gives out scans in the order of time.
-
-    Parameters
-    ----------
-    n_radars
-        Radars of the rig.
-    period_ns
-        Of their frames.
-    odometry
-        Limits which ticks are complete.
+    """Gives out scans in the order of time; `odometry` limits which ticks are complete.
 
     Attributes
     ----------

@@ -190,35 +190,18 @@ class SpacingWarning(SessionObserver):
 class LiveSource:
     """The rig as a stream of scans in real time.
 
-    Parameters
-    ----------
-    radars
-        What the modules answered, in the order of the rig.
-    limits
-        Of the sampler, see `RadarFrame`.
-    odometry
-        Takes the lines.
-    log
-        Gets everything but the scans, in this thread.
-    duration_s
-        When to end; None if never.
-    clock_ns
-        The host's monotonic time, that of the drivers' arrivals.
+    `radars` and `clocks` are in the order of the rig; `limits` are those of the sampler, see
+    `RadarFrame`; `clock_ns` is the host's monotonic time, that of the drivers' arrivals. `log` gets
+    everything but the scans, in this thread.
 
     Attributes
     ----------
-    ticks
-        Makes scans of frames.
-    clocks
-        Of every radar, in the order of the rig.
     ended
         Why `scans` ended: a text if that was to be expected, else the error.
     worst_wait_s
         How long a scan waited for SLAM before it was given out, at worst.
     busy_s
         Time spent in SLAM, logs and views.
-    lost_frames
-        Frames missing between the counters that arrived, over all radars and streams.
     """
 
     def __init__(  # noqa: PLR0917 - everything a run consists of

@@ -108,24 +108,10 @@ class LinkLog(SessionObserver):
 class RunSource:
     """The input of a run: an emulated rig, live modules or a recorded session, and its SLAM.
 
-    Attributes
-    ----------
-    info
-        SLAM gets the frames of its radars without their gains.
-    rig
-        The mounts that SLAM uses.
-    truth_at
-        For sinks and results only.
-    lost_frames
-        Returns the frames missing so far between counters, over all radars.
-    link_log
-        Gets the lines about links while scans are drawn.
-    close
-        Called before sinks are closed: what it logs is still recorded.
-    smoothing_asked
-        Called after every scan: whether sinks shall get the smoothed run so far.
-    map_file
-        The map that SLAM began with, None if it began with an empty one.
+    `truth_at` is for sinks and results only. `lost_frames` returns the frames missing so far
+    between counters, over all radars. `close` is called before sinks are closed: what it logs is
+    still recorded. `smoothing_asked` is called after every scan: whether sinks shall get the
+    smoothed run so far. `map_file` is the map that SLAM began with, None if it was an empty one.
     """
 
     info: SessionInfo
@@ -190,8 +176,6 @@ class RunRecord:
 
     Attributes
     ----------
-    states
-        Numbers of every state.
     last
         The last state with its map; None if there is none.
     smoothed
@@ -202,10 +186,8 @@ class RunRecord:
         map frame; empty of preset `paper`.
     n_frames
         Radar frames used, over all radars.
-    start_ns
-        Session time of the first scan.
-    duration_ns, wall_s
-        Session time covered and the time it took.
+    start_ns, duration_ns, wall_s
+        Session time of the first scan, session time covered, and the time it took.
     """
 
     states: States
@@ -461,13 +443,7 @@ def frames_between(last: RadarFrame | Frame, frame: RadarFrame | Frame) -> int:
 
 
 class LostFrames(SessionObserver):
-    """Counts the frames missing between counters of one stream.
-
-    Attributes
-    ----------
-    n_lost
-        So far, over all radars.
-    """
+    """Counts the frames missing between counters of one stream, over all radars."""
 
     def __init__(self) -> None:
         self.n_lost = 0
@@ -504,16 +480,8 @@ class LinkChange:
 class LinkCount:
     """Frames received and lost of one radar.
 
-    Attributes
-    ----------
-    frames, lost, faults
-        Frames that came; counters missing between them; warnings in the log of its link.
-    last
-        Its newest frame; None before the first.
-    longest_gap
-        Most frames lost in a row.
-    state
-        Of the link now; None before anything was received.
+    `lost` counts the counters missing between frames, `longest_gap` the most of them in a row,
+    `faults` the warnings in the log of its link.
     """
 
     frames: int = 0
