@@ -147,6 +147,22 @@ def note(
     axes.annotate(text, at, xytext=offset_points, **(options | more))
 
 
+_HOLLOW = {"markerfacecolor": "none"}
+
+
+def _mark(
+    axes: Axes,
+    points_m: NDArray[np.float64],
+    marker: object,
+    size: float,
+    colour: str,
+    **more: Any,  # noqa: ANN401 - of plot
+) -> None:
+    """Draw a marker at each point, shape (n, 2) or (2,)."""
+    options: dict[str, Any] = {"marker": marker, "markersize": size, "color": colour}
+    axes.plot(*np.reshape(points_m, (-1, 2)).T, linestyle="none", **(options | more))
+
+
 # Chi-square quantile for two degrees of freedom, in closed form.
 CHI2_95_TWO_DOF = -2.0 * math.log(1.0 - 0.95)
 
@@ -265,16 +281,8 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
     _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
     _draw_robot(axes, compose(place, states.estimate[-1]))
     if len(info.true_landmarks_m):
-        axes.plot(
-            *info.true_landmarks_m.T,
-            linestyle="none",
-            marker="+",
-            markersize=11,
-            markeredgewidth=1.4,
-            color="#30343b",
-            label="true landmark",
-            zorder=4,
-        )
+        looks = {"markeredgewidth": 1.4, "label": "true landmark", "zorder": 4}
+        _mark(axes, info.true_landmarks_m, "+", 11, "#30343b", **looks)
     for number, ends_m in enumerate(last.wall_spans_m):
         name = "estimated wall" if number == 0 else None
         axes.plot(*transform(place, ends_m).T, color=LANDMARK, linewidth=2.0, label=name)
@@ -375,17 +383,8 @@ def _title_and_remark(
 
 
 def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
-    axes.plot(
-        *pose[:2],
-        linestyle="none",
-        marker="o",
-        markersize=11,
-        markerfacecolor="none",
-        markeredgewidth=1.6,
-        color="#30343b",
-        label="start",
-        zorder=7,
-    )
+    looks = {"markeredgewidth": 1.6, "label": "start", "zorder": 7}
+    _mark(axes, pose[:2], "o", 11, "#30343b", **_HOLLOW, **looks)
 
 
 def _draw_smoothed(axes: Axes, record: RunRecord) -> None:
@@ -395,31 +394,15 @@ def _draw_smoothed(axes: Axes, record: RunRecord) -> None:
     path = transform(place, smoothed.poses[:, :2])
     axes.plot(*path.T, color=SMOOTHED, linewidth=1.1, label="smoothed at the end")
     if len(smoothed.landmark_ids):
-        axes.plot(
-            *transform(place, smoothed.landmarks_m).T,
-            linestyle="none",
-            marker="D",
-            markersize=8,
-            markerfacecolor="none",
-            markeredgewidth=1.2,
-            color=SMOOTHED,
-            label="smoothed landmark",
-            zorder=5,
-        )
+        looks = {"markeredgewidth": 1.2, "label": "smoothed landmark", "zorder": 5}
+        points = transform(place, smoothed.landmarks_m)
+        _mark(axes, points, "D", 8, SMOOTHED, **_HOLLOW, **looks)
 
 
 def _draw_robot(axes: Axes, pose: NDArray[np.float64]) -> None:
-    axes.plot(
-        *pose[:2],
-        linestyle="none",
-        marker=(3, 0, np.degrees(pose[2]) - 90.0),
-        markersize=10,
-        markeredgecolor="white",
-        markeredgewidth=0.8,
-        color=ESTIMATE,
-        label="last pose",
-        zorder=8,
-    )
+    triangle = (3, 0, np.degrees(pose[2]) - 90.0)
+    rim = {"markeredgecolor": "white", "markeredgewidth": 0.8}
+    _mark(axes, pose[:2], triangle, 10, ESTIMATE, **rim, label="last pose", zorder=8)
 
 
 def _draw_landmarks(axes: Axes, last: Snapshot, map_extent_m: float) -> None:
@@ -448,26 +431,11 @@ def _draw_landmarks(axes: Axes, last: Snapshot, map_extent_m: float) -> None:
     )
     if not len(points):
         return
-    axes.plot(
-        *points.T,
-        linestyle="none",
-        marker="o",
-        markersize=3.6,
-        color=LANDMARK,
-        label="estimated landmark",
-        zorder=6,
-    )
-    axes.plot(  # the legend's own sample: a collection of two colours has none
-        [],
-        [],
-        linestyle="none",
-        marker="o",
-        markersize=11,
-        markerfacecolor=(*matplotlib.colors.to_rgb(LANDMARK), 0.14),
-        markeredgecolor=LANDMARK,
-        markeredgewidth=1.2,
-        label=ellipse_text(enlarged),
-    )
+    _mark(axes, points, "o", 3.6, LANDMARK, label="estimated landmark", zorder=6)
+    # the legend's own sample: a collection of two colours has none
+    filled = {"markerfacecolor": (*matplotlib.colors.to_rgb(LANDMARK), 0.14)}
+    looks = {"markeredgecolor": LANDMARK, "markeredgewidth": 1.2, "label": ellipse_text(enlarged)}
+    _mark(axes, np.zeros((0, 2)), "o", 11, LANDMARK, **filled, **looks)
 
 
 def draw_image(
@@ -500,16 +468,8 @@ def draw_image(
             called = "true wall or box" if number == 0 else None
             axes.plot(*line.T, color=_IN_IMAGE, linewidth=0.7, label=called)
         if len(info.true_landmarks_m):
-            axes.plot(
-                *info.true_landmarks_m.T,
-                linestyle="none",
-                marker="o",
-                markersize=11,
-                markerfacecolor="none",
-                markeredgewidth=0.8,
-                color=_IN_IMAGE,
-                label="true landmark",
-            )
+            looks = {"markeredgewidth": 0.8, "label": "true landmark"}
+            _mark(axes, info.true_landmarks_m, "o", 11, _IN_IMAGE, **_HOLLOW, **looks)
     axes.set_xlim(grid.x_m, right)
     axes.set_ylim(grid.y_m, top)
     if is_narrow:

@@ -28,7 +28,6 @@ from xethru_protocol.wire.x4 import BASEBAND_BIN_M, RF_BIN_M
 
 Samples = NDArray[np.float32] | NDArray[np.complex64]
 
-"""Frames of one B-scan; as many are held before they are sent."""
 _LINES = 256
 """Lines of the log that are sent together."""
 _MOST_FAULTS = 1000
