@@ -26,7 +26,6 @@ TAPS = CHANNELS[3]
 FILTER = (np.array(TAPS.i_taps) - 1j * np.array(TAPS.q_taps)) / TAPS.absolute_sum
 CARRIER = CARRIER_HZ[3]
 SIGMA_S = math.sqrt(math.log(10)) / (math.pi * 1.4e9)  # of the nominal pulse
-BIN_M = DECIMATION * SPEED_OF_LIGHT_MPS / (2 * SAMPLING_RATE_HZ)
 
 STRETCH = 64  # frames: 3.8 s
 FAR = slice(-20, None)  # bins taken for empty

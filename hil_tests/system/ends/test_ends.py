@@ -123,13 +123,6 @@ def test_a_stopped_terminal_stops_no_demo(stage: Stage, tmp_path: Path) -> None:
 
 
 @THOROUGH
-def test_a_killed_conversion_leaves_nothing_half() -> None:
-    findings = run_trials(1, 5, names=["convert"], endings=[Ending.KILL])
-    assert findings.problems == []
-    assert findings.ended.total() == 1
-
-
-@THOROUGH
 @pytest.mark.timeout(2000)
 @pytest.mark.parametrize("ending", [Ending.KILL, TERM, HANG_UP, Ending.FULL_DISK])
 def test_programs_can_be_ended_at_any_time(ending: Ending) -> None:

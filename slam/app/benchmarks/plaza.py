@@ -109,7 +109,7 @@ def read_run(path: Path) -> Run:
             continue
         range_m, variance = row.values
         if variance <= 0.0:
-            raise row.error("its variance is not positive")
+            raise row.error("its covariance is not positive")
         label, sigma_m = int(second[1:]), math.sqrt(variance)
         seen[first].append(LandmarkMeasurement(range_m=range_m, range_sigma_m=sigma_m, label=label))
     if not odometry:

@@ -186,11 +186,8 @@ def run_sweep(
 ) -> None:
     """Run all cells, write ``out``, print one line per group.
 
-    OUT.part holds the runs done so far, and the same command goes on with it. A command whose
-    result is there already prints it again. The scene is the lab and the preset robust, if none is
-    given; ``laps`` leaves out all but the first; ``settings`` are dotted keys of a preset and the
-    values to try. ``jobs`` is the number of processes, None for one per core; ``dask`` the address
-    of a scheduler that runs them instead.
+    A command whose result is there already prints it again. ``settings`` are dotted keys of a
+    preset and the values to try; ``jobs`` is None for one process per core.
 
     Raises AppError before the first run for a wrong name, or a file that cannot be written or
     belongs to something else; later for a scene too short, a full disk, or a worker process or a
