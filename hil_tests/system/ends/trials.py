@@ -135,7 +135,6 @@ def run_trials(
     count: int,
     seed: int,
     *,
-    names: Sequence[str] = NAMES,
     endings: Sequence[Ending] = ENDINGS,
     say: Callable[[str], None] = lambda text: None,
 ) -> Findings:
@@ -148,7 +147,7 @@ def run_trials(
         place = Path(temporary)
         stage = Stage(place, stack)
         wholes = {}
-        for name in names:
+        for name in NAMES:
             program = stage.program(name)
             (at := place / f"whole-{name}").mkdir()
             (of_whole := at / "out").mkdir()
@@ -158,8 +157,8 @@ def run_trials(
             )
             say(f"{name}: {took_s:.1f} s")
         for number in range(count if endings else 0):
-            name = names[number % len(names)]
-            ending = endings[(number // len(names)) % len(endings)]
+            name = NAMES[number % len(NAMES)]
+            ending = endings[(number // len(NAMES)) % len(endings)]
             at = place / f"trial-{seed}-{number}"
             what = f"{number + 1} of {count}: {name}, {ending.name}"
             try:
