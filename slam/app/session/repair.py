@@ -37,17 +37,37 @@ _PIECE_BYTES = 1 << 20
 class Repair:
     """What a file holds and lacks, and what was made of it.
 
-    Of the old file are `cut_at`, the byte at which it ended too early; `damages`, the places that
-    were left out; `has_index`, whether its index had the right checksum; `has_right_data`, whether
-    the checksum over all of its data is right, if it has one; `schemas` and `channels` by their
-    numbers; `message_counts`, messages by channel as its index has them; and where its data end,
-    with their checksum. `n_messages` is of the new file, and `kept` is where the old one is now,
-    None where it was not moved.
-
-    Of a session, `head` has the first whole message of each topic that describes it, in order;
-    `gaps` what is lost, by the byte at which the damage begins; `n_elsewhere` how many messages are
-    missing where nothing is damaged, as of a chunk cut out. `spans` has session times of the first
-    and the last message by channel [ns].
+    Attributes
+    ----------
+    path
+        The file that opens everywhere now.
+    cut_at
+        Byte at which the old file ended too early; None if it did not.
+    damages
+        Places of the old file that were left out.
+    has_index
+        Whether the old file had an index, with the right checksum.
+    has_right_data
+        Whether the checksum over all of the old file's data is right, if it has one.
+    schemas, channels
+        By their numbers in the old file.
+    head
+        Of a session, the first whole message of each topic that describes it, in order.
+    metadata
+        Of a session, as the old file has it.
+    message_counts, data_end, checksum
+        Of the old file: messages by channel as its index has them, where its data end, and their
+        checksum.
+    gaps
+        Of a session, what is lost, by the byte at which the damage begins.
+    n_elsewhere
+        Of a session, messages that are missing where nothing is damaged, as of a chunk cut out.
+    n_messages
+        In the new file.
+    spans
+        Session time of the first and the last message by channel [ns].
+    kept
+        Where the old file is now; None where it was not moved.
     """
 
     path: Path

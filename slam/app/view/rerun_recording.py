@@ -119,10 +119,24 @@ class RowTimes:
 class RerunRecording:
     """Sends rows to an .rrd file, to a viewer that listens or to one that reads standard output.
 
-    `target` is a file, the address of a viewer, or None for standard output; messages call a file
-    `called`, its path if None. `recording_id` is the same for the same run: a file written twice is
-    the same. `start_ns` is when it began, since 1970; `epoch_ns` the session time that
-    `device_time` is counted from, the first scan's: what was before it is shown at it.
+    Parameters
+    ----------
+    target
+        A file, the address of a viewer, or None for standard output.
+    blueprint
+        How a viewer lays it out, unless its user chose otherwise.
+    recording_id
+        The same for the same run: a file written twice is the same.
+    name, start_ns
+        What viewers call it, and when it began, since 1970.
+    called
+        What messages call the file; None: its path.
+
+    Attributes
+    ----------
+    epoch_ns
+        Session time that `device_time` is counted from: the first scan's. What was before it is
+        shown at it.
 
     Raises
     ------
