@@ -24,6 +24,7 @@ from slam.app.publish.sinks import Publishing
 from slam.app.run.maps import MapOptions, MapSaver, MapUse, map_use, recorded_use
 from slam.app.run.output import RunProgress, note
 from slam.app.run.result_files import SESSION, VIEW, finish, hold_folder, saying_what_is_left
+from slam.app.run.rows_by_time import RowsByTime
 from slam.app.run.runner import (
     LinkLog,
     LostFrames,
@@ -49,7 +50,6 @@ from slam.live.session_records import (
     Snapshot,
 )
 from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
-from slam.robust.solver.growing_arrays import RowsByTime
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
 

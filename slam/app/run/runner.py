@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from slam.app.run.rows_by_time import RowsByTime
 from slam.frames import RadarFrame, StepInputError
 from slam.geometry import Rig
 from slam.library.evaluation import TrueAssociationNis, true_range_nis
@@ -33,7 +34,7 @@ from slam.live.session_records import (
     TruthAt,
 )
 from slam.results import Pipeline, SmoothedRun, StepResult
-from slam.robust.solver.growing_arrays import PackedRows, RowsByTime
+from slam.robust.solver.growing_arrays import PackedRows
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.matching import ProtocolRecord
 
