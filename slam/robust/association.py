@@ -354,8 +354,6 @@ def find_known(
 class WeighedRanges:
     """The k ranges that are of known landmarks, and what they do to a state; shapes (k,)."""
 
-    ranges_m: Array
-    sigmas_m: Array
     gain: Array  # shape (m, k), of the ranges in ``weighted``
     weighted: Array  # white innovations, weighted by Huber
     white: Array  # those before the weights
@@ -386,8 +384,6 @@ def weigh_known(
     odds = noise.detection_probability / np.maximum(density, noise.clutter_per_m)
     log_density = -0.5 * (np.square(white) + math.log(math.tau)) - np.log(scales_m)
     return WeighedRanges(
-        ranges_m=ranges_m,
-        sigmas_m=sigmas_m,
         gain=gain,
         weighted=weighted,
         white=white,
@@ -704,7 +700,7 @@ def density_per_m2(points_m: Array, reach_m: float) -> float:
 
 def predicted_ranges(
     state: State, seen: View, known: Known, side_of: Indices, antennas: Antennas
-) -> list[PredictedRange]:
+) -> tuple[PredictedRange, ...]:
     """Return the ranges of landmarks that could continue a track, before any is looked at.
 
     Those of walls are left out: their echoes have no fixed place to compare with a true landmark's.
@@ -721,11 +717,11 @@ def predicted_ranges(
 
 def ranges_predicted(
     state: State, seen: View, antennas: Antennas, which: Iterable[tuple[int, int, float]]
-) -> list[PredictedRange]:
+) -> tuple[PredictedRange, ...]:
     """Return the predictions for radars and rows of landmarks, with variances [m^2]."""
     places = antennas.position_m.tolist()
     points = (state.landmarks_m - state.position_m) @ rotation(state.heading_rad)
-    return [
+    return tuple(
         PredictedRange(
             radar=radar,
             landmark_id=state.landmark_ids[row],
@@ -735,4 +731,4 @@ def ranges_predicted(
             point_m=(float(points[row, 0]), float(points[row, 1])),
         )
         for radar, row, variance in which
-    ]
+    )

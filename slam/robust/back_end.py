@@ -103,6 +103,16 @@ _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 _FREE_M, _FREE_RAD = 1.0, 1.0
 
 
+def _together(one: UpdateReport, other: UpdateReport) -> UpdateReport:
+    return UpdateReport(
+        continued=one.continued + other.continued,
+        nis=one.nis + other.nis,
+        dof=one.dof + other.dof,
+        predicted=one.predicted + other.predicted,
+        evidence=one.evidence + other.evidence,
+    )
+
+
 class RobustBackEnd:
     """Range SLAM with a consistent covariance.
 
@@ -465,21 +475,16 @@ class RobustBackEnd:
         )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
-        continued, nis, likelihoods = self._correct(known, seen, looks, antennas)
-        used = {(radar, index) for radar, index, _ in continued}
+        report = self._correct(known, seen, looks, antennas, predicted)
+        used = {(radar, index) for radar, index, _ in report.continued}
         evidence_of_misses = [(id_, self._existence.unheard(id_)) for id_ in missed]
-        for _, _, id_ in continued:
+        for _, _, id_ in report.continued:
             self._existence.heard(id_)
         if any(scan.labelled for scan in scans):
             used |= {(scan.radar, index) for scan in scans for index, _ in scan.labelled}
-            of_beacons, nis_of_beacons, evidence, more = self._take_labelled(scans, added_m)
-            continued, nis = continued + of_beacons, nis + nis_of_beacons
-            likelihoods, predicted = [*likelihoods, *evidence], [*predicted, *more]
-        dof = len(continued)
+            report = _together(report, self._take_labelled(scans, added_m))
         for scan in with_bearings:
-            points, nis_of_points, evidence, more = self._take_points(scan, added_m)
-            continued, nis, dof = continued + points, nis + nis_of_points, dof + 2 * len(points)
-            likelihoods, predicted = [*likelihoods, *evidence], [*predicted, *more]
+            report = _together(report, self._take_points(scan, added_m))
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         of_patches = self._take_patches(patches, added_m)
         of_tracklets = self._initialise_landmarks()
@@ -493,13 +498,8 @@ class RobustBackEnd:
         if decide:
             self._decide()
         self._log.set_causal(self.state.pose)
-        return UpdateReport(
-            continued=continued,
-            nis=nis,
-            dof=dof,
-            predicted=tuple(predicted),
-            evidence=(*likelihoods, *evidence_of_misses, *of_patches, *of_tracklets),
-        )
+        evidence = (*report.evidence, *evidence_of_misses, *of_patches, *of_tracklets)
+        return replace(report, evidence=evidence)
 
     def _check_radars(self, scans: Sequence[RangeScan]) -> None:
         radars = {scan.radar for scan in scans}
@@ -546,36 +546,29 @@ class RobustBackEnd:
         seen: View,
         scans: Sequence[RangeScan],
         antennas: Antennas,
-    ) -> tuple[tuple[tuple[int, int, int], ...], float, list[tuple[int, float]]]:
-        """Correct the state with all ranges found at once, weighted by Huber; log them.
-
-        Returns (radar, index, landmark id) of each range, the NIS before the weights, and of each
-        range the landmark and its evidence.
-        """
+        predicted: tuple[PredictedRange, ...],
+    ) -> UpdateReport:
+        """Correct the state with all ranges found at once, weighted by Huber; log them."""
         if not len(known.assigned):
-            return (), 0.0, []
+            return UpdateReport(continued=(), nis=0.0, dof=0, predicted=predicted)
         state, ids = self.state, self.state.feature_ids
         weighed = weigh_known(state, known, seen, scans, self.parameters.ranges)
         continued = tuple(
             (radar, index, ids[int(known.rows[place])])
             for radar, index, place in known.assigned.tolist()
         )
-        nominal_m, turns_rad = antennas.nominal_m.tolist(), antennas.turns_rad.tolist()
-        for (radar, _, landmark_id), range_m, sigma_m in zip(
-            continued, weighed.ranges_m.tolist(), weighed.sigmas_m.tolist(), strict=True
-        ):
-            self._log.add_range(
-                self._log.n_poses - 1,
-                radar,
-                landmark_id,
-                antenna=nominal_m[radar],
-                turn_rad=turns_rad[radar],
-                range_m=range_m,
-                sigma_m=sigma_m,
-            )
+        of_radar = {scan.radar: scan for scan in scans}
+        for radar, index, id_ in continued:
+            self._log_range(of_radar[radar], index, id_, antennas)
         state.apply(weighed.gain, weighed.weighted)
-        evidence = zip((id_ for _, _, id_ in continued), weighed.evidence.tolist(), strict=True)
-        return continued, float(weighed.white @ weighed.white), list(evidence)
+        of_ranges = zip(continued, weighed.evidence.tolist(), strict=True)
+        return UpdateReport(
+            continued=continued,
+            nis=float(weighed.white @ weighed.white),
+            dof=len(continued),
+            predicted=predicted,
+            evidence=tuple((id_, nats) for (_, _, id_), nats in of_ranges),
+        )
 
     def _beacon_rows(self) -> list[int]:
         """Return the rows of landmarks whose ranges have labels."""
@@ -592,25 +585,22 @@ class RobustBackEnd:
         ids = enumerate(self.state.landmark_ids)
         return [*self._labelled_rows(), *(row for row, id_ in ids if id_ < self._first_id)]
 
-    def _take_labelled(
-        self, scans: Sequence[RangeScan], added_m: float
-    ) -> tuple[
-        tuple[tuple[int, int, int], ...], float, list[tuple[int, float]], list[PredictedRange]
-    ]:
+    def _rows_by_label(self) -> dict[int, int]:
+        rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
+        labels = self._landmark_of_label.items()
+        return {label: rows[id_] for label, id_ in labels if id_ in rows}
+
+    def _take_labelled(self, scans: Sequence[RangeScan], added_m: float) -> UpdateReport:
         """Correct the state with the ranges that have labels, and log them all.
 
-        Returns what `_correct` does, and what was predicted. A range beyond the gate corrects
-        nothing now; it is logged, too: which are outliers, the solution over the whole run decides.
-        ``added_m`` is added in squares to the noise of ranges in the gate.
+        A range beyond the gate corrects nothing now; it is logged, too: which are outliers, the
+        solution over the whole run decides. ``added_m`` is added in squares to the noise of ranges
+        in the gate.
         """
         state = self.state
         antennas = antennas_of(self.rig, scans, state.calibration, state.mounts_m)
         widened = [scan.with_added_sigma(added_m) for scan in scans]
-        rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
-        row_of_label = {
-            label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
-        }
-        seen = view(state, antennas)
+        seen, row_of_label = view(state, antennas), self._rows_by_label()
         known, refused = find_labelled(state, seen, widened, row_of_label, self.parameters)
         variances = np.sum((known.H @ state.P.block(known.at)) * known.H, axis=1).tolist()
         which = [
@@ -627,8 +617,8 @@ class RobustBackEnd:
         of_radar = {scan.radar: scan for scan in scans}
         for radar, index, row in refused:
             self._log_range(of_radar[radar], index, ids[row], antennas)
-        continued, nis, evidence = self._correct(known, seen, scans, antennas)
-        evidence += [(ids[row], miss) for _, _, row in refused]
+        report = self._correct(known, seen, scans, antennas, predicted)
+        misses = [(ids[row], miss) for _, _, row in refused]
         for scan in scans:
             for index, label in scan.labelled:
                 self._heard.add(label)
@@ -639,7 +629,7 @@ class RobustBackEnd:
                     waiting = self._waiting[label]
                     waiting.n_ranges += 1
                     self._log_range(scan, index, waiting.log_id, antennas)
-        return continued, nis, evidence, predicted
+        return replace(report, evidence=(*report.evidence, *misses))
 
     def _log_range(self, scan: RangeScan, index: int, id_: int, antennas: Antennas) -> None:
         x_m, y_m = antennas.nominal_m[scan.radar].tolist()
@@ -676,7 +666,7 @@ class RobustBackEnd:
             if scan.faces_m is not None:
                 self._take_faces(scan, scan.faces_m)
                 continue
-            found += self._take_points(scan, added_m)[2]
+            found += self._take_points(scan, added_m).evidence
             self._decide()
         return found
 
@@ -691,16 +681,11 @@ class RobustBackEnd:
             self._existence.hit(wall_id, n_frames)
             self._log.add_detections(wall_id, detections)
 
-    def _take_points(
-        self, scan: RangeScan, added_m: float
-    ) -> tuple[
-        tuple[tuple[int, int, int], ...], float, list[tuple[int, float]], list[PredictedRange]
-    ]:
+    def _take_points(self, scan: RangeScan, added_m: float) -> UpdateReport:
         """Correct the state with a scan with bearings; log it; make landmarks of what is new.
 
-        Returns what `_correct` does, and what was predicted. What is certain corrects the pose
-        first, and is followed by what is certain then. A labelled detection that is too far off is
-        logged all the same.
+        What is certain corrects the pose first, and is followed by what is certain then. A labelled
+        detection that is too far off is logged all the same.
         """
         assert scan.bearings_rad is not None
         state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
@@ -711,34 +696,21 @@ class RobustBackEnd:
             for index, pair in enumerate(zip(scan.ranges_m, scan.bearings_rad, strict=True))
             if 0.0 < pair[0] < LONGEST_M and math.isfinite(pair[1])
         ]
-        rows = {id_: row for row, id_ in enumerate(ids)}
-        row_of_label = {
-            label: rows[id_] for label, id_ in self._landmark_of_label.items() if id_ in rows
-        }
-        miss = math.log(1.0 - noise.detection_probability)
-        evidence: list[tuple[int, float]] = []
-        pairs: list[tuple[int, int]] = []
-        predicted: list[PredictedRange] = []
-        nis = 0.0
+        row_of_label, hit = self._rows_by_label(), set[int]()
+        report = UpdateReport(continued=(), nis=0.0, dof=0)
         while True:
             seen = view(state, antennas)
-            hit = {row for _, row in pairs}
             found = find_points(state, seen, wide, (free, hit, row_of_label), self.parameters)
             if not found.pairs:
                 break
-            pairs += found.pairs
+            hit.update(row for _, row in found.pairs)
             for (_, row), nats in zip(found.pairs, found.evidence, strict=True):
                 if self._log.is_new_passage(ids[row]):
                     self.evidence += nats
-            nis_of_pairs, likelihoods, of_pairs = self._correct_points(
-                scan, seen, found.pairs, antennas
-            )
-            nis, evidence = nis + nis_of_pairs, evidence + likelihoods
-            predicted += of_pairs
+            report = _together(report, self._correct_points(scan, seen, found.pairs, antennas))
             used = {index for index, _ in found.pairs}
             free = [index for index in free if index not in used]
-        continued = tuple([(scan.radar, index, ids[row]) for index, row in pairs])
-        hit_ids = {landmark_id for _, _, landmark_id in continued}
+        hit_ids = {ids[row] for row in hit}
         rule = self.parameters.bearings(of_patches=scan.is_patch)
         for landmark_id in sorted(hit_ids):
             self._existence.hit(landmark_id, rule.frames_per_scan)
@@ -752,12 +724,13 @@ class RobustBackEnd:
             found = replace(found, missed=())
         # Those that are seen rarely are missed often: half of the expected hits, at most.
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
+        miss = math.log(1.0 - noise.detection_probability)
         missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
         # What one scan misses, the next ones miss likely, too: those of a window count as one.
         self.evidence += miss * len(missed - hit_ids) / self.parameters.tracklets.window
         for landmark_id in sorted(missed - hit_ids):
             self._existence.miss(landmark_id, 0.5 * odds)
-            evidence.append((landmark_id, miss))
+        misses = [(landmark_id, miss) for landmark_id in sorted(missed - hit_ids)]
         far = {index for index, _ in refused}
         free = [index for index in free if index not in far]
         detections = detections_of(scan, free, self._log.n_poses - 1, antennas, noise)
@@ -766,7 +739,7 @@ class RobustBackEnd:
         self._antennas, self._settled = antennas, hit_ids | missed
         if detections:
             self._place_points()
-        return continued, nis, evidence, predicted
+        return replace(report, evidence=(*report.evidence, *misses))
 
     def _take_shown(self, radar: int, shown: set[int], hidden: set[int]) -> None:
         """Take the ids that a patch shows and hides; leave out the single ranges of the latter."""
@@ -780,7 +753,7 @@ class RobustBackEnd:
         seen: View,
         pairs: Sequence[tuple[int, int]],
         antennas: Antennas,
-    ) -> tuple[float, list[tuple[int, float]], list[PredictedRange]]:
+    ) -> UpdateReport:
         """Correct the state with detections of landmarks, index and row each; log them."""
         assert scan.bearings_rad is not None
         state, noise, ids = self.state, self.parameters.ranges, self.state.landmark_ids
@@ -808,14 +781,21 @@ class RobustBackEnd:
         clutter = max(noise.clutter_per_m / noise.field_of_view_rad, len(scan.ranges_m) / area)
         log_n = -0.5 * np.square(white) - 0.5 * math.log(math.tau) - np.log(scales)
         log_n = log_n.reshape(-1, 2).sum(axis=1) + math.log(noise.detection_probability / clutter)
-        likelihoods = [(ids[row], value) for row, value in zip(rows, log_n.tolist(), strict=True)]
         pose = self._log.n_poses - 1
         for row, detection in zip(
             rows, detections_of(scan, indices, pose, antennas, noise), strict=True
         ):
             self._log.add_detections(ids[row], [detection])
         state.apply(gain, weighted)
-        return float(white @ white), likelihoods, predicted
+        return UpdateReport(
+            continued=tuple([(scan.radar, index, ids[row]) for index, row in pairs]),
+            nis=float(white @ white),
+            dof=len(white),
+            predicted=predicted,
+            evidence=tuple(
+                (ids[row], nats) for row, nats in zip(rows, log_n.tolist(), strict=True)
+            ),
+        )
 
     def _place_points(self) -> None:
         """Let tentative landmarks be those of the map that they certainly are, or have labels of.
