@@ -241,23 +241,6 @@ def assess(
         table[row, MISFIT] = left / expected
 
 
-@kernel("i8(f8[:,::1], f8, i8)")
-def keep(table: Array, least: float, n_bins: int) -> int:
-    """Sort the echoes that are high enough and in the frame to the top; return how many."""
-    n = 0
-    for row in range(len(table)):
-        if table[row, AMPLITUDE] > least and -0.5 <= table[row, POSITION] < n_bins - 0.5:
-            for k in range(COLUMNS):
-                table[n, k], table[row, k] = table[row, k], table[n, k]
-            for at in range(n, 0, -1):
-                if table[at - 1, POSITION] <= table[at, POSITION]:
-                    break
-                for k in range(COLUMNS):
-                    table[at - 1, k], table[at, k] = table[at, k], table[at - 1, k]
-            n += 1
-    return n
-
-
 @kernel("void(f8, f8, f8, f8[:,::1])")
 def raise_deviations(sigma_y: float, s: float, wrong: float, table: Array) -> None:
     """Raise the deviation of each echo by the part ``wrong`` of the others at its position."""

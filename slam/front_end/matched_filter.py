@@ -284,8 +284,10 @@ def refit(
             group = _fitted(group, others, filtered, split)
         groups.append(group)
     table = np.concatenate(groups)
-    least = pulse_filter.threshold * filtered.sigma_y
-    table = table[: kernels.keep(table, least, pulse_filter.n_bins)]
+    position, least = table[:, POSITION], pulse_filter.threshold * filtered.sigma_y
+    is_inside = (position >= -0.5) & (position < pulse_filter.n_bins - 0.5)
+    table = table[is_inside & (table[:, AMPLITUDE] > least)]
+    table = table[np.argsort(table[:, POSITION], kind="stable")]
     _assess(table, filtered, within)
     return table
 
