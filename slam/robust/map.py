@@ -423,12 +423,12 @@ def _candidates(state: State, density: float, neighbourhood_m: float) -> list[Co
 
 def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
     """Return d^2 of the statement that pairs of rows, shape (k, 2), are one landmark each."""
-    i, j = state.layout.first_columns(pairs).T
+    P = state.P.block(state.landmark_columns(np.arange(len(state.landmark_ids))))
+    i, j = 2 * pairs.T
 
     def spread(a: int, b: int) -> Array:
-        entries = state.P.entries
-        own = entries(i + a, i + b) + entries(j + a, j + b)
-        return np.asarray(own - entries(i + a, j + b) - entries(j + a, i + b))
+        own = P[i + a, i + b] + P[j + a, j + b]
+        return np.asarray(own - P[i + a, j + b] - P[j + a, i + b])
 
     xx, yy, xy = spread(0, 0) + sigma_m**2, spread(1, 1) + sigma_m**2, spread(0, 1)
     apart = state.landmarks_m[pairs[:, 0]] - state.landmarks_m[pairs[:, 1]]

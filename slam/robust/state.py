@@ -120,19 +120,6 @@ class SymmetricMatrix:
             result += self._put_off(at, at)
         return result
 
-    def entries(self, rows: Indices, columns: Indices) -> Array:
-        """Return single entries, shape (k,) for rows and columns of shape (k,)."""
-        low, high = np.minimum(rows, columns), np.maximum(rows, columns)
-        result: Array = self._lower[high, low]
-        if self._n_pairs:
-            first, second = self._first[:, : self._n_pairs], self._second[:, : self._n_pairs]
-            result += np.einsum("ij,ij->i", first[rows], second[columns])
-            result += np.einsum("ij,ij->i", second[rows], first[columns])
-        if self._n_grams:
-            grams = self._grams[:, : self._n_grams]
-            result -= np.einsum("ij,ij->i", grams[rows], grams[columns])
-        return result
-
     def full(self) -> Array:
         """Return a full copy, shape (m, m), symmetric bit for bit."""
         self._carry_out()
