@@ -274,11 +274,22 @@ def advantage(place: Account, other: Account, rule: BranchRule) -> float:
 
 
 class Alternative:
-    """A back end that takes the steps since a carry beside the main one."""
+    """A back end that takes the steps since a carry beside the main one.
 
-    def __init__(self, back_end: RobustBackEnd, since: int, *, merges: bool = False) -> None:
+    Where the robot may have come to, it is a copy of the back end before the carry.
+    """
+
+    def __init__(
+        self,
+        back_end: RobustBackEnd,
+        since: int,
+        price_nats: float = 0.0,
+        *,
+        merges: bool = False,
+    ) -> None:
         self.back_end = back_end
         self.since = since
+        self.price_nats = price_nats  # how unlikely it is that the robot came there
         self.merges = merges  # whether it merges landmarks, and solves for the whole run
         self.next_step = since
         self.evidence: list[Array] = []  # of each step taken, as `evidence_table` has it
@@ -292,16 +303,6 @@ class Alternative:
             report = self.back_end.update(step.scans, solve=self.merges)
             self.evidence.append(evidence_table(report))
             self.next_step = number + 1
-
-
-class Place(Alternative):
-    """A copy of the back end before a carry, where the robot may have come to."""
-
-    def __init__(
-        self, back_end: RobustBackEnd, since: int, price_nats: float, *, merges: bool = False
-    ) -> None:
-        super().__init__(back_end, since, merges=merges)
-        self.price_nats = price_nats  # how unlikely it is that the robot came there
 
 
 @dataclass(slots=True, kw_only=True)
@@ -318,10 +319,10 @@ class Carry:
     new: Alternative  # with an empty map at first
     pose: Array  # shape (3,), before it: [m, m, rad], map frame
     moved: Array  # shape (3,), [m, m, rad], body frame before it: odometry since
-    hidden: Place | None  # a motion that the wheels did not report, and no carry
-    placed: list[Place] = field(default_factory=list)  # where the robot may be on the map
+    hidden: Alternative | None  # a motion that the wheels did not report, and no carry
+    placed: list[Alternative] = field(default_factory=list)  # where the robot may be on the map
     until: int = 0  # step at which these are dropped; 0 until they have caught up
-    adopted: Place | None = None
+    adopted: Alternative | None = None
     stayed: Alternative | None = None  # the back end that stayed, once the place is adopted
 
 
@@ -609,7 +610,7 @@ class Branches:
         totals = totals_of([table], carry.map, self._rule)
         return account_of(totals, back_end.n_reported_since(carry.next_id))
 
-    def _place_of(self, carry: Carry, places: Sequence[Place]) -> Place | None:
+    def _place_of(self, carry: Carry, places: Sequence[Alternative]) -> Alternative | None:
         """Return the place that the robot is at rather than where it was, or anywhere else.
 
         What is missed by the one that stayed must pay the price, not what looks alike, unless the
@@ -646,7 +647,7 @@ class Branches:
         )
         return found if is_there and self._is_only_there(carry, found, account) else None
 
-    def _is_only_there(self, carry: Carry, place: Place, account: Account) -> bool:
+    def _is_only_there(self, carry: Carry, place: Alternative, account: Account) -> bool:
         """Return whether what fits at a place would fit nowhere else on the map.
 
         After a motion that the wheels did not report the robot is near, whatever is alike.
@@ -660,7 +661,7 @@ class Branches:
 
         return self._stand_out(carry.map, hits, carry.next_id, is_no_chance)
 
-    def _adopt(self, carry: Carry, placed: Place) -> None:
+    def _adopt(self, carry: Carry, placed: Alternative) -> None:
         """Let a place be that of the main back end; the one that stayed goes on beside it."""
         carry.stayed = Alternative(self.main, carry.since)
         carry.stayed.next_step, carry.stayed.evidence = self._now, self._tables(carry.since)
@@ -781,7 +782,7 @@ class Branches:
             new=Alternative(before.with_empty_map(), since),
             pose=before.pose,
             moved=moved,
-            hidden=Place(hidden, since, math.log(self._rule.steps_per_hidden), merges=True),
+            hidden=Alternative(hidden, since, math.log(self._rule.steps_per_hidden), merges=True),
         )
 
     def _begin_lost(self, saved: SavedMap) -> None:
@@ -841,7 +842,7 @@ class Branches:
         there: Constellation,
         placement: Placement,
         price_nats: float,
-    ) -> Place:
+    ) -> Alternative:
         """Return a copy of the back end before a carry, set down at a place on its map."""
         points = []
         for row, own in placement.pairs:
@@ -852,4 +853,4 @@ class Branches:
         back_end = carry.base.copy()
         back_end.set_down(placement.motion, points)
         back_end.state.next_id = self.main.state.next_id + _IDS_APART
-        return Place(back_end, carry.since, price_nats)
+        return Alternative(back_end, carry.since, price_nats)
