@@ -141,6 +141,12 @@ class WallCells:
                 spans.append((begin, end))
         return spans
 
+    def ends_m(self, wall_id: int, phi: float, d: float) -> Array:
+        """Return the ends of these stretches of a wall (phi, d), shape (k, 2, 2), map frame."""
+        n, t = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
+        spans = np.array(self.spans_m(wall_id)).reshape(-1, 2)
+        return np.asarray(d * n + spans[:, :, None] * t)
+
     def forget(self, wall_id: int) -> None:
         self._cells.pop(wall_id, None)
 
@@ -498,18 +504,11 @@ class WallKeeper:
 
     def spans_m(self, row: int) -> Array:
         """Return the ends of the known stretches of a wall, shape (k, 2, 2), map frame."""
-        phi, d = (float(value) for value in self._state.walls[row])
-        spans = np.array(self.cells.spans_m(self._state.wall_ids[row])).reshape(-1, 2)
-        return _ends_m(phi, d, spans)
+        return self.cells.ends_m(self._state.wall_ids[row], *self._state.walls[row].tolist())
 
 
 def wall_spans_m(wall: SavedWall, cell_m: float) -> Array:
     """Return the ends of the stretches of a saved wall that gave echoes, (k, 2, 2), map frame."""
     cells = WallCells(cell_m)
     cells.know(wall.id, wall.cells)
-    return _ends_m(wall.phi_rad, wall.d_m, np.array(cells.spans_m(wall.id)).reshape(-1, 2))
-
-
-def _ends_m(phi: float, d: float, spans: Array) -> Array:
-    n, t = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
-    return np.asarray(d * n + spans[:, :, None] * t)
+    return cells.ends_m(wall.id, wall.phi_rad, wall.d_m)
