@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +25,6 @@ from slam.imaging.reflectors import Reflectors, SeparationRule
 Array = NDArray[np.float64]
 
 _PULSE_M = 0.052  # s, of a module with 1.4 GHz
-
-
-class PointKind(StrEnum):
-    """What the wavefront says of a reflector."""
-
-    POINT = "point"
-    ROUND = "round"  # the wavefront is flatter than that of a point, as that of a wide cylinder
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +84,6 @@ class PatchPoint:
     bearing_sigma_rad: float
     amplitude: float
     snr: float
-    kind: PointKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,11 +138,6 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
                 bearing_sigma_rad=bearing_sigma_rad,
                 amplitude=float(reflectors.amplitude[k]),
                 snr=float(reflectors.snr[k]),
-                kind=(
-                    PointKind.POINT
-                    if reflectors.flatness[k] <= rule.flatness[0]
-                    else PointKind.ROUND
-                ),
             )
         )
     return tuple(points)

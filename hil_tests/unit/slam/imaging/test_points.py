@@ -21,7 +21,6 @@ from slam.imaging.patches import Patch, seen_from
 from slam.imaging.points import (
     PatchLine,
     PatchPoint,
-    PointKind,
     PointRule,
     lines_of,
     points_of,
@@ -117,7 +116,6 @@ def test_without_noise_a_point_is_where_it_is(place: tuple[float, float]) -> Non
     (point,) = patch_points(patch_of(of_point(straight(), place)))
     assert math.dist((point.x_m, point.y_m), place) < 5e-4
     assert point.range_m == pytest.approx(math.dist(place, (0.1, 0.2)), abs=3e-4)
-    assert point.kind is PointKind.POINT
     assert point.amplitude == pytest.approx(0.01, rel=0.1)
 
 
@@ -210,11 +208,10 @@ def test_the_amplitude_of_an_echo_may_change_evenly_along_the_patch(slope: float
     assert found.energy[0] == pytest.approx(np.sum(level**2), rel=0.02)
 
 
-def test_a_wide_cylinder_is_round_and_stands_at_its_surface() -> None:
+def test_a_wide_cylinder_is_a_point_at_its_surface() -> None:
     centre, radius_m = np.array([0.1, 0.95]), 0.3
     ranges_m = np.linalg.norm(centre - antennas_of(straight()), axis=1) - radius_m
     (point,) = patch_points(patch_of(rf_frames(ranges_m, 0.01 / ranges_m)))
-    assert point.kind is PointKind.ROUND
     assert (point.x_m, point.y_m) == pytest.approx((0.1, 0.65), abs=1e-3)
 
 

@@ -24,7 +24,7 @@ from slam.front_end import make_detector
 from slam.geometry import between, compose, paper_rig, transform
 from slam.imaging.imager import ImagedPatch, Imager
 from slam.imaging.patches import Patch
-from slam.imaging.points import PatchLine, PatchPoint, PointKind
+from slam.imaging.points import PatchLine, PatchPoint
 from slam.results import Belief
 from slam.robust.association import RangeScan, View, antennas_of, find_points, view
 from slam.robust.back_end import RobustBackEnd
@@ -71,7 +71,6 @@ def imaged(origin: Array, rod: Array, sigma_m: float) -> ImagedPatch:
         bearing_sigma_rad=sigma_m / math.hypot(*away),
         amplitude=0.015,
         snr=30.0,
-        kind=PointKind.POINT,
     )
     # Scans take the radar, the mount and the origin of a patch, and no profile.
     patch = Patch(
