@@ -36,6 +36,7 @@ from slam.results import (
 from slam.robust.association import LONGEST_M, RangeScan
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
+from slam.robust.state import turned_covariance
 
 Array = NDArray[np.float64]
 Row: TypeAlias = Sequence[float | None]
@@ -587,6 +588,4 @@ def _motion_noise(moved: Array, heading_rad: float, wheels: WheelNoise) -> Array
     scale, turn_scale, curvature = wheels.calibration_sigmas
     along += (scale * distance_m) ** 2
     heading += (turn_scale * turn_rad) ** 2 + (curvature * distance_m) ** 2
-    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
-    R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(R @ np.diag([along, across, heading]) @ R.T)
+    return turned_covariance(np.diag([along, across, heading]), heading_rad)
