@@ -27,7 +27,7 @@ import numpy as np
 from hil_tests.plugin.findings import Findings, Measurement
 from hil_tests.plugin.radar_targets import WireBytes, WireTap
 from hil_tests.plugin.session_radars import RadarUnderTest
-from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
+from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, McapWriter, pack_array
 from xethru_protocol.recordings.wire_capture import Way
 from xethru_protocol.wire.codec import describe, encode
 from xethru_protocol.wire.connection import Connection, Role
@@ -160,15 +160,12 @@ def decoded(tap: WireTap) -> Iterator[tuple[WireBytes, Sequence[Message | Framin
 
 
 def _write_wire(path: Path, taps: Mapping[str, WireTap]) -> None:
-    from mcap.writer import CompressionType, Writer
-
     with path.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="xethru-hil")
-        schema = writer.register_schema(BYTE_ARRAY, "ros2msg", SCHEMAS[BYTE_ARRAY].encode())
+        writer = McapWriter(stream)
+        schema = SCHEMAS[BYTE_ARRAY].encode()
         for name, tap in taps.items():
             channels = {
-                topic: writer.register_channel(f"/radar/{name}/{topic}", "cdr", schema)
+                topic: writer.add_channel(f"/radar/{name}/{topic}", BYTE_ARRAY, schema, {})
                 for topic in ("rx", "tx", "payload")
             }
             for passed, events in decoded(tap):
@@ -179,10 +176,9 @@ def _write_wire(path: Path, taps: Mapping[str, WireTap]) -> None:
                         channel_id=channels[topic],
                         log_time=tap.started_unix_ns + passed.t_ns - tap.started_ns,
                         publish_time=passed.t_ns,
-                        sequence=0,
                         data=pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8)),
                     )
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+        writer.finish()
 
 
 def _write_rrd(
