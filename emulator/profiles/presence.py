@@ -56,8 +56,8 @@ _NEWEST_MARGIN_DB = 4.0
 _STILL_MPS = 0.1
 _QUIETEST_THRESHOLD_DB = 14.0
 _INTERVAL_BINS = 10
-FULL_MOVEMENT_DB = 40.0
-NO_MOVEMENT_DB = 3.0
+_FULL_MOVEMENT_DB = 40.0
+_NO_MOVEMENT_DB = 3.0
 _ABSORBABLE = 2.0
 """Excess up to which the noise map adapts; every threshold lies above."""
 
@@ -157,14 +157,19 @@ def detections(
 def movement_list(sweep: ProfileSweep, excess: NDArray[np.float64]) -> tuple[float, ...]:
     """Return movement 0...100 per interval of ten bins (51 cm), their average in front.
 
-    0 is an excess of up to 3 dB in all bins of the interval, 100 one of 40 dB.
+    The largest `movement_share` of an interval counts.
     """
     inside = excess[sweep.in_zone]
     starts = np.arange(0, len(inside), _INTERVAL_BINS)
-    peak_db = 10 * np.log10(np.maximum(np.maximum.reduceat(inside, starts), 1e-30))
-    share = (peak_db - NO_MOVEMENT_DB) / (FULL_MOVEMENT_DB - NO_MOVEMENT_DB)
-    values = 100 * np.clip(share, 0, 1)
+    values = 100 * movement_share(np.maximum.reduceat(inside, starts))
     return (float(values.mean()), *values.tolist())
+
+
+def movement_share(excess: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return movement 0...1 of any shape: 0 is an excess of up to 3 dB, 1 one of 40 dB."""
+    excess_db = 10 * np.log10(np.maximum(excess, 1e-30))
+    share = (excess_db - _NO_MOVEMENT_DB) / (_FULL_MOVEMENT_DB - _NO_MOVEMENT_DB)
+    return np.clip(share, 0, 1)
 
 
 def _runs(occupied: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

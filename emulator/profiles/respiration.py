@@ -34,11 +34,10 @@ from numpy.typing import NDArray
 
 from emulator.profiles.doppler import FAST, SLOW, ProfileSweep
 from emulator.profiles.presence import (
-    FULL_MOVEMENT_DB,
-    NO_MOVEMENT_DB,
     DetectedPerson,
     PresenceProcessing,
     ZoneState,
+    movement_share,
     signal_quality,
 )
 from xethru_protocol.wire import messages as m
@@ -173,9 +172,7 @@ def vital_signs(
 
     Movement is normalised as in `normalized_movement_list`; start and end are those of the zone.
     """
-    slow, fast = (
-        _normalized(processing.excess.get(matrix.instance), sweep) for matrix in (SLOW, FAST)
-    )
+    slow, fast = _normalized_movement(processing, sweep)
     zone_m = sweep.range_m[sweep.in_zone]
     return m.VitalSigns(
         counter=counter,
@@ -216,9 +213,7 @@ def normalized_movement_list(
     counter: int, processing: PresenceProcessing, sweep: ProfileSweep
 ) -> m.RespirationNormalizedMovementList:
     """Return movement 0...1 per bin of the zone; 0 is an excess of 3 dB, 1 one of 40 dB."""
-    slow, fast = (
-        _normalized(processing.excess.get(matrix.instance), sweep) for matrix in (SLOW, FAST)
-    )
+    slow, fast = _normalized_movement(processing, sweep)
     return m.RespirationNormalizedMovementList(
         counter=counter,
         start_m=float(sweep.range_m[sweep.in_zone][0]),
@@ -228,9 +223,10 @@ def normalized_movement_list(
     )
 
 
-def _normalized(excess: NDArray[np.float64] | None, sweep: ProfileSweep) -> tuple[float, ...]:
-    if excess is None:
-        return (0.0,) * int(sweep.in_zone.sum())
-    excess_db = 10 * np.log10(np.maximum(excess[sweep.in_zone], 1e-30))
-    share = (excess_db - NO_MOVEMENT_DB) / (FULL_MOVEMENT_DB - NO_MOVEMENT_DB)
-    return tuple(np.clip(share, 0, 1).tolist())
+def _normalized_movement(
+    processing: PresenceProcessing, sweep: ProfileSweep
+) -> list[tuple[float, ...]]:
+    """Return the movement in each bin of the zone, of the slow and of the fast matrix."""
+    still = np.ones(sweep.n_bins)
+    excesses = [processing.excess.get(matrix.instance, still) for matrix in (SLOW, FAST)]
+    return [tuple(movement_share(excess[sweep.in_zone]).tolist()) for excess in excesses]
