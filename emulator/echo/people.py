@@ -37,22 +37,14 @@ from emulator.scene.scene import Scene
 
 
 def person_scatterer(
-    person: PersonSpec,
-    t_ns: NDArray[np.int64],
-    view: Viewpoint | None = None,
-    seed: int = 0,
+    person: PersonSpec, t_ns: NDArray[np.int64], view: Viewpoint, seed: int = 0
 ) -> Scatterers:
-    """Return a person at scene times of shape (n_frames,), int64: k = 1.
-
-    Without a view it is as seen from the front.
-    """
+    """Return a person at scene times of shape (n_frames,), int64: k = 1."""
     position = positions_m(person, t_ns, seed)
     strength = np.where(present(person, t_ns), AMPLITUDE_OF_1_M2 * math.sqrt(person.rcs_m2), 0.0)
     swell_m = chest_displacement_m(person, t_ns, seed)
-    cosines = None
-    if view is not None:
-        way_m = np.concatenate([view.x_m, view.y_m], axis=1) - position
-        cosines = facing_cosines(person, t_ns, way_m, seed)
+    way_m = np.concatenate([view.x_m, view.y_m], axis=1) - position
+    cosines = facing_cosines(person, t_ns, way_m, seed)
     if cosines is not None:
         strength = strength * np.sqrt(share_seen(CROSS_SECTION_SHARES, cosines))
         swell_m = swell_m * share_seen(CHEST_SHARES, cosines)

@@ -36,7 +36,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.echo.paths import Viewpoint, direct_reflections, viewpoint
-from emulator.echo.people import mover_scatterer, person_scatterer
 from emulator.echo.targets import Targets
 from emulator.echo.walls import (
     Faces,
@@ -46,6 +45,8 @@ from emulator.echo.walls import (
     face_reflections,
     faces_of,
 )
+from emulator.scene.motion import swings
+from emulator.scene.people import positions_m
 from emulator.scene.scene import Scene
 from slam.geometry import FieldOfView
 from xethru_protocol.wire import x4
@@ -196,11 +197,10 @@ class RoomTruth:
 
     def people_m(self, t_ns: NDArray[np.int64]) -> Array:
         """Return where people and movers are, shape (n, p, 2)."""
-        moving = [
-            *(person_scatterer(each, t_ns, None, self._seed) for each in self._scene.people),
-            *(mover_scatterer(each, t_ns) for each in self._scene.movers),
+        places = [
+            *(positions_m(each, t_ns, self._seed) for each in self._scene.people),
+            *(swings(each, t_ns)[0] for each in self._scene.movers),
         ]
-        places = [np.column_stack([each.x_m[:, 0], each.y_m[:, 0]]) for each in moving]
         return np.stack(places, axis=1) if places else np.empty((len(t_ns), 0, 2))
 
     def _in_view(self, range_m: Array, cosine: Array) -> Flags:
