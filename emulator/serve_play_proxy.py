@@ -216,7 +216,7 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             raise CannotServeError(str(error), exit_code=2) from error
         except (SceneError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
-        _run(ports, [control], stop, cleanup, zero_ns=zero_ns, control=control.path, feed=feed)
+        _run(ports, control, [], stop, cleanup, zero_ns=zero_ns, feed=feed)
 
 
 def _serials(options: Namespace, of_scene: Sequence[str]) -> list[str]:
@@ -279,9 +279,7 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         ]
         for watch in watches:
             cleanup.callback(watch.close)
-        zero_ns = time.monotonic_ns()
-        services = [*watches, control]
-        _run(ports, services, stop, cleanup, zero_ns=zero_ns, control=control.path)
+        _run(ports, control, watches, stop, cleanup, zero_ns=time.monotonic_ns())
 
 
 def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
@@ -311,9 +309,8 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             ports = DevicePorts([named], folder, LinkOptions(), cleanup)
         except (PortUnavailable, RecordingError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
-        services: list[Service] = [module, control]
         try:
-            _run(ports, services, stop, cleanup, zero_ns=zero_ns, control=control.path)
+            _run(ports, control, [module], stop, cleanup, zero_ns=zero_ns)
         except RecordingError as error:  # the capture's disk is full
             raise CannotServeError(str(error)) from error
     if not module.port_present(time.monotonic_ns()):
@@ -336,12 +333,12 @@ def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
 
 def _run(
     ports: DevicePorts,
+    control: ControlSocket,
     services: Sequence[Service],
     stop: StopFlag,
     cleanup: contextlib.ExitStack,
     *,
     zero_ns: int,
-    control: Path,
     feed: OdometryFeed | None = None,
 ) -> None:
     if stop.requested:
@@ -350,11 +347,11 @@ def _run(
         "ready": True,
         "scene_time_zero_ns": zero_ns,
         "odometry": None if feed is None else os.fspath(feed.path),
-        "control": os.fspath(control),
+        "control": os.fspath(control.path),
         "devices": ports.entries(),
     }
     feeds = [] if feed is None else [feed]
-    server = Server(ports.ports, [*feeds, *services, *ports.services])
+    server = Server(ports.ports, [*feeds, *services, control, *ports.services])
     cleanup.callback(server.close)
     stop.attach(server.stop)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
