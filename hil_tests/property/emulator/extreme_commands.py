@@ -57,7 +57,8 @@ SECOND = 1_000_000_000
 COMMANDS_PER_MODULE = 250
 PACKETS = 6
 """Most that the host reads after a command."""
-LARGEST_FRAME = 9 + 16384
+LARGEST_PACKET = 8000
+"""Protocol reference 1.1: of a Normal packet, escapes included; radar frames have 6163 bytes."""
 ROWS_OF_COMMANDS = [row for kind, row in ROWS.items() if issubclass(kind, Command)]
 
 WORDS = (
@@ -293,7 +294,7 @@ class Trial:
                 self._timed(lambda: self._device.advance(self._now_ns))
             return None
         assert packet
-        assert len(packet) <= LARGEST_FRAME or self._what == "faults"
+        assert len(packet) <= LARGEST_PACKET or self._what == "faults"
         self._findings.packets += 1
         if self._what != "faults":
             first = packet[1 if packet[0] == START else NO_ESCAPE_HEADER_BYTES]

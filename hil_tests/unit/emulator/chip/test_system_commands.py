@@ -108,33 +108,6 @@ def test_injected_frames_are_acknowledged(host: BareHost, bare: BareHost) -> Non
     assert [bare.ask(command) for command in (prepare, inject)] == [m.Error(code=1)] * 2
 
 
-def test_the_wrong_bootloader_key_gets_a_text_before_the_error(host: BareHost) -> None:
-    """4.1; 11 row 19: the old key is refused."""
-    for key in (0xA2B95EF0, 0):
-        host.send(m.StartBootloader(key=key))
-        text, error = host.hear(2)
-        assert isinstance(text, m.DataString)
-        assert (text.content_id, text.info) == (0, 0)
-        assert text.text == "Unknown start_bootloader key."
-        assert error == m.Error(code=1)
-
-
-def test_in_the_bootloader_only_its_commands_answer(host: BareHost) -> None:
-    """4.12."""
-    assert host.ask(m.BootloaderGetDeviceInfo()) == m.Error(code=1), "not there yet"
-    assert host.ask(m.StartBootloader(key=0xA2B96EF1)) == m.Ack()
-    wait(host)
-    assert host.hear() == [], "no BOOTING, no READY"
-    for command in (m.Ping(), m.GetMode(), m.ModReset(), m.Hil()):
-        host.send(command)
-        assert host.hear() == []
-    assert isinstance(host.ask(m.BootloaderGetDeviceInfo()), m.BootloaderSuccess)
-    host.device.power_cycle(host.now_ns)
-    wait(host)
-    assert host.hear(2) == BOOTED
-    assert host.ask(m.Ping()) == READY
-
-
 def test_ten_faults_in_a_row_start_safe_mode(host: BareHost) -> None:
     """8.5."""
     crash(host, 9)

@@ -71,7 +71,7 @@ class BootloaderHost:
     def __init__(self, host: BareHost) -> None:
         self.host = host
         assert host.ask(m.StartBootloader(key=0xA2B96EF1)) == m.Ack()
-        self.wait()
+        assert self.wait() == [], "no BOOTING, no READY"
 
     def wait(self, seconds: float = 3.0) -> list[m.Message]:
         return self.host.at(self.host.now_ns + round(seconds * SECOND))
@@ -135,12 +135,14 @@ def test_a_small_microcontroller_has_fewer_pages() -> None:
 
 
 def test_what_is_not_for_the_bootloader_gets_no_answer(boot: BootloaderHost) -> None:
-    for payload in ("01 AE EA AA EE", "22", "C0", "EE", "02 F1 6E B9 A2"):
+    for payload in ("01 AE EA AA EE", "22", "26", "A0", "C0", "EE", "02 F1 6E B9 A2"):
         assert boot.ask(payload) == ""
 
 
-def test_the_wrong_key_is_answered_with_the_vendors_text(host: BareHost) -> None:
-    host.send(m.StartBootloader(key=0xA2B95EF0))
+@pytest.mark.parametrize("key", [0xA2B95EF0, 0])
+def test_the_wrong_key_is_answered_with_the_vendors_text(host: BareHost, key: int) -> None:
+    """4.1; 11 row 19: the old key is refused."""
+    host.send(m.StartBootloader(key=key))
     text, error = host.hear(2)
     assert text == m.DataString(text=VECTORS["data_string_unknown_bootloader_key"].decoded["value"])
     assert error == m.Error(code=1)
@@ -257,3 +259,4 @@ def test_the_bootloader_is_left_by_a_power_cycle_before_anything_is_written(
 ) -> None:
     boot.ask("C0 00")
     assert boot.power_cycle()[:2] == [m.System(code=0x10), m.System(code=0x11)]
+    assert boot.host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA)
