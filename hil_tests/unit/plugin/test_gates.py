@@ -114,15 +114,6 @@ def test_what_takes_long_in_real_time_must_be_asked_for(
     assert outcome(request, bench, "emu") == "runs"
 
 
-@pytest.mark.parametrize("limit", [(None, None), (0.0, None), (None, 0.0), (-math.inf, math.inf)])
-def test_a_measure_that_is_no_number_fails(limit: tuple[float | None, float | None]) -> None:
-    """Also without limits: a test that computed NaN has measured nothing."""
-    properties: list[tuple[str, object]] = []
-    with pytest.raises(pytest.fail.Exception, match="noise is nan dB"):
-        Measure(properties)("noise", math.nan, unit="dB", limit=limit)
-    assert [name for name, _ in properties] == ["measurement noise"], "reported all the same"
-
-
 @pytest.mark.parametrize(("value", "limit"), [("a", (None, None)), (1.0, (2.0, 1.0))])
 def test_a_measure_that_makes_no_sense_fails_the_test(
     value: object, limit: tuple[float | None, float | None]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.plugin import power, radar_targets
-from hil_tests.plugin.findings import Measure, findings_of
+from hil_tests.plugin.findings import Limit, Measure, findings_of
 from hil_tests.plugin.power import PowerCommand, PowerError
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import TappedTransport, WireTap
@@ -96,11 +96,25 @@ def test_measurements_reach_the_report() -> None:
     assert taken.as_json() == {"name": "jitter", "value": 4.5, **rest}
 
 
-@pytest.mark.parametrize("value", [5.1, 0.9, math.nan])
-def test_measurements_beyond_their_limits_fail(value: float) -> None:
-    measure = Measure([])
-    with pytest.raises(pytest.fail.Exception, match=r"jitter is .* ms \(at least 1, at most 5\)"):
-        measure("jitter", value, unit="ms", limit=(1.0, 5.0))
+@pytest.mark.parametrize(
+    ("value", "limit", "said"),
+    [
+        (5.1, (1.0, 5.0), "5.1 ms (at least 1, at most 5)"),
+        (0.9, (1.0, 5.0), "0.9 ms (at least 1, at most 5)"),
+        # also without limits: a test that computed NaN has measured nothing
+        (math.nan, (None, None), "nan ms"),
+        (math.nan, (0.0, None), "nan ms (at least 0)"),
+        (math.nan, (None, 0.0), "nan ms (at most 0)"),
+        (math.nan, (-math.inf, math.inf), "nan ms (at least -inf, at most inf)"),
+    ],
+)
+def test_measurements_beyond_their_limits_fail(value: float, limit: Limit, said: str) -> None:
+    properties: list[tuple[str, object]] = []
+    measure = Measure(properties)
+    with pytest.raises(pytest.fail.Exception) as failed:
+        measure("jitter", value, unit="ms", limit=limit)
+    assert failed.value.msg == f"jitter is {said}"
+    assert properties == [("measurement jitter", said)], "reported all the same"
     assert len(measure.taken) == 1
 
 
