@@ -1,11 +1,6 @@
-"""Recordings played at emulated ports.
+"""Recordings played at emulated ports: see `xethru-emulator play --help` for when they are.
 
-Playing begins anew for every host that opens the port: at once when it starts the radar (FPS > 0
-or SETMODE RUN), else after half a second without a command, so that a host that only listens has
-had time to flush its side. It ends when the last host has closed the port. Meanwhile the module
-answers every command like any other; FPS, mode and geometry settings are acknowledged and change
-nothing about what is played. Nothing is dropped: a host that reads slowly makes the recording
-wait.
+A host that only listens waits for half a second, so that it has had time to flush its side.
 
 A host takes only frames of the size that the module reports for its frame area, so while a
 recording plays the module reports the frame area of the recording.
@@ -82,11 +77,7 @@ _ANSWERS = frozenset(
 class PlayClock:
     """The time of a recording on the clock of the device that plays it.
 
-    Parameters
-    ----------
-    rate
-        Multiple of real time; at 0 everything is due at once, and the position is that of the
-        last message played.
+    At rate 0 everything is due at once, and the position is that of the last message played.
     """
 
     def __init__(self, rate: float) -> None:
@@ -260,6 +251,8 @@ class PlayStream(MessageStream):
     loop_gap_ns
         Time of the recording between the last message and the first when playing in a loop; None
         to play once.
+    rate
+        Multiple of real time; 0 for as fast as the port takes it.
     from_ns
         Where every host and round begins, ns since the first message.
     kinds
@@ -526,12 +519,8 @@ def played_radars(
     ----------
     recording
         Anything that `read_recording` takes, and sessions of several radars.
-    rate
-        Multiple of real time; 0 for as fast as the port takes it.
-    from_ns
-        Where every host and round begins, ns since the first message of the recording.
-    kinds
-        What to play, as from `kinds`; None for all.
+    rate, from_ns, kinds
+        As of `PlayStream`.
     on_fault
         Called with what could not be read; the rest plays.
     warn
