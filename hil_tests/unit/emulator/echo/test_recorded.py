@@ -224,23 +224,6 @@ def test_amplitude_and_phase_jitter_are_independent() -> None:
     assert abs(np.corrcoef(frames[:, 0], phases)[0, 1]) < 0.13  # 4 standard errors
 
 
-@pytest.mark.parametrize("position", [200.0, 199.50001, 312.123])
-def test_a_pulse_with_an_offset_of_its_carrier_is_its_formula(position: float) -> None:
-    frame = sum_of_pulses(
-        frame=np.array([0]),
-        position=np.array([position]),
-        amplitude=np.array([1.0]),
-        phase_rad=np.array([0.7]),
-        tx_center_frequency=3,
-        shape=(1, 400),
-        pulse=PulseShape(carrier_offset_hz=-1.9e8),
-    )
-    t_s = (np.arange(400) - position) / RATE_HZ
-    sigma_s = math.sqrt(math.log(10)) / (math.pi * 1.4e9)
-    expected = np.exp(-0.5 * (t_s / sigma_s) ** 2) * np.cos(2 * np.pi * 7.1e9 * t_s + 0.7)
-    np.testing.assert_allclose(frame[0], expected, atol=2e-8)
-
-
 HEAD = 'name = "mine"\nenvironment = "lab"\ndescription = "a scene"\n'
 RADAR = '[[radars]]\nname = "left"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.2\nyaw_deg = 90.0\n'
 
