@@ -1,13 +1,6 @@
-"""``--hil-power-cmd``: the command that switches the power of a real radar.
+"""``--hil-power-cmd``: the command that switches the power of a real radar; see docs/testing.md.
 
-| placeholder | stands for |
-|---|---|
-| `{action}` | `off`, then, after a pause, `on`: the command runs twice |
-| `{port}` | the port or address of the radar |
-| `{serial}` | its serial number |
-
-A command without ``{action}`` runs once and takes the power away and gives it back by itself. It is
-cut into words as a shell does, and started without one.
+It is cut into words as a shell does, and started without one.
 """
 
 from __future__ import annotations

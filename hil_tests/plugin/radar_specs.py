@@ -1,22 +1,7 @@
-"""The values of ``--radar``. Standard library only.
+"""The values of ``--radar``, as docs/testing.md lists them. Standard library only.
 
-| spec | radar |
-|---|---|
-| `emu` | emulated in this process, in virtual time |
-| `emu:SCENE?seed=3&fps=17&radar=NAME` | the same in a scene: a name or a .toml file |
-| `emu:?line=pty`, `uart`, `tcp` | an emulator in a process of its own behind such a line |
-| `emu:?firmware=xep` | in this process, with the bare base firmware |
-| `/dev/ttyACM0`, `ports/left` | a module at a port; `?line=uart`: a UART that looks like none |
-| `serial=202611210001` | a module by its serial number, at any port |
-| `auto` | every module that answers; at least one must |
-| `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
-| `rfc2217://HOST:PORT` | a UART behind an adapter that sets the baud rate, such as ser2net |
-| `replay:RECORDING?radar=NAME` | a recording at the port of an emulated module |
-| `SCHEME:TARGET` | whatever the hook `pytest_xethru_radar_target` of a conftest.py makes of it |
-
-Each takes ``?has=NAME,NAME``: further capabilities, such as a reflector on a stage, for tests
-marked with ``@pytest.mark.requires``. ``?known_range=1.50`` at a real module says that the only
-reflector near this range stands 1.50 m in front of it.
+Radars of one emulated scene or recording are chosen by ``?radar=NAME``; at a port, ``?line=uart``
+says that it is a UART although it looks like none.
 """
 
 from __future__ import annotations
