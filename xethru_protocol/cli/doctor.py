@@ -12,6 +12,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from xethru_protocol.cli.output import counted, print_json, print_line, profile_name
@@ -80,13 +81,17 @@ def _is_readable(entry: Path) -> bool:
 
 MACHINE_CHECKS: list[Check[Machine]] = []
 PORT_CHECKS: list[Check[PortProbe]] = []
+_machine_check = partial(Check, MACHINE_CHECKS)
+_port_check = partial(Check, PORT_CHECKS)
+_ending_port_check = partial(Check, PORT_CHECKS, ends=True)
+_local_port_check = partial(Check, PORT_CHECKS, ends=True, network=False)
+_network_port_check = partial(Check, PORT_CHECKS, ends=True, network=True)
 
 _FEW = 4
 _POWER_CYCLE = "take the module's power away for some seconds"
 
 
-@Check(
-    MACHINE_CHECKS,
+@_machine_check(
     "modules found",
     looks_at="USB ids, and the run directory of emulators",
     remedy="plug one in, run xethru-emulator serve --bare, or name a port with --port",
@@ -97,8 +102,7 @@ def _no_module(machine: Machine) -> str | None:
     return "no module was found: none on USB, no emulator is running"
 
 
-@Check(
-    MACHINE_CHECKS,
+@_machine_check(
     "run directory private",
     looks_at="owner and permissions of the run directory",
     remedy="if it is yours: chmod go-w {run_directory}; else set XDG_RUNTIME_DIR to a folder of "
@@ -111,8 +115,7 @@ def _not_private(machine: Machine) -> str | None:
     return f"{folder} is not this user's alone: its list of emulators is ignored"
 
 
-@Check(
-    MACHINE_CHECKS,
+@_machine_check(
     "no dead emulators",
     looks_at="processes named in the run directory",
     remedy="start an emulator, which removes them, or run: rm -r {stale}",
@@ -123,8 +126,7 @@ def _stale_entries(machine: Machine) -> str | None:
     return f"{machine.run_directory} still holds entries of emulators that have died"
 
 
-@Check(
-    MACHINE_CHECKS,
+@_machine_check(
     "emulators' word readable",
     looks_at="entries of the run directory",
     remedy="stop that emulator and run: rm {damaged}",
@@ -135,13 +137,10 @@ def _damaged_entries(machine: Machine) -> str | None:
     return "the entry of a running emulator cannot be read"
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "link leads to a port",
     looks_at="what the path links to",
     remedy="start the emulator again, or remove the link: rm {path}",
-    ends=True,
-    network=False,
 )
 def _stale_link(probe: PortProbe) -> str | None:
     if os.path.islink(probe.path) and not os.path.exists(probe.path):
@@ -149,50 +148,38 @@ def _stale_link(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "port exists",
     looks_at="the path",
     remedy="plug the module in; 'xethru list' shows the ports there are",
-    ends=True,
-    network=False,
 )
 def _missing(probe: PortProbe) -> str | None:
     return None if os.path.exists(probe.path) else "there is no such port"
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "is a serial port",
     looks_at="what kind of file the path is, and its driver",
     remedy="name the module's port, such as /dev/ttyACM0; 'xethru list' shows them",
-    ends=True,
-    network=False,
 )
 def _no_port(probe: PortProbe) -> str | None:
     return None if probe.is_serial_port else "it is not a serial port"
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "group has rights",
     looks_at="permissions of the device",
     remedy="its group may not open it either: add a udev rule, or run sudo chmod 660 {target}",
-    ends=True,
-    network=False,
 )
 def _no_rights_for_the_group(probe: PortProbe) -> str | None:
     joining_helps = os.stat(probe.path).st_mode & 0o060 == 0o060
     return None if joining_helps else _no_rights(probe)
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "user has rights",
     looks_at="permissions of the device",
     remedy="join the group with sudo usermod -aG {group} {user}, then log in again",
-    ends=True,
-    network=False,
 )
 def _no_rights(probe: PortProbe) -> str | None:
     if os.access(probe.path, os.R_OK | os.W_OK):
@@ -200,13 +187,10 @@ def _no_rights(probe: PortProbe) -> str | None:
     return f"user {probe.user} may not open it; it belongs to group {probe.group}"
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "no two readers",
     looks_at="open files of all programs (/proc)",
     remedy="end all of them but one",
-    ends=True,
-    network=False,
 )
 def _shared(probe: PortProbe) -> str | None:
     if len(probe.users) < 2:
@@ -217,73 +201,56 @@ def _shared(probe: PortProbe) -> str | None:
     return f"{names} have it open at once: each gets only a part of what the module sends"
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "nobody else has it open",
     looks_at="open files of all programs (/proc)",
     remedy="end that program; the port was left alone, so nothing else is known",
-    ends=True,
-    network=False,
 )
 def _in_use(probe: PortProbe) -> str | None:
     return f"{probe.users[0]} has it open" if probe.users else None
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "can be opened",
     looks_at="the answer of the system",
     remedy="if a program of another user has it, sudo xethru doctor --port {path} names it",
-    ends=True,
-    network=False,
 )
 def _cannot_open(probe: PortProbe) -> str | None:
     return probe.refusal
 
 
-@Check(
-    PORT_CHECKS,
+@_network_port_check(
     "can be reached",
     looks_at="the answer of the network",
     remedy="check host and port number; tcp:// passes bytes as they are, rfc2217:// sets the rate",
-    ends=True,
-    network=True,
 )
 def _cannot_reach(probe: PortProbe) -> str | None:
     return probe.refusal
 
 
-@Check(
-    PORT_CHECKS,
+@_network_port_check(
     "stays reachable",
     looks_at="the line while PING is sent",
     remedy="end what else is connected: an adapter has one client at a time; else check its cable",
-    ends=True,
-    network=True,
 )
 def _hung_up(probe: PortProbe) -> str | None:
     return "the other side hung up while the module was checked" if probe.contact.gone else None
 
 
-@Check(
-    PORT_CHECKS,
+@_local_port_check(
     "stays connected",
     looks_at="the line while PING is sent",
     remedy="check plug and cable; a module that has just restarted needs ten seconds",
-    ends=True,
-    network=False,
 )
 def _gone(probe: PortProbe) -> str | None:
     return "it went away while the module was checked" if probe.contact.gone else None
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "not in the bootloader",
     looks_at="the answer to a command only the bootloader knows",
     remedy=f"{_POWER_CYCLE}; if it stays there, an update was not finished: "
     "xethru flash IMAGE --port {path} writes its firmware anew",
-    ends=True,
 )
 def _bootloader(probe: PortProbe) -> str | None:
     if not probe.contact.bootloader:
@@ -291,12 +258,10 @@ def _bootloader(probe: PortProbe) -> str | None:
     return "the module is in its bootloader; more than 15 faults in a row bring it there, too"
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "speaks XeThru",
     looks_at="what comes after PING",
     remedy="is it another device? If it is a module, " + _POWER_CYCLE,
-    ends=True,
 )
 def _no_packets(probe: PortProbe) -> str | None:
     contact = probe.contact
@@ -305,13 +270,11 @@ def _no_packets(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "listens",
     looks_at="what comes after PING",
     remedy="if frames fill a UART (115200 baud carry 2 a second of 1431 bins), stop what asks for "
     f"them and wait half a minute; else check the line from host to module, or {_POWER_CYCLE}",
-    ends=True,
 )
 def _no_answer(probe: PortProbe) -> str | None:
     contact = probe.contact
@@ -320,24 +283,20 @@ def _no_answer(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "answers",
     looks_at="the answer to PING, at all rates on a UART",
     remedy="is a module there, and powered? One that has just restarted needs ten seconds; "
     f"if it stays silent, {_POWER_CYCLE}",
-    ends=True,
 )
 def _silent(probe: PortProbe) -> str | None:
     return "nothing answers" if probe.contact.pong is None else None
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "no echo",
     looks_at="the answer to PING",
     remedy="connect the port to a module",
-    ends=True,
 )
 def _echo(probe: PortProbe) -> str | None:
     if probe.contact.pong == Ping().seed:
@@ -345,12 +304,10 @@ def _echo(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "is a module",
     looks_at="the answer to PING",
     remedy="is it another device? 'xethru list' shows the ports there are",
-    ends=True,
 )
 def _unknown_device(probe: PortProbe) -> str | None:
     pong = probe.contact.pong
@@ -359,8 +316,7 @@ def _unknown_device(probe: PortProbe) -> str | None:
     return f"it answers PING with 0x{pong:08X}, as no XeThru module does"
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "usual baud rate",
     looks_at="the rate at which PING was answered",
     remedy=f"{_POWER_CYCLE} (the rate is not stored), or give "
@@ -373,12 +329,10 @@ def _other_rate(probe: PortProbe) -> str | None:
     return f"it answers at {rate} baud, not at {POWER_UP_BAUD}"
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "ready",
     looks_at="the answer to PING",
     remedy="wait ten seconds; if this stays, xethru reset --port {path}",
-    ends=True,
 )
 def _not_ready(probe: PortProbe) -> str | None:
     if probe.contact.pong == PongCode.XTS_SPRP_NOTREADY:
@@ -386,12 +340,10 @@ def _not_ready(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_ending_port_check(
     "not in safe mode",
     looks_at="the answer to PING",
     remedy=f"xethru reset --port {{path}}, or {_POWER_CYCLE}",
-    ends=True,
 )
 def _safe_mode(probe: PortProbe) -> str | None:
     if probe.contact.pong == PongCode.XTS_SPRP_SAFEMODE:
@@ -399,8 +351,7 @@ def _safe_mode(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "has profiles",
     looks_at="order code and firmware id",
     remedy="nothing, for raw radar; an X4M200 or X4M300 gets its profiles with its sensor firmware",
@@ -413,8 +364,7 @@ def _bare_xep(probe: PortProbe) -> str | None:
     return f"bare {name} firmware, as on an X4M03 or X4M05: raw frames, no profiles"
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "is an X4M300",
     looks_at="order code",
     remedy="raw frames work alike; presence needs an X4M300",
@@ -427,8 +377,7 @@ def _other_product(probe: PortProbe) -> str | None:
     return f"it is an {code}, not an X4M300"
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "firmware",
     looks_at="the version list",
     remedy="write the newest firmware (1.6.8; bare XEP: 3.4.8) "
@@ -451,8 +400,7 @@ def _stale_firmware(probe: PortProbe) -> str | None:
     return f"{firmware.name} " + " and ".join(parts)
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "right profile",
     looks_at="GET_PROFILEID",
     remedy="a program that wants presence must load PRESENCE_2; raw radar needs no profile",
@@ -466,8 +414,7 @@ def _wrong_profile(probe: PortProbe) -> str | None:
     return f"profile {profile_name(loaded)} is loaded, not PRESENCE_2, the X4M300's own"
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "profile loaded",
     looks_at="GET_PROFILEID",
     remedy="nothing, for raw radar; for presence, load and start PRESENCE_2 with "
@@ -480,8 +427,7 @@ def _no_profile(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "radar runs",
     looks_at="the mode",
     remedy="start it: xethru stream --port {path}",
@@ -494,8 +440,7 @@ def _stopped(probe: PortProbe) -> str | None:
     return None
 
 
-@Check(
-    PORT_CHECKS,
+@_port_check(
     "transmitter on",
     looks_at="TXPOWER, if no profile runs",
     remedy="xethru reset --port {path}; check the antenna side if it happens again",
