@@ -4,18 +4,22 @@ import random
 import shutil
 from collections import Counter
 from collections.abc import Callable
-from datetime import UTC
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hil_tests.unit.xethru_protocol.recordings.messages import META, MS, presence, write_capture
+from hil_tests.unit.xethru_protocol.recordings.messages import (
+    META,
+    MS,
+    presence,
+    write_capture,
+    write_recording,
+)
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingFacts,
     RecordingFault,
-    RecordingWriter,
     convert,
     load,
     read_recording,
@@ -34,22 +38,13 @@ FRAMES: list[tuple[m.Response, int | None]] = [
 ]
 
 
-def _vendor(path: Path) -> None:
-    with RecordingWriter(path, timezone=UTC) as writer:
-        for message, t_ns in FRAMES:
-            assert t_ns is not None
-            writer.write(message, t_ns)
-
-
 def _without_index(path: Path) -> None:
-    _vendor(path)
+    write_recording(path, FRAMES)
     (path / META).unlink()
 
 
 def _text(path: Path) -> None:
-    with RecordingWriter(path, timezone=UTC) as writer:
-        for counter in range(N_MESSAGES):
-            writer.write(presence(counter), counter * 10**9)
+    write_recording(path, ((presence(counter), counter * 10**9) for counter in range(N_MESSAGES)))
 
 
 def _mcap(path: Path) -> None:
@@ -65,7 +60,7 @@ def _mcap(path: Path) -> None:
 
 # how each is written, and how many messages a flipped bit may cost
 WRITTEN: dict[str, tuple[Callable[[Path], None], int]] = {
-    "vendor": (_vendor, 1),
+    "vendor": (lambda path: write_recording(path, FRAMES), 1),
     "without_index": (_without_index, 2),
     "text": (_text, 2),  # it may join two lines
     "a.xtwire": (lambda path: write_capture(path, FRAMES), 1),

@@ -2,7 +2,6 @@
 
 import tempfile
 from dataclasses import replace
-from datetime import UTC
 from functools import cache
 from pathlib import Path
 
@@ -13,15 +12,18 @@ from hypothesis import strategies as st
 
 from hil_tests.property.examples import examples
 from hil_tests.property.message_strategies import messages, of_type
-from hil_tests.unit.xethru_protocol.recordings.messages import MS
+from hil_tests.unit.xethru_protocol.recordings.messages import (
+    MS,
+    presence,
+    write_capture,
+    write_recording,
+)
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingFacts,
     RecordingFault,
     RecordingReader,
-    RecordingWriter,
     Split,
-    WireCapture,
     convert,
     read_recording,
 )
@@ -29,7 +31,6 @@ from xethru_protocol.recordings.mcap import read_mcap, write_mcap
 from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
-from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.table import RESPONSES
 
 STORED = [kind.message for kind in KINDS]
@@ -66,12 +67,7 @@ def test_vendor_directories_give_back_what_was_written(
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording"
-        with RecordingWriter(
-            path, user_header=header, split=Split(records=limit), timezone=UTC
-        ) as writer:
-            for message, t_ns in timed:
-                assert t_ns is not None
-                assert writer.write(message, t_ns)
+        write_recording(path, timed, user_header=header, split=Split(records=limit))
         if timed:
             assert payloads(list(read_recording(path))) == payloads(timed)
 
@@ -95,16 +91,13 @@ def test_single_records_are_those_of_the_stream(
     if not timed:
         return
     with tempfile.TemporaryDirectory() as folder:
-        with RecordingWriter(
-            folder,
+        write_recording(
+            Path(folder),
+            timed,
             user_header=header,
             split=Split(records=files),
             split_directories=None if directories is None else Split(records=directories),
-            timezone=UTC,
-        ) as writer:
-            for message, t_ns in timed:
-                assert t_ns is not None
-                assert writer.write(message, t_ns)
+        )
         with RecordingReader(folder) as reader:
             records = list(reader)
             found = [(record.message, record.t_ns) for record in records]
@@ -151,34 +144,22 @@ def test_mcap_and_captures_give_back_what_was_written(
         write_mcap(Path(folder) / "x.mcap", timed, facts)
         if timed:
             assert payloads(list(read_mcap(Path(folder) / "x.mcap", None))) == payloads(timed)
-        module = Connection(Role.MODULE)
-        with WireCapture(Path(folder) / "x.xtwire") as capture:
-            for message, t_ns in timed:
-                capture.write("rx", module.send(message), t_ns)
+        write_capture(Path(folder) / "x.xtwire", timed)
         assert payloads(list(read_recording(Path(folder) / "x.xtwire"))) == payloads(timed)
 
 
 @cache
 def _examples() -> dict[str, tuple[dict[str, bytes], list[tuple[bytes, int | None]]]]:
     """One small recording in each format that can be cut: its files, and its messages."""
-    timed: list[tuple[m.Response, int]] = []
+    timed: list[tuple[m.Response, int | None]] = []
     for counter in range(4):
         values = np.arange(counter + 1, dtype=np.float32)
         timed.append((m.DataFloat(info=counter, values=values), (2 * counter + 1) * MS))
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        with RecordingWriter(root / "vendor", timezone=UTC) as writer:
-            for message, t_ns in timed:
-                writer.write(message, t_ns)
-        with RecordingWriter(root / "csv", timezone=UTC) as writer:
-            for counter in range(4):
-                single = m.PresenceSingle(
-                    counter=counter, state=1, distance_m=0.5, direction=1, signal_quality=9
-                )
-                writer.write(single, counter * MS)
-        with WireCapture(root / "x.xtwire") as capture:
-            for message, t_ns in timed:
-                capture.write("rx", Connection(Role.MODULE).send(message), t_ns)
+        write_recording(root / "vendor", timed)
+        write_recording(root / "csv", [(presence(at), at * MS) for at in range(4)])
+        write_capture(root / "x.xtwire", timed)
         convert(root / "vendor", root / "x.mcap")
         found = {}
         for name in ("vendor", "csv", "x.xtwire", "x.mcap"):

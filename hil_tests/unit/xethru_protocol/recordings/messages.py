@@ -2,15 +2,23 @@
 
 import json
 from collections.abc import Iterable
+from datetime import UTC
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pytest
 
 from hil_tests.paths import FIXTURES
 from xethru_protocol.cli import main
-from xethru_protocol.recordings import RecordingFault, WireCapture, read_recording
+from xethru_protocol.recordings import (
+    RecordingFault,
+    RecordingWriter,
+    WireCapture,
+    WriterOptions,
+    read_recording,
+    recording_facts,
+)
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role
 
@@ -25,6 +33,34 @@ def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
 
 def presence(counter: int) -> m.PresenceSingle:
     return m.PresenceSingle(counter=counter, state=1, distance_m=1.5, direction=2, signal_quality=7)
+
+
+def write_recording(
+    path: Path, timed: Iterable[tuple[m.Response, int | None]], **options: Unpack[WriterOptions]
+) -> None:
+    """Write messages, each of which must be stored, as a directory of ModuleConnector."""
+    with RecordingWriter(path, timezone=UTC, **options) as writer:
+        for message, t_ns in timed:
+            assert t_ns is not None
+            assert writer.write(message, t_ns)
+
+
+def write_again(source: Path, target: Path, **options: Unpack[WriterOptions]) -> None:
+    """Write a recording of the vendor's from what is read; they were made where UTC is."""
+    facts = recording_facts(source)
+    writer = RecordingWriter(
+        target,
+        session_id=facts.session_id,
+        profile_id=facts.profile_id,
+        parameter_file=facts.parameter_file,
+        user_header=facts.user_header,
+        timezone=UTC,
+        **options,
+    )
+    for message, t_ns in read_recording(source):
+        assert t_ns is not None
+        assert writer.write(message, t_ns)
+    writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
 
 
 def write_capture(path: Path, timed: Iterable[tuple[m.Response, int | None]]) -> None:

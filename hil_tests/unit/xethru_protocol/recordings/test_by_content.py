@@ -3,7 +3,6 @@
 import io
 import shutil
 from collections.abc import Callable
-from datetime import UTC
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +15,12 @@ from hil_tests.unit.xethru_protocol.recordings.messages import (
     RECORDINGS,
     presence,
     read_with_faults,
+    write_recording,
 )
 from xethru_protocol.cli import main
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingFault,
-    RecordingWriter,
     convert,
     load,
     read_recording,
@@ -55,9 +54,7 @@ def of_kind(kind: str, number: int) -> m.Response:
 
 def record(path: Path, kind: str) -> list[m.Response]:
     messages = [of_kind(kind, number) for number in range(N_FRAMES)]
-    with RecordingWriter(path, timezone=UTC) as writer:
-        for number, message in enumerate(messages):
-            writer.write(message, number * 1000 * MS)
+    write_recording(path, ((message, at * 1000 * MS) for at, message in enumerate(messages)))
     return messages
 
 

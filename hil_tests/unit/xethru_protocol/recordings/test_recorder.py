@@ -119,24 +119,6 @@ def test_a_listener_set_meanwhile_stays(
     assert radar.listener is later
 
 
-def test_recorders_end_in_any_order(radar: X4M300, line: LoopbackTransport, tmp_path: Path) -> None:
-    heard: list[int] = []
-    radar.listener = lambda message, t_ns: heard.append(t_ns)
-    first, second = (
-        Recorder(radar, tmp_path, clock=line.clock_ns, session_id=name) for name in ("a", "b")
-    )
-    first.start()
-    second.start()
-    first.stop()
-    radar.ping()
-    assert len(heard) == 1
-    second.stop()
-    first.start()
-    radar.ping()
-    assert len(heard) == 2
-    first.stop()
-
-
 @pytest.mark.parametrize("order", ["abAa", "abBb", "abAaBb", "abcBbACca"])
 def test_recorders_of_one_radar_start_and_stop_in_any_order(tmp_path: Path, order: str) -> None:
     """Each stores every frame of its time once; a capital letter stops one."""

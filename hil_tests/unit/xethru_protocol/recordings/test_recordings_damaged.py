@@ -8,7 +8,7 @@ import struct
 import subprocess
 import sys
 import tracemalloc
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -22,6 +22,7 @@ from hil_tests.unit.xethru_protocol.recordings.messages import (
     frame,
     presence,
     read_with_faults,
+    write_recording,
 )
 from xethru_protocol.recordings import (
     RecordingError,
@@ -57,9 +58,8 @@ def test_the_meta_file_names_the_recording(tmp_path: Path) -> None:
 def test_any_user_header_is_found_without_an_index(
     header: bytes, message: m.Response, tmp_path: Path
 ) -> None:
-    with RecordingWriter(tmp_path / "r", user_header=header) as writer:
-        for number in range(3):
-            writer.write(message, number * MS)
+    timed = [(message, number * MS) for number in range(3)]
+    write_recording(tmp_path / "r", timed, user_header=header)
     assert recording_facts(tmp_path / "r").user_header == header
     (tmp_path / "r" / META).unlink()
     found, faults = read_with_faults(tmp_path / "r")
@@ -172,9 +172,8 @@ def test_a_damaged_head_of_the_meta_file_costs_no_message(
 @pytest.mark.rare
 def test_a_long_index_stays_packed_in_memory(tmp_path: Path) -> None:
     n_messages = 20_000
-    with RecordingWriter(tmp_path / "long") as writer:
-        for counter in range(n_messages):
-            writer.write(frame(counter, 1), counter * MS)
+    timed = ((frame(counter, 1), counter * MS) for counter in range(n_messages))
+    write_recording(tmp_path / "long", timed)
     tracemalloc.start()
     try:
         counters = [message.info for message, _ in read_recording(tmp_path / "long")]  # type: ignore[attr-defined]  # frames only
@@ -239,9 +238,7 @@ def test_an_index_that_is_too_short_or_too_long_is_reported(tmp_path: Path) -> N
 
 
 def test_a_missing_data_file_is_reported(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "two", timezone=UTC) as writer:
-        writer.write(frame(1), 0)
-        writer.write(presence(2), 0)
+    write_recording(tmp_path / "two", [(frame(1), 0), (presence(2), 0)])
     next((tmp_path / "two").glob("*.csv")).unlink()
     found, faults = read_with_faults(tmp_path / "two")
     assert found == [(frame(1), 0)]

@@ -7,7 +7,7 @@ lines, name and bit of a kind are written here by hand.
 import re
 import struct
 from dataclasses import replace
-from datetime import UTC, timedelta, timezone
+from datetime import timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ import pytest
 
 from hil_tests.golden.vectors import load
 from hil_tests.paths import FIXTURES
-from xethru_protocol.recordings import RecordingWriter, read_recording, recording_facts
+from hil_tests.unit.xethru_protocol.recordings.messages import write_again, write_recording
+from xethru_protocol.recordings import RecordingWriter, read_recording
 from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import decode_response
@@ -71,8 +72,7 @@ def message_of(name: str) -> m.Response:
 
 def written(message: m.Response, folder: Path, kind: str, bit: int, suffix: str) -> bytes:
     """Content of the one data file, after a look at the meta file and at what is read back."""
-    with RecordingWriter(folder, timezone=UTC) as writer:
-        assert writer.write(message, TIME_NS)
+    write_recording(folder, [(message, TIME_NS)])
     meta = (folder / "xethru_recording_meta.dat").read_bytes()
     assert struct.unpack_from("<I", meta, 0x25) == (1 << bit,)
     assert list(read_recording(folder)) == [(message, TIME_NS)]
@@ -103,8 +103,7 @@ def test_respiration_is_stored_without_its_counter(tmp_path: Path) -> None:
     """As the vendor's recorder does: see `test_every_kind_is_read_as_it_was_sent`."""
     message = message_of("appdata_respiration")
     assert isinstance(message, m.RespStatus)
-    with RecordingWriter(tmp_path, timezone=UTC) as writer:
-        writer.write(message, TIME_NS)
+    write_recording(tmp_path, [(message, TIME_NS)])
     file = tmp_path / "xethru_respiration_19700101_000001.csv"
     assert file.read_text().splitlines()[1] == STAMP + "0;15;1.25;2.5;9"
     assert list(read_recording(tmp_path)) == [(replace(message, counter=0), TIME_NS)]
@@ -113,13 +112,12 @@ def test_respiration_is_stored_without_its_counter(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["a;b\n\\n\rü\x85;", "two\n\nlines\n", "\n", "TimeStamp;\nx", ""])
 def test_text_with_separators_and_line_ends_is_stored_as_it_is(text: str, tmp_path: Path) -> None:
     message = m.DataString(content_id=1, info=2, text=text)
-    with RecordingWriter(tmp_path, timezone=UTC) as writer:
-        for t_ns in (TIME_NS, TIME_NS + 1_000_000):
-            writer.write(message, t_ns)
+    timed = [(message, TIME_NS), (message, TIME_NS + 1_000_000)]
+    write_recording(tmp_path, timed)
     content = (tmp_path / "xethru_datastring_19700101_000001.csv").read_bytes().decode("latin-1")
     titles = "TimeStamp;ContentId;Info;Message\n"
     assert content == f"{titles}{STAMP}1;2;{text}\n{STAMP.replace('002', '003')}1;2;{text}\n"
-    assert list(read_recording(tmp_path)) == [(message, TIME_NS), (message, TIME_NS + 1_000_000)]
+    assert list(read_recording(tmp_path)) == timed
 
 
 # The vendor's recorder was given these vectors, in this order and with range_idx 0 in the four
@@ -161,12 +159,7 @@ def test_every_kind_is_written_as_the_vendor_does(tmp_path: Path) -> None:
 
     The vendor's recorder reads the clock more than once for a message.
     """
-    facts = recording_facts(EVERY_KIND)
-    writer = RecordingWriter(tmp_path / "r", session_id=facts.session_id, timezone=UTC)
-    for message, t_ns in read_recording(EVERY_KIND):
-        assert t_ns is not None
-        writer.write(message, t_ns)
-    writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
+    write_again(EVERY_KIND, tmp_path / "r")
     for theirs in EVERY_KIND.iterdir():
         ours = tmp_path / "r" / theirs.name
         if theirs.suffix == ".csv":

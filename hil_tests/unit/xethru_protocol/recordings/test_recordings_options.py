@@ -20,6 +20,8 @@ from hil_tests.unit.xethru_protocol.recordings.messages import (
     frame,
     presence,
     read_with_faults,
+    write_again,
+    write_recording,
 )
 from xethru_protocol.recordings import (
     RecordingError,
@@ -57,8 +59,7 @@ def test_a_session_without_id_gets_a_uuid(given: str | None, tmp_path: Path) -> 
 
 
 def test_a_conversion_gives_the_session_an_id(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "a", session_id="x") as writer:
-        writer.write(frame(1), 0)
+    write_recording(tmp_path / "a", [(frame(1), 0)], session_id="x")
     content = bytearray((tmp_path / "a" / META).read_bytes())
     content[0x59] = 0
     (tmp_path / "a" / META).write_bytes(content)
@@ -78,22 +79,6 @@ def test_a_session_directory_is_named_as_the_vendor_does() -> None:
     )
 
 
-def written_again(source: Path, target: Path, *, split: Split, directories: bool) -> None:
-    facts = recording_facts(source)
-    with RecordingWriter(
-        target,
-        session_id=facts.session_id,
-        user_header=facts.user_header,
-        split=None if directories else split,
-        split_directories=split if directories else None,
-        timezone=UTC,
-    ) as writer:
-        for message, t_ns in read_recording(source):
-            assert t_ns is not None
-            writer.write(message, t_ns)
-        writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
-
-
 @pytest.mark.parametrize(
     ("name", "split"),
     [("split_files", Split(seconds=1)), ("split_directories", Split(bytes=60))],
@@ -102,8 +87,10 @@ def test_a_split_recording_is_written_as_the_vendor_does(
     name: str, split: Split, tmp_path: Path
 ) -> None:
     source = RECORDINGS / name
-    is_directories = name == "split_directories"
-    written_again(source, tmp_path / "again", split=split, directories=is_directories)
+    if name == "split_directories":
+        write_again(source, tmp_path / "again", split_directories=split)
+    else:
+        write_again(source, tmp_path / "again", split=split)
     theirs = {path.relative_to(source): path for path in source.rglob("*") if path.is_file()}
     ours = tmp_path / "again"
     assert theirs.keys() == {path.relative_to(ours) for path in ours.rglob("*") if path.is_file()}
@@ -124,9 +111,8 @@ def test_a_meta_file_is_read_with_those_that_follow() -> None:
 
 
 def test_a_directory_that_is_missing_in_a_chain_is_reported(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path, split_directories=Split(records=1), session_id="s") as writer:
-        for counter in range(3):
-            writer.write(frame(counter), counter * MS)
+    timed = [(frame(counter), counter * MS) for counter in range(3)]
+    write_recording(tmp_path, timed, split_directories=Split(records=1), session_id="s")
     parts = sorted(tmp_path.iterdir())
     assert [part.name[-2:] for part in parts] == ["_0", "_1", "_2"]
     for path in parts[1].iterdir():
@@ -144,11 +130,8 @@ def test_a_directory_that_is_missing_in_a_chain_is_reported(tmp_path: Path) -> N
 
 def test_more_than_ten_directories_keep_their_order(tmp_path: Path) -> None:
     folder = tmp_path / "rec" / "xethru_recording_19700101_000000_s"
-    with RecordingWriter(
-        folder, split_directories=Split(records=1), session_id="s", timezone=UTC
-    ) as writer:
-        for counter in range(12):
-            writer.write(frame(counter), counter * MS)
+    timed = [(frame(counter), counter * MS) for counter in range(12)]
+    write_recording(folder, timed, split_directories=Split(records=1), session_id="s")
     assert counters(folder) == list(range(12))
     assert counters(tmp_path / "rec") == list(range(12))
 
@@ -184,9 +167,7 @@ def test_files_under_other_names_are_found_by_the_index(tmp_path: Path) -> None:
     """As the vendor's recorder names them: the base name, a stamp, the kind's suffix."""
     names = {m.DataFloat: "lab", m.PresenceSingle: "who"}
     timed = [(frame(1), 0), (presence(2), 5 * MS), (frame(3), 9 * MS)]
-    with RecordingWriter(tmp_path, basenames=names, timezone=UTC) as writer:
-        for message, t_ns in timed:
-            writer.write(message, t_ns)
+    write_recording(tmp_path, timed, basenames=names)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "lab_19700101_000000.dat",
         "who_19700101_000000.csv",

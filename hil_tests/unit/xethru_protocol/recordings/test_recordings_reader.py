@@ -216,16 +216,3 @@ def test_iq_records_hold_their_bytes(tmp_path: Path) -> None:
     assert isinstance(record.message, m.BasebandIq)
     assert record.message.counter == 49
     np.testing.assert_allclose(record.message.i[:2], [0.049, 0.098], rtol=1e-6)
-
-
-def test_a_damaged_list_of_files_is_done_without(tmp_path: Path) -> None:
-    """A file name with a zero byte is one that no system opens."""
-    copy = shutil.copytree(RECORDINGS / "float", tmp_path / "rec")
-    with RecordingReader(copy) as reader:
-        whole = [record.data for record in reader]
-    (name,) = (path.name.encode() for path in copy.glob("xethru_datafloat_*.dat"))
-    content = (copy / META).read_bytes()
-    assert content.count(name) == 1
-    (copy / META).write_bytes(content.replace(name, name[:10] + b"\0" + name[11:]))
-    with RecordingReader(copy) as reader:
-        assert [record.data for record in reader] == whole

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from hil_tests.paths import real_recording, shared_data
-from hil_tests.unit.xethru_protocol.recordings.messages import META, MS, RECORDINGS, frame, presence
+from hil_tests.unit.xethru_protocol.recordings.messages import (
+    META,
+    MS,
+    RECORDINGS,
+    frame,
+    presence,
+    write_again,
+    write_recording,
+)
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingFault,
@@ -21,22 +29,6 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.recordings.vendor.writer import session_directory
 from xethru_protocol.wire import messages as m
-
-
-def write_again(source: Path, target: Path) -> None:
-    facts = recording_facts(source)
-    writer = RecordingWriter(
-        target,
-        session_id=facts.session_id,
-        profile_id=facts.profile_id,
-        parameter_file=facts.parameter_file,
-        user_header=facts.user_header,
-        timezone=UTC,  # where the vendor's recordings were made
-    )
-    for message, t_ns in read_recording(source):
-        assert t_ns is not None
-        assert writer.write(message, t_ns)
-    writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
 
 
 def contents(directory: Path) -> dict[str, bytes]:
@@ -135,9 +127,7 @@ def test_every_record_is_what_the_vendors_reader_gives() -> None:
 
 def test_several_kinds_keep_their_order_in_time(tmp_path: Path) -> None:
     written = [(frame(1), 10 * MS), (presence(2), 20 * MS), (frame(3), 30 * MS)]
-    with RecordingWriter(tmp_path / "two", timezone=UTC) as writer:
-        for message, t_ns in written:
-            writer.write(message, t_ns)
+    write_recording(tmp_path / "two", written)
     assert sorted(path.name for path in (tmp_path / "two").iterdir()) == [
         "xethru_datafloat_19700101_000000.dat",
         "xethru_presence_single_19700101_000000.csv",
@@ -159,9 +149,7 @@ def test_several_kinds_keep_their_order_in_time(tmp_path: Path) -> None:
 def test_split_files_are_read_as_one(tmp_path: Path, split: Split, files: int) -> None:
     written = [(frame(counter), counter * 10 * MS) for counter in range(5)]
     folder = tmp_path / "split"
-    with RecordingWriter(folder, user_header=b"head", split=split, timezone=UTC) as writer:
-        for message, t_ns in written:
-            writer.write(message, t_ns)
+    write_recording(folder, written, user_header=b"head", split=split)
     data = sorted(folder.glob("*.dat"))
     assert len(data) == files + 1  # and the meta file
     assert list(read_recording(folder)) == written
@@ -174,11 +162,8 @@ def test_split_files_are_read_as_one(tmp_path: Path, split: Split, files: int) -
 
 def test_a_split_closes_a_full_file_at_once_in_the_index(tmp_path: Path) -> None:
     """Entries by hand: ms, kind, data type, size, file, begin in the file, end over all files."""
-    with RecordingWriter(
-        tmp_path / "split", session_id="s", split=Split(records=1), timezone=UTC
-    ) as writer:
-        writer.write(frame(1), 5 * MS)
-        writer.write(frame(2), 9 * MS)
+    timed = [(frame(1), 5 * MS), (frame(2), 9 * MS)]
+    write_recording(tmp_path / "split", timed, session_id="s", split=Split(records=1))
     meta = (tmp_path / "split" / META).read_bytes()
     index = meta[0x59 + 2 :]  # behind the session id and its NUL
     assert [struct.unpack_from("<IBIIIQQ", index, 33 * row) for row in range(4)] == [
@@ -210,11 +195,10 @@ def test_one_of_several_files_has_its_own_times_without_a_list_of_files(tmp_path
 
 def test_a_recording_split_by_directory_is_read_as_one(tmp_path: Path) -> None:
     for part in range(2):
-        with RecordingWriter(tmp_path / f"xethru_recording_{part}_s", session_id="s") as writer:
-            writer.write(frame(part), part * MS)
+        folder = tmp_path / f"xethru_recording_{part}_s"
+        write_recording(folder, [(frame(part), part * MS)], session_id="s")
     assert [message for message, _ in read_recording(tmp_path)] == [frame(0), frame(1)]
-    with RecordingWriter(tmp_path / "xethru_recording_2_other", session_id="other") as writer:
-        writer.write(frame(2), 0)
+    write_recording(tmp_path / "xethru_recording_2_other", [(frame(2), 0)], session_id="other")
     with pytest.raises(RecordingError, match="holds 3 recordings of 2 sessions"):
         list(read_recording(tmp_path))
 
@@ -223,10 +207,8 @@ def test_a_recording_split_by_directory_is_read_as_one(tmp_path: Path) -> None:
 def test_a_directory_whose_meta_file_is_lost_is_known_by_its_name(
     n_lost: int, tmp_path: Path
 ) -> None:
-    split = Split(records=1)
-    with RecordingWriter(tmp_path, session_id="a b", split_directories=split) as writer:
-        for counter in range(3):
-            writer.write(frame(counter), 1000 * counter * MS)
+    timed = [(frame(counter), 1000 * counter * MS) for counter in range(3)]
+    write_recording(tmp_path, timed, session_id="a b", split_directories=Split(records=1))
     folders = sorted(tmp_path.iterdir())
     for folder in folders[:n_lost]:
         (folder / META).unlink()
@@ -239,8 +221,7 @@ def test_a_directory_whose_meta_file_is_lost_is_known_by_its_name(
 def test_sessions_whose_names_differ_in_a_number_are_not_joined(tmp_path: Path) -> None:
     for name in ("lab_1", "lab_2"):
         folder = session_directory(tmp_path, name, 0, UTC)
-        with RecordingWriter(folder, session_id=name) as writer:
-            writer.write(frame(1), 0)
+        write_recording(folder, [(frame(1), 0)], session_id=name)
         if name == "lab_1":
             (folder / META).unlink()
     with pytest.raises(RecordingError, match="of 2 sessions"):
@@ -253,8 +234,7 @@ def test_directories_without_session_id_are_not_taken_for_one_recording(
 ) -> None:
     for radar in range(2):
         folder = tmp_path / f"xethru_recording_{radar}"
-        with RecordingWriter(folder, session_id="x") as writer:
-            writer.write(frame(radar), 0)
+        write_recording(folder, [(frame(radar), 0)], session_id="x")
         content = bytearray((folder / META).read_bytes())
         content[0x59] = 0  # as earlier versions wrote
         (folder / META).write_bytes(content)
