@@ -41,7 +41,7 @@ from xethru_protocol.wire.codes import (
     error_name,
 )
 from xethru_protocol.wire.fields import hex_bytes
-from xethru_protocol.wire.table import ROWS, command, id32, response
+from xethru_protocol.wire.table import ROWS, ReplyT, command, id32, response
 from xethru_protocol.wire.table import Command as Command
 from xethru_protocol.wire.table import Message as Message
 from xethru_protocol.wire.table import Response as Response
@@ -94,59 +94,55 @@ _DATA = ResponseCode.XTS_SPR_DATA
 _CONTENT_ID = fields.Number("I", shown=fields.short_hexadecimal)
 
 
-@response(_REPLY, ElementType.XTS_SPRD_NONE, name="REPLY NONE")
-class ReplyNone(Response):
-    """Answer without elements; no firmware is known to send it. 5.2."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Reply(Response):
+    """Header of an answer: what it answers, and a number beside it. 5.2."""
 
     content_id: Annotated[int, _CONTENT_ID] = 0
     info: Annotated[int, fields.U32] = 0
+
+
+@response(_REPLY, ElementType.XTS_SPRD_NONE, name="REPLY NONE")
+class ReplyNone(_Reply):
+    """Answer without elements; no firmware is known to send it. 5.2."""
+
     trailer: Annotated[int | None, fields.OptionalByte(shown_if_absent=True)] = None
 
 
 @response(_REPLY, ElementType.XTS_SPRD_BYTE, name="REPLY BYTE")
-class ReplyByte(Response):
+class ReplyByte(_Reply):
     """Answer of bytes. 5.2."""
 
-    content_id: Annotated[int, _CONTENT_ID] = 0
-    info: Annotated[int, fields.U32] = 0
     values: Annotated[bytes, fields.Elements("c", 1, "values", trailer=1, trailer_shown=True)]
 
 
 @response(_REPLY, ElementType.XTS_SPRD_INT, name="REPLY INT")
-class ReplyInt(Response):
+class ReplyInt(_Reply):
     """Answer of signed 32-bit integers; the only REPLY without trailer. 5.2."""
 
-    content_id: Annotated[int, _CONTENT_ID] = 0
-    info: Annotated[int, fields.U32] = 0
     values: Annotated[tuple[int, ...], fields.Elements("i", 4, "values", trailer_shown=True)]
 
 
 @response(_REPLY, ElementType.XTS_SPRD_FLOAT, name="REPLY FLOAT")
-class ReplyFloat(Response):
+class ReplyFloat(_Reply):
     """Answer of float32 values, as exact Python floats. 5.2."""
 
-    content_id: Annotated[int, _CONTENT_ID] = 0
-    info: Annotated[int, fields.U32] = 0
     values: Annotated[
         tuple[float, ...], fields.Elements("f", 4, "values", trailer=4, trailer_shown=True)
     ]
 
 
 @response(_REPLY, ElementType.XTS_SPRD_STRING, name="REPLY STRING")
-class ReplyString(Response):
+class ReplyString(_Reply):
     """Answer of text, one character per byte. 5.2."""
 
-    content_id: Annotated[int, _CONTENT_ID] = 0
-    info: Annotated[int, fields.U32] = 0
     text: Annotated[str, fields.Elements("s", 1, "value", trailer=1, trailer_shown=True)]
 
 
 @response(_REPLY, ElementType.XTS_SPRD_USER, name="REPLY USER")
-class ReplyUser(Response):
+class ReplyUser(_Reply):
     """Answer of a user structure, as bytes. 5.2."""
 
-    content_id: Annotated[int, _CONTENT_ID] = 0
-    info: Annotated[int, fields.U32] = 0
     values: Annotated[bytes, fields.Elements("c", 1, "values", trailer=1, trailer_shown=True)]
 
 
@@ -255,34 +251,34 @@ _FREQUENCY_STEP = fields.Number("f", "frequency_step")
 _RANGE = fields.Number("f", "range")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Baseband(_Bulk):
+    """Header of the two baseband messages of a profile. 7.1."""
+
+    counter: Annotated[int, fields.U32]
+    num_bins: Annotated[int, fields.U32]
+    bin_length_m: Annotated[float, _BIN_LENGTH]
+    sampling_frequency_hz: Annotated[float, _SAMPLING]
+    carrier_frequency_hz: Annotated[float, _CARRIER]
+    range_offset_m: Annotated[float, _OFFSET]
+
+
 @response(*appdata(AppDataId.XTS_ID_BASEBAND_IQ), name="BASEBAND_IQ", bulk=True)
-class BasebandIq(_Bulk):
+class BasebandIq(_Baseband):
     """Complex baseband of the running profile. 7.1.
 
     ``i`` and ``q``: shape (num_bins,), float32, read-only. Ranges in module metres;
     ``range_offset_m`` is the range of bin 0.
     """
 
-    counter: Annotated[int, fields.U32]
-    num_bins: Annotated[int, fields.U32]
-    bin_length_m: Annotated[float, _BIN_LENGTH]
-    sampling_frequency_hz: Annotated[float, _SAMPLING]
-    carrier_frequency_hz: Annotated[float, _CARRIER]
-    range_offset_m: Annotated[float, _OFFSET]
     i: Annotated[FloatArray, fields.Bins("num_bins")]
     q: Annotated[FloatArray, fields.Bins("num_bins")]
 
 
 @response(*appdata(AppDataId.XTS_ID_BASEBAND_AMPLITUDE_PHASE), name="BASEBAND_AP", bulk=True)
-class BasebandAp(_Bulk):
+class BasebandAp(_Baseband):
     """Baseband as amplitude and phase [rad]. 7.1; fields as in `BasebandIq`."""
 
-    counter: Annotated[int, fields.U32]
-    num_bins: Annotated[int, fields.U32]
-    bin_length_m: Annotated[float, _BIN_LENGTH]
-    sampling_frequency_hz: Annotated[float, _SAMPLING]
-    carrier_frequency_hz: Annotated[float, _CARRIER]
-    range_offset_m: Annotated[float, _OFFSET]
     amplitude: Annotated[FloatArray, fields.Bins("num_bins")]
     phase: Annotated[FloatArray, fields.Bins("num_bins")]
 
@@ -990,6 +986,14 @@ _DIR = CommandCode.XTS_SPC_DIR_COMMAND
 _TYPE = fields.Number("I", "type", shown=fields.hexadecimal).of(codes.FileType)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _OfFile(Command[ReplyT]):
+    """What commands about one file begin with. 4.11."""
+
+    file_type: Annotated[int, _TYPE]
+    identifier: Annotated[int, fields.U32]
+
+
 @command(_DIR, DirCode.XTS_SDC_SEARCH_FILE_TYPE, name="DIR SEARCH_FILE_TYPE", errors=FileError)
 class SearchFileType(Command[ReplyInt]):
     """Ask for the identifiers of all files of a type. 4.11."""
@@ -1003,66 +1007,49 @@ class FindAllFiles(Command[ReplyInt]):
 
 
 @command(_DIR, DirCode.XTS_SDC_CREATE_NEW_FILE, name="DIR CREATE_NEW_FILE", errors=FileError)
-class CreateFile(Command[Ack]):
+class CreateFile(_OfFile[Ack]):
     """Create a file of ``length`` bytes; it is open and erased then. 4.11."""
 
-    file_type: Annotated[int, _TYPE]
-    identifier: Annotated[int, fields.U32]
     length: Annotated[int, fields.U32]
 
 
 @command(_DIR, DirCode.XTS_SDC_OPEN_FILE, name="DIR OPEN_FILE", errors=FileError)
-class OpenFile(Command[Ack]):
+class OpenFile(_OfFile[Ack]):
     """Open a file; at most 10 may be open. 4.11."""
-
-    file_type: Annotated[int, _TYPE]
-    identifier: Annotated[int, fields.U32]
 
 
 @command(_DIR, DirCode.XTS_SDC_SET_FILE_DATA, name="DIR SET_FILE_DATA", errors=FileError)
-class SetFileData(Command[Ack]):
+class SetFileData(_OfFile[Ack]):
     """Write ``data``, at most 1024 bytes, into an open file. 4.11."""
 
-    file_type: Annotated[int, _TYPE]
-    identifier: Annotated[int, fields.U32]
     offset: Annotated[int, fields.U32]
     length: ClassVar[Annotated[int, fields.Count(("data",), "length")]]
     data: Annotated[bytes, fields.Block("length")]
 
 
 @command(_DIR, DirCode.XTS_SDC_CLOSE_FILE, name="DIR CLOSE_FILE", errors=FileError)
-class CloseFile(Command[Ack]):
+class CloseFile(_OfFile[Ack]):
     """Close a file; the firmware ignores ``commit``. 4.11."""
 
-    file_type: Annotated[int, _TYPE]
-    identifier: Annotated[int, fields.U32]
     commit: Annotated[int, fields.U32] = 1
 
 
 @command(_DIR, DirCode.XTS_SDC_GET_FILE_LENGTH, name="DIR GET_FILE_LENGTH", errors=FileError)
-class GetFileLength(Command[ReplyInt]):
+class GetFileLength(_OfFile[ReplyInt]):
     """Ask for a file's size [bytes]; it need not be open. 4.11."""
-
-    file_type: Annotated[int, _TYPE]
-    identifier: Annotated[int, fields.U32]
 
 
 @command(_DIR, DirCode.XTS_SDC_GET_FILE_DATA, name="DIR GET_FILE_DATA", errors=FileError)
-class GetFileData(Command[ReplyByte]):
+class GetFileData(_OfFile[ReplyByte]):
     """Read ``length`` bytes, at most 1024, of an open file. 4.11."""
 
-    file_type: Annotated[int, _TYPE]
-    identifier: Annotated[int, fields.U32]
     offset: Annotated[int, fields.U32]
     length: Annotated[int, fields.U32]
 
 
 @command(_DIR, DirCode.XTS_SDC_DELETE_FILE, name="DIR DELETE_FILE", errors=FileError)
-class DeleteFile(Command[Ack]):
+class DeleteFile(_OfFile[Ack]):
     """Delete a closed file; takes about 100 ms. 4.11."""
-
-    file_type: Annotated[int, _TYPE]
-    identifier: Annotated[int, fields.U32]
 
 
 @command(_DIR, DirCode.XTS_SDC_FORMAT_FILESYSTEM, name="DIR FORMAT_FILESYSTEM", errors=FileError)
