@@ -39,7 +39,8 @@ def write_recording(
     path: Path, timed: Iterable[tuple[m.Response, int | None]], **options: Unpack[WriterOptions]
 ) -> None:
     """Write messages, each of which must be stored, as a directory of ModuleConnector."""
-    with RecordingWriter(path, timezone=UTC, **options) as writer:
+    in_utc: WriterOptions = {"timezone": UTC, **options}
+    with RecordingWriter(path, **in_utc) as writer:
         for message, t_ns in timed:
             assert t_ns is not None
             assert writer.write(message, t_ns)
@@ -48,15 +49,15 @@ def write_recording(
 def write_again(source: Path, target: Path, **options: Unpack[WriterOptions]) -> None:
     """Write a recording of the vendor's from what is read; they were made where UTC is."""
     facts = recording_facts(source)
-    writer = RecordingWriter(
-        target,
-        session_id=facts.session_id,
-        profile_id=facts.profile_id,
-        parameter_file=facts.parameter_file,
-        user_header=facts.user_header,
-        timezone=UTC,
+    as_before: WriterOptions = {
+        "session_id": facts.session_id,
+        "profile_id": facts.profile_id,
+        "parameter_file": facts.parameter_file,
+        "user_header": facts.user_header,
+        "timezone": UTC,
         **options,
-    )
+    }
+    writer = RecordingWriter(target, **as_before)
     for message, t_ns in read_recording(source):
         assert t_ns is not None
         assert writer.write(message, t_ns)

@@ -65,6 +65,9 @@ COMPILED = [
     (1.29, 3.67, 0.2, True, 1.2802469, 3.6979423, 48),
     (3.02, 8.27, 0.18, True, 3.009218, 8.307571, 104),
     (1.21, 5.41, 0.18, True, 1.2088065, 5.4269133, 83),
+    # of the golden vectors
+    (0.2, 9.4, 0.18, False, 0.19929012656211853, 9.400678634643555, 1431),
+    (0.2, 9.4, 0.18, True, 0.18000000715255737, 9.43925952911377, 181),
 ]
 
 
@@ -84,20 +87,6 @@ def test_read_backs_are_to_the_last_bit_those_of_the_compiled_driver(
 def test_area_after_init_has_1467_bins() -> None:
     area = x4.frame_area(*x4.FULL_AREA_M)
     assert (area.n_bins, area.requested_end_m) == (1467, float(np.float32(9.8765432)))
-
-
-@pytest.mark.parametrize(
-    ("downconversion", "start", "end"),
-    [
-        (False, 0.19929012656211853, 9.400678634643555),
-        (True, 0.18000000715255737, 9.43925952911377),
-    ],
-)
-def test_read_back_has_the_float32_values_of_the_vectors(
-    downconversion: bool, start: float, end: float
-) -> None:
-    area = x4.frame_area(0.2, 9.4, 0.18, downconversion)
-    assert (area.start_m, area.end_m) == (start, end)
 
 
 def test_equal_limits_give_the_bins_of_the_reference() -> None:
