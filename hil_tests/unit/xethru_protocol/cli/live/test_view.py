@@ -11,28 +11,22 @@ import threading
 import urllib.request
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from emulator import emulated_port
 from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.terminal import in_terminal
-from hil_tests.unit.xethru_protocol.cli.live.chest import (
-    RANGES_M,
-    breathing,
-    noise,
-    recording,
-    target,
-    times_s,
-)
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said
 from hil_tests.unit.xethru_protocol.scripted import PlainModule
 from xethru_protocol.cli import main
 from xethru_protocol.cli.arguments import parse
-from xethru_protocol.cli.live.analysis import Clutter, LiveAnalysis
+from xethru_protocol.cli.live.analysis import Clutter, LiveAnalysis, VitalAnswer
 from xethru_protocol.cli.live.sources import open_source
 from xethru_protocol.optional_packages import install_command
 from xethru_protocol.wire import messages as m
@@ -40,6 +34,44 @@ from xethru_protocol.wire.codes import X4Setting
 
 Capture = pytest.CaptureFixture[str]
 XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
+FRAME_RATE_HZ = 17.0
+RANGES_M = np.arange(0.4, 5.0, 0.0514)
+CARRIERS_HZ = {3: 7.29e9, 4: 8.748e9}  # by TXCENTERFREQUENCY: protocol reference 9.2
+PULSE_M = 0.12
+NOISE = 1e-4
+
+
+def target(range_m: NDArray[np.float64], tx_center_frequency: int = 3) -> NDArray[np.complex64]:
+    """Echo of amplitude 0.01 at a range per frame, shape (n_frames, n_bins), and noise."""
+    wavelength_m = 299_792_458 / CARRIERS_HZ[tx_center_frequency]
+    away = RANGES_M[np.newaxis] - range_m[:, np.newaxis]
+    phase = np.exp(-4j * np.pi * range_m[:, np.newaxis] / wavelength_m)
+    echo: NDArray[np.complex128] = 0.01 * np.exp(-((away / PULSE_M) ** 2)) * phase
+    return (echo + noise(len(range_m))).astype(np.complex64)
+
+
+def noise(n_frames: int) -> NDArray[np.complex128]:
+    random = np.random.default_rng(7)
+    shape = n_frames, len(RANGES_M)
+    parts: NDArray[np.complex128] = random.standard_normal((*shape, 2)).view(np.complex128)
+    return NOISE * parts[..., 0]
+
+
+def times_s(duration_s: float) -> NDArray[np.float64]:
+    return np.arange(round(duration_s * FRAME_RATE_HZ)) / FRAME_RATE_HZ
+
+
+def breathing(
+    duration_s: float, *, range_m: float = 1.5, rate_bpm: float = 15.0
+) -> NDArray[np.float64]:
+    """Range of a chest that moves by 8 mm."""
+    return range_m + 4e-3 * np.sin(2 * np.pi * rate_bpm / 60 * times_s(duration_s))
+
+
+def recording(path: Path, iq: NDArray[np.complex64], tx_center_frequency: int = 3) -> Path:
+    settings = json.dumps({"TXCENTERFREQUENCY": tx_center_frequency})
+    np.savez(path, iq=iq, ranges_m=RANGES_M, frame_rate_hz=FRAME_RATE_HZ, settings=settings)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -393,3 +425,11 @@ def test_a_browser_is_served_until_the_end(ends_by: str, at_rest: Path) -> None:
         assert process.stderr.read() == ""
         assert process.wait(timeout=seconds(10)) == (130 if ends_by == "a signal" else 0)
     wait_until(lambda: not Path(f"/proc/{viewer}").exists())
+
+
+LISTENING = VitalAnswer(t_s=59.0, heard_s=59.0, window_s=60.0, breathing=None, presence=None)
+
+
+def test_a_full_window_without_a_rate_is_not_waited_for() -> None:
+    full, longer = (replace(LISTENING, t_s=t_s, heard_s=t_s) for t_s in (60.0, 61.0))
+    assert full.text == longer.text != LISTENING.text
