@@ -1,6 +1,11 @@
-"""Recordings played at emulated ports: see `xethru-emulator play --help` for when they are.
+"""Recordings played at emulated ports.
 
-A host that only listens waits for half a second, so that it has had time to flush its side.
+Playing begins anew for every host that opens the port: at once when it starts the radar (FPS > 0
+or SETMODE RUN), else after half a second without a command, so that a host that only listens has
+had time to flush its side. It ends when the last host has closed the port. Meanwhile the module
+answers every command like any other; FPS, mode and geometry settings are acknowledged and change
+nothing about what is played. Nothing is dropped: a host that reads slowly makes the recording
+wait.
 
 A host takes only frames of the size that the module reports for its frame area, so while a
 recording plays the module reports the frame area of the recording.
