@@ -254,6 +254,7 @@ class InProcessTarget(RadarTarget):
             Identity(serial=radar.serial, order_code=MODELS[model].order_code),
             echo_source(self._scene, self._index, self.spec.seed),
             Pace.REALTIME,
+            clock=radar.clock,
             options=DeviceOptions.of_model(model, firmware=self.spec.firmware),
         )
         self._line = FaultyLine(device)
@@ -519,7 +520,10 @@ def _serve_arguments(spec: RadarArgument) -> list[str]:
 
 
 def _scene_text(spec: RadarArgument) -> str | None:
-    if not spec.target:
+    """Return the scene file; None for an empty room and for a random one, which its name makes."""
+    from emulator.scene.rooms import room_of
+
+    if not spec.target or room_of(spec.target):
         return None
     path = Path(spec.target)
     if path.suffix != ".toml":

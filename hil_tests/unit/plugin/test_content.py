@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hil_tests.device.test_content import CHECKS, range_errors_m
+from hil_tests.paths import FIXTURES
 from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import RadarTarget, target_of
 from hil_tests.plugin.session_radars import RadarUnderTest
@@ -15,10 +17,10 @@ from xethru_protocol.driver.frames import Frame
 
 @contextmanager
 def frames_with(
-    kind: str | None, count: int, *, n: int
+    kind: str | None, count: int, *, n: int, scene: str | Path = "lab"
 ) -> Iterator[tuple[list[Frame], RadarTarget]]:
-    """Give frames of the lab with a fault, armed for so many firings, 0: for each frame."""
-    (spec,) = parse_specs(["emu:lab"])
+    """Give frames of a scene with a fault, armed for so many firings, 0: for each frame."""
+    (spec,) = parse_specs([f"emu:{scene}"])
     under_test = RadarUnderTest(target_of(spec))
     under_test.begin_test()
     radar = under_test.open()
@@ -61,3 +63,20 @@ def test_a_drift_of_ranges_is_measured(kind: str | None, drift_mm: float) -> Non
         errors = range_errors_m(frames, place.known_ranges_m)
     late_mm = [1e3 * error for t_ns, error in errors if t_ns > frames[-34].arrival_ns]
     assert np.median(late_mm) == pytest.approx(drift_mm, abs=4)
+
+
+def test_a_random_room_is_a_scene_without_a_file() -> None:
+    with frames_with(None, 0, n=1, scene="pillars:3") as (frames, place):
+        assert len(frames) == 1
+        assert place.scene_text is None
+
+
+def test_a_module_has_the_clock_of_its_scene(tmp_path: Path) -> None:
+    """A clock that is a thousandth fast: the same number of frames takes that much less."""
+    lab = (FIXTURES / "scenes" / "lab.toml").read_text("utf-8")
+    (tmp_path / "fast.toml").write_text(lab.replace("\nserial", "\nclock_ppm = 1000.0\nserial"))
+    took_ns = []
+    for scene in ("lab", tmp_path / "fast.toml"):
+        with frames_with(None, 0, n=200, scene=scene) as (frames, _):
+            took_ns.append(frames[-1].arrival_ns - frames[0].arrival_ns)
+    assert took_ns[0] / took_ns[1] == pytest.approx(1.001, abs=1e-6)
