@@ -57,7 +57,13 @@ from scipy import fft
 from scipy.optimize import brentq
 
 from slam.config import FrontEnd, SlamConfig
-from slam.frames import Detection, RadarFrame, reaches_limits, usable_samples
+from slam.frames import (
+    Detection,
+    RadarFrame,
+    StepInputError,
+    reaches_limits,
+    usable_samples,
+)
 from slam.front_end import kernels
 from slam.front_end.kernels import (
     AMPLITUDE,
@@ -107,7 +113,8 @@ _RESOLUTION = float(np.finfo(np.float32).eps)
 class PulseFilter:
     """Correlation of frames of one length with the pulse of one module.
 
-    ``false_alarms`` and ``noise_is_known`` are those of `threshold_sigmas`.
+    ``false_alarms`` and ``noise_is_known`` are those of `threshold_sigmas`. Raises StepInputError
+    if frames are shorter than the pulse.
     """
 
     def __init__(
@@ -121,6 +128,11 @@ class PulseFilter:
     ) -> None:
         pulse, taps = module.model, module.equaliser
         half = pulse.half_length(bin_length_m)
+        if n_bins < 2 * half + 1:
+            raise StepInputError(
+                f"a frame of {n_bins} bins is shorter than a pulse ({2 * half + 1}); "
+                "ask the module for a longer frame area"
+            )
         template = pulse.samples(np.zeros(1), bin_length_m)[0]
         energy = float(np.sum(np.abs(template) ** 2))
         self.pulse = pulse

@@ -511,7 +511,10 @@ def _measured(row: Sequence[Any], kind: str) -> _Measured:
         numbers = dict(zip(names[1:], map(float, values[1:n]), strict=True))
         label = None if values[n:] in ((), (None,)) else operator.index(values[n])
     except (TypeError, ValueError, OverflowError):
-        text = f"({', '.join(names)}), numbers, and perhaps the id of a landmark, a whole number"
+        text = (
+            f"({', '.join(names)}), the radar as a whole number (int), the others as numbers, "
+            "and perhaps the id of a landmark, an int"
+        )
         raise StepInputError(f"{kind} {values}: must be {text}") from None
     one = _Measured(radar, label, **numbers)
     sigmas = [value for name, value in numbers.items() if "sigma" in name]

@@ -485,9 +485,11 @@ class RobustBackEnd:
             report = _together(report, self._take_labelled(scans, added_m))
         for scan in with_bearings:
             report = _together(report, self._take_points(scan, added_m))
-        self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
+        # A step in which no radar looked is none of those that a window counts.
+        if antennas.has_frame.any() or patches:
+            self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         of_patches = self._take_patches(patches, added_m)
-        of_tracklets = self._initialise_landmarks()
+        of_tracklets = self._initialise_landmarks() if antennas.has_frame.any() else []
         self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:

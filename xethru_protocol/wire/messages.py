@@ -94,7 +94,7 @@ _DATA = ResponseCode.XTS_SPR_DATA
 _CONTENT_ID = fields.Number("I", shown=fields.short_hexadecimal)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)  # rows compare all of their fields
 class _Reply(Response):
     """Header of an answer: what it answers, and a number beside it. 5.2."""
 
@@ -986,7 +986,7 @@ _DIR = CommandCode.XTS_SPC_DIR_COMMAND
 _TYPE = fields.Number("I", "type", shown=fields.hexadecimal).of(codes.FileType)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)  # rows compare all of their fields
 class _OfFile(Command[ReplyT]):
     """What commands about one file begin with. 4.11."""
 

@@ -123,6 +123,7 @@ REFUSED: dict[str, Callable[[Slam, int], object]] = {
         t, P, frames=[replace(FRAME, samples=np.full(9, np.inf, np.float32), t_ns=t)]
     ),
     "no frame": lambda s, t: s.step(t, P, frames=[FOREIGN]),
+    "radar as a float": lambda s, t: s.step(t, P, ranges=[(0.0, 1.0, 0.1)]),
     "range of an unknown radar": lambda s, t: s.step(t, P, ranges=[(2, 1.0, 0.1)]),
     "negative radar": lambda s, t: s.step(t, P, ranges=[(-1, 1.0, 0.1)]),
     "NaN range": lambda s, t: s.step(t, P, ranges=[(0, math.nan, 0.1)]),

@@ -473,3 +473,52 @@ def test_images_begin_anew_where_the_wheels_may_have_slipped(
         slam.step_detections([], {tick * TICK_NS: pose}.__getitem__, tick * TICK_NS)
     assert anew == [11]
     assert sorted({*range(1, 20)} - {*taken}) == [10, 11]
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1.0])
+def test_odometry_that_begins_anew_elsewhere_goes_on_as_before(turn_rad: float) -> None:
+    """A source that restarts reports another pose: no robot jumps by a metre in 0.2 s."""
+    restart_ns, anew = 60 * TICK_NS, np.array([1.0, 0.2, turn_rad])
+
+    def restarted(t_ns: int) -> Array:
+        return straight(t_ns) if t_ns < restart_ns else compose(anew, straight(t_ns))
+
+    expected, found = drive(robust(), 90, straight), drive(robust(), 90, restarted)
+    assert found[-1].pose == pytest.approx(expected[-1].pose, abs=1e-3)
+    assert found[-1].landmarks == pytest.approx(expected[-1].landmarks, abs=1e-3)
+    # It may have been carried meanwhile, so the pose is unsure until landmarks are recognised.
+    usual, unsure = (max(one.pose_covariance[0, 0] for one in some) for some in (expected, found))
+    assert unsure > 100 * usual
+
+
+def test_a_robot_that_brakes_hard_is_where_its_wheels_say() -> None:
+    """From 1.5 m/s it stands 0.2 s later: less than gravity, and no restart."""
+
+    def braking(t_ns: int) -> Array:
+        return np.array([1.5 * min(t_ns, 10 * TICK_NS) / NS, 0.0, 0.0])
+
+    slam = robust()
+    for tick in range(15):
+        t_ns = tick * TICK_NS
+        results = slam.step_detections([], braking, t_ns)
+        assert all(row.belief.pose == pytest.approx(braking(t_ns), abs=1e-9) for row in results)
+
+
+@pytest.mark.parametrize("every", [1, 2, 4])
+def test_steps_without_a_look_cost_no_landmark(every: int) -> None:
+    """A program may step more often than its radars measure."""
+    slam = robust(override(ROBUST, {"robust.patches": False}))
+    for tick in range(90 * every):
+        t_ns = tick * TICK_NS // every
+        seen = [
+            RangeScan(
+                radar=radar,
+                ranges_m=tuple(one.range_m for one in echoes(straight(t_ns), radar, t_ns)),
+            )
+            for radar in range(len(RIG.mounts))
+        ]
+        slam.step_scans([], seen if tick % every == 0 else [], straight, t_ns)
+    found = slam.belief().landmarks
+    assert len(found) > 0
+    near = np.linalg.norm(found[:, np.newaxis] - RODS, axis=2).min(axis=1)
+    assert near == pytest.approx(np.zeros(len(found)), abs=0.02)
