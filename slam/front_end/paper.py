@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from slam.config import BackgroundFilter, DetectionConfig, PeakPosition
-from slam.frames import Detection, RadarFrame
+from slam.frames import Detection, RadarFrame, StepInputError
 
 Array = NDArray[np.float64]
 
@@ -118,7 +118,7 @@ class SavitzkyGolay:
     def smooth(self, samples: Array) -> Array:
         """Return smoothed samples, shape (..., n), n at least the filter's length."""
         if samples.shape[-1] < self.length:
-            raise ValueError(
+            raise StepInputError(
                 f"a frame of {samples.shape[-1]} bins is shorter than the smoothing filter "
                 f"({self.length}); ask the module for a longer frame area"
             )

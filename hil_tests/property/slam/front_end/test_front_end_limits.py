@@ -13,8 +13,8 @@ from scipy.stats import ncx2
 from hil_tests.paths import study
 from hil_tests.unit.slam.simulation import BIN_LENGTH_M as BIN_M
 from hil_tests.unit.slam.simulation import frame_of
-from slam.config import SlamConfig, override
-from slam.frames import RadarFrame
+from slam.config import SlamConfig, load_preset, override
+from slam.frames import RadarFrame, StepInputError
 from slam.front_end import make_detector
 from slam.front_end.matched_filter import _MEDIAN_EFFICIENCY
 
@@ -288,3 +288,20 @@ def test_the_scatter_of_the_estimated_noise_is_that_of_a_median_of_correlated_po
     cells = 4 * covariances / median**2  # relative variance of the estimate, times their number
     mean = math.sqrt(math.tau) / spacing  # the same of a mean of powers
     assert mean / cells == pytest.approx(_MEDIAN_EFFICIENCY, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("preset", "n_bins"),
+    [("paper", 1), ("paper", 14), ("robust", 0), ("robust", 1), ("robust", 30)],
+)
+def test_a_frame_that_is_too_short_is_refused(preset: str, n_bins: int) -> None:
+    frame = RadarFrame(
+        radar=0,
+        t_ns=0,
+        counter=1,
+        samples=np.full(n_bins, 1e-3, dtype=np.float32),
+        range_start_m=0.2,
+        bin_length_m=BIN_M,
+    )
+    with pytest.raises(StepInputError, match=f"a frame of {n_bins} bins is shorter than"):
+        make_detector(load_preset(preset)).detect(frame)
