@@ -47,6 +47,7 @@ Array = NDArray[np.float64]
 
 _NS_PER_S = 1_000_000_000
 _STILL_M, _STILL_RAD = 1e-3, 1e-3  # wheels that report less stand
+_RATE_NS = 100_000_000  # shortest time over which the rate of the motion is taken
 
 
 class RobustSlam:
@@ -355,14 +356,16 @@ class ContinuousOdometry:
 
     t_ns: int
     pose: Array  # shape (3,)
-    rate: Array  # shape (3,): motion [m, m, rad] per second since the step before
-    origin: Array | None  # shape (3,), of the source's frame since its last jump
-    has_jumped: bool  # at this step
+    origin: Array | None = None  # shape (3,), of the source's frame since its last jump
+    has_jumped: bool = False  # at this step
+    # Motion [m, m, rad] per second, shape (3,), up to the time and pose that it is of
+    rate: Array
+    rate_ns: int
+    rate_pose: Array
 
     @classmethod
     def begin(cls, reported: Array, t_ns: int) -> ContinuousOdometry:
-        rate = np.zeros(3)
-        return cls(t_ns=t_ns, pose=reported, rate=rate, origin=None, has_jumped=False)
+        return cls(t_ns=t_ns, pose=reported, rate=np.zeros(3), rate_ns=t_ns, rate_pose=reported)
 
     def placed(self, reported: Array) -> Array:
         """Return a pose that the source reports, on this odometry."""
@@ -373,13 +376,28 @@ class ContinuousOdometry:
         took_s = (t_ns - self.t_ns) / _NS_PER_S
         pose = self.placed(reported)
         motion, expected = between(self.pose, pose), took_s * self.rate
-        away_m = math.hypot(motion[0] - expected[0], motion[1] - expected[1])
-        if away_m <= max(jump_m, g * took_s**2):
-            rate = motion / took_s if took_s > 0.0 else self.rate
-            return replace(self, t_ns=t_ns, pose=pose, rate=rate, has_jumped=False)
-        pose = compose(self.pose, expected)
-        origin = compose(pose, between(reported, np.zeros(3)))
-        return replace(self, t_ns=t_ns, pose=pose, origin=origin, has_jumped=True)
+        away_m = min(
+            math.hypot(*motion[:2]),
+            math.hypot(*(motion - expected)[:2]),
+        )
+        if away_m > max(jump_m, g * took_s**2):
+            pose = compose(self.pose, expected)
+            origin = compose(pose, between(reported, np.zeros(3)))
+            return ContinuousOdometry(
+                t_ns=t_ns,
+                pose=pose,
+                origin=origin,
+                has_jumped=True,
+                rate=self.rate,
+                rate_ns=t_ns,
+                rate_pose=pose,
+            )
+        after = replace(self, t_ns=t_ns, pose=pose, has_jumped=False)
+        # Steps may follow on each other at once, as one for each sensor: no rate is known of them.
+        if t_ns - self.rate_ns < _RATE_NS:
+            return after
+        rate = between(self.rate_pose, pose) * (_NS_PER_S / (t_ns - self.rate_ns))
+        return replace(after, rate=rate, rate_ns=t_ns, rate_pose=pose)
 
 
 class PointNoise:

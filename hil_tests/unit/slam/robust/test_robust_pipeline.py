@@ -504,6 +504,22 @@ def test_a_robot_that_brakes_hard_is_where_its_wheels_say() -> None:
         assert all(row.belief.pose == pytest.approx(braking(t_ns), abs=1e-9) for row in results)
 
 
+def test_steps_that_follow_at_once_tell_no_rate() -> None:
+    """A step for each of two sensors, the pose of the first up to the second, at 2.5 m/s."""
+
+    def stepwise(t_ns: int) -> Array:
+        return np.array([0.25 * (t_ns // (NS // 10)), 0.0, 0.0])
+
+    slam = robust()
+    for tick in range(20):
+        for after_ns in (-5_000, 5_000):
+            t_ns = (tick + 1) * NS // 10 + after_ns
+            results = slam.step_detections([], stepwise, t_ns)
+            assert all(
+                row.belief.pose == pytest.approx(stepwise(t_ns), abs=1e-9) for row in results
+            )
+
+
 @pytest.mark.parametrize("every", [1, 2, 4])
 def test_steps_without_a_look_cost_no_landmark(every: int) -> None:
     """A program may step more often than its radars measure."""
