@@ -113,8 +113,7 @@ _RESOLUTION = float(np.finfo(np.float32).eps)
 class PulseFilter:
     """Correlation of frames of one length with the pulse of one module.
 
-    ``false_alarms`` and ``noise_is_known`` are those of `threshold_sigmas`. Raises StepInputError
-    if frames are shorter than the pulse.
+    ``false_alarms`` and ``noise_is_known`` are those of `threshold_sigmas`.
     """
 
     def __init__(
@@ -128,11 +127,6 @@ class PulseFilter:
     ) -> None:
         pulse, taps = module.model, module.equaliser
         half = pulse.half_length(bin_length_m)
-        if n_bins < 2 * half + 1:
-            raise StepInputError(
-                f"a frame of {n_bins} bins is shorter than a pulse ({2 * half + 1}); "
-                "ask the module for a longer frame area"
-            )
         template = pulse.samples(np.zeros(1), bin_length_m)[0]
         energy = float(np.sum(np.abs(template) ** 2))
         self.pulse = pulse
@@ -447,6 +441,8 @@ class MatchedFilterDetector:
     def detect_many(
         self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
     ) -> list[tuple[Detection, ...]]:
+        for frame in frames:  # before anything is learnt of one
+            self._check_length(frame)
         if self._static is not None:
             frames = [
                 self._static.removed(frame, offset_m)
@@ -461,6 +457,15 @@ class MatchedFilterDetector:
                 if has_learnt:  # the other frames come behind another filter
                     break
         return found
+
+    def _check_length(self, frame: RadarFrame) -> None:
+        n_bins = frame.samples.size
+        shortest = 2 * self._nominal.model.half_length(frame.bin_length_m) + 1
+        if n_bins < shortest:
+            raise StepInputError(
+                f"a frame of {n_bins} bins is shorter than a pulse ({shortest}); ask the module "
+                "for a longer frame area"
+            )
 
     def _detections(
         self, frame: RadarFrame, filtered: Filtered, range_offset_m: float

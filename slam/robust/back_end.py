@@ -461,7 +461,10 @@ class RobustBackEnd:
         looks = [scan for scan in scans if scan.looks]
         self._images.take_scans(scans, self._log.n_poses - 1)
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
-        self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
+        # A step in which no radar looked is none of those that a window counts.
+        has_look = bool(antennas.has_frame.any())
+        if has_look:
+            self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         with_bearings = [scan for scan in scans if scan.bearings_rad is not None]
@@ -485,11 +488,10 @@ class RobustBackEnd:
             report = _together(report, self._take_labelled(scans, added_m))
         for scan in with_bearings:
             report = _together(report, self._take_points(scan, added_m))
-        # A step in which no radar looked is none of those that a window counts.
-        if antennas.has_frame.any() or patches:
+        if has_look or patches:
             self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         of_patches = self._take_patches(patches, added_m)
-        of_tracklets = self._initialise_landmarks() if antennas.has_frame.any() else []
+        of_tracklets = self._initialise_landmarks() if has_look else []
         self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:

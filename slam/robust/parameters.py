@@ -311,8 +311,6 @@ class BranchRule:
     seconds, one in twenty is a carry."""
     stop_s: Annotated[float, Origin.CHOSEN, "s"] = 1.0
     """Shortest stop of the wheels: one that is shorter counts as driving."""
-    jump_m: Annotated[float, Origin.CHOSEN] = 0.3
-    """Least jump of odometry that may be a restart of its source; ranges find shorter ones."""
     steps_per_hidden: Annotated[float, Origin.CHOSEN, "scans"] = 3000.0
     """How many scans there are to one motion that the wheels do not report: one in ten minutes."""
     steps_per_jump: Annotated[float, Origin.CHOSEN, "scans"] = 100.0

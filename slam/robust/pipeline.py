@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import g
 
 from slam.config import SlamConfig, WheelNoise
 from slam.frames import Detection, Detector, RadarFrame, detect_all
@@ -47,7 +46,6 @@ Array = NDArray[np.float64]
 
 _NS_PER_S = 1_000_000_000
 _STILL_M, _STILL_RAD = 1e-3, 1e-3  # wheels that report less stand
-_RATE_NS = 100_000_000  # shortest time over which the rate of the motion is taken
 
 
 class RobustSlam:
@@ -73,7 +71,7 @@ class RobustSlam:
         self.rig = rig
         parameters = back_end_parameters(config, wheels, rules)
         self._on_map = on_map
-        self._branches, self._rule = Branches(rig, parameters, on_map), parameters.branches
+        self._branches = Branches(rig, parameters, on_map)
         # What is reported of a map that stays as it is
         self._fixed: tuple[Belief, Array] | None = None
         if on_map is not None and on_map.is_fixed:
@@ -90,9 +88,7 @@ class RobustSlam:
             imager = Imager(config, rig, wheels, pulses)
             self._patches = PatchScans(imager, rig, parameters)
         self._check = InputCheck(rig)
-        self._odometry: ContinuousOdometry | None = None  # at the last step
-        self._pose: Array | None = None  # of it, at the last state
-        self._heading_rad = 0.0  # that its source reported then
+        self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0  # time of that
         # Since when the wheels have stood at a pose, and how long they did since the last state
         self._still, self._still_ns, self._stood_ns = np.zeros(3), 0, 0
@@ -180,46 +176,33 @@ class RobustSlam:
         given: Sequence[RangeScan] = (),
         frames: Sequence[RadarFrame] = (),
     ) -> tuple[StepResult, ...]:
-        reported = self._check.begin(pose_at, t_ns)
-        odometry = ContinuousOdometry.begin(reported, t_ns)
-        if self._odometry is not None:
-            odometry = self._odometry.next(reported, t_ns, self._rule.jump_m)
-        pose = odometry.pose
+        pose = self._check.begin(pose_at, t_ns)
         poses = {t_ns: pose}
         if self._pose is None:
-            self._accept((), poses, t_ns, odometry)
+            self._accept((), poses, t_ns)
             self._pose, self._t_ns = pose, t_ns
             self._still, self._still_ns, self._stood_ns = pose, t_ns, 0
-            self._noise_since(reported, t_ns)
+            self._noise_since(pose, t_ns)
             return ()
-
-        def pose_of(stamp_ns: int) -> Array:
-            return odometry.placed(self._check.pose(pose_at, stamp_ns))
-
-        pictured = () if self._patches is None or odometry.has_jumped else frames
-        poses |= {frame.t_ns: pose_of(frame.t_ns) for frame in pictured}
+        if self._patches is not None:
+            poses |= {frame.t_ns: self._check.pose(pose_at, frame.t_ns) for frame in frames}
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         window = self.config.window
         if not has_moved(self._pose, pose, window.min_distance_m, window.min_turn_rad):
-            self._accept(pictured, poses, t_ns, odometry)
+            self._accept(frames, poses, t_ns)
             self._stand(pose, t_ns)
             return ()
-        # Before a jump the source had another frame.
         moved = {
-            radar: (
-                None
-                if stamp_ns == t_ns or odometry.has_jumped
-                else between(pose, pose_of(stamp_ns))
-            )
+            radar: None if stamp_ns == t_ns else between(pose, self._check.pose(pose_at, stamp_ns))
             for radar, stamp_ns in stamps_ns.items()
         }
         detections = detect()
-        self._accept(pictured, poses, t_ns, odometry)
+        self._accept(frames, poses, t_ns)
         self._stand(pose, t_ns)
         sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         branches = self._branches
         elapsed_s = (t_ns - self._t_ns) / _NS_PER_S
-        covariance = self._noise_since(reported, t_ns)
+        covariance = self._noise_since(self._pose, t_ns)
         stood_s = self._stood_ns / _NS_PER_S
         branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
         imaged = {frame.radar for frame in frames} if self._patches is not None else set[int]()
@@ -234,7 +217,7 @@ class RobustSlam:
         return (
             StepResult(
                 t_ns=t_ns,
-                odometry_pose=reported,
+                odometry_pose=pose,
                 belief=self.belief(),
                 detections=detections,
                 report=report,
@@ -260,20 +243,9 @@ class RobustSlam:
             for one in new
         )
 
-    def _accept(
-        self,
-        frames: Sequence[RadarFrame],
-        poses: Mapping[int, Array],
-        t_ns: int,
-        odometry: ContinuousOdometry,
-    ) -> None:
+    def _accept(self, frames: Sequence[RadarFrame], poses: Mapping[int, Array], t_ns: int) -> None:
         """Take a step; images take every frame, even where the robot has hardly moved."""
         self._check.accept(t_ns)
-        self._odometry = odometry
-        if odometry.has_jumped:  # the robot may have been carried, as while the wheels stand
-            self._stood_ns = max(self._stood_ns, round(self._rule.stop_s * _NS_PER_S))
-            if self._patches is not None:
-                self._patches.begin_anew()
         if self._patches is not None:
             self._patches.take(frames, poses, t_ns, self.back_end.state.calibration)
 
@@ -283,17 +255,16 @@ class RobustSlam:
             self._still, self._still_ns = pose, t_ns
         self._stood_ns = max(self._stood_ns, t_ns - self._still_ns)
 
-    def _noise_since(self, reported: Array, t_ns: int) -> Array | None:
+    def _noise_since(self, before: Array, t_ns: int) -> Array | None:
         """Return the noise since the last state, (3, 3), body frame of the pose before.
 
-        None where the model of the wheels has it. ``reported`` is the pose of their source now.
+        None where the model of the wheels has it.
         """
-        before_rad, self._heading_rad = self._heading_rad, float(reported[2])
         if self._noise_at is None:
             return None
         noise = self._noise_at(t_ns)
         new, self._noise = noise - self._noise, noise
-        return np.asarray(turned_covariance(new, -before_rad) + self._least_noise)
+        return np.asarray(turned_covariance(new, -float(before[2])) + self._least_noise)
 
     def belief(self) -> Belief:
         """Return pose and map as they are reported now."""
@@ -343,61 +314,6 @@ class RobustSlam:
             )
             for radar, motion in moved.items()
         ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ContinuousOdometry:
-    """Odometry at a step, where a source that began anew at another pose goes on.
-
-    A source that is restarted begins at zero: a jump that would take an acceleration above that of
-    gravity, which no wheel can pass on, is none of the robot. It is then taken to have gone on as
-    before.
-    """
-
-    t_ns: int
-    pose: Array  # shape (3,)
-    origin: Array | None = None  # shape (3,), of the source's frame since its last jump
-    has_jumped: bool = False  # at this step
-    # Motion [m, m, rad] per second, shape (3,), up to the time and pose that it is of
-    rate: Array
-    rate_ns: int
-    rate_pose: Array
-
-    @classmethod
-    def begin(cls, reported: Array, t_ns: int) -> ContinuousOdometry:
-        return cls(t_ns=t_ns, pose=reported, rate=np.zeros(3), rate_ns=t_ns, rate_pose=reported)
-
-    def placed(self, reported: Array) -> Array:
-        """Return a pose that the source reports, on this odometry."""
-        return reported if self.origin is None else compose(self.origin, reported)
-
-    def next(self, reported: Array, t_ns: int, jump_m: float) -> ContinuousOdometry:
-        """Return the odometry at the next step; a jump of less than ``jump_m`` is none."""
-        took_s = (t_ns - self.t_ns) / _NS_PER_S
-        pose = self.placed(reported)
-        motion, expected = between(self.pose, pose), took_s * self.rate
-        away_m = min(
-            math.hypot(*motion[:2]),
-            math.hypot(*(motion - expected)[:2]),
-        )
-        if away_m > max(jump_m, g * took_s**2):
-            pose = compose(self.pose, expected)
-            origin = compose(pose, between(reported, np.zeros(3)))
-            return ContinuousOdometry(
-                t_ns=t_ns,
-                pose=pose,
-                origin=origin,
-                has_jumped=True,
-                rate=self.rate,
-                rate_ns=t_ns,
-                rate_pose=pose,
-            )
-        after = replace(self, t_ns=t_ns, pose=pose, has_jumped=False)
-        # Steps may follow on each other at once, as one for each sensor: no rate is known of them.
-        if t_ns - self.rate_ns < _RATE_NS:
-            return after
-        rate = between(self.rate_pose, pose) * (_NS_PER_S / (t_ns - self.rate_ns))
-        return replace(after, rate=rate, rate_ns=t_ns, rate_pose=pose)
 
 
 class PointNoise:

@@ -475,51 +475,6 @@ def test_images_begin_anew_where_the_wheels_may_have_slipped(
     assert sorted({*range(1, 20)} - {*taken}) == [10, 11]
 
 
-@pytest.mark.parametrize("turn_rad", [0.0, 1.0])
-def test_odometry_that_begins_anew_elsewhere_goes_on_as_before(turn_rad: float) -> None:
-    """A source that restarts reports another pose: no robot jumps by a metre in 0.2 s."""
-    restart_ns, anew = 60 * TICK_NS, np.array([1.0, 0.2, turn_rad])
-
-    def restarted(t_ns: int) -> Array:
-        return straight(t_ns) if t_ns < restart_ns else compose(anew, straight(t_ns))
-
-    expected, found = drive(robust(), 90, straight), drive(robust(), 90, restarted)
-    assert found[-1].pose == pytest.approx(expected[-1].pose, abs=1e-3)
-    assert found[-1].landmarks == pytest.approx(expected[-1].landmarks, abs=1e-3)
-    # It may have been carried meanwhile, so the pose is unsure until landmarks are recognised.
-    usual, unsure = (max(one.pose_covariance[0, 0] for one in some) for some in (expected, found))
-    assert unsure > 100 * usual
-
-
-def test_a_robot_that_brakes_hard_is_where_its_wheels_say() -> None:
-    """From 1.5 m/s it stands 0.2 s later: less than gravity, and no restart."""
-
-    def braking(t_ns: int) -> Array:
-        return np.array([1.5 * min(t_ns, 10 * TICK_NS) / NS, 0.0, 0.0])
-
-    slam = robust()
-    for tick in range(15):
-        t_ns = tick * TICK_NS
-        results = slam.step_detections([], braking, t_ns)
-        assert all(row.belief.pose == pytest.approx(braking(t_ns), abs=1e-9) for row in results)
-
-
-def test_steps_that_follow_at_once_tell_no_rate() -> None:
-    """A step for each of two sensors, the pose of the first up to the second, at 2.5 m/s."""
-
-    def stepwise(t_ns: int) -> Array:
-        return np.array([0.25 * (t_ns // (NS // 10)), 0.0, 0.0])
-
-    slam = robust()
-    for tick in range(20):
-        for after_ns in (-5_000, 5_000):
-            t_ns = (tick + 1) * NS // 10 + after_ns
-            results = slam.step_detections([], stepwise, t_ns)
-            assert all(
-                row.belief.pose == pytest.approx(stepwise(t_ns), abs=1e-9) for row in results
-            )
-
-
 @pytest.mark.parametrize("every", [1, 2, 4])
 def test_steps_without_a_look_cost_no_landmark(every: int) -> None:
     """A program may step more often than its radars measure."""
