@@ -461,7 +461,7 @@ class RobustBackEnd:
         looks = [scan for scan in scans if scan.looks]
         self._images.take_scans(scans, self._log.n_poses - 1)
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
-        # A step in which no radar looked is none of those that a window counts.
+        # Steps in which no radar looked do not count towards windows of frames.
         has_look = bool(antennas.has_frame.any())
         if has_look:
             self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
