@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from slam.geometry import Rig, wrap_angles
 from slam.results import (
     MapChanges,
-    PredictedRange,
     SavedLandmark,
     SavedMap,
     SmoothedRun,
@@ -478,7 +477,7 @@ class RobustBackEnd:
         )
         predicted = predicted_ranges(self.state, seen, known, self._side_of, antennas)
         missed = self._count(known)
-        report = self._correct(known, seen, looks, antennas, predicted)
+        report = replace(self._correct(known, seen, looks, antennas), predicted=predicted)
         used = {(radar, index) for radar, index, _ in report.continued}
         evidence_of_misses = [(id_, self._existence.unheard(id_)) for id_ in missed]
         for _, _, id_ in report.continued:
@@ -550,11 +549,10 @@ class RobustBackEnd:
         seen: View,
         scans: Sequence[RangeScan],
         antennas: Antennas,
-        predicted: tuple[PredictedRange, ...],
     ) -> UpdateReport:
         """Correct the state with all ranges found at once, weighted by Huber; log them."""
         if not len(known.assigned):
-            return UpdateReport(continued=(), nis=0.0, dof=0, predicted=predicted)
+            return UpdateReport(continued=(), nis=0.0, dof=0)
         state, ids = self.state, self.state.feature_ids
         weighed = weigh_known(state, known, seen, scans, self.parameters.ranges)
         continued = tuple(
@@ -570,7 +568,6 @@ class RobustBackEnd:
             continued=continued,
             nis=float(weighed.white @ weighed.white),
             dof=len(continued),
-            predicted=predicted,
             evidence=tuple((id_, nats) for (_, _, id_), nats in of_ranges),
         )
 
@@ -621,7 +618,7 @@ class RobustBackEnd:
         of_radar = {scan.radar: scan for scan in scans}
         for radar, index, row in refused:
             self._log_range(of_radar[radar], index, ids[row], antennas)
-        report = self._correct(known, seen, scans, antennas, predicted)
+        report = self._correct(known, seen, scans, antennas)
         misses = [(ids[row], miss) for _, _, row in refused]
         for scan in scans:
             for index, label in scan.labelled:
@@ -633,7 +630,7 @@ class RobustBackEnd:
                     waiting = self._waiting[label]
                     waiting.n_ranges += 1
                     self._log_range(scan, index, waiting.log_id, antennas)
-        return replace(report, evidence=(*report.evidence, *misses))
+        return replace(report, predicted=predicted, evidence=(*report.evidence, *misses))
 
     def _log_range(self, scan: RangeScan, index: int, id_: int, antennas: Antennas) -> None:
         x_m, y_m = antennas.nominal_m[scan.radar].tolist()
