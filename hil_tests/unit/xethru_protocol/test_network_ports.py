@@ -46,7 +46,11 @@ class _PtyPort(serial.Serial):
 
 
 class Redirector:
-    """pyserial's RFC 2217 server on a serial port, for one client after the other."""
+    """pyserial's RFC 2217 server on a serial port, for one client after the other.
+
+    It claims the port: the number of a pty is soon given to another one, and a driver that looks
+    for the module it had there would set the rate of this one.
+    """
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -78,7 +82,7 @@ class Redirector:
                 self._client, _ = self._listener.accept()
             except OSError:
                 return
-            with self._client, _PtyPort(self._path, 9600, timeout=0.01) as port:
+            with self._client, _PtyPort(self._path, 9600, timeout=0.01, exclusive=True) as port:
                 # the stubs of pyserial ask for two ports; a port and a writer are used
                 manager = rfc2217.PortManager(port, self)  # type: ignore[arg-type] # wants write()
                 gone = threading.Event()
