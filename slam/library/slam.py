@@ -217,6 +217,7 @@ class Slam:
         """Take a pose of the wheels between steps: frames get their poses from it.
 
         Times rise. A robot whose odometry comes more often than its scans calls this for each pose.
+        Where the source begins anew, at its first pose or at zero, the robot goes on as before.
         Raises StepInputError, a ValueError, and forgets the pose, if it cannot be one.
         """
         t_ns, pose = _stamp(t_ns), _pose(pose, f"odometry at {t_ns} ns")
@@ -407,7 +408,7 @@ class Slam:
         if odometry_pose is not None:
             pose = _pose(odometry_pose, f"odometry at {t_ns} ns")
             if len(track) and t_ns <= track.last_ns:
-                apart = between(track.pose_at(t_ns), pose)
+                apart = between(track.pose_at(t_ns), compose(track.frame_at(t_ns), pose))
                 if t_ns < track.last_ns or np.abs(apart).max() > _SAME:
                     raise StepInputError(
                         f"odometry_pose at {t_ns} ns: poses until {track.last_ns} ns were given "

@@ -185,7 +185,7 @@ _HOLD_NS = NS_PER_S // 2
 class OdometryTrack(PoseTrack):
     """Odometry as TUM lines in time order, asked for the pose at any time between them.
 
-    Iterating gives the samples.
+    Iterating gives the samples as they came.
     """
 
     def __init__(self, samples: Iterable[TumSample]) -> None:
@@ -231,15 +231,19 @@ class OdometryTrack(PoseTrack):
         """Return whether the pose at this time lies between two samples close enough."""
         return self.gap_ns(t_ns) <= MOST_GAP_NS
 
-    def append(self, sample: TumSample) -> None:
-        """Take a sample; OdometryError if it is not later than all before it."""
+    def append(self, sample: TumSample) -> bool:
+        """Take a sample; OdometryError if it is not later than all before it.
+
+        Return whether the source seems to have begun anew.
+        """
         if self._stamps_ns and sample.t_ns <= self.last_ns:
             number = self._n_forgotten + len(self) + 1
             raise OdometryError(f"odometry: line {number} is not later than the line before")
-        self._noise.extend(self._noise_after(sample))
-        self.add(sample.t_ns, (sample.x_m, sample.y_m, sample.heading_rad))
+        is_restart = self.add(sample.t_ns, (sample.x_m, sample.y_m, sample.heading_rad))
+        self._noise.extend(self._newest_noise(sample))
         self._qz.append(sample.qz)
         self._qw.append(sample.qw)
+        return is_restart
 
     def forget_before(self, t_ns: int) -> int:
         n_forgotten = super().forget_before(t_ns)
@@ -248,25 +252,27 @@ class OdometryTrack(PoseTrack):
         del self._noise[: _NOISE_SIZE * n_forgotten]
         return n_forgotten
 
-    def _noise_after(self, sample: TumSample) -> list[float]:
-        """Return the noise until a sample that comes next, as `noise_at` has it.
+    def _newest_noise(self, sample: TumSample) -> list[float]:
+        """Return the noise until the newest sample, as `noise_at` has it.
 
         Its velocity is taken to err independently of the one before, for the time between the two.
         """
-        if not sample.velocity_covariance or len(self._noise) != _NOISE_SIZE * len(self):
+        n_before = len(self) - 1
+        if not sample.velocity_covariance or len(self._noise) != _NOISE_SIZE * n_before:
             return []
-        if not len(self):
+        if not n_before:
             return [0.0] * _NOISE_SIZE
-        dt_s = (sample.t_ns - self.last_ns) / NS_PER_S
+        dt_s = (sample.t_ns - self._stamps_ns[-2]) / NS_PER_S
         added = symmetric(sample.velocity_covariance)
         turned = np.eye(3)
-        c, s = math.cos(sample.heading_rad), math.sin(sample.heading_rad)
+        heading_rad = sample.heading_rad + float(self.frame_at(sample.t_ns)[2])
+        c, s = math.cos(heading_rad), math.sin(heading_rad)
         turned[:2, :2] = [[c, -s], [s, c]]
-        noise = self._noise_of(-1) + dt_s**2 * (turned @ added @ turned.T)
+        noise = self._noise_of(n_before - 1) + dt_s**2 * (turned @ added @ turned.T)
         return [float(number) for number in noise.ravel()]
 
     def _noise_of(self, row: int) -> NDArray[np.float64]:
-        begin = _NOISE_SIZE * (row % len(self))
+        begin = _NOISE_SIZE * row
         return np.array(self._noise[begin : begin + _NOISE_SIZE]).reshape(3, 3)
 
     def noise_at(self, t_ns: int) -> NDArray[np.float64]:

@@ -168,7 +168,9 @@ class Scan:
     only: SLAM was not stepped with it. Iterating gives the frames.
 
     Where they are known, `odometry` returns the wheels' pose at a time [ns], and `truth` is the
-    true pose at `t_ns`; both of shape (3,), the latter in the world frame.
+    true pose at `t_ns`; both of shape (3,), the latter in the world frame. `odom_frame`, shape
+    (3,), is the frame in which the source of odometry has its poses then, in that of `odometry`:
+    another one once the source has begun anew (`slam.library.pose_track`).
     """
 
     counter: int
@@ -178,6 +180,7 @@ class Scan:
     used: bool = True
     odometry: PoseAt | None = None
     truth: NDArray[np.float64] | None = field(default=None, compare=False)
+    odom_frame: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3), compare=False)
 
     def __iter__(self) -> Iterator[RadarFrame]:
         return iter(self.frames)

@@ -125,11 +125,12 @@ def _drive_of(session: RecordedSession, detector: MatchedFilterDetector, stop: S
         raise AppError(f"{session.path}: holds no radar frame; record a longer drive")
     if len(samples) < 2:
         raise AppError(f"{session.path}: holds no odometry to speak of; record a longer drive")
-    track = tuple(OdometryTrack(samples))
+    track = OdometryTrack(samples)
+    stamps_ns = [sample.t_ns for sample in track]
     return make_drive(
         session.rig,
-        np.array([sample.t_ns for sample in track], dtype=np.int64),
-        np.array([(sample.x_m, sample.y_m, sample.heading_rad) for sample in track]),
+        np.array(stamps_ns, dtype=np.int64),
+        np.array([track.pose_at(t_ns) for t_ns in stamps_ns]),
         RangeSet.of(detections),
     )
 

@@ -140,7 +140,7 @@ class LiveOdometry:
             self._track = OdometryTrack([sample])
             return ""
         before = self._track.last
-        self._track.append(sample)
+        is_restart = self._track.append(sample)
         warnings = []
         if self._trouble:
             warnings.append("its lines are sound again")
@@ -151,7 +151,12 @@ class LiveOdometry:
             warnings.append(
                 f"{elapsed_ns / NS_PER_S:.1f} s of it are missing; no scan of them is used"
             )
-        if step_m > MOST_SPEED_MPS * elapsed_ns / NS_PER_S:
+        if is_restart:
+            warnings.append(
+                f"it begins again at ({sample.x_m:.2f}, {sample.y_m:.2f}) m; SLAM goes on from the "
+                "pose before that"
+            )
+        elif step_m > MOST_SPEED_MPS * elapsed_ns / NS_PER_S:
             warnings.append(
                 f"the pose jumped by {step_m:.2f} m in {elapsed_ns / NS_PER_S:.3f} s; "
                 "was it reset? SLAM takes it for a drive"
@@ -217,6 +222,9 @@ class LiveOdometry:
 
     def noise_at(self, t_ns: int) -> NDArray[np.float64]:
         return self._whole().noise_at(t_ns)
+
+    def frame_at(self, t_ns: int) -> NDArray[np.float64]:
+        return self._whole().frame_at(t_ns)
 
     def _whole(self) -> OdometryTrack:
         if self._track is None:

@@ -50,6 +50,7 @@ class Ros2Sink(Sink):
         self._drawn_ns: int | None = None
         self._offset_ns: int | None = None
         self._newest_ns = self._tf_ns = 0  # of scans, of the newest transform: time of ROS
+        self._odom_frame = np.zeros(3)  # `Scan.odom_frame` of the newest one that SLAM took
 
     def open(self) -> None:
         """Enter the domain; others see the topics from now on."""
@@ -69,6 +70,8 @@ class Ros2Sink(Sink):
         if self._newest_ns > self._tf_ns:  # the scan before led to no state: the robot stands
             self._write_transform(self._newest_ns)
         self._newest_ns = self._ros_ns(scan.t_ns)
+        if scan.used:
+            self._odom_frame = scan.odom_frame
         for frame in scan.frames if self._has_frames else ():
             name = radar_topic(self._info.radars[frame.radar])
             self._writers[name](pack_array(FLOAT_ARRAY, frame.samples))
@@ -113,7 +116,8 @@ class Ros2Sink(Sink):
         if self._last is None:
             return
         self._tf_ns = t_ns
-        map_from_odom = compose(self._last.estimate, between(self._last.odometry, np.zeros(3)))
+        begin = compose(self._last.estimate, between(self._last.odometry, np.zeros(3)))
+        map_from_odom = compose(begin, self._odom_frame)
         self._writers["tf"](cdr.transforms(t_ns, {("map", "odom"): map_from_odom}))
 
     def _ros_ns(self, t_ns: int) -> int:

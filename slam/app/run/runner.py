@@ -58,9 +58,11 @@ def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 class Odometry(Protocol):
-    """Gives the wheels' pose, shape (3,), odometry frame, at a session time."""
+    """Gives the wheels' pose, shape (3,), odometry frame, at a session time; see `PoseTrack`."""
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]: ...
+
+    def frame_at(self, t_ns: int) -> NDArray[np.float64]: ...
 
 
 class StepGivenUpError(BaseException):
@@ -385,6 +387,7 @@ def run_slam(
             results: tuple[StepResult, ...] = ()
             try:
                 if scan.used:
+                    scan = replace(scan, odom_frame=odometry.frame_at(scan.t_ns))
                     if world_from_map is None:
                         world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
                     counters.put(scan.t_ns, scan.counter)

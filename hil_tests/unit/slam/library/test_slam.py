@@ -248,6 +248,20 @@ def test_odometry_may_come_after_the_step_of_its_time() -> None:
         assert slam.step(2 * 10**9, (0.3, 0.0, heading_rad)).t_ns == 2 * 10**9
 
 
+def test_a_source_of_odometry_that_begins_anew_changes_nothing() -> None:
+    anew, whole = made(), made()
+    for number in range(40):
+        t_ns = number * TICK_NS
+        for stamp_ns in range(t_ns - 4 * TICK_NS // 5, t_ns + 1, TICK_NS // 5):
+            began_ns = 20 * TICK_NS if stamp_ns >= 20 * TICK_NS else 0
+            anew.add_odometry(stamp_ns, drive(stamp_ns) - drive(began_ns))
+            whole.add_odometry(stamp_ns, drive(stamp_ns))
+        given = None if number % 2 else drive(t_ns) - drive(began_ns)
+        state = anew.step(t_ns, given, frames=frames(number))
+        assert state.pose == pytest.approx(whole.step(t_ns, frames=frames(number)).pose, abs=1e-9)
+    assert anew.landmarks.positions_m == pytest.approx(whole.landmarks.positions_m, abs=1e-9)
+
+
 def test_headings_need_not_be_unwrapped() -> None:
     """A frame half way between two poses on both sides of pi looks the way between them."""
     slam = Slam(RIG, front_end=Rod())

@@ -4,6 +4,7 @@ import contextlib
 import math
 import socket
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from slam.app.odometry.live import LiveOdometry
-from slam.geometry import wrap_angle
+from slam.geometry import between, compose, wrap_angle
 from slam.live import odometry_track as track
 from slam.live.errors import OdometryError
 from slam.live.odometry_track import (
@@ -131,7 +132,7 @@ def test_a_missing_or_silent_socket_is_named(tmp_path: Path) -> None:
 @given(st.lists(st.floats(-2 * math.pi, 2 * math.pi), min_size=2, max_size=30))
 def test_a_track_that_grows_unwraps_like_numpy_to_the_last_bit(headings: list[float]) -> None:
     samples = [
-        TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=math.sin(h / 2), qw=math.cos(h / 2))
+        TumSample(t_ns=t_ns, x_m=float(t_ns), y_m=0.0, qz=math.sin(h / 2), qw=math.cos(h / 2))
         for t_ns, h in enumerate(headings)
     ]
     drive = OdometryTrack(samples[:1])
@@ -142,6 +143,119 @@ def test_a_track_that_grows_unwraps_like_numpy_to_the_last_bit(headings: list[fl
         assert drive.pose_at(row)[2] == wrap_angle(float(heading_rad))
     with pytest.raises(OdometryError):
         drive.append(samples[-1])
+
+
+Row = tuple[int, float, float, float]
+PERIOD_NS = 20_000_000
+
+
+def turned_drive() -> list[Row]:
+    """Return a drive at 0.5 m/s: a metre, a quarter turn on the spot and a metre to the left."""
+    legs = [(k / 100, 0.0, 0.0) for k in range(100)]
+    legs += [(1.0, 0.0, k * math.pi / 100) for k in range(50)]
+    legs += [(1.0, k / 100, math.pi / 2) for k in range(100)]
+    return [(k * PERIOD_NS, *pose) for k, pose in enumerate(legs)]
+
+
+def from_row(
+    rows: list[Row], first: int, start: tuple[float, float, float] = (0, 0, 0)
+) -> list[Row]:
+    """Return rows whose source begins at ``start`` again at one of them."""
+    origin = np.array(rows[first][1:])
+    seen = [compose(np.array(start), between(origin, np.array(row[1:]))) for row in rows[first:]]
+    again = [(t_ns, *pose.tolist()) for (t_ns, *_), pose in zip(rows[first:], seen, strict=True)]
+    return [*rows[:first], *again]
+
+
+def assert_same_path(drive: OdometryTrack, rows: list[Row]) -> None:
+    for t_ns, *pose in rows:
+        apart = between(np.array(pose), drive.pose_at(t_ns))
+        assert np.abs(apart).max() < 1e-9, t_ns
+
+
+@pytest.mark.parametrize("start", [(0.0, 0.0, 0.0), (-3.0, 2.0, 1.0)])
+@pytest.mark.parametrize("row", [60, 130, 220])
+def test_a_source_that_begins_anew_goes_on_where_it_was(
+    row: int, start: tuple[float, float, float]
+) -> None:
+    """Straight or turning at one rate it is as without: all poses, and those half way."""
+    rows = from_row(turned_drive(), 0, start)
+    drive = OdometryTrack.from_lines(lines_of(from_row(rows, row, start)))
+    assert_same_path(drive, rows)
+    half = [(row - 1, row), (row, row + 1)]
+    for before, after in half:
+        expected = (np.array(rows[before][1:]) + np.array(rows[after][1:])) / 2
+        t_ns = (rows[before][0] + rows[after][0]) // 2
+        np.testing.assert_allclose(drive.pose_at(t_ns), expected, atol=1e-9)
+    assert [sample.x_m for sample in drive][row] == start[0]  # what is recorded is what came
+    expected = compose(np.array(rows[row][1:]), between(np.array(start), np.zeros(3)))
+    np.testing.assert_allclose(drive.frame_at(rows[row][0]), expected, atol=1e-9)
+    np.testing.assert_array_equal(drive.frame_at(rows[row][0] - 1), np.zeros(3))
+
+
+def test_a_source_may_begin_anew_again_and_old_poses_be_forgotten() -> None:
+    rows = turned_drive()
+    given = from_row(from_row(rows, 90), 200)
+    drive = OdometryTrack.from_lines(lines_of(given[:1]))
+    for number, row in enumerate(given[1:], start=1):
+        began_anew = drive.append(parse_tum_line(lines_of([row])[0]))
+        assert began_anew == (number in (90, 200))
+        drive.forget_before(row[0] - 10 * PERIOD_NS)
+    assert len(drive) < len(rows)
+    assert_same_path(drive, rows[-10:])
+
+
+def test_a_source_without_a_pose_for_a_while_says_zero_and_goes_on() -> None:
+    rows = turned_drive()
+    zeros = [(t_ns, 0.0, 0.0, 0.0) for t_ns, *_ in rows[120:140]]
+    given = [*rows[:120], *zeros, *rows[140:]]
+    drive = OdometryTrack.from_lines(lines_of(given))
+    assert_same_path(drive, rows[:120] + rows[140:])
+
+
+def test_the_robot_stood_while_nothing_came_for_long() -> None:
+    """Then it is not known how it drove, and a source that begins anew does not say."""
+    rows = turned_drive()
+    given = [row for k, row in enumerate(from_row(rows, 220)) if not 160 <= k < 220]
+    drive = OdometryTrack.from_lines(lines_of(given))
+    np.testing.assert_allclose(drive.pose_at(rows[220][0]), rows[159][1:], atol=1e-9)
+    went_on = between(np.array(rows[220][1:]), np.array(rows[-1][1:]))
+    since = between(drive.pose_at(rows[220][0]), drive.pose_at(rows[-1][0]))
+    np.testing.assert_allclose(since, went_on, atol=1e-9)
+
+
+def test_the_noise_of_a_source_that_began_anew_is_turned_with_it() -> None:
+    triangle = (0.04, 0.01, 0.0, 0.01, 0.0, 0.02)
+    tracks = []
+    for rows in (turned_drive(), from_row(turned_drive(), 200)):
+        samples = (parse_tum_line(line) for line in lines_of(rows))
+        tracks.append(OdometryTrack(replace(one, velocity_covariance=triangle) for one in samples))
+    whole, restarted = (track.noise_at(tracks[0].last_ns) for track in tracks)
+    np.testing.assert_allclose(restarted, whole, atol=1e-12)
+
+
+def along(step_ns: int, *places_m: float) -> list[Row]:
+    return [(k * step_ns, x_m, 0.0, 0.0) for k, x_m in enumerate(places_m)]
+
+
+def on_circle(radius_m: float, turn_rad: float) -> list[Row]:
+    turns = (turn_rad * k for k in range(200))
+    places = [(radius_m * math.sin(a), radius_m * (1.0 - math.cos(a)), a) for a in turns]
+    return [(k * 10**8, *place) for k, place in enumerate(places)]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        pytest.param(on_circle(10.0, 0.1), id="laps at 10 m/s"),
+        pytest.param(on_circle(0.0, 0.35), id="a spin at 3.5 rad/s"),
+        pytest.param(along(10**9, 0.0, 0.8, 1.6, 0.8, 0.02), id="home, at a pose a second"),
+        pytest.param(along(10**8, 0.0, 0.1, 0.1, 0.1, 0.9, 1.0), id="poses that were held"),
+        pytest.param(along(10**8, 0.0, 0.1, 0.2, 5.0, 5.1), id="a pose that was set"),
+    ],
+)
+def test_what_may_have_been_driven_is_taken_for_it(rows: list[Row]) -> None:
+    assert_same_path(OdometryTrack.from_lines(lines_of(rows)), rows)
 
 
 finite = st.floats(-1e6, 1e6, allow_subnormal=False)

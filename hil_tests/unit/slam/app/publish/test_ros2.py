@@ -32,7 +32,7 @@ from slam.app.odometry.dds import TYPE_HASHES, Ros2Domain, idl_type
 from slam.app.publish.ros2 import Ros2Sink
 from slam.app.publish.sinks import Publishing
 from slam.app.session.viewer_topics import landmark_markers
-from slam.geometry import compose
+from slam.geometry import between, compose
 from slam.live.session import cdr
 from slam.live.session_records import SessionInfo
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, pack_array
@@ -114,6 +114,19 @@ def test_the_transform_is_repeated_while_the_robot_stands_and_no_stamp_comes_twi
             sink.on_snapshot(snapshot(counter))
     stamps = [t_ns_of(one.transforms[0].header) for one in transforms.take(8)]
     assert stamps == [FRAME_NS * counter for counter in range(1, 9)]
+    sink.close()
+
+
+def test_the_transform_is_of_the_robots_own_odometry_once_that_began_anew(space: str) -> None:
+    sink, state, frame = sink_in(space), snapshot(3), np.array([1.0, -2.0, 0.5])
+    transforms = Subscriber(f"/{space}/tf", TFMessage)
+    transforms.wait_for_publisher()
+    sink.on_scan(replace(scan(3), odom_frame=frame))
+    sink.on_snapshot(state)
+    (one,) = transforms.take(1)[0].transforms
+    map_from_odom = planar(one.transform.translation, one.transform.rotation)
+    own = between(frame, state.odometry)  # the pose that the robot's source has now
+    np.testing.assert_allclose(compose(map_from_odom, own), state.estimate, atol=1e-12)
     sink.close()
 
 
