@@ -16,14 +16,14 @@ _NS_PER_S = 1_000_000_000
 # Forgetting moves all later poses, so it is done for some at a time
 _FEWEST_FORGOTTEN = 64
 
-# A source of odometry that is restarted begins at its first pose again, or at zero. The distances
-# are in metres, a turn of 1 rad counts as one.
-_JUMP = 0.3
-_AT_START = 1e-3
-# Of a first message that comes a little late, where nothing can have driven there
-_NEAR_START, _MOST_ACCELERATION_MPS2 = 0.1, 10.0
-# For so long a robot is taken to go on as before
-_MOST_EXTRAPOLATED_S = 1.0
+# A source of odometry that is restarted is near its first pose, or zero [m, rad], ...
+_NEAR_START = 0.1
+# ... after a step so long that is faster than twice what it has shown [m, rad]
+_JUMP, _FASTER = 0.3, 2.0
+# Rates are taken over this time, and up to 10 m/s and 10 rad/s: no such robot has these radars
+_RATE_NS, _MOST_RATE = 100_000_000, 10.0
+# The robot goes on for so long, at its velocity over so long
+_GOES_ON_NS, _VELOCITY_NS = 1_000_000_000, 300_000_000
 
 
 class PoseTrack:
@@ -37,20 +37,31 @@ class PoseTrack:
     Later ones may be added while a robot drives; what lies between earlier ones stays the same to
     the last bit.
 
-    If the source begins anew, at its first pose or at zero, the robot is taken to have gone on as
-    before, or to have stood where nothing came for more than a second: `pose_at` has no jump there.
+    If the source is restarted, its poses begin at its first pose or at zero again. The robot is
+    then taken to have gone on as before, or to have stood where nothing came for more than a
+    second, and `pose_at` has no jump. A source that jumps elsewhere, too, is taken as it is.
+
+    Parameters
+    ----------
+    may_restart
+        False takes all poses as they are: those of a reference, or of a path that was made.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, may_restart: bool = True) -> None:
         self._stamps_ns = array("q")
         self._x_m, self._y_m = array("d"), array("d")
         self._heading_rad = array("d")  # unwrapped
         self._last = (0.0, 0.0, 0.0)  # as it was given
-        self._turns_rad = 0.0  # what unwrapping adds to it
-        # Where the source began anew: the times, and its frame from then on in that of the first
+        self._turns_rad = 0.0  # what unwrapping adds to its heading
+        self._may_restart = may_restart
+        self._starts = [(0.0, 0.0, 0.0)]
+        # Where the source was restarted: the times, and its frame from then on in that of `pose_at`
         self._restarts_ns: list[int] = []
         self._frames: list[NDArray[np.float64]] = []
-        self._starts = [(0.0, 0.0, 0.0)]
+        self._frame_before = np.zeros(3)
+        # Since when its rate is taken, and the fastest so far [m/s, rad/s]; None: not known
+        self._rate_since: tuple[int, tuple[float, float, float]] | None = None
+        self._fastest: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -66,41 +77,48 @@ class PoseTrack:
     def add(self, t_ns: int, pose: Sequence[float]) -> bool:
         """Take a pose, [x m, y m, heading rad], later than all before it.
 
-        Return whether the source seems to have begun anew.
+        Return whether the source seems to have been restarted.
         """
         x_m, y_m, heading_rad = pose
-        frame = None
+        given, frame = (x_m, y_m, heading_rad), None
         if not self._stamps_ns:
-            self._starts.append((x_m, y_m, heading_rad))
-        elif _apart(self._last, pose) >= _JUMP:
-            frame = self._new_frame(t_ns, pose)
+            self._starts.append(given)
+        else:
+            frame = self._new_frame(t_ns, given) if self._may_restart else None
+            self._turns_rad += _unwrapping(self._last[2], heading_rad)
         if frame is not None:
+            self._frame_before = self.frame_at(t_ns)
             self._restarts_ns.append(t_ns)
             self._frames.append(frame)
-        if self._stamps_ns:
-            self._turns_rad += _unwrapping(self._last[2], heading_rad)
+            self._rate_since = None
+        self._learn_rate(t_ns, given)
         self._stamps_ns.append(t_ns)
         self._x_m.append(x_m)
         self._y_m.append(y_m)
         self._heading_rad.append(heading_rad + self._turns_rad)
-        self._last = (x_m, y_m, heading_rad)
+        self._last = given
         return frame is not None
 
     def frame_at(self, t_ns: int) -> NDArray[np.float64]:
-        """Return the frame of the poses that were given at a time, shape (3,), in that of all.
+        """Return the frame of the poses given at a time in that of `pose_at`, shape (3,).
 
-        Zeros until the source begins anew.
+        Zeros until the source is restarted.
         """
         n_restarts = bisect_right(self._restarts_ns, t_ns)
         return self._frames[n_restarts - 1] if n_restarts else np.zeros(3)
 
     def forget_before(self, t_ns: int) -> int:
         """Forget what no pose from a time on depends on, now or later; return how many poses."""
+        if not self._stamps_ns:
+            return 0
+        t_ns = min(t_ns, self.last_ns - _VELOCITY_NS)
         n_needless = bisect_right(self._stamps_ns, t_ns) - 1
         if n_needless < _FEWEST_FORGOTTEN:
             return 0
         for column in (self._stamps_ns, self._x_m, self._y_m, self._heading_rad):
             del column[:n_needless]
+        n_old = max(bisect_right(self._restarts_ns, self.first_ns) - 1, 0)
+        del self._restarts_ns[:n_old], self._frames[:n_old]
         return n_needless
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
@@ -119,7 +137,7 @@ class PoseTrack:
         return self._between(len(self) - 2, t_ns) if len(self) > 1 else self._wrapped(0)
 
     def _pose(self, row: int) -> tuple[float, float, float]:
-        """Return the pose of a row, its heading unwrapped as long as the source goes on."""
+        """Return the pose of a row, its heading unwrapped until the first restart."""
         given = self._x_m[row], self._y_m[row], self._heading_rad[row]
         if not self._restarts_ns or self._stamps_ns[row] < self._restarts_ns[0]:
             return given
@@ -136,7 +154,7 @@ class PoseTrack:
         part = (t_ns - before_ns) / (after_ns - before_ns)
         (x_m, y_m, heading_rad), after = self._pose(row), self._pose(row + 1)
         turn_rad = after[2] - heading_rad
-        if self._restarts_ns:
+        if self._restarts_ns and after_ns >= self._restarts_ns[0]:
             turn_rad = wrap_angle(turn_rad)
         return np.array(
             [
@@ -146,29 +164,56 @@ class PoseTrack:
             ]
         )
 
-    def _new_frame(self, t_ns: int, given: Sequence[float]) -> NDArray[np.float64] | None:
-        """Return the frame of the source from a pose far from the last one on; None: as before."""
-        dt_s = (t_ns - self.last_ns) / _NS_PER_S
-        goes_on = dt_s <= _MOST_EXTRAPOLATED_S
-        expected = self.extrapolated(t_ns) if goes_on else self._wrapped(len(self) - 1)
-        now = self.frame_at(t_ns)
-        jump = _apart(expected.tolist(), compose(now, np.array(given)).tolist())
-        is_drivable = jump <= max(_JUMP, _MOST_ACCELERATION_MPS2 * dt_s**2)
-        if jump > _JUMP and self._from_start(given) <= (_AT_START if is_drivable else _NEAR_START):
-            return compose(expected, between(np.array(given), np.zeros(3)))
-        if self._frames and not is_drivable and self._from_start(self._last) <= _NEAR_START:
-            # It never drove from there: for a while its poses were just not known.
-            return self._frames[-2] if len(self._frames) > 1 else np.zeros(3)
+    def _new_frame(
+        self, t_ns: int, given: tuple[float, float, float]
+    ) -> NDArray[np.float64] | None:
+        """Return the frame of the source from a pose on, if it is another one from there."""
+        if self._fastest is None or not self._is_jump(t_ns, given):
+            return None
+        if self._is_near_start(given):
+            return compose(self._continued(t_ns), between(np.array(given), np.zeros(3)))
+        if self._frames and self._is_near_start(self._last):
+            # It did not drive from there: for a while its poses were not known.
+            return self._frame_before
+        self._may_restart = False
         return None
 
-    def _from_start(self, given: Sequence[float]) -> float:
-        return min(_apart(start, given) for start in self._starts)
+    def _is_jump(self, t_ns: int, given: tuple[float, float, float]) -> bool:
+        assert self._fastest is not None
+        could = _FASTER * (t_ns - self.last_ns) / _NS_PER_S
+        steps, rates = _apart(self._last, given), self._fastest
+        return any(a > max(_JUMP, could * rate) for a, rate in zip(steps, rates, strict=True))
+
+    def _is_near_start(self, given: tuple[float, float, float]) -> bool:
+        return any(max(_apart(start, given)) <= _NEAR_START for start in self._starts)
+
+    def _continued(self, t_ns: int) -> NDArray[np.float64]:
+        """Return where a robot is at a time behind the newest pose that goes on as before it."""
+        last = self._wrapped(len(self) - 1)
+        before_ns = self.last_ns - _VELOCITY_NS
+        if t_ns - self.last_ns > _GOES_ON_NS or before_ns < self.first_ns:
+            return last
+        moved = last - PoseTrack.pose_at(self, before_ns)
+        moved[2] = wrap_angle(moved[2])
+        return np.asarray(last + (t_ns - self.last_ns) / _VELOCITY_NS * moved)
+
+    def _learn_rate(self, t_ns: int, given: tuple[float, float, float]) -> None:
+        since_ns, pose = self._rate_since or (t_ns, given)
+        if self._rate_since is None:
+            self._rate_since = t_ns, given
+        elif t_ns - since_ns >= _RATE_NS:
+            elapsed_s = (t_ns - since_ns) / _NS_PER_S
+            mps, radps = (apart / elapsed_s for apart in _apart(pose, given))
+            if max(mps, radps) <= _MOST_RATE:
+                fastest = self._fastest or (0.0, 0.0)
+                self._fastest = max(mps, fastest[0]), max(radps, fastest[1])
+            self._rate_since = t_ns, given
 
 
-def _apart(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return how far two poses are apart [m], a turn of 1 rad as a metre."""
-    turn_rad = abs(wrap_angle(other[2] - one[2]))
-    return math.hypot(other[0] - one[0], other[1] - one[1]) + turn_rad
+def _apart(one: Sequence[float], other: Sequence[float]) -> tuple[float, float]:
+    """Return how far two poses are apart [m], and turned [rad]."""
+    distance_m = math.hypot(other[0] - one[0], other[1] - one[1])
+    return distance_m, abs(wrap_angle(other[2] - one[2]))
 
 
 def _unwrapping(before_rad: float, after_rad: float) -> float:

@@ -217,7 +217,7 @@ class Slam:
         """Take a pose of the wheels between steps: frames get their poses from it.
 
         Times rise. A robot whose odometry comes more often than its scans calls this for each pose.
-        Where the source begins anew, at its first pose or at zero, the robot goes on as before.
+        If the source is restarted, at its first pose or at zero, the robot goes on as before.
         Raises StepInputError, a ValueError, and forgets the pose, if it cannot be one.
         """
         t_ns, pose = _stamp(t_ns), _pose(pose, f"odometry at {t_ns} ns")

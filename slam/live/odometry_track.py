@@ -188,8 +188,8 @@ class OdometryTrack(PoseTrack):
     Iterating gives the samples as they came.
     """
 
-    def __init__(self, samples: Iterable[TumSample]) -> None:
-        super().__init__()
+    def __init__(self, samples: Iterable[TumSample], *, may_restart: bool = True) -> None:
+        super().__init__(may_restart=may_restart)
         self._qz, self._qw = array("d"), array("d")  # the quaternion of each sample
         # Of each sample the nine numbers of `noise_at`, if all samples have covariances
         self._noise = array("d")
@@ -234,7 +234,7 @@ class OdometryTrack(PoseTrack):
     def append(self, sample: TumSample) -> bool:
         """Take a sample; OdometryError if it is not later than all before it.
 
-        Return whether the source seems to have begun anew.
+        Return whether the source seems to have been restarted.
         """
         if self._stamps_ns and sample.t_ns <= self.last_ns:
             number = self._n_forgotten + len(self) + 1

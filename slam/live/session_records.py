@@ -170,7 +170,7 @@ class Scan:
     Where they are known, `odometry` returns the wheels' pose at a time [ns], and `truth` is the
     true pose at `t_ns`; both of shape (3,), the latter in the world frame. `odom_frame`, shape
     (3,), is the frame in which the source of odometry has its poses then, in that of `odometry`:
-    another one once the source has begun anew (`slam.library.pose_track`).
+    another one once the source was restarted (`slam.library.pose_track`).
     """
 
     counter: int

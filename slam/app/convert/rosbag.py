@@ -165,7 +165,7 @@ def convert_bag(
         odometry = OdometryTrack(contents.odometry)
     except OdometryError:
         raise AppError(f"{bag}: holds no pose on {ODOMETRY_TOPIC}, nav_msgs/Odometry") from None
-    truth = OdometryTrack(contents.truth) if contents.truth else None
+    truth = OdometryTrack(contents.truth, may_restart=False) if contents.truth else None
     if truth is None:
         warnings.append(f"no truth on {truth_topic}: numbers that need it will be null")
     period_ns = float(np.median([1e9 / radar.rate_hz for radar in radars]))

@@ -153,8 +153,8 @@ class LiveOdometry:
             )
         if is_restart:
             warnings.append(
-                f"it begins again at ({sample.x_m:.2f}, {sample.y_m:.2f}) m; SLAM goes on from the "
-                "pose before that"
+                f"the pose jumped to ({sample.x_m:.2f}, {sample.y_m:.2f}) m, as of a source that "
+                "was restarted; SLAM goes on from the pose before"
             )
         elif step_m > MOST_SPEED_MPS * elapsed_ns / NS_PER_S:
             warnings.append(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 
+import numpy as np
 from foxglove import Channel, Context, Schema, start_server
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
@@ -100,7 +102,7 @@ class FoxgloveSink(Sink):
 
     def on_scan(self, scan: Scan) -> None:
         self._server.broadcast_time(scan.t_ns)
-        self._log.on_scan(scan)
+        self._log.on_scan(replace(scan, odom_frame=np.zeros(3)))  # /odom is of the states
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         x_m, y_m, *_, qz, qw = cdr.planar(snapshot.odometry)

@@ -116,8 +116,8 @@ class Ros2Sink(Sink):
         if self._last is None:
             return
         self._tf_ns = t_ns
-        begin = compose(self._last.estimate, between(self._last.odometry, np.zeros(3)))
-        map_from_odom = compose(begin, self._odom_frame)
+        odometry = between(self._odom_frame, self._last.odometry)
+        map_from_odom = compose(self._last.estimate, between(odometry, np.zeros(3)))
         self._writers["tf"](cdr.transforms(t_ns, {("map", "odom"): map_from_odom}))
 
     def _ros_ns(self, t_ns: int) -> int:

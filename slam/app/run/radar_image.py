@@ -179,7 +179,7 @@ class ImagePath:
         wheels: OdometryTrack | None = None,
     ) -> None:
         self.name, self.frame, self.t_ns, self.poses = name, frame, t_ns, poses
-        self._wheels, self._track = wheels, PoseTrack()
+        self._wheels, self._track = wheels, PoseTrack(may_restart=False)
         for stamp_ns, pose in zip(t_ns.tolist(), poses.tolist(), strict=True):
             self._track.add(stamp_ns, pose)
         steps_m = np.hypot(*np.diff(poses[:, :2], axis=0).T)

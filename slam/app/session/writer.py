@@ -270,6 +270,7 @@ class SessionLog(SessionObserver):
         self._start_ns = start_ns
         self._samples: Iterator[TumSample] = iter(odometry or ())
         self._odometry_ns = -1  # of the newest sample written
+        self._odom_frame = _ORIGIN  # `Scan.odom_frame` of the newest one that SLAM took
         self._truth_at = truth_at
         self._t_ns = start_ns
         self._names = [radar.name for radar in info.radars]
@@ -300,6 +301,8 @@ class SessionLog(SessionObserver):
     def on_scan(self, scan: Scan) -> None:
         """Write the frames of one tick, and the odometry that their poses come from."""
         self._t_ns = scan.t_ns
+        if scan.used:
+            self._odom_frame = scan.odom_frame
         needed_ns = max([scan.t_ns, *(frame.t_ns for frame in scan.frames)])
         while self._odometry_ns < needed_ns and (sample := next(self._samples, None)) is not None:
             self.on_odometry(sample)
@@ -350,9 +353,12 @@ class SessionLog(SessionObserver):
             self._file.write("/truth", t_ns, cdr.pose_stamped(t_ns, "world", snapshot.truth))
         self._file.write("/estimate", t_ns, cdr.pose_stamped(t_ns, "map", snapshot.estimate))
         self._file.write("/landmarks", t_ns, cdr.landmark_cloud(t_ns, snapshot))
+        odometry = snapshot.odometry
+        if self._odom_frame.any():
+            odometry = between(self._odom_frame, odometry)
         links = {
-            ("map", "odom"): compose(snapshot.estimate, between(snapshot.odometry, _ORIGIN)),
-            ("odom", "base_link"): snapshot.odometry,
+            ("map", "odom"): compose(snapshot.estimate, between(odometry, _ORIGIN)),
+            ("odom", "base_link"): odometry,
         }
         self._file.write("/tf", t_ns, cdr.transforms(t_ns, links))
         if snapshot.step is not None:  # before its state, which a reader waits for

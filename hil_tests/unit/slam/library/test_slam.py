@@ -248,7 +248,7 @@ def test_odometry_may_come_after_the_step_of_its_time() -> None:
         assert slam.step(2 * 10**9, (0.3, 0.0, heading_rad)).t_ns == 2 * 10**9
 
 
-def test_a_source_of_odometry_that_begins_anew_changes_nothing() -> None:
+def test_a_restarted_source_of_odometry_changes_nothing() -> None:
     anew, whole = made(), made()
     for number in range(40):
         t_ns = number * TICK_NS

@@ -132,7 +132,7 @@ def test_a_missing_or_silent_socket_is_named(tmp_path: Path) -> None:
 @given(st.lists(st.floats(-2 * math.pi, 2 * math.pi), min_size=2, max_size=30))
 def test_a_track_that_grows_unwraps_like_numpy_to_the_last_bit(headings: list[float]) -> None:
     samples = [
-        TumSample(t_ns=t_ns, x_m=float(t_ns), y_m=0.0, qz=math.sin(h / 2), qw=math.cos(h / 2))
+        TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=math.sin(h / 2), qw=math.cos(h / 2))
         for t_ns, h in enumerate(headings)
     ]
     drive = OdometryTrack(samples[:1])
@@ -145,21 +145,20 @@ def test_a_track_that_grows_unwraps_like_numpy_to_the_last_bit(headings: list[fl
         drive.append(samples[-1])
 
 
+Pose = tuple[float, float, float]
 Row = tuple[int, float, float, float]
 PERIOD_NS = 20_000_000
 
 
 def turned_drive() -> list[Row]:
-    """Return a drive at 0.5 m/s: a metre, a quarter turn on the spot and a metre to the left."""
-    legs = [(k / 100, 0.0, 0.0) for k in range(100)]
-    legs += [(1.0, 0.0, k * math.pi / 100) for k in range(50)]
-    legs += [(1.0, k / 100, math.pi / 2) for k in range(100)]
+    """Return a drive at 0.5 m/s: 3 m, a quarter turn on the spot, and 3 m to the left."""
+    legs = [(k / 100, 0.0, 0.0) for k in range(300)]
+    legs += [(3.0, 0.0, k * math.pi / 100) for k in range(50)]
+    legs += [(3.0, k / 100, math.pi / 2) for k in range(300)]
     return [(k * PERIOD_NS, *pose) for k, pose in enumerate(legs)]
 
 
-def from_row(
-    rows: list[Row], first: int, start: tuple[float, float, float] = (0, 0, 0)
-) -> list[Row]:
+def from_row(rows: list[Row], first: int, start: Pose = (0.0, 0.0, 0.0)) -> list[Row]:
     """Return rows whose source begins at ``start`` again at one of them."""
     origin = np.array(rows[first][1:])
     seen = [compose(np.array(start), between(origin, np.array(row[1:]))) for row in rows[first:]]
@@ -174,16 +173,13 @@ def assert_same_path(drive: OdometryTrack, rows: list[Row]) -> None:
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.0, 0.0), (-3.0, 2.0, 1.0)])
-@pytest.mark.parametrize("row", [60, 130, 220])
-def test_a_source_that_begins_anew_goes_on_where_it_was(
-    row: int, start: tuple[float, float, float]
-) -> None:
+@pytest.mark.parametrize("row", [60, 330, 620])
+def test_the_path_of_a_restarted_source_goes_on(row: int, start: Pose) -> None:
     """Straight or turning at one rate it is as without: all poses, and those half way."""
     rows = from_row(turned_drive(), 0, start)
     drive = OdometryTrack.from_lines(lines_of(from_row(rows, row, start)))
     assert_same_path(drive, rows)
-    half = [(row - 1, row), (row, row + 1)]
-    for before, after in half:
+    for before, after in ((row - 1, row), (row, row + 1)):
         expected = (np.array(rows[before][1:]) + np.array(rows[after][1:])) / 2
         t_ns = (rows[before][0] + rows[after][0]) // 2
         np.testing.assert_allclose(drive.pose_at(t_ns), expected, atol=1e-9)
@@ -193,41 +189,66 @@ def test_a_source_that_begins_anew_goes_on_where_it_was(
     np.testing.assert_array_equal(drive.frame_at(rows[row][0] - 1), np.zeros(3))
 
 
-def test_a_source_may_begin_anew_again_and_old_poses_be_forgotten() -> None:
+@pytest.mark.parametrize("first_m", [0.0, 0.01, 0.09, 0.11])
+def test_a_first_pose_up_to_10_cm_from_the_start_is_that_of_a_restarted_source(
+    first_m: float,
+) -> None:
     rows = turned_drive()
-    given = from_row(from_row(rows, 90), 200)
+    t_ns = rows[299][0] + PERIOD_NS
+    drive = OdometryTrack.from_lines(lines_of([*rows[:300], (t_ns, first_m, 0.0, 0.0)]))
+    expected_m = 3.0 if first_m < 0.1 else first_m
+    assert drive.pose_at(t_ns)[0] == pytest.approx(expected_m, abs=1e-9)
+
+
+def test_where_the_path_goes_on_does_not_hang_on_the_last_two_poses() -> None:
+    """Wheels that count coarsely turn back and forth, and two messages may have come at once."""
+    tick_rad = 0.02
+    rows = [(k * PERIOD_NS, k / 100, 0.0, tick_rad * (k % 2)) for k in range(200)]
+    drive = OdometryTrack.from_lines(lines_of([*rows, (200 * PERIOD_NS, 0.0, 0.0, 0.0)]))
+    expected = [2.0, 0.0, 0.0]
+    assert drive.pose_at(200 * PERIOD_NS) == pytest.approx(expected, abs=1.1 * tick_rad)
+    rows += [(rows[-1][0] + 1000, 2.0, 0.0, 0.0), (rows[-1][0] + 10**9, 0.0, 0.0, 0.0)]
+    drive = OdometryTrack.from_lines(lines_of(rows))
+    assert drive.pose_at(rows[-1][0]) == pytest.approx([2.5, 0.0, 0.0], abs=0.1)
+
+
+def test_a_source_may_be_restarted_again_and_old_poses_be_forgotten() -> None:
+    rows = turned_drive()
+    given = from_row(from_row(rows, 90), 500)
+    kept = OdometryTrack.from_lines(lines_of(given))
     drive = OdometryTrack.from_lines(lines_of(given[:1]))
     for number, row in enumerate(given[1:], start=1):
-        began_anew = drive.append(parse_tum_line(lines_of([row])[0]))
-        assert began_anew == (number in (90, 200))
-        drive.forget_before(row[0] - 10 * PERIOD_NS)
-    assert len(drive) < len(rows)
+        was_restarted = drive.append(parse_tum_line(lines_of([row])[0]))
+        assert was_restarted == (number in (90, 500))
+        drive.forget_before(row[0])
+        assert drive.pose_at(row[0]).tobytes() == kept.pose_at(row[0]).tobytes()
+    assert len(drive) < 100
     assert_same_path(drive, rows[-10:])
 
 
 def test_a_source_without_a_pose_for_a_while_says_zero_and_goes_on() -> None:
     rows = turned_drive()
-    zeros = [(t_ns, 0.0, 0.0, 0.0) for t_ns, *_ in rows[120:140]]
-    given = [*rows[:120], *zeros, *rows[140:]]
+    zeros = [(t_ns, 0.0, 0.0, 0.0) for t_ns, *_ in rows[520:540]]
+    given = [*from_row(rows[:520], 400), *zeros, *from_row(rows, 400)[540:]]
     drive = OdometryTrack.from_lines(lines_of(given))
-    assert_same_path(drive, rows[:120] + rows[140:])
+    assert_same_path(drive, rows[:520] + rows[540:])
 
 
 def test_the_robot_stood_while_nothing_came_for_long() -> None:
-    """Then it is not known how it drove, and a source that begins anew does not say."""
+    """Then it is not known how it drove, and a restarted source does not say."""
     rows = turned_drive()
-    given = [row for k, row in enumerate(from_row(rows, 220)) if not 160 <= k < 220]
+    given = [row for k, row in enumerate(from_row(rows, 500)) if not 440 <= k < 500]
     drive = OdometryTrack.from_lines(lines_of(given))
-    np.testing.assert_allclose(drive.pose_at(rows[220][0]), rows[159][1:], atol=1e-9)
-    went_on = between(np.array(rows[220][1:]), np.array(rows[-1][1:]))
-    since = between(drive.pose_at(rows[220][0]), drive.pose_at(rows[-1][0]))
+    np.testing.assert_allclose(drive.pose_at(rows[500][0]), rows[439][1:], atol=1e-9)
+    went_on = between(np.array(rows[500][1:]), np.array(rows[-1][1:]))
+    since = between(drive.pose_at(rows[500][0]), drive.pose_at(rows[-1][0]))
     np.testing.assert_allclose(since, went_on, atol=1e-9)
 
 
-def test_the_noise_of_a_source_that_began_anew_is_turned_with_it() -> None:
+def test_the_noise_of_a_restarted_source_is_turned_with_it() -> None:
     triangle = (0.04, 0.01, 0.0, 0.01, 0.0, 0.02)
     tracks = []
-    for rows in (turned_drive(), from_row(turned_drive(), 200)):
+    for rows in (turned_drive(), from_row(turned_drive(), 400)):
         samples = (parse_tum_line(line) for line in lines_of(rows))
         tracks.append(OdometryTrack(replace(one, velocity_covariance=triangle) for one in samples))
     whole, restarted = (track.noise_at(tracks[0].last_ns) for track in tracks)
@@ -244,18 +265,41 @@ def on_circle(radius_m: float, turn_rad: float) -> list[Row]:
     return [(k * 10**8, *place) for k, place in enumerate(places)]
 
 
+def on_square(step_ns: int) -> list[Row]:
+    """Return three laps of a metre a step and a quarter turn a step."""
+    corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+    lap = [(*corners[k % 4], side * math.pi / 2) for side in range(4) for k in (side, side + 1)]
+    return [(k * step_ns, *pose) for k, pose in enumerate(3 * lap)]
+
+
+MS = 10**6
+
+
 @pytest.mark.parametrize(
     "rows",
     [
-        pytest.param(on_circle(10.0, 0.1), id="laps at 10 m/s"),
+        pytest.param(on_circle(9.0, 0.1), id="laps at 9 m/s"),
         pytest.param(on_circle(0.0, 0.35), id="a spin at 3.5 rad/s"),
-        pytest.param(along(10**9, 0.0, 0.8, 1.6, 0.8, 0.02), id="home, at a pose a second"),
-        pytest.param(along(10**8, 0.0, 0.1, 0.1, 0.1, 0.9, 1.0), id="poses that were held"),
-        pytest.param(along(10**8, 0.0, 0.1, 0.2, 5.0, 5.1), id="a pose that was set"),
+        pytest.param([*on_circle(0.0, 0.35)[:180:5], (18000 * MS, 0.0, 0.0, 0.0)], id="its stop"),
+        pytest.param(on_square(2000 * MS), id="a square, its corners every other second"),
+        pytest.param(on_square(200 * MS), id="a square, a side in 0.2 s"),
+        pytest.param(along(1000 * MS, 0.0, 0.5, 0.0), id="there and back in two steps"),
+        pytest.param(along(1000 * MS, 0.0, 0.8, 1.6, 0.8, 0.8, 0.02), id="home after a rest"),
+        pytest.param(along(100 * MS, 0.0, 0.1, 0.1, 0.1, 0.9, 1.0), id="poses that were held"),
+        pytest.param(along(100 * MS, 0.0, 0.1, 0.2, 5.0, 5.1), id="a pose that was set"),
+        pytest.param(along(100 * MS, 0.0, 0.1, 0.2, 5.0, 5.1, 0.0, 0.1), id="set there and back"),
+        pytest.param(along(20 * MS, *[0.0] * 50, 1.0, *[0.0] * 50), id="one outlier"),
+        pytest.param(along(20 * MS, *[0.0] * 50, *[5.0] * 50, 5.01, 5.02), id="zeros at first"),
     ],
 )
-def test_what_may_have_been_driven_is_taken_for_it(rows: list[Row]) -> None:
+def test_what_is_no_restart_is_taken_as_it_is(rows: list[Row]) -> None:
     assert_same_path(OdometryTrack.from_lines(lines_of(rows)), rows)
+
+
+def test_a_reference_is_taken_as_it_is() -> None:
+    rows = from_row(turned_drive(), 330)
+    samples = [parse_tum_line(line) for line in lines_of(rows)]
+    assert_same_path(OdometryTrack(samples, may_restart=False), rows)
 
 
 finite = st.floats(-1e6, 1e6, allow_subnormal=False)

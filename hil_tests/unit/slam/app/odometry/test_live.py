@@ -67,11 +67,16 @@ def test_a_pose_that_jumps_and_a_gap_are_said() -> None:
     assert said[2].startswith("3.0 s of it are missing")
 
 
-def test_a_source_that_begins_anew_is_said_and_does_not_move_the_robot() -> None:
-    odometry, said = fed(line(1.0), line(1.1, 0.4), line(1.2, 0.8), line(1.3), line(1.4, 0.4))
-    assert said[3] == "it begins again at (0.00, 0.00) m; SLAM goes on from the pose before that"
-    assert odometry.pose_at(1_400_000_000) == pytest.approx([1.6, 0.0, 0.0])
-    assert odometry.frame_at(1_400_000_000) == pytest.approx([1.2, 0.0, 0.0])
+def test_a_restarted_source_is_said_and_does_not_move_the_robot() -> None:
+    driven = [line(1.0 + 0.1 * k, 0.05 * k) for k in range(20)]
+    odometry, said = fed(*driven, *(line(3.0 + 0.1 * k, 0.05 * k) for k in range(5)))
+    assert said[20] == (
+        "the pose jumped to (0.00, 0.00) m, as of a source that was restarted; SLAM goes on from "
+        "the pose before"
+    )
+    assert [text for text in said if text] == [said[20]]
+    assert odometry.pose_at(3_400_000_000) == pytest.approx([1.2, 0.0, 0.0])
+    assert odometry.frame_at(3_400_000_000) == pytest.approx([1.0, 0.0, 0.0])
 
 
 def test_poses_are_known_between_samples_that_are_near_only() -> None:

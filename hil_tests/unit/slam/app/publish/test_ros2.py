@@ -117,7 +117,7 @@ def test_the_transform_is_repeated_while_the_robot_stands_and_no_stamp_comes_twi
     sink.close()
 
 
-def test_the_transform_is_of_the_robots_own_odometry_once_that_began_anew(space: str) -> None:
+def test_the_transform_is_of_the_robots_own_odometry_once_that_was_restarted(space: str) -> None:
     sink, state, frame = sink_in(space), snapshot(3), np.array([1.0, -2.0, 0.5])
     transforms = Subscriber(f"/{space}/tf", TFMessage)
     transforms.wait_for_publisher()

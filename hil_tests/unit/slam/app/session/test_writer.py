@@ -170,6 +170,18 @@ def test_transforms_chain_to_the_estimate(finished: Path) -> None:
     assert_is(both, snapshot(9).estimate)
 
 
+def test_transforms_are_of_the_frame_that_odometry_has_since_its_source_was_restarted(
+    tmp_path: Path,
+) -> None:
+    frame, state = np.array([1.0, -2.0, 0.5]), snapshot(3)
+    with SessionLog(tmp_path / "s.mcap", session_info(), odometry(20)) as log:
+        log.on_scan(dataclasses.replace(scan(3), odom_frame=frame))
+        log.on_snapshot(state)
+    links = links_of(messages(tmp_path / "s.mcap", "/tf")[0][2])
+    assert_is(chained((complex(1.0, -2.0), 0.5), links["odom", "base_link"]), state.odometry)
+    assert_is(chained(links["map", "odom"], links["odom", "base_link"]), state.estimate)
+
+
 def test_the_newest_static_message_holds_every_static_transform(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
     log = SessionLog(path, session_info(), odometry(20))
