@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import RadarFrame
+from slam.frames import RadarFrame, usable_samples
 from slam.front_end.pulse import ModulePulse, PulseModel
 from slam.geometry import FieldOfView, Mount, transform
 from slam.imaging.back_projection import Aperture
@@ -76,6 +76,9 @@ class Patch:
     origin
         Shape (3,), the patch's frame in the frame of the poses that it was made of, which is that
         of odometry or a map.
+    cut
+        Shape (n, n_bins): which samples of the frames lay at a limit of the module's sampler. None:
+        none did.
     """
 
     radar: int
@@ -86,6 +89,7 @@ class Patch:
     middle: int
     origin: Array
     profiles: RangeProfiles
+    cut: NDArray[np.bool_] | None = None
 
     @cached_property
     def aperture(self) -> Aperture:
@@ -139,6 +143,7 @@ class _Look:
     pose: Array
     antenna: Array
     samples: Samples
+    cut: NDArray[np.bool_]  # as in `Patch`
     range_start_m: float
     way_m: float  # of the antenna since the start
 
@@ -216,6 +221,7 @@ class PatchMaker:
                 pose=pose,
                 antenna=antenna,
                 samples=samples,
+                cut=_cut(frame, samples.size),
                 range_start_m=start_m,
                 way_m=way_m,
             )
@@ -242,6 +248,7 @@ class PatchMaker:
         middle_m = 0.5 * (looks[0].way_m + looks[-1].way_m)
         middle = int(np.argmin([abs(look.way_m - middle_m) for look in looks]))
         origin = looks[middle].pose
+        cut = np.array([look.cut for look in looks])
         return Patch(
             radar=self.radar,
             mount=self.mount,
@@ -251,6 +258,7 @@ class PatchMaker:
             middle=middle,
             origin=origin,
             profiles=self._profiles(rows, looks[0].range_start_m, bin_length_m),
+            cut=cut if cut.any() else None,
         )
 
     def _profiles(self, rows: Samples, range_start_m: float, bin_length_m: float) -> RangeProfiles:
@@ -268,3 +276,10 @@ class PatchMaker:
             profile_filter = ProfileFilter(pulse, rows.shape[1], bin_length_m)
             self._filter = pulse, profile_filter
         return profile_filter.apply(rows, range_start_m)
+
+
+def _cut(frame: RadarFrame | RecordedFrame, n_bins: int) -> NDArray[np.bool_]:
+    samples = frame.samples[:n_bins]
+    if isinstance(frame, RecordedFrame):
+        return np.zeros(samples.size, dtype=np.bool_)
+    return ~(usable_samples(replace(frame, samples=samples)) | np.isnan(samples))

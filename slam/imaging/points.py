@@ -45,9 +45,11 @@ class PointRule:
     beside_share: float = 0.25
     beside_wall_share: float = 0.1
     # Until the module's pulse is learnt, in place of both `beside_m`, of points and of separation,
-    # and of the `beside_share` of separation
+    # and of the `beside_share` of separation; the former is also that of what is cut off
     unlearned_beside_m: float = 0.18
     unlearned_beside_share: float = 0.4
+    # Of the range of an echo that the sampler has cut off
+    cut_sigma_m: float = 0.04
     most_fading: float = 0.4
     least_wall_share: float = 0.3  # size over that of the strongest reflector
     # Clutter that stays for some seconds goes along with the robot, as the echo of a wall does.
@@ -121,13 +123,16 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
     antenna, (bx, by) = aperture.antennas_m[patch.middle], aperture.boresights[patch.middle]
     turn = np.array([[bx, -by], [by, bx]])
     places = antenna + reflectors.places_m @ turn.T
-    is_point = _are_points(patch, reflectors, places, rule)
+    are_cut = _are_cut(patch, places, rule)
+    is_point = _are_points(patch, reflectors, places, rule, are_cut)
     order = np.flatnonzero(is_point)[np.argsort(reflectors.range_m[is_point])]
     points = []
     for k in order.tolist():
         lines = places[k] - aperture.antennas_m
         lines /= np.linalg.norm(lines, axis=1, keepdims=True)
         sigma_m, bearing_sigma_rad = _sigmas(patch, reflectors, k, lines, rule)
+        if are_cut[k]:
+            sigma_m = math.hypot(sigma_m, rule.cut_sigma_m)
         points.append(
             PatchPoint(
                 x_m=float(places[k, 0]),
@@ -191,7 +196,11 @@ def in_view(patch: Patch, places: Array) -> Array:
 
 
 def _are_points(
-    patch: Patch, reflectors: Reflectors, places: Array, rule: PointRule
+    patch: Patch,
+    reflectors: Reflectors,
+    places: Array,
+    rule: PointRule,
+    are_cut: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     may_be, amplitude = reflectors.flatness <= rule.flatness[1], reflectors.amplitude
     # Where a face ends, its echo fades, and its wavefront is between that of a plane and a point.
@@ -203,18 +212,44 @@ def _are_points(
     fades = np.abs(first - last) > rule.most_fading * (first + last)
     may_be &= ~fades | (reflectors.flatness <= rule.flatness[0])
     chosen = may_be & (amplitude >= rule.least_share * amplitude.max(where=may_be, initial=0.0))
-    chosen &= stand_out(reflectors, rule) & (in_view(patch, places) >= rule.least_in_view)
+    chosen &= stand_out(reflectors, rule, are_cut)
+    chosen &= in_view(patch, places) >= rule.least_in_view
     return np.asarray(chosen & ~_are_images(reflectors, rule))
 
 
-def stand_out(reflectors: Reflectors, rule: PointRule) -> NDArray[np.bool_]:
+def _are_cut(patch: Patch, places: Array, rule: PointRule) -> NDArray[np.bool_]:
+    """Return which places (k, 2) have echoes that the sampler has cut off in most frames.
+
+    What is left of such an echo is beside its place, and looks like two or three.
+    """
+    if patch.cut is None:
+        return np.zeros(len(places), dtype=np.bool_)
+    profiles, n_bins = patch.profiles, patch.cut.shape[1]
+    n_cut = np.zeros((len(patch.cut), n_bins + 1), dtype=np.int64)
+    n_cut[:, 1:] = np.cumsum(patch.cut, axis=1)
+    ranges_m = np.linalg.norm(places[:, np.newaxis] - patch.aperture.antennas_m, axis=2)
+    ends_m = ranges_m + np.array([-rule.beside_m, rule.beside_m])[:, np.newaxis, np.newaxis]
+    ends = np.ceil((ends_m - profiles.range_start_m) / profiles.bin_length_m).astype(np.int64)
+    first, end = np.clip(ends, 0, n_bins)
+    frames = np.arange(len(n_cut))
+    some_cut = n_cut[frames, end] > n_cut[frames, first]
+    return np.asarray(some_cut.mean(axis=1) > rule.least_in_view)
+
+
+def stand_out(
+    reflectors: Reflectors, rule: PointRule, are_cut: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
     """Return which reflectors are more than noise and what stronger ones beside them leave."""
     size, range_m = np.sqrt(reflectors.energy), reflectors.range_m
     xy = reflectors.places_m
-    is_beside = np.abs(range_m[:, np.newaxis] - range_m) < rule.beside_m
+    apart_m = np.abs(range_m[:, np.newaxis] - range_m)
+    is_beside = apart_m < rule.beside_m
     is_near = np.linalg.norm(xy[:, np.newaxis] - xy, axis=2) < rule.beside_m
     share = np.where(is_near, 2 * rule.beside_share, rule.beside_share)
     share = np.where(reflectors.flatness > rule.flatness[2], rule.beside_wall_share, share)
+    if are_cut is not None:
+        is_beside |= are_cut[:, np.newaxis] & (apart_m < rule.unlearned_beside_m)
+        share = np.where(are_cut[:, np.newaxis], 1.0, share)
     is_less = np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1)
     return np.asarray((reflectors.snr >= rule.least_snr) & ~is_less)
 

@@ -83,6 +83,22 @@ def test_poses_are_in_the_body_frame_of_the_middle() -> None:
     np.testing.assert_allclose(back, path[: len(back)], atol=1e-9)
 
 
+def test_a_patch_says_which_samples_the_sampler_has_cut_off() -> None:
+    maker = PatchMaker(0, MOUNT, VIEW, lambda _: PULSE, RULE)
+    for index, pose in enumerate(line(0.3)):
+        frame = frame_at(pose, index)
+        loud = frame.samples * (index in (3, 4))  # of two frames the rod is beyond the limits
+        patch = maker.add(replace(frame, samples=loud, limits=(-0.005, 0.005)), pose)
+        if patch is not None:
+            break
+    assert patch is not None
+    assert patch.cut is not None
+    assert np.flatnonzero(patch.cut.any(axis=1)).tolist() == [3, 4]
+    at = patch.cut.any(axis=0)
+    assert np.ptp(patch.profiles.ranges_m[at]) < 6 * MODEL.sigma_m
+    assert patches_of(line(0.3))[0].cut is None
+
+
 def test_a_rod_comes_to_a_focus_where_it_is_in_the_frame_of_the_patch() -> None:
     # The rod stands beside the end of the path: of so few frames that see it, the static part,
     # their mean, keeps little.

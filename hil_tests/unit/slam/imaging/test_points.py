@@ -133,6 +133,19 @@ def test_a_weak_point_in_range_of_a_strong_one_is_found_beyond_its_pulse() -> No
     assert np.linalg.norm(found - [(0.1, 0.8), (0.0, 1.3)], axis=1).max() < 4e-3
 
 
+@pytest.mark.parametrize("amplitude", [0.04, 0.12, 0.25])
+def test_an_echo_that_the_sampler_cuts_off_is_one_and_not_sure(amplitude: float) -> None:
+    """Less than half a metre away it is 2 to 12 times the limit; what is left looks like two."""
+    limit = 0.074
+    frames = of_point(straight(), (0.2, 0.6), amplitude) + of_point(straight(), (0.0, 1.3))
+    frames += noise(3)
+    patch = replace(patch_of(np.clip(frames, -limit, limit)), cut=np.abs(frames) > limit)
+    near, far = patch_points(patch)
+    assert abs(near.range_m - math.dist((0.2, 0.6), (0.1, 0.2))) < 2 * near.sigma_m
+    assert near.sigma_m > 10 * far.sigma_m
+    assert math.dist((far.x_m, far.y_m), (0.0, 1.3)) < 4e-3
+
+
 def test_noise_alone_has_no_points_and_no_walls() -> None:
     # 60 patches of some 250 resolution cells: one false alarm would be 7e-5 per cell.
     for seed in range(60):
