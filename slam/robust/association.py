@@ -662,26 +662,36 @@ def correspondence(
 
     ``density`` is that of all things of the kind: how likely a chance neighbour is.
     """
-    distance = float(residual @ np.linalg.solve(S, residual))
-    log_det = float(np.linalg.slogdet(math.tau * S)[1])
-    evidence = -0.5 * (distance + log_det) - math.log(density)
-    return Correspondence(pair=pair, mahalanobis_sq=distance, evidence=evidence)
+    return correspondences([pair], residual[None], S[None], density)[0]
+
+
+def correspondences(
+    pairs: Iterable[tuple[int, int]], residuals: Array, S: Array, density: float
+) -> list[Correspondence]:
+    """Judge k pairs of things likewise, by residuals (k, 2) with covariances S (k, 2, 2)."""
+    distances = (residuals[:, None] @ np.linalg.solve(S, residuals[..., None])).ravel()
+    evidence = -0.5 * (distances + np.linalg.slogdet(math.tau * S)[1]) - math.log(density)
+    return [
+        Correspondence(pair=pair, mahalanobis_sq=distance, evidence=nats)
+        for pair, distance, nats in zip(pairs, distances.tolist(), evidence.tolist(), strict=True)
+    ]
 
 
 def certain(
-    correspondences: Sequence[Correspondence], refused: Collection[tuple[int, int]] = ()
+    judged: Sequence[Correspondence], refused: Collection[tuple[int, int]] = ()
 ) -> Correspondence | None:
     """Return the likeliest of those that are possible and that nothing speaks against.
 
     That all things are new, and each correspondence that contradicts it, possible or not, must be
     less likely by `MARGIN_NATS`. Those of the pairs ``refused`` are not returned.
     """
-    ranked = sorted(correspondences, key=lambda one: -one.evidence)
+    ranked = sorted(judged, key=lambda one: -one.evidence)
     for one in ranked:
-        rivals = [other for other in ranked if other is not one and one.contradicts(other)]
-        least = max([0.0, *(rival.evidence for rival in rivals)])
-        is_certain = one.is_possible and one.evidence - least > MARGIN_NATS
-        if is_certain and one.pair not in refused:
+        if not one.is_possible or one.pair in refused:
+            continue
+        # The likeliest of its rivals comes first.
+        least = next((other.evidence for other in ranked if one.contradicts(other)), 0.0)
+        if one.evidence - max(0.0, least) > MARGIN_NATS:
             return one
     return None
 

@@ -24,7 +24,7 @@ from slam.robust.association import (
     RangeScan,
     View,
     certain,
-    correspondence,
+    correspondences,
     density_per_m2,
 )
 from slam.robust.parameters import MARGIN_NATS, TAIL_PROBABILITY, MapRule
@@ -352,14 +352,6 @@ def saved_map_of(
     )
 
 
-def judge(state: State, pair: tuple[int, int], sigma_m: float, density: float) -> Correspondence:
-    """Judge whether two landmarks, by row, are one."""
-    H = np.hstack([np.eye(2), -np.eye(2)])
-    P = state.P.block(state.landmark_columns(np.array(pair, dtype=np.intp)))
-    residual = state.landmarks_m[pair[1]] - state.landmarks_m[pair[0]]
-    return correspondence(pair, residual, H @ P @ H.T + sigma_m**2 * np.eye(2), density)
-
-
 def apply_merge(state: State, pairs: Pairs, sigma_m: float) -> None:
     """State that pairs of landmarks are one, of one radius, and marginalise the second of each."""
     k, layout = state.layout.landmark_size, state.layout
@@ -412,18 +404,21 @@ def _candidates(state: State, density: float, neighbourhood_m: float) -> list[Co
         return []
     near = cKDTree(state.landmarks_m).query_pairs(neighbourhood_m, output_type="ndarray")
     near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.intp)
-    distances = _distances_sq(state, near, MERGE_SIGMA_M)
+    points = state.landmarks_m
+    P = state.P.block(state.landmark_columns(np.arange(len(points))))
+    distances = _distances_sq(points, P, near, MERGE_SIGMA_M)
     # What contradicts a possible one and comes within the margin of it is kept, too.
-    limit = float(chdtri(2, TAIL_PROBABILITY)) + 2.0 * MARGIN_NATS
-    return [
-        judge(state, (first, second), MERGE_SIGMA_M, density)
-        for first, second in near[distances <= limit].tolist()
-    ]
+    near = near[distances <= float(chdtri(2, TAIL_PROBABILITY)) + 2.0 * MARGIN_NATS]
+    first, second = near.T
+    at = np.stack([2 * first, 2 * first + 1, 2 * second, 2 * second + 1], axis=-1)
+    H = np.hstack([np.eye(2), -np.eye(2)])
+    S = H @ P[at[:, :, None], at[:, None, :]] @ H.T + MERGE_SIGMA_M**2 * np.eye(2)
+    pairs = [(one, other) for one, other in near.tolist()]
+    return correspondences(pairs, points[second] - points[first], S, density)
 
 
-def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
+def _distances_sq(points: Array, P: Array, pairs: Indices, sigma_m: float) -> Array:
     """Return d^2 of the statement that pairs of rows, shape (k, 2), are one landmark each."""
-    P = state.P.block(state.landmark_columns(np.arange(len(state.landmark_ids))))
     i, j = 2 * pairs.T
 
     def spread(a: int, b: int) -> Array:
@@ -431,7 +426,7 @@ def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
         return np.asarray(own - P[i + a, j + b] - P[j + a, i + b])
 
     xx, yy, xy = spread(0, 0) + sigma_m**2, spread(1, 1) + sigma_m**2, spread(0, 1)
-    apart = state.landmarks_m[pairs[:, 0]] - state.landmarks_m[pairs[:, 1]]
+    apart = points[pairs[:, 0]] - points[pairs[:, 1]]
     x, y = apart[:, 0], apart[:, 1]
     # Where rounding has left no spread at all, nothing is ruled out here.
     determinant = np.maximum(xx * yy - xy**2, 0.0)

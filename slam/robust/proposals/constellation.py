@@ -18,7 +18,7 @@ of the merge.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,10 +77,8 @@ def find_placements(here: Constellation, there: Constellation, rule: BranchRule)
     if len(here.ids) < least or len(there.ids) < least:
         return []
     found: dict[Pairs, Placement] = {}
-    for pairs in dict.fromkeys(_guesses(here.points_m, there.points_m, rule, len(here.ids))):
-        placement = _judged(here, there, pairs)
-        if placement is not None and len(placement.pairs) >= least:
-            found[placement.pairs] = placement
+    for placement in _placements(here, there, rule, len(here.ids)):
+        found[placement.pairs] = placement
     middle = here.points_m.mean(axis=0)
     distinct: list[Placement] = []
     for one in sorted(found.values(), key=lambda one: -one.evidence):
@@ -117,10 +115,7 @@ def stands_out(
     # rest not to say enough, two of them are.
     alike_nats = nats[seen[0]] + nats[seen].sum() - np.cumsum(nats[seen])
     seeds = int(np.count_nonzero(alike_nats >= own - rule.price_nats)) + 1
-    for pairs in dict.fromkeys(_guesses(here.points_m, known.points_m, rule, seeds)):
-        one = _judged(here, known, pairs)
-        if one is None or len(one.pairs) < rule.least_landmarks:
-            continue
+    for one in _placements(here, known, rule, seeds):
         away = transform(one.motion, here.points_m)[:, None] - known.points_m[None, :]
         is_near = np.sum(away**2, axis=2) <= limits
         # A landmark that lies on its own double is where it was.
@@ -149,15 +144,14 @@ def _differ(one: Array, other: Array, point: Array, rule: BranchRule) -> bool:
 def _guesses(points: Array, targets: Array, rule: BranchRule, seeds: int) -> list[Pairs]:
     """Return the pairs that agree when two landmarks of either map are laid on each other.
 
-    Of ``points``, two of the first ``seeds``.
+    Of ``points``, two of the first ``seeds``. Pairs are mutual nearest neighbours within reach.
     """
     gaps = targets[None, :] - targets[:, None]
     lengths = np.hypot(gaps[..., 0], gaps[..., 1])
     angles = np.arctan2(gaps[..., 1], gaps[..., 0])
     long_enough = lengths >= rule.base_m
-    found: list[Pairs] = []
-    first, tree = points[:seeds], cKDTree(targets)
-    least = min(rule.least_landmarks, len(points))
+    first, tree, n, least = points[:seeds], cKDTree(targets), len(points), rule.least_landmarks
+    rows, agree = np.zeros((0, n), dtype=np.intp), np.zeros((0, n), dtype=np.bool_)
     for a in range(len(first)):
         for b in range(a + 1, len(first)):
             gap = points[b] - points[a]
@@ -166,42 +160,54 @@ def _guesses(points: Array, targets: Array, rule: BranchRule, seeds: int) -> lis
                 continue
             direction = math.atan2(gap[1], gap[0])
             alike = np.argwhere(long_enough & (np.abs(lengths - length) <= rule.reach_m))
-            # Most lay too few on any other, which a tree finds out for all of them together.
             turns = angles[alike[:, 0], alike[:, 1]] - direction
             by_turn = points - (points[a] + points[b]) / 2
             x, y = np.cos(turns)[:, None], np.sin(turns)[:, None]
             laid = np.stack([x * by_turn[:, 0], y * by_turn[:, 0]], axis=-1)
             laid += np.stack([-y * by_turn[:, 1], x * by_turn[:, 1]], axis=-1)
             laid += targets[alike].mean(axis=1)[:, None]
-            near_m, _ = tree.query(laid, distance_upper_bound=rule.reach_m * _ROOM)
-            for i, j in alike[np.isfinite(near_m).sum(axis=1) >= least].tolist():
-                turn = float(angles[i, j]) - direction
-                R = rotation(turn)
-                middle = (targets[i] + targets[j]) / 2 - R @ (points[a] + points[b]) / 2
-                moved = points @ R.T + middle
-                away = np.hypot(*np.moveaxis(targets[:, None] - moved[None, :], -1, 0))
-                pairs = _nearest(away, rule.reach_m)
-                if len(pairs) >= least:
-                    found.append(pairs)
-    found.sort(key=lambda pairs: -len(pairs))
-    return found[: rule.most_tried]
+            near_m, row = tree.query(laid, distance_upper_bound=rule.reach_m * _ROOM)
+            is_near = np.asarray(near_m <= rule.reach_m)
+            # Many lay too few on any other, or no more than those that are found already.
+            able = is_near.sum(axis=1) >= least
+            laid, is_near = laid[able], is_near[able]
+            # The row is too large where none is within reach.
+            row = np.minimum(row, len(targets) - 1)[able]
+            away = targets[row][:, :, None] - laid[:, None, :]
+            is_mutual = np.hypot(away[..., 0], away[..., 1]).argmin(axis=2) == np.arange(n)
+            rows, agree = np.vstack([rows, row]), np.vstack([agree, is_near & is_mutual])
+            counts = agree.sum(axis=1)
+            most = np.argsort(-counts, kind="stable")[: rule.most_tried]
+            rows, agree = rows[most], agree[most]
+            if len(most) == rule.most_tried:  # Of equals, the first stay.
+                least = max(least, int(counts[most[-1]]) + 1)
+    return [
+        tuple(sorted(zip(row[own].tolist(), np.flatnonzero(own).tolist(), strict=True)))
+        for row, own in zip(rows, agree, strict=True)
+        if np.count_nonzero(own) >= rule.least_landmarks
+    ]
 
 
-def _nearest(away: Array, reach_m: float) -> Pairs:
-    """Return mutual nearest neighbours (row, column) within reach."""
-    best_column, best_row = away.argmin(axis=1), away.argmin(axis=0)
-    return tuple(
-        (row, int(column))
-        for row, column in enumerate(best_column)
-        if best_row[column] == row and away[row, column] <= reach_m
-    )
-
-
-def _judged(here: Constellation, there: Constellation, pairs: Pairs) -> Placement | None:
-    """Return the placement by the pairs, the worst left out until all fit; None below two."""
-    beta = density_per_m2(there.points_m, NEIGHBOURHOOD_M)
+def _placements(
+    here: Constellation, there: Constellation, rule: BranchRule, seeds: int
+) -> Iterator[Placement]:
+    """Yield the placements by the guesses, those of too few landmarks left out."""
     spans = np.ptp(there.points_m, axis=0) + 2 * NEIGHBOURHOOD_M
-    area_m2 = float(spans[0] * spans[1])
+    place_nats = math.log(math.tau * float(spans[0] * spans[1]))
+    new_nats = math.log(density_per_m2(there.points_m, NEIGHBOURHOOD_M))
+    for pairs in dict.fromkeys(_guesses(here.points_m, there.points_m, rule, seeds)):
+        one = _judged(here, there, pairs, place_nats, new_nats)
+        if one is not None and len(one.pairs) >= rule.least_landmarks:
+            yield one
+
+
+def _judged(
+    here: Constellation, there: Constellation, pairs: Pairs, place_nats: float, new_nats: float
+) -> Placement | None:
+    """Return the placement by the pairs, the worst left out until all fit; None below two.
+
+    ``place_nats`` is that of any place and heading, ``new_nats`` that of a new landmark.
+    """
     while len(pairs) >= 2:
         motion, residual, S, N = _aligned(here, there, pairs)
         S_inverse = np.linalg.inv(S)
@@ -210,8 +216,8 @@ def _judged(here: Constellation, there: Constellation, pairs: Pairs) -> Placemen
             information = N.T @ S_inverse @ N
             log_det = float(np.linalg.slogdet(math.tau * S)[1])
             log_det += float(np.linalg.slogdet(information / math.tau)[1])
-            evidence = -0.5 * (distance + log_det) - math.log(math.tau * area_m2)
-            evidence -= len(pairs) * math.log(beta)
+            evidence = -0.5 * (distance + log_det) - place_nats
+            evidence -= len(pairs) * new_nats
             return Placement(motion=motion, pairs=pairs, evidence=evidence)
         blocks = [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(pairs))]
         apart = residual.reshape(-1, 2)

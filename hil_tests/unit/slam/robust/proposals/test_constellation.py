@@ -1,17 +1,19 @@
 """Where one map lies on another, from the constellation of their landmarks."""
 
 import math
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 
 from slam.geometry import between, transform
-from slam.robust.association import density_per_m2
+from slam.robust.association import Pairs, density_per_m2
 from slam.robust.initialisation import BodyPoint, initialise_landmark
 from slam.robust.parameters import BranchRule
 from slam.robust.proposals.constellation import (
     Constellation,
     Placement,
+    _guesses,
     constellation_of,
     find_placement,
     stands_out,
@@ -116,6 +118,44 @@ def test_a_constellation_has_the_errors_of_its_landmarks() -> None:
     swept = np.array([-PLACES[0, 1], PLACES[0, 0], -PLACES[2, 1], PLACES[2, 0]])
     expected = 0.01 * np.outer(swept, swept) + (2.5e-5 + 1e-4) * np.eye(4)
     assert found.covariance_m2 == pytest.approx(expected, abs=1e-12)
+
+
+def guesses_one_by_one(points: Array, targets: Array, seeds: int) -> list[Pairs]:
+    """Return what `_guesses` returns, by plain loops over complex numbers."""
+    here, there = ([complex(x, y) for x, y in places.tolist()] for places in (points, targets))
+    found: list[Pairs] = []
+    for a, b in combinations(here[:seeds], 2):
+        for i, j in permutations(there, 2):
+            one, other = abs(b - a), abs(j - i)
+            if min(one, other) < RULE.base_m or abs(one - other) > RULE.reach_m:
+                continue
+            turn = (j - i) / (b - a) * one / other
+            laid = [(i + j) / 2 + turn * (point - (a + b) / 2) for point in here]
+            pairs = []
+            for row, target in enumerate(there):
+                away = [abs(target - point) for point in laid]
+                at = int(np.argmin(away))
+                rivals = [abs(rival - laid[at]) for rival in there]
+                if away[at] <= RULE.reach_m and np.argmin(rivals) == row:
+                    pairs.append((row, at))
+            if len(pairs) >= RULE.least_landmarks:
+                found.append(tuple(pairs))
+    return sorted(found, key=len, reverse=True)[: RULE.most_tried]
+
+
+@pytest.mark.parametrize(
+    ("n", "n_others", "seeds", "count"), [(3, 9, 3, 6), (7, 8, 2, 9), (7, 12, 7, 200)]
+)
+def test_guesses_are_those_of_plain_loops(n: int, n_others: int, seeds: int, count: int) -> None:
+    """Half the landmarks are seen again, with errors, among others; of many guesses 200 stay."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([0.0, 0.0], [2.5, 1.5], (n, 2))
+    again = points[::2] + rng.normal(0.0, 0.05, points[::2].shape)
+    others = rng.uniform([-2.0, -1.0], [2.0, 2.0], (n_others, 2))
+    targets = np.vstack([others, transform(np.array([0.6, 0.1, 2.0]), again)])
+    found = _guesses(points, targets, RULE, seeds)
+    assert len(found) == count
+    assert found == guesses_one_by_one(points, targets, seeds)
 
 
 FRAMES = np.array([[pitch, y] for pitch in range(5) for y in (0.0, 0.8)])
