@@ -241,6 +241,10 @@ class SmoothedRun:
         Shape (n, 3), [x m, y m, heading rad], the heading in [-pi, pi); and (n, 3, 3).
     landmark_ids, landmarks_m, landmark_covariances_m2
         m ids, shape (m, 2) and (m, 2, 2).
+    constants
+        Shape (3 + r, 2): how far the errors s, w [1] and kappa [rad/m] of the wheels at the start,
+        and the range offsets [m] of r radars, are from what was stated, and the standard deviations
+        stated of that; infinite where the run took none. None of a recorded run.
     """
 
     t_ns: NDArray[np.int64]
@@ -249,6 +253,7 @@ class SmoothedRun:
     landmark_ids: tuple[int, ...]
     landmarks_m: Array
     landmark_covariances_m2: Array
+    constants: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

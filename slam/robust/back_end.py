@@ -334,7 +334,7 @@ class RobustBackEnd:
         solved = solve_whole_run(self._log, self.state, self.parameters)
         if solved is None:
             return None
-        poses, pose_covariances, features, covariances_m2 = solved
+        poses, pose_covariances, features, covariances_m2, constants = solved
         rows = self.reported_rows()
         return SmoothedRun(
             t_ns=stamps_ns,
@@ -343,6 +343,7 @@ class RobustBackEnd:
             landmark_ids=tuple(self.state.landmark_ids[row] for row in rows),
             landmarks_m=features[rows],
             landmark_covariances_m2=covariances_m2[rows],
+            constants=constants,
         )
 
     def predict(

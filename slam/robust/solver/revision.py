@@ -194,10 +194,10 @@ def learn_noise(
 
 def solve_whole_run(
     log: RunLog, state: State, parameters: BackEndParameters
-) -> tuple[Array, Array, Array, Array] | None:
-    """Return poses (n + 1, 3) and covariances, features (m, 2) and covariances; None if it fails.
+) -> tuple[Array, Array, Array, Array, Array] | None:
+    """Return poses (n + 1, 3) and covariances, features (m, 2) and covariances, and constants.
 
-    Errors are additive. Nothing is changed.
+    None if it fails. Errors are additive; of the constants see `SmoothedRun`. Nothing is changed.
     """
     if log.n_poses < 2:
         return None
@@ -217,7 +217,11 @@ def solve_whole_run(
     columns = np.column_stack([first, first + 1])
     blocks = border[columns[:, :, None], columns[:, None, :]]
     poses, of_poses = all_poses(problem, best, of_keys)
-    return poses, of_poses, best.fixed[columns - HEAD_SIZE], blocks
+    away, sigmas = smoother.constants(best)
+    stated = np.full(len(away), parameters.ranges.offset_sigma_m)
+    stated[:3] = parameters.wheels.calibration_sigmas
+    constants = np.column_stack([away, np.where(stated > 0.0, sigmas, np.inf)])
+    return poses, of_poses, best.fixed[columns - HEAD_SIZE], blocks, constants
 
 
 def is_determined(information: Array) -> bool:

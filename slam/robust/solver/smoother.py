@@ -537,10 +537,17 @@ class Smoother:
         It is chi-square of the wheels' first calibration and the range offsets over the quantile
         that one in a hundred exceeds.
         """
+        away, sigmas = self.constants(estimate)
+        return float(np.sum((away / sigmas) ** 2)) / float(chdtri(len(away), CONSTANTS_TAIL))
+
+    def constants(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Return how far the constants are from their priors' means, (k,), and the priors' sigmas.
+
+        They are the wheels' first calibration and the range offsets.
+        """
         away, sigmas = self._from_prior(estimate)
         constants = slice(CALIBRATION.start, HEAD_SIZE + self._problem.layout.n_radars)
-        square = float(np.sum((away[constants] / sigmas[constants]) ** 2))
-        return square / float(chdtri(constants.stop - constants.start, CONSTANTS_TAIL))
+        return away[constants], sigmas[constants]
 
     def covariances(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return the covariances of all keyframes (k + 1, 3, 3) and of the border at a solution.
