@@ -228,7 +228,7 @@ def _are_cut(patch: Patch, places: Array, rule: PointRule) -> NDArray[np.bool_]:
     n_cut = np.zeros((len(patch.cut), n_bins + 1), dtype=np.int64)
     n_cut[:, 1:] = np.cumsum(patch.cut, axis=1)
     ranges_m = np.linalg.norm(places[:, np.newaxis] - patch.aperture.antennas_m, axis=2)
-    ends_m = ranges_m + np.array([-rule.beside_m, rule.beside_m])[:, np.newaxis, np.newaxis]
+    ends_m = ranges_m + 0.5 * rule.beside_m * np.array([-1.0, 1.0])[:, np.newaxis, np.newaxis]
     ends = np.ceil((ends_m - profiles.range_start_m) / profiles.bin_length_m).astype(np.int64)
     first, end = np.clip(ends, 0, n_bins)
     frames = np.arange(len(n_cut))
