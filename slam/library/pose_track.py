@@ -39,7 +39,8 @@ class PoseTrack:
 
     If the source is restarted, its poses begin at its first pose or at zero again. The robot is
     then taken to have gone on as before, or to have stood where nothing came for more than a
-    second, and `pose_at` has no jump. A source that jumps elsewhere, too, is taken as it is.
+    second, and `pose_at` has no jump. A source that jumps elsewhere, too, is taken as it is, and so
+    is one whose poses are more than 0.3 s apart.
 
     Parameters
     ----------
@@ -137,7 +138,7 @@ class PoseTrack:
         return self._between(len(self) - 2, t_ns) if len(self) > 1 else self._wrapped(0)
 
     def _pose(self, row: int) -> tuple[float, float, float]:
-        """Return the pose of a row, its heading unwrapped until the first restart."""
+        """Return the pose of a row; its heading is unwrapped until the first restart only."""
         given = self._x_m[row], self._y_m[row], self._heading_rad[row]
         if not self._restarts_ns or self._stamps_ns[row] < self._restarts_ns[0]:
             return given
@@ -168,12 +169,14 @@ class PoseTrack:
         self, t_ns: int, given: tuple[float, float, float]
     ) -> NDArray[np.float64] | None:
         """Return the frame of the source from a pose on, if it is another one from there."""
-        if self._fastest is None or not self._is_jump(t_ns, given):
+        period_ns = self.last_ns - self._stamps_ns[max(len(self) - 2, 0)]
+        if self._fastest is None or period_ns > _VELOCITY_NS or not self._is_jump(t_ns, given):
             return None
         if self._is_near_start(given):
             return compose(self._continued(t_ns), between(np.array(given), np.zeros(3)))
-        if self._frames and self._is_near_start(self._last):
-            # It did not drive from there: for a while its poses were not known.
+        since_ns = t_ns - self._restarts_ns[-1] if self._restarts_ns else _GOES_ON_NS
+        if since_ns < _GOES_ON_NS and self._is_near_start(self._last):
+            # It did not drive from there: for a moment its poses were not known.
             return self._frame_before
         self._may_restart = False
         return None

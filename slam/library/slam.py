@@ -147,7 +147,7 @@ class Slam:
     odometry_noise
         Returns the covariance (3, 3) of the noise that odometry has gathered until a time [ns], in
         the order and frame of its poses; preset ``robust`` takes its growth in place of the white
-        noise of ``wheels``.
+        noise of ``wheels``. It goes on, in the same frame, if the source is restarted.
     front_end
         Finds ranges in frames, in place of the preset's; see `Detector`.
     map

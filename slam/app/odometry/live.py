@@ -151,15 +151,14 @@ class LiveOdometry:
             warnings.append(
                 f"{elapsed_ns / NS_PER_S:.1f} s of it are missing; no scan of them is used"
             )
-        if is_restart:
+        if is_restart or step_m > MOST_SPEED_MPS * elapsed_ns / NS_PER_S:
             warnings.append(
-                f"the pose jumped to ({sample.x_m:.2f}, {sample.y_m:.2f}) m, as of a source that "
-                "was restarted; SLAM goes on from the pose before"
-            )
-        elif step_m > MOST_SPEED_MPS * elapsed_ns / NS_PER_S:
-            warnings.append(
-                f"the pose jumped by {step_m:.2f} m in {elapsed_ns / NS_PER_S:.3f} s; "
-                "was it reset? SLAM takes it for a drive"
+                f"the pose jumped by {step_m:.2f} m in {elapsed_ns / NS_PER_S:.3f} s"
+                + (
+                    ", as when its source is restarted; SLAM does not take it for a drive"
+                    if is_restart
+                    else "; was it reset? SLAM takes it for a drive"
+                )
             )
         return "; ".join(warnings)
 

@@ -35,12 +35,12 @@ _FAR_SIGMAS = 3.0
 """How far a constant may be from its stated value: where the standard deviation is right, one in
 370 is farther, so of the seven constants of four radars one in 53 runs."""
 _WHEELS = (
-    ("distances", "{:.1%}", "the radius of the wheels", "scale_sigma"),
-    ("turns", "{:.1%}", "the track width", "turn_scale_sigma"),
-    ("curvature", "{:.4f} rad/m", "the radii of the wheels", "curvature_sigma_rad_per_m"),
+    ("distances", 100.0, "%", "the radius of the wheels", "scale_sigma"),
+    ("turns", 100.0, "%", "the track width", "turn_scale_sigma"),
+    ("curvature", 1.0, " rad/m", "the radii of the wheels", "curvature_sigma_rad_per_m"),
 )
-"""Of s, w and kappa of the wheels: what they are errors of, how they are written, what may be
-wrong, and the key of their standard deviation in the rig file."""
+"""Of s, w and kappa of the wheels: what they are errors of, factor and unit in which they are
+written, what may be wrong, and the key of their standard deviation in the rig file."""
 
 
 class RunProgress(SessionObserver):
@@ -218,24 +218,28 @@ def constant_warnings(rig: Rig, constants: NDArray[np.float64]) -> list[str]:
         (
             f"odometry: its error of {what}",
             0.0,
-            form,
+            factor,
+            unit,
             f"correct {cause} in the odometry, or raise {key} under [wheels] of the rig file",
         )
-        for what, form, cause, key in _WHEELS
+        for what, factor, unit, cause, key in _WHEELS
     ]
     remedy = "set range_offset_m in the rig file to that, or run uwb-slam calibrate"
     for mount in rig.mounts:
         what = f"radar {mount.name}: its range offset"
-        stated.append((what, mount.range_offset_m, "{:.3f} m", remedy))
-    return [
-        f"warning: {what} was found to be {form.format(mean + away)}, {abs(away) / sigma:.1f} "
-        f"standard deviations from the stated {form.format(mean)} +- {form.format(sigma)}: the "
-        f"covariances of the first poses are too small; {remedy}"
-        for (away, sigma), (what, mean, form, remedy) in zip(
-            constants.tolist(), stated, strict=True
-        )
-        if abs(away) > _FAR_SIGMAS * sigma
-    ]
+        stated.append((what, mount.range_offset_m, 1.0, " m", remedy))
+    warnings = []
+    for (away, sigma), (what, mean, factor, unit, remedy) in zip(
+        constants.tolist(), stated, strict=True
+    ):
+        if abs(away) > _FAR_SIGMAS * sigma:
+            found, said, by = (f"{factor * one:.3g}{unit}" for one in (mean + away, mean, sigma))
+            warnings.append(
+                f"warning: {what} was found to be {found}, {abs(away) / sigma:.1f} standard "
+                f"deviations from the stated {said} +- {by}: the covariances of the first poses "
+                f"are too small; {remedy}"
+            )
+    return warnings
 
 
 def summary_rows(

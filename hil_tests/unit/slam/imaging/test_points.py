@@ -144,6 +144,10 @@ def test_an_echo_that_the_sampler_cuts_off_is_one_and_not_sure(amplitude: float)
     assert abs(near.range_m - math.dist((0.2, 0.6), (0.1, 0.2))) < 2 * near.sigma_m
     assert near.sigma_m > 10 * far.sigma_m
     assert math.dist((far.x_m, far.y_m), (0.0, 1.3)) < 4e-3
+    few = np.zeros_like(frames, dtype=np.bool_)
+    few[:8] = np.abs(frames[:8]) > limit
+    as_whole, unknown = (patch_points(replace(patch, cut=cut)) for cut in (few, None))
+    np.testing.assert_array_equal(places(as_whole), places(unknown))
 
 
 def test_noise_alone_has_no_points_and_no_walls() -> None:

@@ -226,7 +226,17 @@ def test_a_source_may_be_restarted_again_and_old_poses_be_forgotten() -> None:
     assert_same_path(drive, rows[-10:])
 
 
-def test_a_source_without_a_pose_for_a_while_says_zero_and_goes_on() -> None:
+def test_a_restart_may_be_at_zero_where_the_first_pose_was_elsewhere() -> None:
+    rows = from_row(turned_drive(), 0, (-3.0, 2.0, 1.0))
+    assert_same_path(OdometryTrack.from_lines(lines_of(from_row(rows, 620))), rows)
+
+
+def test_a_restart_on_the_spot_turns_nothing() -> None:
+    rows = [(k * PERIOD_NS, 0.0, 0.0, math.pi * k / 100) for k in range(90)]
+    assert_same_path(OdometryTrack.from_lines(lines_of(from_row(rows, 60))), rows)
+
+
+def test_a_source_without_a_pose_for_a_moment_says_zero_and_goes_on() -> None:
     rows = turned_drive()
     zeros = [(t_ns, 0.0, 0.0, 0.0) for t_ns, *_ in rows[520:540]]
     given = [*from_row(rows[:520], 400), *zeros, *from_row(rows, 400)[540:]]
@@ -288,12 +298,21 @@ MS = 10**6
         pytest.param(along(100 * MS, 0.0, 0.1, 0.1, 0.1, 0.9, 1.0), id="poses that were held"),
         pytest.param(along(100 * MS, 0.0, 0.1, 0.2, 5.0, 5.1), id="a pose that was set"),
         pytest.param(along(100 * MS, 0.0, 0.1, 0.2, 5.0, 5.1, 0.0, 0.1), id="set there and back"),
+        pytest.param(along(1000 * MS, 0.0, 0.2, 0.4, 0.6, 0.02, 0.0), id="home, faster than away"),
         pytest.param(along(20 * MS, *[0.0] * 50, 1.0, *[0.0] * 50), id="one outlier"),
         pytest.param(along(20 * MS, *[0.0] * 50, *[5.0] * 50, 5.01, 5.02), id="zeros at first"),
     ],
 )
 def test_what_is_no_restart_is_taken_as_it_is(rows: list[Row]) -> None:
     assert_same_path(OdometryTrack.from_lines(lines_of(rows)), rows)
+
+
+def test_after_a_restart_the_old_frame_is_not_taken_up_again() -> None:
+    rows = [(k * 10**8, 0.05 * k, 0.0, 0.0) for k in range(60)]
+    stands = [(k * 10**8, 0.0, 0.0, 0.0) for k in range(60, 100)]
+    turned = (100 * 10**8, 0.0, 0.0, 0.5)
+    drive = OdometryTrack.from_lines(lines_of([*rows, *stands, turned]))
+    assert drive.pose_at(turned[0]) == pytest.approx([3.0, 0.0, 0.5])
 
 
 def test_a_reference_is_taken_as_it_is() -> None:

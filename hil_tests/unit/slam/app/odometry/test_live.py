@@ -71,8 +71,8 @@ def test_a_restarted_source_is_said_and_does_not_move_the_robot() -> None:
     driven = [line(1.0 + 0.1 * k, 0.05 * k) for k in range(20)]
     odometry, said = fed(*driven, *(line(3.0 + 0.1 * k, 0.05 * k) for k in range(5)))
     assert said[20] == (
-        "the pose jumped to (0.00, 0.00) m, as of a source that was restarted; SLAM goes on from "
-        "the pose before"
+        "the pose jumped by 0.95 m in 0.100 s, as when its source is restarted; SLAM does not take "
+        "it for a drive"
     )
     assert [text for text in said if text] == [said[20]]
     assert odometry.pose_at(3_400_000_000) == pytest.approx([1.2, 0.0, 0.0])

@@ -88,7 +88,7 @@ def test_wheels_that_report_a_tenth_too_much_are_named(capsys: pytest.CaptureFix
     begin, _, rest = line.partition(" was found to be ")
     assert begin == "warning: odometry: its error of distances"
     assert float(rest.partition("%")[0]) == pytest.approx(10.0, abs=2.0)
-    assert "from the stated 0.0% +- 0.7%" in line
+    assert "from the stated 0% +- 0.7%" in line
     assert "scale_sigma under [wheels] of the rig file" in line
 
 
@@ -98,7 +98,7 @@ def test_ranges_that_are_10_cm_too_long_are_named(capsys: pytest.CaptureFixture[
     assert begin == f"warning: radar {paper_rig().mounts[1].name}: its range offset"
     # beyond the offset that was stated
     assert float(rest.partition(" m")[0]) == pytest.approx(0.15, abs=0.01)
-    assert "from the stated 0.050 m +- 0.020 m" in line
+    assert "from the stated 0.05 m +- 0.02 m" in line
     assert "set range_offset_m in the rig file" in line
 
 
