@@ -48,7 +48,9 @@ class PointRule:
     # and of the `beside_share` of separation; the former is also that of what is cut off
     unlearned_beside_m: float = 0.18
     unlearned_beside_share: float = 0.4
-    # Of the range of an echo that the sampler has cut off
+    # If a larger share of the samples of an echo is at a limit of the sampler (from 1.5 times the
+    # limit on), its range is so uncertain
+    most_cut: float = 0.3
     cut_sigma_m: float = 0.04
     most_fading: float = 0.4
     least_wall_share: float = 0.3  # size over that of the strongest reflector
@@ -218,9 +220,9 @@ def _are_points(
 
 
 def _are_cut(patch: Patch, places: Array, rule: PointRule) -> NDArray[np.bool_]:
-    """Return which places (k, 2) have echoes that the sampler has cut off in most frames.
+    """Return which places (k, 2) have echoes of which the sampler has cut off too much.
 
-    What is left of such an echo is beside its place, and looks like two or three.
+    What is left of such an echo may be beside its place, and look like two or three.
     """
     if patch.cut is None:
         return np.zeros(len(places), dtype=np.bool_)
@@ -232,8 +234,8 @@ def _are_cut(patch: Patch, places: Array, rule: PointRule) -> NDArray[np.bool_]:
     ends = np.ceil((ends_m - profiles.range_start_m) / profiles.bin_length_m).astype(np.int64)
     first, end = np.clip(ends, 0, n_bins)
     frames = np.arange(len(n_cut))
-    some_cut = n_cut[frames, end] > n_cut[frames, first]
-    return np.asarray(some_cut.mean(axis=1) > rule.least_in_view)
+    n_near = n_cut[frames, end] - n_cut[frames, first]
+    return np.asarray(n_near.sum(axis=1) > rule.most_cut * (end - first).sum(axis=1))
 
 
 def stand_out(
@@ -248,8 +250,9 @@ def stand_out(
     share = np.where(is_near, 2 * rule.beside_share, rule.beside_share)
     share = np.where(reflectors.flatness > rule.flatness[2], rule.beside_wall_share, share)
     if are_cut is not None:
-        is_beside |= are_cut[:, np.newaxis] & (apart_m < rule.unlearned_beside_m)
-        share = np.where(are_cut[:, np.newaxis], 1.0, share)
+        either_cut = are_cut[:, np.newaxis] | are_cut
+        is_beside |= either_cut & (apart_m < rule.unlearned_beside_m)
+        share = np.where(either_cut, 1.0, share)
     is_less = np.any(is_beside & (size[:, np.newaxis] < share * size), axis=1)
     return np.asarray((reflectors.snr >= rule.least_snr) & ~is_less)
 

@@ -133,9 +133,9 @@ def test_a_weak_point_in_range_of_a_strong_one_is_found_beyond_its_pulse() -> No
     assert np.linalg.norm(found - [(0.1, 0.8), (0.0, 1.3)], axis=1).max() < 4e-3
 
 
-@pytest.mark.parametrize("amplitude", [0.04, 0.12, 0.25])
+@pytest.mark.parametrize("amplitude", [0.12, 0.18, 0.25])
 def test_an_echo_that_the_sampler_cuts_off_is_one_and_not_sure(amplitude: float) -> None:
-    """Less than half a metre away it is 2 to 12 times the limit; what is left looks like two."""
+    """Less than half a metre away it is 5 to 12 times the limit; what is left looks like two."""
     limit = 0.074
     frames = of_point(straight(), (0.2, 0.6), amplitude) + of_point(straight(), (0.0, 1.3))
     frames += noise(3)
@@ -145,7 +145,7 @@ def test_an_echo_that_the_sampler_cuts_off_is_one_and_not_sure(amplitude: float)
     assert near.sigma_m > 10 * far.sigma_m
     assert math.dist((far.x_m, far.y_m), (0.0, 1.3)) < 4e-3
     few = np.zeros_like(frames, dtype=np.bool_)
-    few[:8] = np.abs(frames[:8]) > limit
+    few[:3] = np.abs(frames[:3]) > limit
     as_whole, unknown = (patch_points(replace(patch, cut=cut)) for cut in (few, None))
     np.testing.assert_array_equal(places(as_whole), places(unknown))
 
