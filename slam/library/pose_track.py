@@ -16,13 +16,13 @@ _NS_PER_S = 1_000_000_000
 # Forgetting moves all later poses, so it is done for some at a time
 _FEWEST_FORGOTTEN = 64
 
-# A source of odometry that is restarted is near its first pose, or zero [m, rad], ...
+# How near to its first pose, or to zero, a restarted source begins [m, rad]
 _NEAR_START = 0.1
-# ... after a step so long that is faster than twice what it has shown [m, rad]
+# How far its pose jumps at least [m, rad], and how many times faster than the robot ever moved
 _JUMP, _FASTER = 0.3, 2.0
-# Rates are taken over this time, and up to 10 m/s and 10 rad/s: no such robot has these radars
+# Over which time rates are taken, and the largest that counts [m/s, rad/s]: no robot is faster
 _RATE_NS, _MOST_RATE = 100_000_000, 10.0
-# The robot goes on for so long, at its velocity over so long
+# For how long the robot is taken to go on, and over which time its velocity is taken
 _GOES_ON_NS, _VELOCITY_NS = 1_000_000_000, 300_000_000
 
 
