@@ -91,9 +91,9 @@ class Redirector:
                     manager: rfc2217.PortManager = manager, gone: threading.Event = gone
                 ) -> None:
                     while not gone.is_set():
-                        data = port.read(4096)
+                        # a client may purge what this thread was about to read
                         with contextlib.suppress(OSError):
-                            self.write(b"".join(manager.escape(data)))
+                            self.write(b"".join(manager.escape(port.read(4096))))
 
                 reading = threading.Thread(target=pass_on)
                 reading.start()
