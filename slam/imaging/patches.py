@@ -279,6 +279,7 @@ class PatchMaker:
 
 
 def _cut(frame: RadarFrame | RecordedFrame, n_bins: int) -> NDArray[np.bool_]:
+    """Return which of the first samples, shape (n_bins,), lie at a limit; none of a recording."""
     samples = frame.samples[:n_bins]
     if isinstance(frame, RecordedFrame):
         return np.zeros(samples.size, dtype=np.bool_)
