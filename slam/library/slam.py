@@ -28,7 +28,6 @@ from slam.results import (
     MapChanges,
     NoiseAt,
     Pipeline,
-    PoseAt,
     SmoothedRun,
     StartOnMap,
     StepResult,
@@ -44,6 +43,7 @@ Row: TypeAlias = Sequence[float | None]
 
 _MOST_AHEAD_NS = 100_000_000
 _KEPT_NS = 2_000_000_000
+_ROUND_NS = 1_000_000_000  # longest round of mounts that measure in turn
 _SAME = 1e-9  # [m] and [rad]: two poses of one time that differ by less are one
 _ROUNDED = 1e-9  # of gathered noise, for covariances without full rank
 _MOST_STAMP_NS = 2**63 - 1
@@ -200,6 +200,11 @@ class Slam:
         self._threads = ThreadpoolController()
         self._odometry = PoseTrack()
         self._newest: dict[int, tuple[int, int]] = {}  # stream and counter, by radar
+        # By mount, ranges that wait for those of the others, and the mounts of the newest step that
+        # had its ranges; the mounts of the last round
+        self._waiting: dict[int, _Waiting] = {}
+        self._beside: dict[int, set[int]] = {}
+        self._round = set[int]()
         self._is_lost = on_map is not None and on_map.pose is None
         # The newest belief, and odometry at it
         self._belief = Belief(mean=np.zeros(3), covariance=np.zeros((3, 3)))
@@ -258,6 +263,8 @@ class Slam:
             is known what was ranged, as from a UWB anchor, and range and field of view do not
             matter. All that a mount measured without ids must be given at once: what should be
             there and is not counts against a landmark. A mount that is not mentioned did not look.
+            Mounts that measure in turn may have a step each: ranges without ids are taken once
+            every mount of the last round has some, one has new ones, or after a second.
         points
             (radar, range_m, bearing_rad, sigma_m, bearing_sigma_rad), and an id in the same way:
             the bearing is counted from the mount's ``yaw_rad``.
@@ -280,7 +287,7 @@ class Slam:
         if self._noise_at is not None:
             self._noise_now = _later_noise(self._noise_at(t_ns), self._noise, t_ns)
         with self._threads.limit(limits=1):  # the same bits on every machine
-            results = self._stepped(taken, scans, poses.__getitem__, t_ns)
+            results = self._gathered(taken, scans, poses, t_ns)
         track.forget_before(t_ns - _KEPT_NS)
         self._odometry, self._noise = track, self._noise_now
         self._newest |= {frame.radar: (frame.stream, frame.counter) for frame in taken}
@@ -430,20 +437,51 @@ class Slam:
 
         return pose_at
 
-    def _stepped(
+    def _gathered(
         self,
         frames: Sequence[RadarFrame],
         scans: Sequence[RangeScan],
-        pose_at: PoseAt,
+        poses: dict[int, Array],
         t_ns: int,
     ) -> tuple[StepResult, ...]:
+        """Step the pipeline; with ranges of mounts that measure in turn, once a round is over."""
+        new = [_Waiting(scan=scan, t_ns=t_ns, pose=poses[t_ns]) for scan in scans]
+        given = [one for one in new if not one.is_part_of_round]
+        ranged = {one.scan.radar: one for one in new if one.is_part_of_round}
+        measured = {one.scan.radar for one in new} | {frame.radar for frame in frames}
+        kept = {radar: one for radar, one in self._waiting.items() if radar not in measured}
+        waiting = kept | ranged
+        # A mount that measures together with others, and has no range this time, is not waited for.
+        due = self._round.difference(waiting, *[self._beside.get(radar, ()) for radar in waiting])
+        since_ns = min([one.t_ns for one in waiting.values()], default=t_ns)
+        is_over = not due or len(kept) < len(self._waiting) or t_ns - since_ns >= _ROUND_NS
+        if is_over:
+            given += waiting.values()
+        results: tuple[StepResult, ...] = ()
+        if given or frames or not waiting:
+            results = self._stepped(frames, given, poses, t_ns)
+        if waiting and is_over:
+            self._round, waiting = set(waiting), {}
+        self._waiting = waiting
+        self._beside |= {radar: set(ranged) for radar in ranged}
+        return results
+
+    def _stepped(
+        self,
+        frames: Sequence[RadarFrame],
+        given: Sequence[_Waiting],
+        poses: dict[int, Array],
+        t_ns: int,
+    ) -> tuple[StepResult, ...]:
+        pose_at = (poses | {one.t_ns: one.pose for one in given}).__getitem__
         if isinstance(self._pipeline, RobustSlam):
+            scans = [one.scan_from(t_ns, poses[t_ns]) for one in given]
             return self._pipeline.step_scans(frames, scans, pose_at, t_ns)
-        if scans:
+        if given:
             detections = [
-                Detection(radar=scan.radar, t_ns=t_ns, range_m=range_m, amplitude=math.nan)
-                for scan in scans
-                for range_m in scan.ranges_m
+                Detection(radar=one.scan.radar, t_ns=one.t_ns, range_m=range_m, amplitude=math.nan)
+                for one in given
+                for range_m in one.scan.ranges_m
             ]
             return self._pipeline.step_detections(detections, pose_at, t_ns)
         return self._pipeline.step(frames, pose_at, t_ns)
@@ -475,6 +513,27 @@ class Slam:
         cosine, sine = math.cos(self._start[2]), math.sin(self._start[2])
         R[:2, :2] = [[cosine, -sine], [sine, cosine]]
         return np.asarray(R @ covariances @ R.T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Waiting:
+    """What a mount measured, when, and where odometry had the robot then."""
+
+    scan: RangeScan
+    t_ns: int
+    pose: Array
+
+    @property
+    def is_part_of_round(self) -> bool:
+        """Return whether it is ranges without ids, which say little without the other mounts'."""
+        return self.scan.bearings_rad is None and self.scan.labels is None
+
+    def scan_from(self, t_ns: int, pose: Array) -> RangeScan:
+        """Return the scan as part of a state at another time."""
+        if t_ns == self.t_ns:
+            return self.scan
+        x, y, turn = between(pose, self.pose).tolist()
+        return replace(self.scan, moved=(x, y, turn))
 
 
 def _on_map(given: str | Path | MapFile, start: Array | None, *, is_fixed: bool) -> StartOnMap:

@@ -34,7 +34,6 @@ from slam import (
     override,
 )
 from slam.geometry import between, compose, transform
-from slam.results import PoseAt
 
 TICK_NS = 200_000_000
 RIG = Rig([Mount(x_m=x_m, y_m=0.2, yaw_rad=math.pi / 2) for x_m in (-0.1, 0.1)])
@@ -248,6 +247,46 @@ def test_odometry_may_come_after_the_step_of_its_time() -> None:
         assert slam.step(2 * 10**9, (0.3, 0.0, heading_rad)).t_ns == 2 * 10**9
 
 
+def range_row(radar: int, t_ns: int) -> tuple[int, float, float]:
+    mount = RIG.mounts[radar]
+    x_m = mount.x_m + drive(t_ns)[0]
+    return radar, math.hypot(ROD[0] - x_m, ROD[1] - mount.y_m), 0.003
+
+
+@pytest.mark.parametrize("between_ns", [TICK_NS // 2, TICK_NS // 20, 0])
+@pytest.mark.parametrize("preset", ["robust", "paper"])
+def test_mounts_may_measure_in_turn(preset: str, between_ns: int) -> None:
+    """Each in a step of its own, at the pose of then; steps in between may have no ranges."""
+    slam = Slam(RIG, preset)
+    for number in range(60):
+        t_ns = number * TICK_NS
+        for radar in (0, 1):
+            slam.step(t_ns, drive, ranges=[range_row(radar, t_ns)])
+            t_ns += between_ns
+        slam.step(t_ns, drive)
+    (landmark_m,) = slam.landmarks.positions_m
+    assert landmark_m == pytest.approx(ROD, abs=0.01)
+
+
+def test_a_mount_that_measures_no_more_is_waited_for_once() -> None:
+    slam = Slam(RIG)
+
+    def n_states(t_ns: int, *radars: int) -> int:
+        state = slam.step(t_ns, drive, ranges=[range_row(radar, t_ns) for radar in radars])
+        return len(state.results)
+
+    half = TICK_NS // 2
+    n = [n_states(k * half, k % 2) for k in range(9)]
+    assert n == [0, 0, 1, 0, 1, 0, 1, 0, 1]  # the first one is the start; each has both mounts
+    assert [n_states(k * half, 0) for k in range(9, 13)] == [0, 1, 1, 1]
+    assert [n_states(k * half, 0, 1) for k in range(13, 16)] == [1, 1, 1]
+    assert n_states(16 * half, 0) == 1  # mount 1 saw nothing beside mount 0
+    assert [n_states(k * half, k % 2) for k in range(17, 20)] == [1, 0, 1]
+    # A range waits for a second.
+    assert n_states(20 * half, 0) == 0
+    assert [n_states(20 * half + 250_000_000 * k) for k in range(1, 5)] == [0, 0, 0, 1]
+
+
 def test_a_restarted_source_of_odometry_changes_nothing() -> None:
     anew, whole = made(), made()
     for number in range(40):
@@ -267,8 +306,8 @@ def test_headings_need_not_be_unwrapped() -> None:
     slam = Slam(RIG, front_end=Rod())
     seen: list[Pose] = []
 
-    def spy(frames: object, scans: object, pose_at: PoseAt, t_ns: int) -> tuple[()]:
-        seen.append(pose_at(t_ns - TICK_NS // 2))
+    def spy(frames: object, given: object, poses: dict[int, Pose], t_ns: int) -> tuple[()]:
+        seen.append(poses[t_ns - TICK_NS // 2])
         return ()
 
     slam.step(0, (0.0, 0.0, math.pi - 0.1))
