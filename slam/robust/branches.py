@@ -457,15 +457,18 @@ class Branches:
             one.take(step.evidence, rule)
             if seen is not None:
                 one.measure(seen)
-            if not one.is_confirmed(rule) or not looks or self._is_alike_elsewhere(one):
+            if not looks or not (self._is_on_few(one) or self._is_confirmed(one)):
                 doubts.append(one)
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
-        if carried > 0.0:
+        n_known = self.main.n_reported_since(0) if self._has_stood else 0
+        # An empty map begins where the robot first drives.
+        if carried > 0.0 and (n_known or self._now):
             variances = np.array(rule.lost_variances)
             newest = Doubt(
                 next_id=step.next_id,
+                knew_few=n_known < rule.least_landmarks,
                 position_m=position_m,
                 probability=carried,
                 covariance=carried * np.diag(variances),
@@ -482,6 +485,18 @@ class Branches:
                 self._doubts.append(one)
         while len(self._doubts) > rule.most_doubts:
             self._doubts[0].join(self._doubts.pop(1))
+
+    def _is_on_few(self, doubt: Doubt) -> bool:
+        """Return whether a doubt knew too few landmarks to be confirmed, and has enough since.
+
+        They are the map then, and the robot is sure of its place among them. Where the few and the
+        start lie on it may be wrong.
+        """
+        n_new = self.main.n_reported_since(doubt.next_id)
+        return doubt.knew_few and n_new >= self._rule.least_landmarks
+
+    def _is_confirmed(self, doubt: Doubt) -> bool:
+        return doubt.is_confirmed(self._rule) and not self._is_alike_elsewhere(doubt)
 
     def _is_alike_elsewhere(self, doubt: Doubt) -> bool:
         """Return whether the landmarks that fit the pose may be others of the map.

@@ -3,6 +3,7 @@
 A carry that is possible during a stop adds to the reported covariance. The pose itself stays where
 it is. A doubt ends when landmarks known before it fit the pose, and their ranges leave no direction
 of the motion open: two landmarks abeam of the robot say nothing of where it is along its course.
+Where too few were known before it, the doubt ends once enough are known since.
 """
 
 from __future__ import annotations
@@ -68,6 +69,7 @@ class Doubt:
     """Carries that the wheels did not report, if they happened."""
 
     next_id: int  # landmarks known before them have smaller ids
+    knew_few: bool  # whether these were fewer than place a robot
     position_m: Array  # shape (2,), where the newest of them may have been
     probability: float  # added up
     # shape (3, 3), of x, y [m] and heading for a pose at the position: the probability times the
@@ -117,6 +119,7 @@ class Doubt:
         self.covariance = self.at(newer.position_m) + newer.covariance
         self.variances = self.variances + newer.variances
         self.probability += newer.probability
+        self.knew_few &= newer.knew_few
         self.position_m, self.information = newer.position_m, newer.information
 
     def join(self, newer: Doubt) -> None:

@@ -259,6 +259,36 @@ def test_ranges_behind_a_stop_show_whether_the_robot_was_carried() -> None:
     assert discontinuity(before, [RangeScan(radar=1, ranges_m=(0.5,))], 0.03, noise) == 0.0
 
 
+@pytest.mark.parametrize(("stop", "n_before"), [(1, 0), (5, 0), (15, 2), (25, 4)])
+def test_a_doubt_on_too_few_landmarks_ends_with_three_newer_ones(stop: int, n_before: int) -> None:
+    """A stop before the first drive is no doubt; three that were mapped by then are waited for."""
+    rng, poses = np.random.default_rng(3), straight(60)
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    steps = follow(
+        branches, reported(poses, LAB, rng, 0.0), scans_of(poses, PLACES, rng, SIGMA_M), stop=stop
+    )
+    n_known, n_doubts, n_new = 0, list[int](), list[int]()
+    first_id = None
+    for k in range(1, len(poses)):
+        if k == stop:
+            n_known, first_id = branches.main.n_reported_since(0), branches.main.state.next_id
+        next(steps)
+        if first_id is not None:
+            n_doubts.append(len(branches._doubts))
+            n_new.append(branches.main.n_reported_since(first_id))
+    assert n_known == n_before
+    assert n_new[-1] >= RULE.least_landmarks
+    if stop == 1:
+        assert not any(n_doubts)
+    elif n_known < RULE.least_landmarks:
+        end = n_doubts.index(0)
+        enough = next(k for k, n in enumerate(n_new) if n >= RULE.least_landmarks)
+        assert enough <= end <= enough + branches._look_every
+        assert not any(n_doubts[end:])
+    else:
+        assert all(n_doubts)
+
+
 def test_evidence_is_the_likelihood_of_the_ranges() -> None:
     """Of one range alone, so that its prediction is all there is to it."""
     rng, poses = np.random.default_rng(7), straight(70)

@@ -27,6 +27,7 @@ def doubtful(x_m: float, probability: float = 1.0) -> Doubt:
     """Return a doubt at a place on the x axis: of a motion of covariance CARRY."""
     return Doubt(
         next_id=9,
+        knew_few=False,
         position_m=np.array([x_m, 0.0]),
         probability=probability,
         covariance=probability * CARRY,
