@@ -24,6 +24,8 @@ from slam.imaging.reflectors import Reflectors, SeparationRule
 
 Array = NDArray[np.float64]
 
+# From which way across the line of sight on a bearing is computed
+_LEAST_SPREAD_M = 1e-6
 _PULSE_M = 0.052  # s, of a module with 1.4 GHz
 
 
@@ -133,6 +135,8 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
         lines = places[k] - aperture.antennas_m
         lines /= np.linalg.norm(lines, axis=1, keepdims=True)
         sigma_m, bearing_sigma_rad = _sigmas(patch, reflectors, k, lines, rule)
+        if bearing_sigma_rad > aperture.half_beam_rad:
+            continue
         if are_cut[k]:
             sigma_m = math.hypot(sigma_m, rule.cut_sigma_m)
         points.append(
@@ -171,6 +175,8 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
             continue
         sight = np.broadcast_to(normal, antennas.shape)
         sigma_m, bearing_sigma_rad = _sigmas(patch, reflectors, k, sight, rule)
+        if bearing_sigma_rad > aperture.half_beam_rad:
+            continue
         lines.append(
             PatchLine(
                 normal=normal,
@@ -289,7 +295,8 @@ def _sigmas(
 ) -> tuple[float, float]:
     """Return the standard deviations of range [m] and bearing [rad] of a reflector.
 
-    ``lines`` (n, 2) are the directions to where it answers, at each antenna.
+    ``lines`` (n, 2) are the directions to where it answers, at each antenna. The
+    bearing of what was in the beam from one place only, or along one line, is not known.
     """
     profiles, antennas = patch.profiles, patch.aperture.antennas_m
     sight = lines[patch.middle]
@@ -299,12 +306,15 @@ def _sigmas(
     lever = -(antennas - antennas[patch.middle]) @ across
     lever -= np.average(lever, weights=weights)
     spread = math.sqrt(float(np.average(lever**2, weights=weights)))
-    of_range = weights * lever / float(weights @ lever**2)  # bearing per error of each range
     snr = float(reflectors.snr[k])
+    sigma_m = math.hypot(_PULSE_M / snr, rule.range_floor_m)
+    if spread < _LEAST_SPREAD_M:
+        return sigma_m, math.inf
+    of_range = weights * lever / float(weights @ lever**2)  # bearing per error of each range
     bearing = (1 / (snr * profiles.wave_number_rad_per_m * spread)) ** 2
     bearing += _wheel_variance(patch, of_range[:, np.newaxis] * lines, rule.wheels)
     bearing += rule.bearing_floor_rad**2
-    return math.hypot(_PULSE_M / snr, rule.range_floor_m), math.sqrt(bearing)
+    return sigma_m, math.sqrt(bearing)
 
 
 def _wheel_variance(patch: Patch, pulls: Array, wheels: WheelNoise) -> float:

@@ -111,6 +111,17 @@ def places(points: Sequence[PatchPoint]) -> Array:
     return np.array([(point.x_m, point.y_m) for point in points]).reshape(-1, 2)
 
 
+def test_what_was_in_the_beam_from_one_place_only_has_no_bearing() -> None:
+    """Two frames, a second apart and 0.3 m, of which one looks at the rod: no point, no warning."""
+    poses = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    patch = patch_of(of_point(poses, (0.1, 1.0)) + noise(1)[:2], poses, middle=0)
+    reflectors = separated(patch, RULE.separation)
+    assert len(reflectors.levels)
+    alone = replace(reflectors, levels=reflectors.levels * np.array([1.0, 0.0]))
+    with np.errstate(all="raise"):
+        assert points_of(patch, alone, RULE) == ()
+
+
 @pytest.mark.parametrize("place", [(0.1, 1.1), (0.45, 1.0), (-0.3, 1.3), (0.2, 0.6)])
 def test_without_noise_a_point_is_where_it_is(place: tuple[float, float]) -> None:
     (point,) = patch_points(patch_of(of_point(straight(), place)))
