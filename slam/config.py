@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -272,6 +272,12 @@ class WheelNoise:
     # Smallest standard deviation of one step
     floor_m: float = 3e-6
     floor_rad: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a number that is not finite, or negative."""
+        for name, value in asdict(self).items():
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"wheels: {name} is {value}; it must be finite, and not negative")
 
     @property
     def calibration_sigmas(self) -> tuple[float, float, float]:

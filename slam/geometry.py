@@ -228,6 +228,11 @@ class Rig:
             where = mount.x_m, mount.y_m, mount.yaw_rad, mount.range_offset_m
             if not all(map(math.isfinite, where)):
                 raise ValueError(f"mount {number}, {mount}: its numbers must be finite")
+            if abs(mount.yaw_rad) > math.tau:
+                raise ValueError(
+                    f"mount {number}, {mount}: yaw_rad is in radians, at most a turn; of degrees "
+                    "take math.radians"
+                )
         named = [m if m.name else replace(m, name=f"radar{k}") for k, m in enumerate(self.mounts)]
         if len({mount.name for mount in named}) < len(named):  # maps and sessions go by names
             raise ValueError(f"mounts are called {', '.join(mount.name for mount in named)}")

@@ -3,8 +3,8 @@
 `open_rig` sets up the modules of a robot and gives a scan for each frame period; `Slam.step` takes
 it with the pose of the wheels, and returns where the robot is. Here both come from an emulated
 robot, as fast as they are read, and frames are timed by their counters. On a robot of your own it
-is `open_rig("robot.toml")`, times are those of `time.monotonic_ns`, and the pose is your robot's:
-`slam.step(scan.t_ns, robot.pose(), frames=scan)`. It prints
+is `open_rig("robot.toml")`, times are those of `time.monotonic_ns`, and the poses of its wheels are
+given by `slam.add_odometry(stamp_ns, pose)` before `slam.step(scan.t_ns, frames=scan)`. It prints
 
 ```text
 10 s: at +0.80, +0.51 m, 5 landmarks

@@ -24,6 +24,10 @@ _JUMP, _FASTER = 0.3, 2.0
 _RATE_NS, _MOST_RATE = 100_000_000, 10.0
 # For how long the robot is taken to go on, and over which time its velocity is taken
 _GOES_ON_NS, _VELOCITY_NS = 1_000_000_000, 300_000_000
+# By how much the poses of a robot that stands may differ [m, rad]
+_STOOD = 0.02
+# Over which time, at least, it is taken behind the newest pose: stamps of arrival bunch
+_NEWEST_NS = 50_000_000
 
 
 class PoseTrack:
@@ -131,11 +135,30 @@ class PoseTrack:
         after = bisect_right(stamps_ns, t_ns)
         if after in (0, len(stamps_ns)):
             return self._wrapped(min(after, len(stamps_ns) - 1))
-        return self._between(after - 1, t_ns)
+        return self._between(after - 1, t_ns, after)
+
+    def gap_at(self, t_ns: int) -> tuple[int, int] | None:
+        """Return the times of the poses around a time, if the robot drove unseen between them.
+
+        That is for more than a second, and by more than `_STOOD`.
+        """
+        after = bisect_right(self._stamps_ns, t_ns)
+        if after in (0, len(self)) or self._stamps_ns[after - 1] == t_ns:
+            return None
+        before_ns, after_ns = self._stamps_ns[after - 1 : after + 1]
+        if after_ns - before_ns <= _GOES_ON_NS:
+            return None
+        apart = _apart(self._pose(after - 1), self._pose(after))
+        return (before_ns, after_ns) if max(apart) > _STOOD else None
 
     def extrapolated(self, t_ns: int) -> NDArray[np.float64]:
-        """Return the pose at a time behind the newest one, at the velocity of the last two."""
-        return self._between(len(self) - 2, t_ns) if len(self) > 1 else self._wrapped(0)
+        """Return the pose at a time behind the newest one, at the velocity before it.
+
+        That is taken over 50 ms, or between the last two poses if they are further apart.
+        """
+        newest = len(self) - 1
+        before = max(bisect_right(self._stamps_ns, self.last_ns - _NEWEST_NS) - 1, 0)
+        return self._between(before, t_ns, newest) if before < newest else self._wrapped(0)
 
     def _pose(self, row: int) -> tuple[float, float, float]:
         """Return the pose of a row; its heading is unwrapped until the first restart only."""
@@ -149,11 +172,11 @@ class PoseTrack:
         x_m, y_m, heading_rad = self._pose(row)
         return np.array([x_m, y_m, wrap_angle(heading_rad)])
 
-    def _between(self, row: int, t_ns: int) -> NDArray[np.float64]:
-        """Return the pose on the line through that of a row and the next one."""
-        before_ns, after_ns = self._stamps_ns[row], self._stamps_ns[row + 1]
+    def _between(self, row: int, t_ns: int, later: int) -> NDArray[np.float64]:
+        """Return the pose on the line through those of two rows."""
+        before_ns, after_ns = self._stamps_ns[row], self._stamps_ns[later]
         part = (t_ns - before_ns) / (after_ns - before_ns)
-        (x_m, y_m, heading_rad), after = self._pose(row), self._pose(row + 1)
+        (x_m, y_m, heading_rad), after = self._pose(row), self._pose(later)
         turn_rad = after[2] - heading_rad
         if self._restarts_ns and after_ns >= self._restarts_ns[0]:
             turn_rad = wrap_angle(turn_rad)

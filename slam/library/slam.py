@@ -177,12 +177,16 @@ class Slam:
         if isinstance(rig, RigFile):
             wheels = wheels or rig.wheels.noise
             rig = rig.rig
+        if not isinstance(rig, Rig):
+            raise ValueError(f"rig is {rig!r}; give a Rig, or what load_rig returns of a file")
         if not rig.mounts:
             raise ValueError("the rig has no mount; what measures ranges sits at one")
         self.rig = rig
         self.config = load_preset(preset) if isinstance(preset, str) else preset
         self._wheels = wheels or WheelNoise()
         given = None if start is None else _pose(start, "start")
+        if given is not None and abs(given[2]) > math.tau:
+            raise ValueError(f"start: its heading is {given[2]:g}; it is in radians")
         on_map = None if map is None else _on_map(map, given, is_fixed=localise)
         if (map is not None or localise) and self.config.back_end is not BackEnd.ROBUST:
             raise ValueError("map, localise: preset paper begins with an empty map; use robust")
@@ -256,7 +260,8 @@ class Slam:
             at a time [ns], such as `Scan.odometry` of a session.
         frames
             At most one of each radar, each with its own time of the same clock. Its pose lies
-            between those given; up to 100 ms behind the newest one it is extrapolated.
+            between those given, which are at most a second apart while the robot drives; up to 100
+            ms behind the newest one it is extrapolated.
         ranges
             (radar, range_m, sigma_m) or (radar, range_m, sigma_m, landmark_id): index of the mount,
             true metres from there at ``t_ns``, standard deviation. With an id, any whole number, it
@@ -433,6 +438,11 @@ class Slam:
                 )
             if stamp_ns > track.last_ns:
                 return track.extrapolated(stamp_ns)
+            if (gap := track.gap_at(stamp_ns)) is not None:
+                raise StepInputError(
+                    f"no odometry at {stamp_ns} ns: the robot drove, and no pose came between "
+                    f"{gap[0]} and {gap[1]} ns; leave out what was seen then"
+                )
             return track.pose_at(stamp_ns)
 
         return pose_at
@@ -580,8 +590,10 @@ def _measured(row: Sequence[Any], kind: str) -> _Measured:
     sigmas = [value for name, value in numbers.items() if "sigma" in name]
     if not all(map(math.isfinite, numbers.values())) or min(sigmas) <= 0.0:
         raise StepInputError(f"{kind} {values}: numbers must be finite, sigmas positive")
-    if not 0.0 < one.range_m < LONGEST_M:
-        raise StepInputError(f"{kind} {values}: range_m must be positive, and below {LONGEST_M:g}")
+    if not 0.0 < one.range_m < LONGEST_M or one.sigma_m > LONGEST_M:
+        raise StepInputError(
+            f"{kind} {values}: range_m must be positive, it and sigma_m below {LONGEST_M:g}"
+        )
     return one
 
 

@@ -6,6 +6,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -115,6 +116,7 @@ REFUSED: dict[str, Callable[[Slam, int], object]] = {
     ),
     "unknown radar": lambda s, t: s.step(t, P, frames=[replace(FRAME, radar=2, t_ns=t)]),
     "two frames": lambda s, t: s.step(t, P, frames=[*frames(t // T), *frames(t // T)]),
+    "range of a huge deviation": lambda s, t: s.step(t, P, ranges=[(0, 1.0, 1e200)]),
     "frame again": lambda s, t: s.step(t, P, frames=frames(t // T - 1)),
     "frame too new": lambda s, t: s.step(t, P, frames=frames(t // T, (0, T))),
     "frame older than odometry": lambda s, t: s.step(t, P, frames=frames(t // T, (0, -99 * T))),
@@ -285,6 +287,45 @@ def test_a_mount_that_measures_no_more_is_waited_for_once() -> None:
     # A range waits for a second.
     assert n_states(20 * half, 0) == 0
     assert [n_states(20 * half + 250_000_000 * k) for k in range(1, 5)] == [0, 0, 0, 1]
+
+
+def test_one_late_stamp_does_not_throw_the_robot_forward() -> None:
+    """A pose that is stamped 60 us before the next one makes no velocity of hundreds of m/s."""
+    slam = Slam(RIG)
+    for k in range(20):
+        t_ns = k * 50_000_000
+        late_ns = 49_940_000 if k == 18 else 0
+        slam.add_odometry(t_ns + late_ns, drive(t_ns))
+    t_ns = 19 * 50_000_000 + 90_000_000
+    slam.step(0)
+    assert slam.step(t_ns).pose == pytest.approx(drive(t_ns), abs=1e-9)
+
+
+def test_what_was_seen_while_the_robot_drove_unseen_is_refused() -> None:
+    """No pose came for 1.1 s; a robot that stood meanwhile is where it was."""
+    for way_m, is_refused in ((0.5, True), (0.0, False)):
+        slam = Slam(RIG, front_end=Rod())
+        slam.add_odometry(0, (0.0, 0.0, 0.0))
+        slam.add_odometry(1_100_000_000, (way_m, 0.0, 0.0))
+        slam.step(0)
+        frame = replace(FRAME, t_ns=500_000_000)
+        with (
+            pytest.raises(StepInputError, match="the robot drove") if is_refused else nullcontext()
+        ):
+            slam.step(1_100_000_000, frames=[frame])
+        assert slam.step(1_100_000_000).pose == pytest.approx([way_m, 0.0, 0.0], abs=1e-9)
+
+
+def test_what_is_no_radian_no_rig_or_no_noise_says_so() -> None:
+    with pytest.raises(ValueError, match=r"math\.radians"):
+        Rig([Mount(x_m=0.0, y_m=0.2, yaw_rad=90.0)])
+    with pytest.raises(ValueError, match=r"start.*radians"):
+        Slam(RIG, start=(0.0, 0.0, 90.0))
+    with pytest.raises(ValueError, match="load_rig"):
+        Slam("robot.toml")  # type: ignore[arg-type]  # wrong on purpose
+    for wrong in (math.nan, math.inf, -0.01):
+        with pytest.raises(ValueError, match="wheels: scale_sigma is"):
+            WheelNoise(scale_sigma=wrong)
 
 
 def test_a_restarted_source_of_odometry_changes_nothing() -> None:
