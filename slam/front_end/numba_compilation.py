@@ -45,9 +45,9 @@ class _Kernel:
         vectorise = numba.config.LOOP_VECTORIZE
         numba.config.LOOP_VECTORIZE = vectorise if self._has_long_loops else 0
         try:
-            kept = numba.njit(cache=True, error_model="numpy")(bound)
+            kept = numba.njit(cache=True, error_model="numpy", nogil=True)(bound)
         except RuntimeError:  # no folder can be written
-            kept = numba.njit(error_model="numpy")(bound)
+            kept = numba.njit(error_model="numpy", nogil=True)(bound)
         try:
             kept.compile(self._signature)
         finally:

@@ -448,12 +448,18 @@ class RobustBackEnd:
         self._log.set_causal(state.pose)
 
     def update(
-        self, scans: Sequence[RangeScan], *, solve: bool = True, decide: bool = True
+        self,
+        scans: Sequence[RangeScan],
+        *,
+        solve: bool = True,
+        decide: bool = True,
+        may_wait: bool = False,
     ) -> UpdateReport:
         """Take in the scans of one time; a radar without a frame is absent, not empty.
 
         Without ``solve`` merges and the solution over all poses wait for a later time. With
-        ``decide`` what is unclear is taken for the likeliest; without it, questions stay open.
+        ``decide`` what is unclear is taken for the likeliest; without it, questions stay open. With
+        ``may_wait`` the solution of a long run is left to the caller (``awaits_solution``).
         """
         patches = [scan for scan in scans if scan.is_patch]
         scans = [scan for scan in scans if not scan.is_patch]
@@ -497,7 +503,8 @@ class RobustBackEnd:
         if solve:
             self._initialise_beacons()
             self._merge()
-            if is_due(self._log, self.state, self.parameters):
+            may_wait = may_wait and self._is_long
+            if not may_wait and is_due(self._log, self.state, self.parameters):
                 self.relinearise()
         if decide:
             self._decide()
@@ -517,6 +524,20 @@ class RobustBackEnd:
         """Take what is unclear for the likeliest."""
         while (question := self.question()) is not None:
             self.answer(question, question.options[0])
+
+    @property
+    def _is_long(self) -> bool:
+        return self._log.n_poses > self.parameters.relinearisation.most_at_once
+
+    @property
+    def awaits_solution(self) -> bool:
+        """Return whether the whole run should be solved for, which takes long."""
+        return self._is_long and is_due(self._log, self.state, self.parameters)
+
+    @property
+    def since_solved(self) -> int:
+        """Return how many steps ago the whole run was solved for, or that was tried."""
+        return self._log.since_solved
 
     def relinearise(self) -> bool:
         """Solve for all poses and replace the belief; return whether that worked."""

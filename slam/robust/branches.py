@@ -44,6 +44,9 @@ merged, a loop is closed.
 
 While nothing is suspicious that costs a copy of the back end now and then.
 
+A long run is solved for by a copy of the back end in a thread of its own, beside some scans. It
+takes these afterwards, and is the main back end from then on.
+
 ``Hypotheses`` are for detections with bearings: where it is unclear which landmark a tentative one
 is, every option is followed by a back end of its own (D. B. Reid, "An Algorithm for Tracking
 Multiple Targets", IEEE Transactions on Automatic Control 24(6), 1979).
@@ -53,6 +56,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -83,6 +87,9 @@ from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
 _IDS_APART = 1000
+
+# One for all runs of the process
+_SOLVER = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slam-solver")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -305,6 +312,21 @@ class Alternative:
             self.next_step = number + 1
 
 
+def _solved(back_end: RobustBackEnd) -> RobustBackEnd:
+    back_end.relinearise()
+    return back_end
+
+
+@dataclass(slots=True, kw_only=True)
+class Solving:
+    """A long run that is being solved for."""
+
+    main: RobustBackEnd  # which goes on meanwhile
+    since: int  # the step after those that are solved for
+    solution: Future[RobustBackEnd]
+    solved: Alternative | None = None  # which takes the steps since
+
+
 @dataclass(slots=True, kw_only=True)
 class Carry:
     """The question whether the robot was carried before a step, and to which place."""
@@ -357,6 +379,8 @@ class Branches:
         self._judged = 0  # the evidence of the steps before it has been judged
         self._recognised_ids: set[int] = set()  # new landmarks that were searched for
         self._doubts: list[Doubt] = []
+        self._solution_rule = parameters.relinearisation
+        self._solving: Solving | None = None
         self.is_lost = False
         if saved is not None and start is None:
             self._begin_lost(saved)
@@ -427,7 +451,7 @@ class Branches:
             )
             carry_nats -= self._shown(before, after, self._increment)
         position_m = self.main.state.position_m.copy()
-        report = self.main.update(scans)
+        report = self.main.update(scans, may_wait=True)
         step = Step(
             increment=self._increment,
             scans=scans,
@@ -440,12 +464,36 @@ class Branches:
         self._steps[self._now] = step
         self._doubt(step, report, position_m)
         self._now += 1
+        self._solve_beside()
         was_lost = self.is_lost
         moved = self._carry is not None and self._decide(self._carry)
         if self._now % self._look_every == 0:
             self._look()
         carried = (moved or self.is_lost) and not was_lost
         return replace(report, carried=carried, lost=self.is_lost)
+
+    def _solve_beside(self) -> None:
+        """Begin to solve for a long run beside the scans, or adopt what was begun.
+
+        That is at a scan that is fixed beforehand, so a replay does the same. A solution is dropped
+        if the main back end was solved for, or replaced, meanwhile.
+        """
+        solving, rule = self._solving, self._solution_rule
+        if solving is not None:
+            age = self._now - solving.since
+            if solving.main is not self.main or self.main.since_solved < age:
+                self._solving = None
+            elif age >= rule.adopted_after:
+                if solving.solved is None:
+                    solving.solved = Alternative(solving.solution.result(), solving.since - 1)
+                    solving.solved.next_step = solving.since
+                solved, end = solving.solved, solving.solved.next_step + self._rule.catch_up
+                solved.take(self._steps, min(end, self._now))
+                if solved.next_step == self._now:
+                    self.main, self._solving = solved.back_end, None
+        elif self.main.awaits_solution:
+            solution = _SOLVER.submit(_solved, self.main.copy())
+            self._solving = Solving(main=self.main, since=self._now, solution=solution)
 
     def _doubt(self, step: Step, report: UpdateReport, position_m: Array) -> None:
         """Keep the doubt whether the robot was carried, until the pose is confirmed."""

@@ -242,6 +242,10 @@ class RelinearisationRule:
     """Most scans between two solutions, at the beginning of a run."""
     run_share: Annotated[float, Origin.BUDGET] = 0.1
     """Later, most scans as a share of the run: so all solutions cost in proportion to it."""
+    most_at_once: Annotated[int, Origin.BUDGET, "scans"] = 2000
+    """A longer run is solved for beside the scans that follow."""
+    adopted_after: Annotated[int, Origin.BUDGET, "scans"] = 20
+    """After how many of them its solution is adopted."""
     iterations: Annotated[int, Origin.BUDGET, "steps"] = 10
     """Most steps of one solution."""
     outlier_sigmas: Annotated[float, Origin.QUANTILE] = 4.0

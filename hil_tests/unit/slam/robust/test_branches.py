@@ -259,6 +259,39 @@ def test_ranges_behind_a_stop_show_whether_the_robot_was_carried() -> None:
     assert discontinuity(before, [RangeScan(radar=1, ranges_m=(0.5,))], 0.03, noise) == 0.0
 
 
+def test_a_long_run_is_solved_for_beside_the_scans() -> None:
+    """What is adopted at a fixed scan is, to the last bit, a copy that was solved and caught up."""
+    rng, poses = np.random.default_rng(3), np.vstack([straight(75)] * 3)
+    increments = reported(poses, LAB, rng, 0.0)
+    scans = list(scans_of(poses, PLACES, rng, SIGMA_M))
+    parameters = parameters_for(LAB, SIGMA_M)
+    rule = replace(parameters.relinearisation, most_at_once=100, adopted_after=13)
+    branches = Branches(paper_rig(), replace(parameters, relinearisation=rule))
+    copies, adopted = dict[int, RobustBackEnd](), list[int]()
+    for k, (increment, seen) in enumerate(zip(increments, scans, strict=True), start=1):
+        before, was_solving = branches.main, branches._solving is not None
+        for copied in copies.values():
+            copied.predict(increment, elapsed_s=1.0)
+            copied.update(seen, solve=False)
+        branches.predict(increment)
+        branches.update(seen)
+        if branches.main is not before:
+            begun, solved = copies.popitem()
+            # It has caught up ten steps at a time.
+            assert k == begun + rule.adopted_after + 1
+            assert branches.main.pose.tobytes() == solved.pose.tobytes()
+            assert branches.main.pose_covariance.tobytes() == solved.pose_covariance.tobytes()
+            adopted.append(k)
+        elif was_solving and branches._solving is None:  # the main one was solved for meanwhile
+            copies.clear()
+        elif branches._solving is not None and not was_solving:
+            assert k >= rule.most_at_once
+            copies[k] = branches.main.copy()
+            copies[k].relinearise()
+    assert len(adopted) > 1
+    assert math.dist(branches.main.pose, poses[-1]) < 0.05
+
+
 @pytest.mark.parametrize(("stop", "n_before"), [(1, 0), (5, 0), (15, 2), (25, 4)])
 def test_a_doubt_on_too_few_landmarks_ends_with_three_newer_ones(stop: int, n_before: int) -> None:
     """A stop before the first drive is no doubt; three that were mapped by then are waited for."""
