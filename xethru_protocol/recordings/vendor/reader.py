@@ -19,6 +19,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -353,6 +354,12 @@ class _DataFileReader:
         smallest = kind.header.itemsize
         header = self._stream.read(smallest)
         size = kind.record_size(header) if len(header) == smallest else smallest
+        # after a loss of power; a record without elements is one where the index has it
+        if size == smallest != listed and (
+            self._data_end <= begin or self._data_end < begin + smallest < self.size
+        ):
+            self._cut(left)
+            return None
         following: int | None = None
         before, self._before = self._before, max(self._before, begin)
         if listed not in (None, size) and not self._is_record_at(begin + size, kind):
@@ -373,6 +380,18 @@ class _DataFileReader:
         self.report(f"a record is damaged: it claims {size} bytes", min(begin, following - 1))
         self.skip(following - begin)
         return None, None
+
+    @cached_property
+    def _data_end(self) -> int:
+        """From where on the file holds nothing but zeros."""
+        end = self.size
+        while end:
+            begin = max(end - _LARGEST_PLAUSIBLE_RECORD, 0)
+            self._stream.seek(begin)
+            if data := self._stream.read(end - begin).rstrip(b"\0"):
+                return begin + len(data)
+            end = begin
+        return 0
 
     def _is_record_at(self, at: int, kind: BinaryKind) -> bool:
         """Whether a plausible record stands at a place, or the file ends there."""
@@ -427,7 +446,7 @@ class _DataFileReader:
     def _continued(self) -> bytes:
         """Read the lines without a time stamp that follow: the text of the record has them."""
         begin = end = self._stream.tell()
-        while (line := self._stream.readline()) and not _STAMP.match(line):
+        while (line := self._stream.readline().rstrip(b"\0")) and not _STAMP.match(line):
             end += len(line)
         self._stream.seek(begin)
         return self._stream.read(end - begin)
@@ -436,7 +455,9 @@ class _DataFileReader:
         self.ended = True
         if left:
             self.faulty = True
-            self.report(f"the last record is cut: {left} bytes of it are there")
+            is_zero = self._data_end <= self.position
+            cut = f"the last record is cut: {left} bytes of it are there"
+            self.report(f"only zeros follow: {left} bytes" if is_zero else cut)
 
     def disagree(self, offset: int, reason: str) -> None:
         """Report the first place where the index and the file differ, which costs times."""

@@ -11,6 +11,7 @@ import tracemalloc
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 
@@ -103,6 +104,42 @@ def test_a_cut_record_is_reported_after_all_whole_ones(
     assert [(fault.file, fault.offset) for fault in faults] == [(file.name, offset)]
     with pytest.raises(RecordingError):
         list(read_recording(copy))
+
+
+EMPTY = m.DataFloat(info=0, values=np.empty(0, np.float32))  # 12 zeros in the file
+
+
+@pytest.mark.parametrize("zeros", [1, 13, 4092])
+@pytest.mark.parametrize("last", [frame(7), EMPTY, m.DataString(text="two\nlines")])
+def test_zeros_behind_the_last_record_are_no_records(
+    last: m.Response, zeros: int, tmp_path: Path
+) -> None:
+    """A file system leaves them after a loss of power."""
+    timed: list[tuple[m.Response, int | None]] = [(last, 0), (last, MS)]
+    write_recording(tmp_path, timed)
+    assert list(read_recording(tmp_path)) == timed
+    (file,) = tmp_path.glob("xethru_data*")
+    size = file.stat().st_size
+    os.truncate(file, size + zeros)
+    found, faults = read_with_faults(tmp_path)
+    assert found == timed
+    assert [(fault.offset, fault.minor) for fault in faults] == [(size, False)]
+
+
+@pytest.mark.parametrize("begin", [104 * 30, 104 * 30 + 3])
+@pytest.mark.parametrize("has_index", [True, False])
+def test_records_in_place_of_which_zeros_are_there_are_cut(
+    begin: int, has_index: bool, tmp_path: Path
+) -> None:
+    copy = copy_of("iq", tmp_path)
+    (file,) = copy.glob("xethru_baseband_iq_*")
+    os.truncate(file, begin)
+    os.truncate(file, 104 * 40)
+    if not has_index:
+        (copy / META).unlink()
+    found, faults = read_with_faults(copy)
+    assert len(found) == 30
+    assert [fault.offset for fault in faults if not fault.minor] == [104 * 30]
 
 
 @pytest.mark.parametrize(
