@@ -203,11 +203,7 @@ def raw_config(arguments: argparse.Namespace) -> "RawConfig | None":
     Ends the program on wrong usage.
     """
     if arguments.attach:
-        for option in ("frame_area", "fps", "baseband"):
-            if getattr(arguments, option):
-                arguments.refuse(
-                    f"--attach changes nothing: leave --{option.replace('_', '-')} out"
-                )
+        refuse_raw_settings(arguments, "--attach changes nothing")
         return None
     from xethru_protocol.driver.link import RawConfig
 
@@ -215,6 +211,13 @@ def raw_config(arguments: argparse.Namespace) -> "RawConfig | None":
     if start_m >= end_m:
         arguments.refuse("argument --frame-area: START must be smaller than END")
     return RawConfig(frame_area_m=(start_m, end_m), downconversion=arguments.baseband)
+
+
+def refuse_raw_settings(arguments: argparse.Namespace, why: str) -> None:
+    """End the program if settings of raw radar frames are given."""
+    for option in ("frame_area", "fps", "baseband"):
+        if getattr(arguments, option):
+            arguments.refuse(f"{why}: leave --{option.replace('_', '-')} out")
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+from xethru_protocol.cli.arguments import refuse_raw_settings
 from xethru_protocol.cli.output import (
     CommandFailed,
     frame_timeout_s,
@@ -211,6 +212,9 @@ def _may_be_on(radar: X4M300, feature: OutputFeature) -> bool:
 def profile_of(arguments: Namespace) -> ProfileMode | None:
     """Return the profile to record, None for none; ends the program on wrong usage."""
     name = arguments.profile
+    if name != "raw":
+        is_set = "takes --zone, not raw settings" if name in PROFILES else "changes nothing"
+        refuse_raw_settings(arguments, f"--profile {name} {is_set}")
     if name not in PROFILES:
         for option in ("output", "zone", "sensitivity"):
             if getattr(arguments, option) is not None:
