@@ -300,6 +300,8 @@ def convert(arguments: Namespace) -> int:
     if not is_array_file(Path(source)):
         recording_facts(source)  # raises before anything is removed
     path = Path(target)
+    if _given(arguments) and suffix_of(path) not in SUFFIXES:
+        arguments.refuse(f"--frame-area and --frames are for {', '.join(SUFFIXES)}, not {target}")
     if is_part_of(Path(source), path):
         raise RecordingError(f"{source} cannot be converted into itself")
     progress = Progress("xethru convert")

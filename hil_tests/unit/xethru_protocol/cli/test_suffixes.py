@@ -34,6 +34,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (XETHRU, ["record", "--port", "p", "--out", "x.MCAP"]),
         (XETHRU, ["record", "--port", "p", "--wire", "x.mcap"]),
         (XETHRU, ["record", "--port", "p", "--wire", "x.dat"]),
+        (XETHRU, ["convert", "rec", "x.mcap", "--frame-area", "1", "2"]),
+        (XETHRU, ["convert", "rec", "x", "--frames", "rf"]),
         (XETHRU, ["export", "wireshark", "--out", "x.ksy"]),
         (XETHRU, ["export", "kaitai", "--out", "x.lua"]),
         (EMULATOR, ["proxy", "--port", "p", "--wire", "x.pcap"]),
