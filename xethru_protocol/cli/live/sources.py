@@ -92,6 +92,8 @@ def open_source(arguments: Namespace) -> Iterator[FrameSource]:
         arguments.refuse(f"--port {arguments.port} or {arguments.recording}, not both")
     if arguments.recording is not None and arguments.attach:
         arguments.refuse("--attach is for the --port of a module")
+    if arguments.port is not None and (arguments.radar is not None or arguments.rate != 1):
+        arguments.refuse("--radar and --rate are for a recording")
     if arguments.recording is not None:
         source = _recorded(arguments)
         yield source

@@ -315,6 +315,8 @@ def test_a_terminal_is_drawn_in_place(at_rest: Path) -> None:
         (["rec", "--window", "5"], '"5" must be seconds, from 20 to 600'),
         (["rec", "--clutter", "median"], "invalid choice"),
         (["--port", "p", "--frame-area", "5", "1"], "START must be smaller than END"),
+        (["--port", "p", "--radar", "left"], "--radar and --rate are for a recording"),
+        (["--port", "p", "--rate", "2"], "--radar and --rate are for a recording"),
     ],
 )
 def test_wrong_usage(options: list[str], part: str, capsys: Capture) -> None:
