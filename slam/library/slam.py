@@ -202,6 +202,7 @@ class Slam:
             self.config, rig, self._wheels, front_end, noise_at=noise_at, on_map=on_map
         )
         self._threads = ThreadpoolController()
+        self._limiter: Any = None  # while a solver needs it
         self._odometry = PoseTrack()
         self._newest: dict[int, tuple[int, int]] = {}  # stream and counter, by radar
         # By mount, ranges that wait for those of the others, and the mounts of the newest step that
@@ -291,8 +292,15 @@ class Slam:
         poses = {stamp: _pose(pose_at(stamp), f"odometry at {stamp} ns") for stamp in stamps_ns}
         if self._noise_at is not None:
             self._noise_now = _later_noise(self._noise_at(t_ns), self._noise, t_ns)
-        with self._threads.limit(limits=1):  # the same bits on every machine
+        # One thread of BLAS gives the same bits on every machine, also to what solves meanwhile.
+        limiter = self._limiter or self._threads.limit(limits=1)
+        try:
             results = self._gathered(taken, scans, poses, t_ns)
+        finally:
+            is_solving = isinstance(self._pipeline, RobustSlam) and self._pipeline.is_solving
+            self._limiter = limiter if is_solving else None
+            if not is_solving:
+                limiter.restore_original_limits()
         track.forget_before(t_ns - _KEPT_NS)
         self._odometry, self._noise = track, self._noise_now
         self._newest |= {frame.radar: (frame.stream, frame.counter) for frame in taken}

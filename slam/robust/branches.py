@@ -391,6 +391,11 @@ class Branches:
         return self._carry.map if self.is_lost and self._carry is not None else self.main
 
     @property
+    def is_solving(self) -> bool:
+        """Return whether another thread may be solving for the whole run."""
+        return self._solving is not None
+
+    @property
     def is_unplaced(self) -> bool:
         """Return whether the robot began on a map, and has not found its place there yet."""
         return self.is_lost and self._carry is not None and self._carry.is_start
@@ -490,6 +495,8 @@ class Branches:
                 solved, end = solving.solved, solving.solved.next_step + self._rule.catch_up
                 solved.take(self._steps, min(end, self._now))
                 if solved.next_step == self._now:
+                    state = solved.back_end.state
+                    state.next_id = max(state.next_id, self.main.state.next_id)
                     self.main, self._solving = solved.back_end, None
         elif self.main.awaits_solution:
             solution = _SOLVER.submit(_solved, self.main.copy())

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import slam as library
 from slam import (
@@ -35,6 +36,7 @@ from slam import (
     override,
 )
 from slam.geometry import between, compose, transform
+from slam.robust.pipeline import RobustSlam
 
 TICK_NS = 200_000_000
 RIG = Rig([Mount(x_m=x_m, y_m=0.2, yaw_rad=math.pi / 2) for x_m in (-0.1, 0.1)])
@@ -287,6 +289,22 @@ def test_a_mount_that_measures_no_more_is_waited_for_once() -> None:
     # A range waits for a second.
     assert n_states(20 * half, 0) == 0
     assert [n_states(20 * half + 250_000_000 * k) for k in range(1, 5)] == [0, 0, 0, 1]
+
+
+def test_blas_has_one_thread_for_as_long_as_something_is_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def n_threads() -> set[int]:
+        return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+    solving, seen, slam = [True, True, False], list[set[int]](), Slam(RIG)
+    monkeypatch.setattr(RobustSlam, "is_solving", property(lambda _: solving[len(seen)]))
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = n_threads()
+        for number in range(3):
+            slam.step(number * TICK_NS, drive(number * TICK_NS))
+            seen.append(n_threads())
+    assert seen == [{1}, {1}, before]
 
 
 def test_one_late_stamp_does_not_throw_the_robot_forward() -> None:
