@@ -230,6 +230,11 @@ def path_of(
     elif name == "smoothed" and smoothed is not None:
         t_ns, poses = smoothed.t_ns, smoothed.poses
     elif name == "estimate" and len(states):
+        if states.lost.all():
+            raise NoImageError(
+                "the robot was lost all the time, so path estimate has no pose; take `uwb-slam "
+                "image --path odometry`"
+            )
         t_ns, poses, wheels = states.t_ns, states.estimate, odometry
         t_ns, poses = t_ns[~states.lost], poses[~states.lost]
     else:

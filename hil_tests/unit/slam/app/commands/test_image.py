@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,11 @@ from emulator.scene.scene import load_scene
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import odometry, run, session_info
 from slam.app.cli import main
+from slam.app.commands.demo import write_image
 from slam.app.rig.emulated import rig_of, wheels_of
 from slam.app.run.radar_image import RollingImage
-from slam.app.run.runner import execute
+from slam.app.run.replay import play_states
+from slam.app.run.runner import RunRecord, execute
 from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import loopback_source
 from slam.config import load_preset
@@ -29,6 +31,7 @@ from slam.library.slam import make_slam
 from slam.live.odometry_track import OdometryTrack, Trajectory, write_tum
 from slam.live.session.reader import open_session
 from slam.live.session_records import RadarImage, Scan, SessionObserver, Snapshot
+from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.processing.downconversion import downconvert, line_bins
 
 RODS = np.array([[0.1, 0.9], [0.5, 1.3], [0.0, -1.0], [0.45, -0.8], [0.9, 0.8]])
@@ -63,6 +66,14 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     truth = folder / "truth.tum"
     write_tum(truth, Trajectory(stamps_ns=stamps_ns, poses=trajectory.poses(stamps_ns)))
     return Drive(folder=folder, truth=truth)
+
+
+def lost_until(drive: Drive, state: int | None) -> RunRecord:
+    """Return the record of a drive as of a robot that was lost until a state, or all the time."""
+    record = play_states(open_session(drive.session), [], StopFlag())
+    lost = np.zeros(len(record.states), dtype=bool)
+    lost[:state] = True
+    return replace(record, smoothed=None, states=replace(record.states, lost=lost))
 
 
 def brightest_m(
@@ -261,6 +272,22 @@ class TestErrors:
             )
             assert (code, printed) == (1, "")
             assert "empty.mcap" in errors
+
+    def test_a_robot_that_was_lost_all_the_time(
+        self,
+        drive: Drive,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        record = lost_until(drive, None)
+        monkeypatch.setattr("slam.app.commands.image.play_states", lambda *_: record)
+        code, printed, errors = run(capsys, "image", drive.folder, "--out", tmp_path / "out")
+        assert (code, printed, errors.count("\n")) == (1, "", 1)
+        assert "lost all the time" in errors
+        write_image(drive.folder, record, open_session(drive.session).odometry())  # of demo
+        assert "lost all the time" in capsys.readouterr().err
+        assert not (drive.folder / "image.png").exists()
 
     def test_a_recording_needs_a_path_and_a_mount(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
