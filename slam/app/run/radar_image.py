@@ -210,8 +210,9 @@ def path_of(
 ) -> ImagePath:
     """Return a path of a run by name: smoothed, estimate or odometry; None: the first that it has.
 
-    In the frame of the world where that is known, else of the map; the wheels' path begins where
-    the estimate does. NoImageError if there is no such path.
+    In the frame of the world where that is known, else of the map. The wheels' path is laid on the
+    first state that is not lost, and stays in their own frame if there is none. NoImageError if
+    there is no such path.
     """
     states, smoothed = record.states, record.smoothed
     name = name or ("smoothed" if smoothed else "estimate" if len(states) else "odometry")
@@ -222,11 +223,11 @@ def path_of(
     if name == "odometry":
         t_ns = np.array([sample.t_ns for sample in odometry])
         poses = np.array([odometry.pose_at(at_ns) for at_ns in t_ns.tolist()])
-        if len(states):
-            begin = between(states.odometry[0], np.zeros(3))
-            place = compose(place, compose(states.estimate[0], begin))
+        if len(found := np.flatnonzero(~states.lost)):
+            begin = between(states.odometry[found[0]], np.zeros(3))
+            place = compose(place, compose(states.estimate[found[0]], begin))
         else:
-            frame = "odom"
+            place, frame = np.zeros(3), "odom"
     elif name == "smoothed" and smoothed is not None:
         t_ns, poses = smoothed.t_ns, smoothed.poses
     elif name == "estimate" and len(states):

@@ -21,12 +21,13 @@ from hil_tests.unit.slam.app.sessions import odometry, run, session_info
 from slam.app.cli import main
 from slam.app.commands.demo import write_image
 from slam.app.rig.emulated import rig_of, wheels_of
-from slam.app.run.radar_image import RollingImage
+from slam.app.run.radar_image import RollingImage, path_of
 from slam.app.run.replay import play_states
 from slam.app.run.runner import RunRecord, execute
 from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import loopback_source
 from slam.config import load_preset
+from slam.geometry import compose
 from slam.library.slam import make_slam
 from slam.live.odometry_track import OdometryTrack, Trajectory, write_tum
 from slam.live.session.reader import open_session
@@ -71,9 +72,15 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 def lost_until(drive: Drive, state: int | None) -> RunRecord:
     """Return the record of a drive as of a robot that was lost until a state, or all the time."""
     record = play_states(open_session(drive.session), [], StopFlag())
-    lost = np.zeros(len(record.states), dtype=bool)
-    lost[:state] = True
-    return replace(record, smoothed=None, states=replace(record.states, lost=lost))
+    assert record.last is not None
+    lost, estimate = np.zeros(len(record.states), dtype=bool), record.states.estimate.copy()
+    lost[:state], estimate[:state] = True, 9.0  # a guess
+    return replace(
+        record,
+        smoothed=None,
+        states=replace(record.states, lost=lost, estimate=estimate),
+        last=replace(record.last, world_from_map=np.array([1.0, 2.0, 0.5])),
+    )
 
 
 def brightest_m(
@@ -121,6 +128,18 @@ def test_other_paths_show_the_same_rods(
     assert run(capsys, "image", drive.folder, "--path", given, "--out", tmp_path)[0] == 0
     for rod in SEEN:
         assert np.abs(brightest_m(tmp_path, rod) - rod).max() < 0.06
+
+
+def test_the_path_of_wheels_is_laid_on_the_first_pose_that_was_found(drive: Drive) -> None:
+    session = open_session(drive.session)
+    record = lost_until(drive, 5)
+    path = path_of(record, session.odometry(), session.info, "odometry")
+    assert path.frame == "world"
+    expected = compose(record.world_from_map, record.states.estimate[5])
+    np.testing.assert_allclose(path.place_at(int(record.states.t_ns[5])), expected, atol=1e-9)
+    path = path_of(lost_until(drive, None), session.odometry(), session.info, "odometry")
+    assert path.frame == "odom"
+    np.testing.assert_array_equal(path.poses[0], session.odometry().pose_at(int(path.t_ns[0])))
 
 
 def test_the_map_of_nav2_has_the_image_as_its_server_reads_it(made: Path) -> None:
