@@ -98,6 +98,18 @@ class RigWheels(_RigTable):
     turn_scale_sigma: _Sigma = WheelNoise().turn_scale_sigma
     curvature_sigma_rad_per_m: _Sigma = WheelNoise().curvature_sigma_rad_per_m
 
+    @classmethod
+    def of(cls, noise: WheelNoise) -> Self:
+        return cls(
+            along_sigma_m_per_sqrt_m=noise.along_m_per_sqrt_m,
+            across_sigma_m_per_sqrt_m=noise.across_m_per_sqrt_m,
+            heading_sigma_rad_per_sqrt_m=noise.heading_rad_per_sqrt_m,
+            heading_sigma_rad_per_rad=noise.heading_rad_per_rad,
+            scale_sigma=noise.scale_sigma,
+            turn_scale_sigma=noise.turn_scale_sigma,
+            curvature_sigma_rad_per_m=noise.curvature_sigma_rad_per_m,
+        )
+
     @property
     def noise(self) -> WheelNoise:
         return WheelNoise(

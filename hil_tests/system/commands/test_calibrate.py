@@ -1,13 +1,17 @@
 """`uwb-slam calibrate` on what `uwb-slam demo` records: planted offsets come back."""
 
 import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 
 from hil_tests.paths import FIXTURES
+from hil_tests.unit.slam.app.sessions import odometry, session_info, write_session
 from slam.app.cli import main
 from slam.app.rig.rig_files import load_rig
+from slam.config import WheelNoise
+from slam.library.rig_files import RigPulse
 
 SCENES = FIXTURES / "scenes"
 
@@ -25,6 +29,31 @@ def short_drive(folder: Path) -> str:
     path = folder / "short.toml"
     path.write_text(text)
     return str(path)
+
+
+def test_what_a_drive_does_not_determine_stays_as_it_was(tmp_path: Path) -> None:
+    """Frames of noise determine nothing."""
+    info, wheels = session_info(), WheelNoise(scale_sigma=0.02, heading_rad_per_sqrt_m=0.003)
+    pulse = RigPulse(
+        step_m=0.0388,
+        relative_error=0.02,
+        real=(0.0, 0.4, 1.0, 0.5, 0.1),
+        imaginary=(0.0, -0.1, 0.0, 0.2, 0.0),
+    )
+    radars = tuple(
+        replace(radar, serial=f"{index:012}", range_offset_m=0.01, gain_db=gain_db, pulse=received)
+        for index, (radar, gain_db, received) in enumerate(
+            zip(info.radars, (1.5, -1.5), (pulse.received, None), strict=True)
+        )
+    )
+    known = replace(info, radars=radars, wheels=asdict(wheels))
+    session = write_session(tmp_path / "s.mcap", 6, odometry(8), known)
+    assert main(["calibrate", str(session), "--rig", str(tmp_path / "rig.toml")]) == 0
+    found = load_rig(tmp_path / "rig.toml")
+    assert found.wheels.noise == wheels
+    assert [radar.gain_db for radar in found.radars] == [1.5, -1.5]
+    assert [radar.pulse for radar in found.radars] == [pulse, None]
+    assert [radar.range_offset_m for radar in found.radars] == [0.01, 0.01]
 
 
 @pytest.mark.rare

@@ -33,11 +33,10 @@ from slam.frames import Detection, RadarFrame
 from slam.front_end.matched_filter import MatchedFilterDetector
 from slam.front_end.pulse_estimation import PulseEstimator
 from slam.geometry import Rig
-from slam.library.rig_files import RigFile, RigRadar
+from slam.library.rig_files import RigFile, RigRadar, RigWheels
 from slam.live.errors import AppError
 from slam.live.odometry_track import OdometryTrack, TumSample
 from slam.live.session.reader import RecordedSession, open_session
-from slam.live.session_records import SessionInfo
 from xethru_protocol.operating_system import StopFlag, json_text, one_line, read_bounded
 from xethru_protocol.transport import is_network_port
 
@@ -91,7 +90,7 @@ def run_calibrate(
     planted = _planted(report.drive.rig, scene)
     try:
         if rig is not None:
-            write_rig(rig, _rig_file(recorded.info, report))
+            write_rig(rig, _rig_file(recorded, report))
     finally:  # behind the file, which no output can cost; and also if it cannot be written
         if as_json:
             print_text(json_text(_facts(report, planted), indent=2, allow_nan=False))
@@ -101,7 +100,7 @@ def run_calibrate(
 
 def _detector_of(session: RecordedSession, stop: StopFlag) -> MatchedFilterDetector:
     """Return a detector that has estimated the modules' pulses from all frames of a session."""
-    detector = MatchedFilterDetector(_FRONT_END)
+    detector = MatchedFilterDetector(_FRONT_END, [mount.pulse for mount in session.rig.mounts])
     for record in session.records():
         if isinstance(record, RadarFrame):
             stop.check()
@@ -189,11 +188,11 @@ def _is_number(value: object) -> bool:
     return math.isfinite(value)
 
 
-def _rig_file(info: SessionInfo, report: _CalibrationReport) -> RigFile:
-    """Return the calibrated rig as a file; what the drive does not determine stays nominal."""
+def _rig_file(session: RecordedSession, report: _CalibrationReport) -> RigFile:
+    """Return the calibrated rig as a file; what the drive does not determine stays as it was."""
     is_known = report.calibration.offset_sigmas_m <= OFFSET_LIMIT_M
     radars = []
-    for index, radar in enumerate(info.radars):
+    for index, radar in enumerate(session.info.radars):
         shift = report.calibration.mount_shifts_m[index] if is_known[index] else np.zeros(2)
         pulse = report.pulses.pulse(index)
         has_gain = report.gains.gain_sigmas_db[index] <= _GAIN_LIMIT_DB
@@ -208,12 +207,13 @@ def _rig_file(info: SessionInfo, report: _CalibrationReport) -> RigFile:
                 if is_known[index]
                 else radar.range_offset_m,
                 phase_offset_deg=math.degrees(radar.phase_offset_rad),
-                gain_db=float(report.gains.gains_db[index]) if has_gain else 0.0,
+                gain_db=float(report.gains.gains_db[index]) if has_gain else radar.gain_db,
                 port=radar.port if is_network_port(radar.port) else None,
                 pulse=None if pulse is None else rounded_pulse(pulse),
             )
         )
-    return RigFile(radars=tuple(radars))
+    wheels = RigWheels.of(session.wheels) if session.info.wheels else RigWheels()
+    return RigFile(radars=tuple(radars), wheels=wheels)
 
 
 def _check_rig_place(rig: Path, session: Path) -> None:
