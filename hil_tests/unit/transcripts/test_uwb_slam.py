@@ -105,6 +105,7 @@ TABLES: dict[str, dict[str, object]] = {
     "not_finite": AUTHORS | {"obsRHS": np.full((STATES, 5, 2), np.nan)},
     "cube": AUTHORS | {"R2": np.zeros((STATES, 5, 2))},
     "standstill": AUTHORS | {"t": np.zeros((STATES, 1))},
+    "no_length": AUTHORS | {"bins": np.zeros((4, 2))},
     "words": AUTHORS | {"odom": "text"},
 }
 

@@ -10,10 +10,12 @@ obsRHS  (n, m, 2)        origin and counter-clockwise from forward; of the right
 R1..R4  (n, n_bins)      raw frames of the four radars; rows of zeros are missing
 ======  ===============  ========================================================================
 
-Two more variables, which their programs ignore and ours write::
+Three more variables, which their programs ignore and ours write::
 
     t       (n, 1)   session time of the state [s]
     mounts  (4, 3)   of the radars: x, y [mm], boresight [rad], body frame
+    bins    (4, 2)   of the radars: range of the first bin, and length of one [mm], without what the
+                     module measures too long
 
 Their fixes are points; SLAM here takes ranges. A fix determines the two ranges it is made of, since
 it is where the circles around the two radars of its side meet. A session gets these ranges, each
@@ -48,6 +50,7 @@ from slam.live.session_records import RadarInfo, Scan
 from slam.paper.trilateration import Trilaterator
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.validation import reason_of
+from xethru_protocol.wire.x4 import TRUE_PER_MODULE_METRE
 
 _MM = 1e-3
 _POSE_UNITS = np.array([_MM, _MM, 1.0])
@@ -73,6 +76,9 @@ class MatDrive:
         Shape (n,), ascending; None if not in the file.
     mounts
         Shape (4, 3): x [m], y [m], boresight [rad], body frame; None if not in the file.
+    bins_m
+        Shape (4, 2): range of the first bin and length of one, true metres; None if not in the
+        file.
     """
 
     odometry: Array
@@ -81,6 +87,7 @@ class MatDrive:
     frames: dict[int, NDArray[np.float32]]
     stamps_s: Array | None = None
     mounts: Array | None = None
+    bins_m: Array | None = None
 
 
 def read_mat(path: Path) -> MatDrive:
@@ -114,9 +121,13 @@ def read_mat(path: Path) -> MatDrive:
     if stamps_s is not None and not np.all(np.diff(stamps_s) > 0):
         raise AppError(f"{path}: t must go forward from state to state")
     mounts = _variable(path, table, "mounts", (3,), 4) if "mounts" in table else None
+    bins = _variable(path, table, "bins", (2,), 4) if "bins" in table else None
+    if bins is not None and not np.all(bins[:, 1] > 0):
+        raise AppError(f"{path}: bins must have a length above zero")
     return MatDrive(
         stamps_s=stamps_s,
         mounts=None if mounts is None else mounts * _POSE_UNITS,
+        bins_m=None if bins is None else bins * _MM,
         odometry=odometry * _POSE_UNITS,
         left=tuple(map(_points_of, left)),
         right=tuple(map(_points_of, right)),
@@ -136,6 +147,8 @@ def write_mat(path: Path, drive: MatDrive) -> None:
         table["t"] = drive.stamps_s[:, np.newaxis]
     if drive.mounts is not None:
         table["mounts"] = drive.mounts / _POSE_UNITS
+    if drive.bins_m is not None:
+        table["bins"] = drive.bins_m / _MM
     with naming(path):
         path.open("wb").close()  # savemat's own error would not name the reason
         savemat(path, table, appendmat=False, do_compression=True)
@@ -226,16 +239,21 @@ def convert_mat(
         stamps_ns = [round(row * NS_PER_S / rate_hz) for row in range(len(drive.odometry))]
     else:
         stamps_ns = [round(stamp_s * NS_PER_S) for stamp_s in drive.stamps_s.tolist()]
+    bins_m = np.array([(0.0, _BIN_M)] * 4)
+    if drive.bins_m is not None:
+        bins_m = drive.bins_m / TRUE_PER_MODULE_METRE
     radars = tuple(
         imported_radar(
             # whatever a module measures too long, it is in the fixes already
             replace(mount, range_offset_m=0.0),
-            range_start_m=0.0,
-            bin_length_m=_BIN_M,
+            range_start_m=start_m,
+            bin_length_m=length_m,
             n_bins=drive.frames[number].shape[1] if number in drive.frames else 0,
             rate_hz=rate_hz,
         )
-        for number, mount in enumerate(rig.mounts, start=1)
+        for number, mount, (start_m, length_m) in zip(
+            _RADARS, rig.mounts, bins_m.tolist(), strict=True
+        )
     )
     info = imported_info(mat, radars, preset, time_base="states", has_detections=True)
     poses = [
@@ -320,6 +338,9 @@ def write_detections(
         frames={number: np.array(rows) for number, rows in frames.items()},
         stamps_s=np.array(stamps_s),
         mounts=np.array([(mount.x_m, mount.y_m, mount.yaw_rad) for mount in rig.mounts]),
+        bins_m=TRUE_PER_MODULE_METRE
+        * np.array([(radar.range_start_m, radar.bin_length_m) for radar in session.info.radars])
+        - [(mount.range_offset_m, 0.0) for mount in rig.mounts],
     )
     write_mat(out, drive)
     n_fixes = sum(map(len, drive.left)) + sum(map(len, drive.right))

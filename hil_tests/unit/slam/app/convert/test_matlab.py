@@ -189,6 +189,23 @@ def test_a_session_as_such_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert drive.frames[2][row].tolist() == scan(counter, 4).frames[1].samples.tolist()
 
 
+def test_frames_come_back_at_their_ranges(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = four_radars()
+    radars = [replace(each, range_offset_m=0.01 * k) for k, each in enumerate(info.radars)]
+    known = replace(info, radars=tuple(radars))
+    track = OdometryTrack.from_lines([format_tum_line(scan(0).t_ns, np.zeros(3))])
+    session = write_scans(tmp_path / "s.mcap", [scan(0, 4)], track, known)
+    assert run(capsys, "convert", session, tmp_path / "a.mat")[0] == 0
+    assert run(capsys, "convert", tmp_path / "a.mat", tmp_path / "again.mcap")[0] == 0
+    before, after = (open_session(tmp_path / name) for name in ("s.mcap", "again.mcap"))
+    for one, other in zip(before.frames(), after.frames(), strict=True):
+        offset_m = 0.01 * one.radar  # the mounts of a file have none
+        assert other.range_start_m == pytest.approx(one.range_start_m - offset_m, abs=1e-12)
+        assert other.bin_length_m == pytest.approx(one.bin_length_m, abs=1e-15)
+
+
 def test_a_file_that_cannot_be_written_says_why(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", authors_table())
     drive = read_mat(tmp_path / "a.mat")
