@@ -473,16 +473,14 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
     convert.add_argument(
         "--truth",
         dest="truth_topic",
-        default="/slam_out_pose",
         metavar="TOPIC",
-        help="default: %(default)s",
+        help="default: /slam_out_pose",
     )
     convert.add_argument(
         "--rate",
         dest="rate_hz",
         metavar="RATE",
         type=_count,
-        default=5,
         help="states/s of a .mat, which has no stamps (default: 5)",
     )
     convert.add_argument(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -55,6 +55,15 @@ def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: St
 
 _SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
 _OF_SESSION = (_MAT_SUFFIX, _WIRE_SUFFIX, ".bag")
+_USES = {
+    "to .mat": ("--preset",),
+    "to .xtwire": ("--radar",),
+    "to a bag": (),
+    "of a .mat": ("--preset", "--rig", "--rate"),
+    "of a bag": ("--preset", "--rig", "--frame-area", "--truth"),
+}
+"""The options of each conversion."""
+_RATE_HZ, _TRUTH_TOPIC = 5, "/slam_out_pose"
 _PRESET = "robust"
 _MAT_PRESET = "paper"  # such ranges are of its front end: they scatter by a bin, 7 mm
 
@@ -66,15 +75,17 @@ def run_convert(
     out: Path,
     rig: str | None,
     frame_area_m: Sequence[float] | None,
-    truth_topic: str,
-    rate_hz: int,
+    truth_topic: str | None,
+    rate_hz: int | None,
     preset: str | None,
     radar: str | None,
 ) -> None:
     """Convert a session to a bag or MATLAB file, or such a file to a session; names say which.
 
-    After an error, what was begun is removed.
+    Options that it does not use are refused. After an error, what was begun is removed.
     """
+    given: dict[str, object] = {"--preset": preset, "--rig": rig, "--rate": rate_hz}
+    given |= {"--radar": radar, "--frame-area": frame_area_m, "--truth": truth_topic}
     if out.exists():
         raise AppError(f"{out}: exists; choose another name")
     refuse_pipe(source)
@@ -87,6 +98,8 @@ def run_convert(
         )
     warnings: list[str] = []
     if is_session and out.suffix != _SESSION_SUFFIX:
+        known = out.suffix in (_MAT_SUFFIX, _WIRE_SUFFIX)
+        _refuse_unused(f"to {out.suffix}" if known else "to a bag", given)
         with _whole(out) as fresh:
             result = _from_session(open_session(source, stop), fresh, preset, radar, stop)
     elif out.suffix != _SESSION_SUFFIX:
@@ -100,13 +113,14 @@ def run_convert(
         )
     else:
         is_mat = source.suffix == _MAT_SUFFIX or begins_with(source, MAT_MAGIC)
+        _refuse_unused("of a .mat" if is_mat else "of a bag", given)
         name = preset or (_MAT_PRESET if is_mat else _PRESET)
         _config(name)  # reports a wrong name before anything is read
         given_rig = None if rig is None else load_rig(rig).rig
         with _whole(out) as fresh:
             if is_mat:
                 result = convert_mat(
-                    source, fresh, stop, preset=name, rig=given_rig, rate_hz=rate_hz
+                    source, fresh, stop, preset=name, rig=given_rig, rate_hz=rate_hz or _RATE_HZ
                 )
             else:
                 result, warnings = convert_bag(
@@ -116,11 +130,20 @@ def run_convert(
                     preset=name,
                     rig=given_rig or AUTHORS_RIG,
                     area_m=None if frame_area_m is None else (frame_area_m[0], frame_area_m[1]),
-                    truth_topic=truth_topic,
+                    truth_topic=_TRUTH_TOPIC if truth_topic is None else truth_topic,
                 )
     for line in warnings:
         note(f"{source}: {line}")
     print_text(result.replace(str(fresh), str(out)))
+
+
+def _refuse_unused(conversion: str, given: Mapping[str, object]) -> None:
+    for option, value in given.items():
+        if value is not None and option not in _USES[conversion]:
+            users = " or ".join(name for name, used in _USES.items() if option in used)
+            raise UsageError(
+                f"{option}: is for a conversion {users}, not {conversion}; leave it out"
+            )
 
 
 def _is_session(path: Path, stop: StopFlag) -> bool:

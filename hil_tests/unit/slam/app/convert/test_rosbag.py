@@ -154,6 +154,34 @@ def problem(capsys: pytest.CaptureFixture[str], bag: Path, *options: object, cod
     return err
 
 
+@pytest.mark.parametrize(
+    ("source", "out", "used"),
+    [
+        ("s.mcap", "a.mat", {"--preset"}),
+        ("s.mcap", "a.xtwire", {"--radar"}),
+        ("s.mcap", "a.bag", set()),
+        ("s.mcap", "a", set()),
+        ("a.mat", "b.mcap", {"--preset", "--rig", "--rate"}),
+        ("a.bag", "b.mcap", {"--preset", "--rig", "--frame-area", "--truth"}),
+    ],
+)
+def test_an_option_that_a_conversion_does_not_use_is_refused(
+    source: str, out: str, used: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    SessionLog(tmp_path / "s.mcap", session_info(), None).close()  # nothing else is there
+    for words in (
+        ("--preset", "paper"),
+        ("--rig", "lab"),
+        ("--rate", 5),
+        ("--radar", "radar0"),
+        ("--frame-area", 0.2, 9.4),
+        ("--truth", "/slam_out_pose"),
+    ):
+        code, _, err = run(capsys, "convert", tmp_path / source, tmp_path / out, *words)
+        assert code == (1 if words[0] in used else 2)
+        assert (words[0] in err) == (words[0] not in used)
+
+
 def test_another_frame_area(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = authors_bag(tmp_path / "short.bag", n_bins=500)
     assert run(capsys, "convert", short, tmp_path / "s.mcap", "--frame-area", 0.2, 3.41)[0] == 0
@@ -256,8 +284,8 @@ def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path
                 out=out,
                 rig=None,
                 frame_area_m=None,
-                truth_topic="/slam_out_pose",
-                rate_hz=5,
+                truth_topic=None,
+                rate_hz=None,
                 preset=None,
                 radar=None,
             )
