@@ -23,6 +23,7 @@ from emulator.scene.rooms import MOST_ROOMS, room_of
 from emulator.scene.scene import CarriedSpec, Scene
 from emulator.scene.toml_files import TableT, is_name
 from emulator.scene.wheels import scene_odometry
+from slam.app.errors import UsageError
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -320,6 +321,9 @@ def make_case(
 
 
 def first_laps(scene: Scene, count: int) -> Scene:
+    has = len(scene.path.laps)
+    if count > has:
+        raise UsageError(f"--laps {count}: scene {scene.name} has {has} laps; give {has} at most")
     path = scene.path.model_copy(update={"laps": scene.path.laps[:count]})
     return scene.model_copy(update={"path": path})
 

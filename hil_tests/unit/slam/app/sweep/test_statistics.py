@@ -93,6 +93,8 @@ def test_rooms_of_a_family_are_one_group() -> None:
     assert [case.seed for case in lab.with_seeds(3, 1000)] == [1000, 1001, 1002]
     assert lab.scene.path.laps == ("forward", "forward")
     with pytest.raises(UsageError):
+        make_case("lab", "paper", 0, laps=5)
+    with pytest.raises(UsageError):
         rooms_named(["rig:4-3"])
 
 
