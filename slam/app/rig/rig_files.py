@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
@@ -61,6 +62,12 @@ def load_rig(rig: str | Path) -> RigFile:
     try:
         return rig_files.load_rig(rig)
     except ConfigError as error:
+        with suppress(SceneError):
+            load_scene(rig)
+            raise AppError(
+                f"{rig}: is a scene; copy its [[radars]] into a rig file, and its [odometry] "
+                "without rate_hz as [wheels]"
+            ) from None
         raise AppError(str(error)) from None
 
 

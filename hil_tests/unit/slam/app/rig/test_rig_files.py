@@ -118,6 +118,11 @@ def test_a_name_that_is_no_scenes_is_refused_with_those_that_are() -> None:
         load_rig("robot")
 
 
+def test_the_file_of_a_scene_is_called_one() -> None:
+    with pytest.raises(AppError, match="is a scene"):
+        load_rig(FIXTURES / "scenes" / "lab.toml")
+
+
 def test_two_radars_of_one_name_are_refused_in_plain_words(tmp_path: Path) -> None:
     (path := tmp_path / "rig.toml").write_text(RADAR + RADAR)
     with pytest.raises(AppError):
