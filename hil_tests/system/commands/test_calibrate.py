@@ -56,6 +56,18 @@ def test_what_a_drive_does_not_determine_stays_as_it_was(tmp_path: Path) -> None
     assert [radar.range_offset_m for radar in found.radars] == [0.01, 0.01]
 
 
+def test_modules_without_serial_numbers_make_no_rig_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A session that was made of a bag or a MATLAB file has none."""
+    info = session_info()
+    unnamed = replace(info, radars=tuple(replace(radar, serial="") for radar in info.radars))
+    session = write_session(tmp_path / "s.mcap", 6, odometry(8), unnamed)
+    assert main(["calibrate", str(session), "--rig", str(tmp_path / "rig.toml")]) == 1
+    assert "leave --rig out" in capsys.readouterr().err
+    assert not (tmp_path / "rig.toml").exists()
+
+
 @pytest.mark.rare
 @pytest.mark.slow
 def test_a_recorded_drive_gives_back_what_the_scene_planted(

@@ -82,6 +82,11 @@ def run_calibrate(
     _planted(recorded.rig, scene)
     if rig is not None:
         _check_rig_place(rig, session)
+        if not all(radar.serial for radar in recorded.info.radars):
+            raise AppError(
+                f"{session}: does not say which modules measured, and a rig file names each by its "
+                "serial number; leave --rig out"
+            )
     detector = _detector_of(recorded, stop)
     report = _report_of(_drive_of(recorded, detector, stop), known, detector.estimator)
     if recorded.cut_at_byte is not None:
