@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import ThreadpoolController
 
 from slam.config import BackEnd, SlamConfig, WheelNoise, load_preset
 from slam.frames import Detection, Detector, RadarFrame, StepInputError
@@ -21,6 +20,7 @@ from slam.geometry import MOST_M, Rig, between, compose, transform
 from slam.library.pose_track import PoseTrack
 from slam.library.rig_files import RigFile
 from slam.library.saved_map import MapFile, load_map, save_map
+from slam.one_blas_thread import one_blas_thread
 from slam.paper.ekf import motion_jacobian
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import (
@@ -186,7 +186,9 @@ class Slam:
         self._wheels = wheels or WheelNoise()
         given = None if start is None else _pose(start, "start")
         if given is not None and abs(given[2]) > math.tau:
-            raise ValueError(f"start: its heading is {given[2]:g}; it is in radians")
+            raise ValueError(
+                f"start: its heading is {given[2]:g}; give radians, at most a turn (math.radians)"
+            )
         on_map = None if map is None else _on_map(map, given, is_fixed=localise)
         if (map is not None or localise) and self.config.back_end is not BackEnd.ROBUST:
             raise ValueError("map, localise: preset paper begins with an empty map; use robust")
@@ -201,8 +203,6 @@ class Slam:
         self._pipeline = make_slam(
             self.config, rig, self._wheels, front_end, noise_at=noise_at, on_map=on_map
         )
-        self._threads = ThreadpoolController()
-        self._limiter: Any = None  # while a solver needs it
         self._odometry = PoseTrack()
         self._newest: dict[int, tuple[int, int]] = {}  # stream and counter, by radar
         # By mount, ranges that wait for those of the others, and the mounts of the newest step that
@@ -210,6 +210,7 @@ class Slam:
         self._waiting: dict[int, _Waiting] = {}
         self._beside: dict[int, set[int]] = {}
         self._round = set[int]()
+        self._stepped_ns = -_MOST_STAMP_NS  # when the pipeline was stepped last
         self._is_lost = on_map is not None and on_map.pose is None
         # The newest belief, and odometry at it
         self._belief = Belief(mean=np.zeros(3), covariance=np.zeros((3, 3)))
@@ -269,8 +270,8 @@ class Slam:
             is known what was ranged, as from a UWB anchor, and range and field of view do not
             matter. All that a mount measured without ids must be given at once: what should be
             there and is not counts against a landmark. A mount that is not mentioned did not look.
-            Mounts that measure in turn may have a step each: ranges without ids are taken once
-            every mount of the last round has some, one has new ones, or after a second.
+            Mounts that measure in turn may have a step each: ranges without ids wait until every
+            mount of the last round has some, one measures again, or a second is over.
         points
             (radar, range_m, bearing_rad, sigma_m, bearing_sigma_rad), and an id in the same way:
             the bearing is counted from the mount's ``yaw_rad``.
@@ -292,15 +293,8 @@ class Slam:
         poses = {stamp: _pose(pose_at(stamp), f"odometry at {stamp} ns") for stamp in stamps_ns}
         if self._noise_at is not None:
             self._noise_now = _later_noise(self._noise_at(t_ns), self._noise, t_ns)
-        # One thread of BLAS gives the same bits on every machine, also to what solves meanwhile.
-        limiter = self._limiter or self._threads.limit(limits=1)
-        try:
+        with one_blas_thread():
             results = self._gathered(taken, scans, poses, t_ns)
-        finally:
-            is_solving = isinstance(self._pipeline, RobustSlam) and self._pipeline.is_solving
-            self._limiter = limiter if is_solving else None
-            if not is_solving:
-                limiter.restore_original_limits()
         track.forget_before(t_ns - _KEPT_NS)
         self._odometry, self._noise = track, self._noise_now
         self._newest |= {frame.radar: (frame.stream, frame.counter) for frame in taken}
@@ -339,7 +333,7 @@ class Slam:
         It is solved for at every call; later steps return the same as without it. Preset ``paper``
         has none.
         """
-        with self._threads.limit(limits=1):
+        with one_blas_thread():
             run = self._pipeline.smoothed()
         if run is None or not self._start.any():
             return run
@@ -364,7 +358,7 @@ class Slam:
         OSError
             The file cannot be written.
         """
-        with self._threads.limit(limits=1):
+        with one_blas_thread():
             saved = self._pipeline.saved_map()
         if saved is None or self._start.any():
             raise ValueError("save_map: it takes preset robust, and a map that begins at (0, 0, 0)")
@@ -466,20 +460,25 @@ class Slam:
         new = [_Waiting(scan=scan, t_ns=t_ns, pose=poses[t_ns]) for scan in scans]
         given = [one for one in new if not one.is_part_of_round]
         ranged = {one.scan.radar: one for one in new if one.is_part_of_round}
-        measured = {one.scan.radar for one in new} | {frame.radar for frame in frames}
-        kept = {radar: one for radar, one in self._waiting.items() if radar not in measured}
-        waiting = kept | ranged
+        others = {one.scan.radar for one in given} | {frame.radar for frame in frames}
+        before = {radar: one for radar, one in self._waiting.items() if radar not in others}
+        results: tuple[StepResult, ...] = ()
+        newest_ns = max([one.t_ns for one in before.values()], default=t_ns)
+        is_late = t_ns - min([one.t_ns for one in before.values()], default=t_ns) >= _ROUND_NS
+        if is_late or not before.keys().isdisjoint(ranged):
+            # That round ends without the mounts that are missing, when it was measured. A step with
+            # frames may be refused still, and must leave all as it was.
+            if newest_ns >= self._stepped_ns and not frames:
+                results = self._stepped((), [*before.values()], {}, newest_ns)
+            self._round, before = set(before), {}
+        waiting = before | ranged
         # A mount that measures together with others, and has no range this time, is not waited for.
         due = self._round.difference(waiting, *[self._beside.get(radar, ()) for radar in waiting])
-        since_ns = min([one.t_ns for one in waiting.values()], default=t_ns)
-        is_over = not due or len(kept) < len(self._waiting) or t_ns - since_ns >= _ROUND_NS
-        if is_over:
+        if waiting and not due:
             given += waiting.values()
-        results: tuple[StepResult, ...] = ()
-        if given or frames or not waiting:
-            results = self._stepped(frames, given, poses, t_ns)
-        if waiting and is_over:
             self._round, waiting = set(waiting), {}
+        if given or frames or not waiting:
+            results += self._stepped(frames, given, poses, t_ns)
         self._waiting = waiting
         self._beside |= {radar: set(ranged) for radar in ranged}
         return results
@@ -491,9 +490,10 @@ class Slam:
         poses: dict[int, Array],
         t_ns: int,
     ) -> tuple[StepResult, ...]:
-        pose_at = (poses | {one.t_ns: one.pose for one in given}).__getitem__
+        poses = poses | {one.t_ns: one.pose for one in given}
+        pose_at, self._stepped_ns = poses.__getitem__, t_ns
         if isinstance(self._pipeline, RobustSlam):
-            scans = [one.scan_from(t_ns, poses[t_ns]) for one in given]
+            scans = [one.scan_from(t_ns, poses[t_ns], self._wheels) for one in given]
             return self._pipeline.step_scans(frames, scans, pose_at, t_ns)
         if given:
             detections = [
@@ -546,12 +546,15 @@ class _Waiting:
         """Return whether it is ranges without ids, which say little without the other mounts'."""
         return self.scan.bearings_rad is None and self.scan.labels is None
 
-    def scan_from(self, t_ns: int, pose: Array) -> RangeScan:
-        """Return the scan as part of a state at another time."""
+    def scan_from(self, t_ns: int, pose: Array, wheels: WheelNoise) -> RangeScan:
+        """Return the scan as part of a state at another time; the way there adds to its noise."""
         if t_ns == self.t_ns:
             return self.scan
         x, y, turn = between(pose, self.pose).tolist()
-        return replace(self.scan, moved=(x, y, turn))
+        way_m = math.hypot(x, y)
+        along_m2, across_m2, _ = wheels.step_variances(way_m, turn)
+        added_m = math.hypot(math.sqrt(along_m2 + across_m2), wheels.scale_sigma * way_m)
+        return replace(self.scan.with_added_sigma(added_m), moved=(x, y, turn))
 
 
 def _on_map(given: str | Path | MapFile, start: Array | None, *, is_fixed: bool) -> StartOnMap:
@@ -600,7 +603,7 @@ def _measured(row: Sequence[Any], kind: str) -> _Measured:
         raise StepInputError(f"{kind} {values}: numbers must be finite, sigmas positive")
     if not 0.0 < one.range_m < LONGEST_M or one.sigma_m > LONGEST_M:
         raise StepInputError(
-            f"{kind} {values}: range_m must be positive, it and sigma_m below {LONGEST_M:g}"
+            f"{kind} {values}: range_m must be positive, range_m and sigma_m below {LONGEST_M:g}"
         )
     return one
 

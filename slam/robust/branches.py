@@ -63,6 +63,7 @@ import numpy as np
 from scipy.special import chdtri, expit
 
 from slam.geometry import Rig, compose, has_moved, transform
+from slam.one_blas_thread import one_blas_thread
 from slam.results import SavedMap, StartOnMap, UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
@@ -87,9 +88,6 @@ from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.
 _IDS_APART = 1000
-
-# One for all runs of the process
-_SOLVER = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slam-solver")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -307,13 +305,14 @@ class Alternative:
             step = steps[number]
             if number > self.since:
                 self.back_end.predict(step.increment, step.covariance, elapsed_s=step.elapsed_s)
-            report = self.back_end.update(step.scans, solve=self.merges)
+            report = self.back_end.update(step.scans, solve=self.merges, may_wait=True)
             self.evidence.append(evidence_table(report))
             self.next_step = number + 1
 
 
 def _solved(back_end: RobustBackEnd) -> RobustBackEnd:
-    back_end.relinearise()
+    with one_blas_thread():
+        back_end.relinearise()
     return back_end
 
 
@@ -381,6 +380,7 @@ class Branches:
         self._doubts: list[Doubt] = []
         self._solution_rule = parameters.relinearisation
         self._solving: Solving | None = None
+        self._is_on_map = saved is not None
         self.is_lost = False
         if saved is not None and start is None:
             self._begin_lost(saved)
@@ -389,11 +389,6 @@ class Branches:
     def map(self) -> RobustBackEnd:
         """Return the back end whose map is reported: as it was, while the robot is lost."""
         return self._carry.map if self.is_lost and self._carry is not None else self.main
-
-    @property
-    def is_solving(self) -> bool:
-        """Return whether another thread may be solving for the whole run."""
-        return self._solving is not None
 
     @property
     def is_unplaced(self) -> bool:
@@ -486,7 +481,7 @@ class Branches:
         solving, rule = self._solving, self._solution_rule
         if solving is not None:
             age = self._now - solving.since
-            if solving.main is not self.main or self.main.since_solved < age:
+            if solving.main is not self.main or self.main.since_solved < rule.every + age:
                 self._solving = None
             elif age >= rule.adopted_after:
                 if solving.solved is None:
@@ -499,7 +494,9 @@ class Branches:
                     state.next_id = max(state.next_id, self.main.state.next_id)
                     self.main, self._solving = solved.back_end, None
         elif self.main.awaits_solution:
-            solution = _SOLVER.submit(_solved, self.main.copy())
+            with_thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slam-solver")
+            solution = with_thread.submit(_solved, self.main.copy())
+            with_thread.shutdown(wait=False)
             self._solving = Solving(main=self.main, since=self._now, solution=solution)
 
     def _doubt(self, step: Step, report: UpdateReport, position_m: Array) -> None:
@@ -517,13 +514,13 @@ class Branches:
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
-        n_known = self.main.n_reported_since(0) if self._has_stood else 0
+        n_known = self._n_reported(0)
         # An empty map begins where the robot first drives.
         if carried > 0.0 and (n_known or self._now):
             variances = np.array(rule.lost_variances)
             newest = Doubt(
                 next_id=step.next_id,
-                knew_few=n_known < rule.least_landmarks,
+                knew_few=n_known < rule.least_landmarks and not self._is_on_map,
                 position_m=position_m,
                 probability=carried,
                 covariance=carried * np.diag(variances),
@@ -547,8 +544,11 @@ class Branches:
         They are the map then, and the robot is sure of its place among them. Where the few and the
         start lie on it may be wrong.
         """
-        n_new = self.main.n_reported_since(doubt.next_id)
-        return doubt.knew_few and n_new >= self._rule.least_landmarks
+        return doubt.knew_few and self._n_reported(doubt.next_id) >= self._rule.least_landmarks
+
+    def _n_reported(self, first_id: int) -> int:
+        ids = self.main.state.landmark_ids
+        return sum(ids[row] >= first_id for row in self.main.reported_rows())
 
     def _is_confirmed(self, doubt: Doubt) -> bool:
         return doubt.is_confirmed(self._rule) and not self._is_alike_elsewhere(doubt)

@@ -245,7 +245,7 @@ class RelinearisationRule:
     most_at_once: Annotated[int, Origin.BUDGET, "scans"] = 2000
     """A longer run is solved for beside the scans that follow."""
     adopted_after: Annotated[int, Origin.BUDGET, "scans"] = 20
-    """After how many of them its solution is adopted."""
+    """After how many of them its solution is there, and catches up with the scans since."""
     iterations: Annotated[int, Origin.BUDGET, "steps"] = 10
     """Most steps of one solution."""
     outlier_sigmas: Annotated[float, Origin.QUANTILE] = 4.0

@@ -100,11 +100,6 @@ class RobustSlam:
         """Return the back end that is believed now."""
         return self._branches.main
 
-    @property
-    def is_solving(self) -> bool:
-        """Return whether another thread may be solving for the whole run."""
-        return self._branches.is_solving
-
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:

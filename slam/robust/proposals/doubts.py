@@ -123,7 +123,12 @@ class Doubt:
         self.position_m, self.information = newer.position_m, newer.information
 
     def join(self, newer: Doubt) -> None:
-        """Add a doubt with other evidence: what confirms both confirms either."""
+        """Add a doubt with other evidence: what confirms both confirms either.
+
+        Of one that knew too few landmarks nothing can: the other one's count.
+        """
+        if self.knew_few and not newer.knew_few:
+            self.next_id = newer.next_id
         self.add(newer)
         self.nats = {id_: nats for id_, nats in newer.nats.items() if id_ < self.next_id}
         # The newer one's is also of landmarks that the older one did not know.

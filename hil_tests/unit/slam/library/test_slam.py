@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -36,6 +37,9 @@ from slam import (
     override,
 )
 from slam.geometry import between, compose, transform
+from slam.one_blas_thread import one_blas_thread
+from slam.results import PoseAt, StepResult
+from slam.robust.association import RangeScan
 from slam.robust.pipeline import RobustSlam
 
 TICK_NS = 200_000_000
@@ -282,29 +286,56 @@ def test_a_mount_that_measures_no_more_is_waited_for_once() -> None:
     half = TICK_NS // 2
     n = [n_states(k * half, k % 2) for k in range(9)]
     assert n == [0, 0, 1, 0, 1, 0, 1, 0, 1]  # the first one is the start; each has both mounts
-    assert [n_states(k * half, 0) for k in range(9, 13)] == [0, 1, 1, 1]
+    assert [n_states(k * half, 0) for k in range(9, 13)] == [0, 2, 1, 1]
     assert [n_states(k * half, 0, 1) for k in range(13, 16)] == [1, 1, 1]
     assert n_states(16 * half, 0) == 1  # mount 1 saw nothing beside mount 0
     assert [n_states(k * half, k % 2) for k in range(17, 20)] == [1, 0, 1]
-    # A range waits for a second.
+    # A range waits for a second, and is of a state of its own then.
     assert n_states(20 * half, 0) == 0
-    assert [n_states(20 * half + 250_000_000 * k) for k in range(1, 5)] == [0, 0, 0, 1]
+    assert [n_states(20 * half + 250_000_000 * k) for k in range(1, 5)] == [0, 0, 0, 2]
 
 
-def test_blas_has_one_thread_for_as_long_as_something_is_solved(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    "mounts", [[(0,), (0,), (0,), (1,)], [(0,), (0,), (1,)], [(0, 1), (0,), (1,), (0,)]]
+)
+def test_no_range_is_lost_where_mounts_measure_unequally_often(
+    mounts: list[tuple[int, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    slam, used = Slam(RIG), list[int]()
+    step_scans = RobustSlam.step_scans
+
+    def watched(
+        self: RobustSlam,
+        frames: Sequence[RadarFrame],
+        given: Sequence[RangeScan],
+        pose_at: PoseAt,
+        t_ns: int,
+    ) -> tuple[StepResult, ...]:
+        used.extend(scan.radar for scan in given)
+        return step_scans(self, frames, given, pose_at, t_ns)
+
+    monkeypatch.setattr(RobustSlam, "step_scans", watched)
+    n_given = Counter[int]()
+    for k in range(40):
+        t_ns = k * TICK_NS // 2
+        slam.step(t_ns, drive, ranges=[range_row(radar, t_ns) for radar in mounts[k % len(mounts)]])
+        n_given.update(mounts[k % len(mounts)])
+    assert n_given - Counter(used) <= Counter([0, 1])  # what waits still
+
+
+def test_blas_has_one_thread_until_the_last_of_two_that_need_it_has_left() -> None:
     def n_threads() -> set[int]:
         return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
 
-    solving, seen, slam = [True, True, False], list[set[int]](), Slam(RIG)
-    monkeypatch.setattr(RobustSlam, "is_solving", property(lambda _: solving[len(seen)]))
     with threadpool_limits(limits=2, user_api="blas"):
         before = n_threads()
-        for number in range(3):
-            slam.step(number * TICK_NS, drive(number * TICK_NS))
-            seen.append(n_threads())
-    assert seen == [{1}, {1}, before]
+        one, other = one_blas_thread(), one_blas_thread()
+        one.__enter__()
+        other.__enter__()
+        one.__exit__(None, None, None)
+        assert n_threads() == {1}
+        other.__exit__(None, None, None)
+        assert n_threads() == before == {2}
 
 
 def test_one_late_stamp_does_not_throw_the_robot_forward() -> None:
@@ -332,6 +363,14 @@ def test_what_was_seen_while_the_robot_drove_unseen_is_refused() -> None:
         ):
             slam.step(1_100_000_000, frames=[frame])
         assert slam.step(1_100_000_000).pose == pytest.approx([way_m, 0.0, 0.0], abs=1e-9)
+
+
+def test_a_loop_that_paused_goes_on() -> None:
+    """Frames just before the newest pose have a place, though none is known for seconds before."""
+    slam = made()
+    for number in (*range(8), *range(40, 48)):
+        late = frames(number, (-30_000_000, -40_000_000))
+        slam.step(number * TICK_NS, drive(number * TICK_NS), frames=late)
 
 
 def test_what_is_no_radian_no_rig_or_no_noise_says_so() -> None:

@@ -17,6 +17,7 @@ from hil_tests.unit.slam.robust.range_world import (
 )
 from slam.geometry import between, compose, paper_rig
 from slam.library.evaluation import nees_pose
+from slam.results import StartOnMap
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.branches import (
@@ -320,6 +321,23 @@ def test_a_doubt_on_too_few_landmarks_ends_with_three_newer_ones(stop: int, n_be
         assert not any(n_doubts[end:])
     else:
         assert all(n_doubts)
+
+
+def test_a_doubt_on_a_given_map_is_not_ended_by_what_is_new_beside_it() -> None:
+    """However few landmarks the map has: the robot's place is one on that map."""
+    rng, poses = np.random.default_rng(3), straight(60)
+    increments, parameters = reported(poses, LAB, rng, 0.0), parameters_for(LAB, SIGMA_M)
+    scans = list(scans_of(poses, PLACES, rng, SIGMA_M))
+    first = RobustBackEnd(paper_rig(), parameters)
+    for _ in follow(first, increments[:15], scans[:15]):
+        pass
+    on_map = StartOnMap(map=first.map_now(), pose=(0.0, 0.0, 0.0))
+    assert len(on_map.map.landmarks) == 2
+    branches = Branches(paper_rig(), parameters, on_map)
+    for _ in follow(branches, increments, scans, stop=3):
+        pass
+    assert branches.main.n_reported_since(on_map.map.next_id) >= RULE.least_landmarks
+    assert branches._doubts
 
 
 def test_evidence_is_the_likelihood_of_the_ranges() -> None:

@@ -122,6 +122,14 @@ def test_doubts_that_are_joined_need_what_both_need() -> None:
     np.testing.assert_allclose(older.variances, 2.0 * np.array(RULE.hidden_variances))
 
 
+def test_one_that_knew_too_few_is_confirmed_with_the_one_that_it_is_joined_to() -> None:
+    older, newer = doubtful(0.0), doubtful(1.0)
+    older.knew_few, older.next_id, newer.next_id = True, 2, 9
+    older.nats, newer.nats = {0: 9.0}, {1: 2.0, 5: 9.0}
+    older.join(newer)
+    assert (older.next_id, older.knew_few, older.nats) == (9, False, {1: 2.0, 5: 9.0})
+
+
 def test_what_ranges_tell_of_a_motion_is_as_ranges_change_with_it() -> None:
     """Against differences of ranges after a motion at the doubt's place, and the way since."""
     doubt, way = doubtful(1.0), np.array([0.4, 0.1, 0.3])
