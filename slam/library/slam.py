@@ -20,7 +20,6 @@ from slam.geometry import MOST_M, Rig, between, compose, transform
 from slam.library.pose_track import PoseTrack
 from slam.library.rig_files import RigFile
 from slam.library.saved_map import MapFile, load_map, save_map
-from slam.one_blas_thread import one_blas_thread
 from slam.paper.ekf import motion_jacobian
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import (
@@ -35,6 +34,7 @@ from slam.results import (
 from slam.robust.association import LONGEST_M, RangeScan
 from slam.robust.parameters import BackEndParameters
 from slam.robust.pipeline import RobustSlam
+from slam.robust.solver.one_blas_thread import one_blas_thread
 from slam.robust.state import turned_covariance
 
 Array = NDArray[np.float64]

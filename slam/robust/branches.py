@@ -63,7 +63,6 @@ import numpy as np
 from scipy.special import chdtri, expit
 
 from slam.geometry import Rig, compose, has_moved, transform
-from slam.one_blas_thread import one_blas_thread
 from slam.results import SavedMap, StartOnMap, UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
@@ -84,6 +83,7 @@ from slam.robust.proposals.constellation import (
     stands_out,
 )
 from slam.robust.proposals.doubts import Doubt, doubted_covariance, seen_ranges
+from slam.robust.solver.one_blas_thread import one_blas_thread
 from slam.robust.state import Array
 
 # An alternative's new landmarks get ids so far beyond the main one's: no id is used twice.

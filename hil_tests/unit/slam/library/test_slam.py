@@ -37,10 +37,10 @@ from slam import (
     override,
 )
 from slam.geometry import between, compose, transform
-from slam.one_blas_thread import one_blas_thread
 from slam.results import PoseAt, StepResult
 from slam.robust.association import RangeScan
 from slam.robust.pipeline import RobustSlam
+from slam.robust.solver.one_blas_thread import one_blas_thread
 
 TICK_NS = 200_000_000
 RIG = Rig([Mount(x_m=x_m, y_m=0.2, yaw_rad=math.pi / 2) for x_m in (-0.1, 0.1)])
