@@ -295,8 +295,8 @@ def _sigmas(
 ) -> tuple[float, float]:
     """Return the standard deviations of range [m] and bearing [rad] of a reflector.
 
-    ``lines`` (n, 2) are the directions to where it answers, at each antenna. The
-    bearing of what was in the beam from one place only, or along one line, is not known.
+    ``lines`` (n, 2) are the directions to where it answers, at each antenna. The bearing of what
+    was in the beam from one place only, or along one line, is not known.
     """
     profiles, antennas = patch.profiles, patch.aperture.antennas_m
     sight = lines[patch.middle]
