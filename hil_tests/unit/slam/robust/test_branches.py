@@ -293,6 +293,26 @@ def test_a_long_run_is_solved_for_beside_the_scans() -> None:
     assert math.dist(branches.main.pose, poses[-1]) < 0.05
 
 
+def test_a_solution_is_dropped_if_the_run_was_solved_for_in_the_step_that_began_it() -> None:
+    """As a merge does: what is computed beside knows nothing of it."""
+    rng, poses = np.random.default_rng(3), np.vstack([straight(75)] * 2)
+    parameters = parameters_for(LAB, SIGMA_M)
+    rule = replace(parameters.relinearisation, most_at_once=100, adopted_after=3)
+    branches = Branches(paper_rig(), replace(parameters, relinearisation=rule))
+    main, n_dropped, begun = branches.main, 0, None
+    for _ in follow(
+        branches, reported(poses, LAB, rng, 0.0), scans_of(poses, PLACES, rng, SIGMA_M)
+    ):
+        if begun is not None:
+            assert branches._solving is None
+            n_dropped += 1
+        begun = branches._solving
+        if begun is not None:
+            branches.main.relinearise()
+    assert n_dropped > 1
+    assert branches.main is main
+
+
 @pytest.mark.parametrize(("stop", "n_before"), [(1, 0), (5, 0), (15, 2), (25, 4)])
 def test_a_doubt_on_too_few_landmarks_ends_with_three_newer_ones(stop: int, n_before: int) -> None:
     """A stop before the first drive is no doubt; three that were mapped by then are waited for."""
