@@ -8,7 +8,7 @@ compiled is kept beside the source, or, where that cannot be written, in the use
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, update_wrapper
+from functools import cache, partial, update_wrapper
 from types import FunctionType
 from typing import Any, TypeVar
 
@@ -44,10 +44,11 @@ class _Kernel:
         # Where loops are short, their vectorised variants would take a third of the compilation.
         vectorise = numba.config.LOOP_VECTORIZE
         numba.config.LOOP_VECTORIZE = vectorise if self._has_long_loops else 0
+        compile_with = partial(numba.njit, error_model="numpy", nogil=True)
         try:
-            kept = numba.njit(cache=True, error_model="numpy", nogil=True)(bound)
+            kept = compile_with(cache=True)(bound)
         except RuntimeError:  # no folder can be written
-            kept = numba.njit(error_model="numpy", nogil=True)(bound)
+            kept = compile_with()(bound)
         try:
             kept.compile(self._signature)
         finally:

@@ -26,8 +26,8 @@ _RATE_NS, _MOST_RATE = 100_000_000, 10.0
 _GOES_ON_NS, _VELOCITY_NS = 1_000_000_000, 300_000_000
 # By how much the poses of a robot that stands may differ [m, rad]
 _STOOD = 0.02
-# How near in time to a pose a robot goes on as it did there
-_NEAR_NS = 100_000_000
+NEAR_NS = 100_000_000
+"""For how long before or behind a pose a robot is taken to go on as it did there."""
 # Over which time, at least, it is taken behind the newest pose: stamps of arrival bunch
 _NEWEST_NS = 50_000_000
 
@@ -148,7 +148,7 @@ class PoseTrack:
         if after in (0, len(self)) or self._stamps_ns[after - 1] == t_ns:
             return None
         before_ns, after_ns = self._stamps_ns[after - 1 : after + 1]
-        is_near = min(t_ns - before_ns, after_ns - t_ns) <= _NEAR_NS
+        is_near = min(t_ns - before_ns, after_ns - t_ns) <= NEAR_NS
         if is_near or after_ns - before_ns <= _GOES_ON_NS:
             return None
         apart = _apart(self._pose(after - 1), self._pose(after))

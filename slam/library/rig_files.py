@@ -83,6 +83,15 @@ class RigRadar(_RigTable):
     pulse: RigPulse | None = None
 
 
+_WHITE = {
+    "along_sigma_m_per_sqrt_m": "along_m_per_sqrt_m",
+    "across_sigma_m_per_sqrt_m": "across_m_per_sqrt_m",
+    "heading_sigma_rad_per_sqrt_m": "heading_rad_per_sqrt_m",
+    "heading_sigma_rad_per_rad": "heading_rad_per_rad",
+}
+"""What `WheelNoise` calls the white noise of a rig file; the other keys are the same."""
+
+
 class RigWheels(_RigTable):
     """How the robot's odometry errs, from its data sheet or a test drive; see `WheelNoise`.
 
@@ -100,27 +109,12 @@ class RigWheels(_RigTable):
 
     @classmethod
     def of(cls, noise: WheelNoise) -> Self:
-        return cls(
-            along_sigma_m_per_sqrt_m=noise.along_m_per_sqrt_m,
-            across_sigma_m_per_sqrt_m=noise.across_m_per_sqrt_m,
-            heading_sigma_rad_per_sqrt_m=noise.heading_rad_per_sqrt_m,
-            heading_sigma_rad_per_rad=noise.heading_rad_per_rad,
-            scale_sigma=noise.scale_sigma,
-            turn_scale_sigma=noise.turn_scale_sigma,
-            curvature_sigma_rad_per_m=noise.curvature_sigma_rad_per_m,
-        )
+        """Return the keys of a noise that a file can hold."""
+        return cls(**{key: getattr(noise, _WHITE.get(key, key)) for key in cls.model_fields})
 
     @property
     def noise(self) -> WheelNoise:
-        return WheelNoise(
-            along_m_per_sqrt_m=self.along_sigma_m_per_sqrt_m,
-            across_m_per_sqrt_m=self.across_sigma_m_per_sqrt_m,
-            heading_rad_per_sqrt_m=self.heading_sigma_rad_per_sqrt_m,
-            heading_rad_per_rad=self.heading_sigma_rad_per_rad,
-            scale_sigma=self.scale_sigma,
-            turn_scale_sigma=self.turn_scale_sigma,
-            curvature_sigma_rad_per_m=self.curvature_sigma_rad_per_m,
-        )
+        return WheelNoise(**{_WHITE.get(key, key): value for key, value in self})
 
 
 class RigFile(_RigTable):

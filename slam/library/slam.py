@@ -17,7 +17,7 @@ from slam.config import BackEnd, SlamConfig, WheelNoise, load_preset
 from slam.frames import Detection, Detector, RadarFrame, StepInputError
 from slam.front_end.numba_compilation import compile_kernels
 from slam.geometry import MOST_M, Rig, between, compose, transform
-from slam.library.pose_track import PoseTrack
+from slam.library.pose_track import NEAR_NS, PoseTrack
 from slam.library.rig_files import RigFile
 from slam.library.saved_map import MapFile, load_map, save_map
 from slam.paper.ekf import motion_jacobian
@@ -41,7 +41,6 @@ Array = NDArray[np.float64]
 Row: TypeAlias = Sequence[float | None]
 """One range or point, numbers and perhaps an id; see `Slam.step`."""
 
-_MOST_AHEAD_NS = 100_000_000
 _KEPT_NS = 2_000_000_000
 _ROUND_NS = 1_000_000_000  # longest round of mounts that measure in turn
 _SAME = 1e-9  # [m] and [rad]: two poses of one time that differ by less are one
@@ -432,7 +431,7 @@ class Slam:
                 track.add(t_ns, pose.tolist())
 
         def pose_at(stamp_ns: int) -> Array:
-            if not len(track) or not track.first_ns <= stamp_ns <= track.last_ns + _MOST_AHEAD_NS:
+            if not len(track) or not track.first_ns <= stamp_ns <= track.last_ns + NEAR_NS:
                 known = f"{track.first_ns} to {track.last_ns} ns" if len(track) else "none so far"
                 raise StepInputError(
                     f"no odometry at {stamp_ns} ns: known {known}; give poses until then first, by "
@@ -550,10 +549,9 @@ class _Waiting:
         """Return the scan as part of a state at another time; the way there adds to its noise."""
         if t_ns == self.t_ns:
             return self.scan
-        x, y, turn = between(pose, self.pose).tolist()
-        way_m = math.hypot(x, y)
-        along_m2, across_m2, _ = wheels.step_variances(way_m, turn)
-        added_m = math.hypot(math.sqrt(along_m2 + across_m2), wheels.scale_sigma * way_m)
+        moved = between(pose, self.pose)
+        added_m = math.sqrt(np.trace(_motion_noise(moved, 0.0, wheels)[:2, :2]))
+        x, y, turn = moved.tolist()
         return replace(self.scan.with_added_sigma(added_m), moved=(x, y, turn))
 
 
