@@ -388,7 +388,7 @@ class RobustBackEnd:
         if slip is None:
             return
         self.may_have_slipped = True
-        first = self._log.n_poses - 1 - len(slip.covariances)
+        first = self._log.n_poses - slip.n_since - len(slip.covariances)
         for pose, covariance in enumerate(slip.covariances, start=first):
             self._log.loosen(pose, covariance)
         n_sure = sum(number < first for number in self.state.past_numbers)

@@ -1,4 +1,4 @@
-"""Possible slips: motion that the wheels report for up to three steps between steps that are alike.
+"""Possible slips: motion that the wheels report for up to three steps between steady motions.
 
 A robot has inertia, so a motion that begins and ends within so few is as likely a slip of the
 wheels as its own. The ranges at its end can hardly tell: a turn changes none, until the robot has
@@ -13,6 +13,10 @@ motion around it, up to half as much again, by the time that it took. Nor is wha
 wheels explains, or what is like the changes from step to step just before, as where wheels count
 coarsely or the heading swings. Before its first step the robot is taken to have moved as after it.
 Wheels that turn less than the robot moves are not seen.
+
+Where the motion changes, as where a turn on the spot begins, a step may be any mixture of the
+motion before and the one behind it: the robot slows down from the one and comes into the other.
+What goes beyond all of these is a possible slip, once both motions were kept for two steps.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -51,12 +55,15 @@ class PossibleSlip:
     covariances
         Of each of its steps, shape (3, 3), dx, dy [m] and turn [rad] in the body frame before it:
         to be added to the noise of the wheels.
+    n_since
+        How many steps followed them.
     since
-        No motion, with the noise of all of them in the pose after the step that follows, in its
+        No motion, with the noise of all of them in the pose after the steps that followed, in its
         body frame.
     """
 
     covariances: tuple[Array, ...]
+    n_since: int
     since: Motion
 
 
@@ -95,9 +102,11 @@ class SlipDetector:
         for first, between in self._newest():
             # Before the first step the robot is taken to have moved as after it
             slip = slip or self._slip(first or last, between, last)
+        slip = slip or self._slip_at_change(last)
         if self._steps and (before := self._steps[-1]) is not None:
             self._take_change(_change(before, last, last.took_s))
-        self._steps = [last] if slip else [*self._steps[-self._rule.most_steps :], last]
+        # The two before a slip and the one behind it, too
+        self._steps = [last] if slip else [*self._steps[-self._rule.most_steps - 2 :], last]
         return slip
 
     def _take_change(self, change: Vector) -> None:
@@ -117,7 +126,7 @@ class SlipDetector:
         for first, between in self._newest():
             if first is not None:
                 rate = [value / first.took_s for value in first.motion]
-                excess = self._excess(between, rate, [first, *between])
+                excess = self._excess(between, [rate], [first, *between])
                 errors += [] if excess is None else [_error_after(between, excess)]
         error = max(errors, key=lambda one: self._square(one.tolist()))
         return 0.5 * np.outer(error, error)
@@ -139,37 +148,70 @@ class SlipDetector:
             (before + after) / around_s
             for before, after in zip(first.motion, last.motion, strict=True)
         ]
-        excess = self._excess(between, rate, steps)
+        excess = self._excess(between, [rate], steps)
         if excess is None:
             return None
         # Where a motion begins or ends, a step is off the mean of both by half of the change
-        whole = self._square(_sum(excess))
-        if self._square([2.0 * value for value in change]) > whole:
+        if self._square([2.0 * value for value in change]) > self._square(_sum(excess)):
             return None
+        return self._possible_slip(between, excess, [last])
+
+    def _slip_at_change(self, last: _Step) -> PossibleSlip | None:
+        """Return what steps report beyond any mixture of the motions before and after them.
+
+        Each of the two was kept for two steps, and they differ.
+        """
+        steps = [step for step in self._steps if step is not None]
+        for n in range(1, min(self._rule.most_steps, len(steps) - 3) + 1):
+            *before, after = steps[-n - 3 :]
+            one, first, *between = before
+            if not (self._is_kept(one, first) and self._is_kept(after, last)):
+                continue
+            if self._is_kept(first, after):
+                break
+            rates = [[value / step.took_s for value in step.motion] for step in (first, after)]
+            excess = self._excess(between, rates, [first, *between, after])
+            if excess is not None:
+                return self._possible_slip(between, excess, [after, last])
+        return None
+
+    def _is_kept(self, before: _Step, after: _Step) -> bool:
+        change = _change(before, after, 0.5 * (before.took_s + after.took_s))
+        return self._is_steady(change, [before, after], 2.0)
+
+    def _possible_slip(
+        self, slipped: Sequence[_Step], excess: Sequence[Vector], since: Sequence[_Step]
+    ) -> PossibleSlip:
         # All of its steps have one error: together they are more uncertain than by separate ones
-        share = whole / sum(self._square(one) for one in excess)
-        since = _error_after([*between, last], [*excess, _ZERO])
+        share = self._square(_sum(excess)) / sum(self._square(one) for one in excess)
+        error = _error_after([*slipped, *since], [*excess, *(_ZERO for _ in since)])
         return PossibleSlip(
             covariances=tuple([0.5 * share * np.outer(one, one) for one in excess]),
+            n_since=len(since),
             since=Motion(
                 step_m=np.zeros(2),
                 turn_rad=0.0,
-                covariance=0.5 * np.outer(since, since),
+                covariance=0.5 * np.outer(error, error),
                 walk_variance=0.0,
             ),
         )
 
     def _excess(
-        self, steps: Sequence[_Step], rate: Sequence[float], around: Sequence[_Step]
+        self, steps: Sequence[_Step], rates: Sequence[Sequence[float]], around: Sequence[_Step]
     ) -> list[Vector] | None:
-        """Return what steps report beyond a rate of motion; None if that is an ordinary change.
+        """Return what steps report beyond one or two rates of motion; None if that is ordinary.
 
-        ``around`` are all steps that the rate is of, and these.
+        ``around`` are all steps that the rates are of, and these.
         """
-        expected = [[value * step.took_s for value in rate] for step in steps]
+        expected = [
+            [_vector([value * step.took_s for value in rate]) for rate in rates] for step in steps
+        ]
         spread = len(steps) + len(steps) ** 2 / 2  # white noise, against the mean of two others
         # By its shares a step that is a little short in all would lack some of its turn
-        change = _sum([*(step.motion for step in steps), *([-x for x in one] for one in expected)])
+        means = [
+            [-sum(values) / len(rates) for values in zip(*one, strict=True)] for one in expected
+        ]
+        change = _sum([*(step.motion for step in steps), *means])
         if self._is_steady(change, around, spread):
             return None
         if len(steps) > 2 and any(
@@ -185,14 +227,36 @@ class SlipDetector:
             return None
         return beyond
 
-    def _off(self, step: Vector, expected: Sequence[float], most_share: float) -> Vector:
-        """Return what a step has beyond the share of an expected motion that is nearest to it."""
-        square = self._square(expected)
-        products = zip(self._weights, step, expected, strict=True)
-        along = sum(weight * one * other for weight, one, other in products)
-        share = min(max(along / square, 0.0), most_share) if square > 0.0 else 0.0
-        x, y, turn = (one - share * other for one, other in zip(step, expected, strict=True))
-        return x, y, turn
+    def _off(self, step: Vector, expected: Sequence[Vector], most_share: float) -> Vector:
+        """Return what a step has beyond the nearest of the ordinary motions.
+
+        These are all mixtures of one or two expected motions, with shares that add up to
+        ``most_share`` at most.
+        """
+        corners = [_ZERO, *(_vector([most_share * value for value in one]) for one in expected)]
+        off = [self._off_line(step, one, other) for one, other in combinations(corners, 2)]
+        if len(expected) == 2:
+            metric = np.sqrt(self._weights)
+            along = np.array(expected).T * metric[:, None]
+            shares = np.linalg.lstsq(along, np.array(step) * metric)[0]
+            if shares.min() >= 0.0 and shares.sum() <= most_share:
+                rest = (np.array(step) * metric - along @ shares) / metric
+                off.append(_vector(rest.tolist()))
+        return min(off, key=self._square)
+
+    def _off_line(self, step: Vector, begin: Vector, end: Vector) -> Vector:
+        """Return what a step has beyond the nearest motion on the line from one to another."""
+        line = [after - before for before, after in zip(begin, end, strict=True)]
+        square = self._square(line)
+        products = zip(self._weights, step, begin, line, strict=True)
+        along = sum(weight * (value - origin) * other for weight, value, origin, other in products)
+        share = min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
+        return _vector(
+            [
+                value - origin - share * other
+                for value, origin, other in zip(step, begin, line, strict=True)
+            ]
+        )
 
     def _square(self, motion: Sequence[float]) -> float:
         return sum(weight * value**2 for weight, value in zip(self._weights, motion, strict=True))
@@ -208,6 +272,11 @@ class SlipDetector:
         steady_rad = max(self._rule.steady_rad, sigmas * self._recent_rad) * factor
         is_short = math.hypot(change[0], change[1]) <= max(steady_m, sigmas * math.sqrt(x + y))
         return is_short and abs(change[2]) <= max(steady_rad, sigmas * math.sqrt(turn))
+
+
+def _vector(values: Sequence[float]) -> Vector:
+    x, y, turn = values
+    return x, y, turn
 
 
 def _sum(motions: Sequence[Sequence[float]]) -> Vector:

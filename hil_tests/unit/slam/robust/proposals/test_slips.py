@@ -203,6 +203,42 @@ def test_a_motion_that_begins_or_ends_is_no_slip(before: Array, after: Array, sh
     assert slips_of([before] * 4 + [within] + [after] * 4) == []
 
 
+@given(
+    before=MOTIONS,
+    after=MOTIONS,
+    shares=st.lists(st.tuples(*[st.floats(0.0, 0.5)] * 2), max_size=2),
+)
+def test_a_mixture_of_the_motions_around_it_is_no_slip(
+    before: Array, after: Array, shares: list[tuple[float, float]]
+) -> None:
+    """The robot slows down from the one and comes into the other, but keeps no third one."""
+    within = [a * before + b * after for a, b in shares]
+    found = slips_of([before] * 4 + within + [after] * 4)
+    assert not [one for one in found if one.n_since == 2]
+
+
+@pytest.mark.parametrize("parts", [(1.0,), (0.5, 0.5), (0.3, 1.1, 0.6)], ids=str)
+@pytest.mark.parametrize("motions", [(AHEAD, TURN), (0.0 * TURN, AHEAD), (TURN, -TURN)], ids=str)
+def test_a_slip_where_the_motion_changes_is_seen_two_steps_later(
+    motions: tuple[Array, Array], parts: tuple[float, ...]
+) -> None:
+    """It is across both motions, so all of it is beyond their mixtures."""
+    before, after = motions
+    across = np.array([0.0, 0.1, 0.0])
+    steps = [before + share * across for share in parts]
+    assert slips_of([before] * 3 + [*steps, after]) == []
+    (found,) = slips_of([before] * 3 + [*steps, after, after])
+    assert (found.n_since, len(found.covariances)) == (2, len(parts))
+    for share, covariance in zip(parts, found.covariances, strict=True):
+        expected = 0.5 * sum(parts) ** 2 * share**2 / sum(one**2 for one in parts)
+        np.testing.assert_allclose(covariance, np.diag([0.0, expected * 0.1**2, 0.0]), atol=1e-12)
+    error = between(
+        chained([*steps, after, after]), chained([*(before for _ in parts), after, after])
+    )
+    np.testing.assert_allclose(found.since.covariance, 0.5 * np.outer(error, error), atol=1e-12)
+    assert slips_of([before] * 3 + [*steps, after, 1.2 * after]) == []  # not kept yet
+
+
 @given(motion=MOTIONS, changes=st.lists(CHANGES, min_size=4, max_size=12))
 def test_what_changes_as_a_steady_motion_does_is_no_slip(
     motion: Array, changes: list[Array]
@@ -327,6 +363,24 @@ def test_corners_are_no_slips(run: Run) -> None:
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
     for _ in follow(branches, run.increments, [[]] * len(run.increments)):
         assert not branches.main.may_have_slipped
+
+
+def test_a_slip_in_a_corner_leaves_its_own_step_uncertain(run: Run) -> None:
+    turns = np.abs(np.diff(run.poses[:, 2])) > 0.05
+    corner = next(k for k in range(10, len(turns)) if turns[k] and not turns[k - 3 : k].any())
+    increments = run.increments.copy()
+    increments[corner - 1] += [0.0, 0.0, -math.copysign(0.2, increments[corner, 2])]
+    back_end = Branches(paper_rig(), parameters_for(LAB, SIGMA_M)).main
+    sigmas_rad = []
+    for increment in increments[: corner + 2]:
+        back_end.predict(increment, elapsed_s=0.2)
+        back_end.update([])
+        sigmas_rad.append(math.sqrt(back_end.pose_covariance[2, 2]))
+    assert back_end.may_have_slipped
+    assert sigmas_rad[-2] < 0.03
+    assert sigmas_rad[-1] == pytest.approx(0.2 / math.sqrt(2.0), rel=0.05)
+    loosened = [k for k, noise in enumerate(back_end._log._covariances.rows) if noise[2, 2] > 0.01]
+    assert loosened == [corner - 1]
 
 
 def test_a_slip_in_sight_of_landmarks_is_corrected_by_their_ranges(run: Run) -> None:
