@@ -207,9 +207,6 @@ class MatchedFilterConfig(_ConfigTable):
     # share of the pulse's energy; 0.07 for a width 10 % off. A difference of this size is not a
     # second echo, and near the peak not a misfit.
     model_error: NonNegative = 0.08
-    # Up to this range [m] what the frames of a radar have in common is taken out: leakage from
-    # transmitter to receiver that rings. 0: nothing is taken out.
-    static_range_m: NonNegative = 0.0
 
 
 class TrilaterationConfig(_ConfigTable):

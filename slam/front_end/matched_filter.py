@@ -48,7 +48,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -102,10 +102,6 @@ _LEAST_SAMPLES = 2.0
 # What a wrong pulse may leave near the peak of one that is fitted, over its relative error: 0.46 to
 # 0.50 for a width 10 or 15 % off, less for skew, ringing and all of them together; a quarter more
 _NEAR_PEAK = 0.625
-# Frames in the mean of `StaticEchoes`, at least (before, short ranges are unknown) and at most; and
-# over how many metres it ends
-_STATIC_LEAST, _STATIC_MEMORY = 20, 300
-_STATIC_FADE_M = 0.1
 # Resolution of a float32 frame, as a part of its largest sample; sigma_y is never less.
 _RESOLUTION = float(np.finfo(np.float32).eps)
 
@@ -386,40 +382,6 @@ def _assess(table: Array, filtered: Filtered, within: tuple[float, float]) -> No
     )
 
 
-class StaticEchoes:
-    """What frames of one radar have in common at short range, taken out of them.
-
-    Leakage that rings is the same in all frames; echoes of the room turn their phase with every few
-    millimetres of way. Frames are to be of different places, as `Pipeline.step` has them detected.
-    """
-
-    def __init__(self, range_m: float) -> None:
-        self._range_m = range_m
-        self._means: dict[tuple[int, int, float], tuple[int, Array]] = {}
-
-    def removed(self, frame: RadarFrame, range_offset_m: float) -> RadarFrame:
-        """Take a frame into the mean and return it without; short ranges as unknown at first.
-
-        Where the mean ends it fades over ``_STATIC_FADE_M``.
-        """
-        ends = (self._range_m + range_offset_m - frame.range_start_m) / frame.bin_length_m
-        fade = _STATIC_FADE_M / frame.bin_length_m
-        n_near = min(max(0, math.ceil(ends + fade)), frame.samples.size)
-        near = np.where(usable_samples(frame), frame.samples, np.nan)[:n_near].astype(np.float64)
-        key = frame.radar, n_near, frame.bin_length_m
-        n, mean = self._means.get(key, (0, np.zeros(n_near)))
-        n += 1
-        known = np.where(np.isnan(near), mean, near)
-        mean = mean + (known - mean) / min(n, _STATIC_MEMORY)
-        self._means[key] = n, mean
-        rest = np.full(n_near, np.nan)
-        if n >= _STATIC_LEAST:
-            share = np.clip((ends + fade - np.arange(n_near)) / fade, 0.0, 1.0)
-            rest = near - share * mean
-        samples = np.concatenate([rest, frame.samples[n_near:]]).astype(np.float32)
-        return replace(frame, samples=samples)
-
-
 class MatchedFilterDetector:
     """Echoes by correlation; under ``joint``, overlapping ones fitted together."""
 
@@ -431,9 +393,6 @@ class MatchedFilterDetector:
         self.estimator = PulseEstimator(self._nominal.model, received)
         self._joint = config.detection.front_end is FrontEnd.JOINT
         self._filters: dict[tuple[int, int, float], PulseFilter] = {}
-        self._static: StaticEchoes | None = None
-        if settings.static_range_m:
-            self._static = StaticEchoes(settings.static_range_m)
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         return self.detect_many([frame], [range_offset_m])[0]
@@ -443,11 +402,6 @@ class MatchedFilterDetector:
     ) -> list[tuple[Detection, ...]]:
         for frame in frames:  # before anything is learnt of one
             self._check_length(frame)
-        if self._static is not None:
-            frames = [
-                self._static.removed(frame, offset_m)
-                for frame, offset_m in zip(frames, offsets_m, strict=True)
-            ]
         found: list[tuple[Detection, ...]] = []
         while len(found) < len(frames):
             rest, offsets = frames[len(found) :], offsets_m[len(found) :]
