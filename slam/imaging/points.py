@@ -8,6 +8,9 @@ Covariance
     the frames. The increments of odometry between frames err independently, but for three constants
     (`slam.config.WheelNoise`); each error moves all antennas behind it, seen from the middle of the
     patch, so its share in the bearing is a sum over them.
+Mirror images
+    From a straight way, what is left of it and what is right of it look alike. Only the beam says
+    which is there, and a beam along the way does not. Near the way the two are one.
 """
 
 from __future__ import annotations
@@ -58,8 +61,14 @@ class PointRule:
     least_wall_share: float = 0.3  # size over that of the strongest reflector
     # Clutter that stays for some seconds goes along with the robot, as the echo of a wall does.
     least_wall_snr: float = 20.0
+    # Along the way of the antenna, the wavefront of a plane is that of a point
+    most_flatness_sigma: float = 0.25
     on_wall_share: float = 0.3
     image_m: float = 0.06  # this near to where an image would be, a reflector is one
+    # A point and its mirror image look alike up to so many radians of phase (standard deviation)
+    alike_rad: float = 1.0
+    # and are two if their bearings differ by more than so many standard deviations
+    two_sigmas: float = 4.0
     range_floor_m: float = 1e-3
     bearing_floor_rad: float = 1e-3
 
@@ -80,6 +89,9 @@ class PatchPoint:
         Its largest in the patch, at 1 m under the law of a rod, in units of the frames.
     snr
         Root of its energy over what is left beside it.
+    mirrored_rad
+        Bearing of its mirror image across the way of the antenna, where that may be what is there,
+        and its own where the two are one; None: it is on this side.
     """
 
     x_m: float
@@ -90,6 +102,7 @@ class PatchPoint:
     bearing_sigma_rad: float
     amplitude: float
     snr: float
+    mirrored_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,16 +152,25 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
             continue
         if are_cut[k]:
             sigma_m = math.hypot(sigma_m, rule.cut_sigma_m)
+        range_m, bearing_rad = float(reflectors.range_m[k]), float(reflectors.bearing_rad[k])
+        apart_rad = _way_to_mirror_rad(patch, places[k], rule)
+        if apart_rad is not None and abs(apart_rad) <= rule.two_sigmas * bearing_sigma_rad:
+            bearing_rad += 0.5 * apart_rad
+            bearing_sigma_rad = math.hypot(bearing_sigma_rad, 0.5 * apart_rad)
+            apart_rad = 0.0
+            c, s = math.cos(bearing_rad), math.sin(bearing_rad)
+            places[k] = antenna + range_m * (turn @ (c, s))
         points.append(
             PatchPoint(
                 x_m=float(places[k, 0]),
                 y_m=float(places[k, 1]),
-                range_m=float(reflectors.range_m[k]),
-                bearing_rad=float(reflectors.bearing_rad[k]),
+                range_m=range_m,
+                bearing_rad=bearing_rad,
                 sigma_m=sigma_m,
                 bearing_sigma_rad=bearing_sigma_rad,
                 amplitude=float(reflectors.amplitude[k]),
                 snr=float(reflectors.snr[k]),
+                mirrored_rad=None if apart_rad is None else bearing_rad + apart_rad,
             )
         )
     return tuple(points)
@@ -173,6 +195,8 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
         feet = antennas + (distance_m - antennas @ normal)[:, np.newaxis] * normal
         if in_view(patch, feet[patch.middle][np.newaxis])[0] < rule.least_in_view:
             continue
+        if _flatness_sigma(patch, reflectors, k, normal) > rule.most_flatness_sigma:
+            continue
         sight = np.broadcast_to(normal, antennas.shape)
         sigma_m, bearing_sigma_rad = _sigmas(patch, reflectors, k, sight, rule)
         if bearing_sigma_rad > aperture.half_beam_rad:
@@ -191,6 +215,21 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
     return tuple(lines)
 
 
+def _flatness_sigma(patch: Patch, reflectors: Reflectors, k: int, sight: Array) -> float:
+    """Return the standard deviation of the flatness of a reflector in direction ``sight`` (2,).
+
+    Range and bearing are fitted, too.
+    """
+    antennas, weights = patch.aperture.antennas_m, reflectors.levels[k]
+    across = (antennas - antennas[patch.middle]) @ (-sight[1], sight[0])
+    phases = patch.profiles.wave_number_rad_per_m * across**2 / (2 * reflectors.range_m[k])
+    fitted = np.column_stack([np.ones_like(across), across]) * weights[:, np.newaxis]
+    left = weights * phases
+    left = left - fitted @ np.linalg.lstsq(fitted, left)[0]
+    known = float(reflectors.snr[k] * np.linalg.norm(left) / np.linalg.norm(weights))
+    return 1.0 / known if known else math.inf
+
+
 def in_view(patch: Patch, places: Array) -> Array:
     """Return the share of the frames that have points (k, 2) in beam and range."""
     aperture = patch.aperture
@@ -201,6 +240,25 @@ def in_view(patch: Patch, places: Array) -> Array:
     seen = ahead >= math.cos(aperture.half_beam_rad) * ranges_m
     seen &= (ranges_m >= aperture.min_range_m) & (ranges_m <= aperture.max_range_m)
     return np.asarray(seen.mean(axis=1))
+
+
+def _way_to_mirror_rad(patch: Patch, place: Array, rule: PointRule) -> float | None:
+    """Return the angle from a place (2,) to its mirror image across the way.
+
+    It is seen from the antenna in the middle; None if what answers cannot be at the mirror image.
+    """
+    antennas = patch.aperture.antennas_m
+    middle = antennas[patch.middle]
+    _, _, (along, across) = np.linalg.svd(antennas - antennas.mean(axis=0))
+    away = place - middle
+    mirrored = middle + (away @ along) * along - (away @ across) * across
+    one_m, other_m = (np.linalg.norm(at - antennas, axis=1) for at in (place, mirrored))
+    phases = patch.profiles.wave_number_rad_per_m * (one_m - other_m)
+    is_alike = float(phases.std()) <= rule.alike_rad
+    if not is_alike or in_view(patch, mirrored[np.newaxis])[0] < rule.least_in_view:
+        return None
+    x, y = mirrored - middle
+    return math.atan2(away[0] * y - away[1] * x, away[0] * x + away[1] * y)
 
 
 def _are_points(
@@ -219,6 +277,9 @@ def _are_points(
     )
     fades = np.abs(first - last) > rule.most_fading * (first + last)
     may_be &= ~fades | (reflectors.flatness <= rule.flatness[0])
+    for k in np.flatnonzero(reflectors.flatness > rule.flatness[1]).tolist():
+        sight = (places[k] - patch.aperture.antennas_m[patch.middle]) / reflectors.range_m[k]
+        may_be[k] |= _flatness_sigma(patch, reflectors, k, sight) > rule.most_flatness_sigma
     chosen = may_be & (amplitude >= rule.least_share * amplitude.max(where=may_be, initial=0.0))
     chosen &= stand_out(reflectors, rule, are_cut)
     chosen &= in_view(patch, places) >= rule.least_in_view

@@ -27,6 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,13 +79,19 @@ class RangeScan:
     # Of flat faces in a patch: the stretch (from, to) along each that gave the echo, counted to the
     # left from the foot of the perpendicular, whose range and bearing are given. None: of points
     faces_m: tuple[tuple[float, float], ...] | None = None
+    # Of each point of a patch the index of its mirror image, which may be itself; only one of the
+    # two is there
+    mirrors: tuple[int | None, ...] | None = None
     # Whether points and walls of patches of the radar come beside these single ranges
     is_imaged: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError if a number is not finite, or missing for one of the ranges."""
         n = len(self.ranges_m)
-        for name in ("sigmas_m", "bearings_rad", "bearing_sigmas_rad", "labels", "faces_m"):
+        for name in (
+            *("sigmas_m", "bearings_rad", "bearing_sigmas_rad"),
+            *("labels", "faces_m", "mirrors"),
+        ):
             values = getattr(self, name)
             if values is not None and len(values) != n:
                 raise ValueError(
@@ -111,6 +118,14 @@ class RangeScan:
         labels = enumerate(self.labels or ())
         return tuple((index, label) for index, label in labels if label is not None)
 
+    def mirrors_of(self, indices: Sequence[int]) -> list[int | None]:
+        """Return the mirror image of each of some detections, by index."""
+        return [None if self.mirrors is None else self.mirrors[index] for index in indices]
+
+    def with_mirrors(self, indices: Sequence[int]) -> set[int]:
+        """Return indices of detections, and those of their mirror images."""
+        return {*indices, *(one for one in self.mirrors_of(indices) if one is not None)}
+
     @property
     def looks(self) -> bool:
         """Return whether the radar looked for whatever is there, and did not ask beacons only."""
@@ -124,6 +139,22 @@ class RangeScan:
         if self.sigmas_m is None or not sigma_m:
             return self
         return replace(self, sigmas_m=tuple([math.hypot(s, sigma_m) for s in self.sigmas_m]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MirrorWay:
+    """The way from where something may be to its mirror image, map frame."""
+
+    x_m: float
+    y_m: float
+    variance: float  # of either of them [m^2]
+
+    def is_like(self, other: MirrorWay | None) -> bool:
+        """Return whether two ways are one: of what is there, from straight ways that differ, no."""
+        if other is None:
+            return False
+        gap = (self.x_m - other.x_m) ** 2 + (self.y_m - other.y_m) ** 2
+        return is_plausible(gap / (self.variance + other.variance), 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -500,6 +531,22 @@ class PointMatches:
     evidence: tuple[float, ...]
     refused: tuple[tuple[int, int], ...]  # the same of labelled ones too far off
     missed: tuple[int, ...]  # rows without labels surely in view, of which nothing was seen
+
+    def without_mirrors(self, scan: RangeScan) -> PointMatches:
+        """Return these without pairs of a detection whose mirror image is a likelier landmark."""
+        ranked = [(nats, pair[0]) for nats, pair in zip(self.evidence, self.pairs, strict=True)]
+        worth = {one[1]: one for one in ranked}
+
+        def is_likelier(index: int) -> bool:
+            both = scan.with_mirrors([index])
+            return worth[index] == max(worth[one] for one in both if one in worth)
+
+        kept = [is_likelier(index) for index, _ in self.pairs]
+        return replace(
+            self,
+            pairs=tuple(compress(self.pairs, kept)),
+            evidence=tuple(compress(self.evidence, kept)),
+        )
 
 
 def _maybe_in_view(

@@ -24,6 +24,7 @@ from slam.robust.association import (
     LONGEST_M,
     Antennas,
     Known,
+    MirrorWay,
     Pairs,
     RangeScan,
     View,
@@ -43,6 +44,7 @@ from slam.robust.initialisation import (
     FeatureRows,
     Guess,
     Option,
+    PointDetection,
     Question,
     Search,
     Sightings,
@@ -726,12 +728,13 @@ class RobustBackEnd:
             found = find_points(state, seen, wide, (free, hit, row_of_label), self.parameters)
             if not found.pairs:
                 break
+            found = found.without_mirrors(scan)
             hit.update(row for _, row in found.pairs)
             for (_, row), nats in zip(found.pairs, found.evidence, strict=True):
                 if self._log.is_new_passage(ids[row]):
                     self.evidence += nats
             report = _together(report, self._correct_points(scan, seen, found.pairs, antennas))
-            used = {index for index, _ in found.pairs}
+            used = scan.with_mirrors([index for index, _ in found.pairs])
             free = [index for index in free if index not in used]
         hit_ids = {ids[row] for row in hit}
         rule = self.parameters.bearings(of_patches=scan.is_patch)
@@ -809,6 +812,7 @@ class RobustBackEnd:
             rows, detections_of(scan, indices, pose, antennas, noise), strict=True
         ):
             self._log.add_detections(ids[row], [detection])
+            self._existence.show(ids[row], self._way_to_mirror(detection))
         state.apply(gain, weighted)
         return UpdateReport(
             continued=tuple([(scan.radar, index, ids[row]) for index, row in pairs]),
@@ -930,9 +934,20 @@ class RobustBackEnd:
             update_with_point(state, row, point)
         rule = self.parameters.bearings(of_patches=tentative.is_of_patches)
         self._existence.hit(landmark_id, len(tentative.seen) * rule.frames_per_scan)
+        ways = [self._way_to_mirror(detection) for detection in tentative.seen]
+        if row is None:
+            self._existence.begin_mirrored(landmark_id, ways)
+        for way in ways:
+            self._existence.show(landmark_id, way)
         self._log.add_detections(landmark_id, tentative.seen)
         if tracklet is not None:
             self._use(landmark_id, tracklet.seen)
+
+    def _way_to_mirror(self, detection: PointDetection) -> MirrorWay | None:
+        if detection.mirrored_rad is None:
+            return None
+        heading_rad, variance = self._log.heading_at(detection.pose), self.pose_covariance[2, 2]
+        return detection.way_to_mirror(heading_rad, variance)
 
     def _ranges_of(self, tentative: TentativePoint) -> Tracklet | None:
         """Return the unassigned single ranges of what patches hold, and use them up."""

@@ -48,6 +48,7 @@ from slam.robust import kernels
 from slam.robust.association import (
     LONGEST_M,
     Antennas,
+    MirrorWay,
     RangeScan,
     certain,
     correspondence,
@@ -797,6 +798,25 @@ class PointDetection:
     bearing_rad: float  # in the body frame of the sample
     bearing_sigma_rad: float
     is_of_patch: bool = False
+    # Bearing of its mirror image, where that is a detection of the scan, too
+    mirrored_rad: float | None = None
+
+    def way_to_mirror(self, heading_rad: float, heading_variance: float) -> MirrorWay | None:
+        """Return the way from here to the mirror image, if there is one.
+
+        The heading is that of the robot at the pose, in the map.
+        """
+        if self.mirrored_rad is None:
+            return None
+        turn_rad = heading_rad + self.turn_rad
+        here, there = (
+            self.range_m * rotation(turn_rad + bearing)[:, 0]
+            for bearing in (self.bearing_rad, self.mirrored_rad)
+        )
+        x_m, y_m = (there - here).tolist()
+        of_bearing = (2.0 * self.range_m * self.bearing_sigma_rad) ** 2
+        variance = of_bearing + heading_variance * (x_m**2 + y_m**2)
+        return MirrorWay(x_m=x_m, y_m=y_m, variance=variance)
 
 
 def detections_of(
@@ -820,9 +840,10 @@ def detections_of(
             bearing_rad=yaw_rad + scan.bearings_rad[index],
             bearing_sigma_rad=bearing_sigma_rad,
             is_of_patch=scan.is_patch,
+            mirrored_rad=None if mirror is None else yaw_rad + scan.bearings_rad[mirror],
         )
-        for index, (sigma_m, bearing_sigma_rad) in zip(
-            indices, np.sqrt(variances).tolist(), strict=True
+        for index, mirror, (sigma_m, bearing_sigma_rad) in zip(
+            indices, scan.mirrors_of(indices), np.sqrt(variances).tolist(), strict=True
         )
     ]
 
@@ -869,6 +890,13 @@ class TentativePoint:
     def is_of_patches(self) -> bool:
         return all(one.is_of_patch for one in self.seen)
 
+    @property
+    def mirrored(self) -> set[tuple[int, int, float]]:
+        """Return its detections that have mirror images; these are the same ones."""
+        return {
+            (one.pose, one.radar, one.range_m) for one in self.seen if one.mirrored_rad is not None
+        }
+
 
 class TentativePoints:
     """Detections with bearings that are of nothing known, as points at rest.
@@ -904,7 +932,7 @@ class TentativePoints:
         self._points.append(one)
 
     def remove(self, one: TentativePoint) -> None:
-        self._points = [other for other in self._points if other is not one]
+        self._points = self._without([one])
 
     def forget_before(self, pose: int) -> None:
         """Forget those that were seen before a pose, by index in the log."""
@@ -919,13 +947,14 @@ class TentativePoints:
         """Return those that are landmarks, of the map or new, and forget them."""
         found = [one for one in self._points if self._is_landmark(one)]
         labels = {one.label for one in found if one.label is not None}
-        kept = [one for one in self._points if one not in found and one.label not in labels]
+        kept = [one for one in self._without(found) if one.label not in labels]
         self._points = kept
-        # Of one label there is one landmark.
+        # Of one label there is one landmark, and so of two mirror images.
         return [
             one
             for k, one in enumerate(found)
             if one.label is None or one.label not in {other.label for other in found[:k]}
+            if not any(one.mirrored & other.mirrored for other in found[:k])
         ]
 
     def take(self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]) -> None:
@@ -949,6 +978,11 @@ class TentativePoints:
         """Return whether enough detections hit a point, and lie as one at rest lets them."""
         hits, rule = len(one.seen), self._parameters.bearings(of_patches=one.is_of_patches)
         return hits >= rule.fewest and is_plausible(one.chi_square, 2 * (hits - 1))
+
+    def _without(self, found: Sequence[TentativePoint]) -> list[TentativePoint]:
+        """Return the points but for some, and their mirror images."""
+        mirrored = set[tuple[int, int, float]]().union(*(one.mirrored for one in found))
+        return [one for one in self._points if one not in found and not one.mirrored & mirrored]
 
     def _assigned(
         self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]

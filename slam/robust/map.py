@@ -20,6 +20,7 @@ from slam.geometry import Rig
 from slam.results import OF_MOUNT, SavedLandmark, SavedMap, SavedRadar, SavedWall
 from slam.robust.association import (
     Correspondence,
+    MirrorWay,
     Pairs,
     RangeScan,
     View,
@@ -43,6 +44,8 @@ class _Record:
     hits: int = 0
     n_heard: int = 0  # ranges of it
     n_unheard: int = 0  # how often a radar had it surely in view and did not hear it
+    # Where its mirror image lies, while that may be what is there
+    mirrored: MirrorWay | None = None
 
 
 class Existence:
@@ -62,6 +65,19 @@ class Existence:
     def miss(self, landmark_id: int, most: float = math.inf) -> None:
         """Count a frame that should have hit a landmark and did not, by no more than ``most``."""
         self._records[landmark_id].score -= min(self._rule.miss, most)
+
+    def begin_mirrored(self, landmark_id: int, ways: Sequence[MirrorWay | None]) -> None:
+        """Note that a landmark may be a mirror image, if it may be in all of its detections."""
+        known = [way for way in ways if way is not None]
+        surest = min(known, key=lambda way: way.variance, default=None)
+        if surest is not None and all(surest.is_like(way) for way in ways):
+            self._records[landmark_id].mirrored = surest
+
+    def show(self, landmark_id: int, way: MirrorWay | None) -> None:
+        """Note where the mirror image of a landmark lies in another detection of it."""
+        record = self._records[landmark_id]
+        if record.mirrored is not None and not record.mirrored.is_like(way):
+            record.mirrored = None
 
     def heard(self, landmark_id: int) -> None:
         self._records[landmark_id].n_heard += 1
@@ -94,7 +110,8 @@ class Existence:
         self._records[landmark_id] = _Record(score=float(self._report_hits), hits=hits)
 
     def is_reported(self, landmark_id: int) -> bool:
-        return self._records[landmark_id].hits >= self._report_hits
+        record = self._records[landmark_id]
+        return record.hits >= self._report_hits and record.mirrored is None
 
     def forget(self, landmark_id: int) -> None:
         self._records.pop(landmark_id, None)
@@ -103,6 +120,7 @@ class Existence:
         into, other = self._records[kept], self._records[gone]
         into.score = min(max(into.score, 0.0) + max(other.score, 0.0), self._rule.most)
         into.hits += other.hits
+        into.mirrored = None if other.mirrored is None else into.mirrored
         into.n_heard += other.n_heard
         into.n_unheard += other.n_unheard
         self.forget(gone)

@@ -443,13 +443,25 @@ class PatchScans:
         # What the wheels do between the patch and the newest pose
         along, _, heading = self._wheels.step_variances(math.hypot(dx, dy), turn)
         share, noise = self._rule.bearing_share, self._noise
+        bearings_rad = [one.bearing_rad for one in found]
+        mirrors: list[int | None] = [None] * len(found)
+        for k, one in enumerate(tuple(found)):
+            mirrored_rad = one.mirrored_rad if isinstance(one, PatchPoint) else None
+            if mirrored_rad == one.bearing_rad:
+                mirrors[k] = k
+            elif mirrored_rad is not None:
+                mirrors[k] = len(mirrors)
+                mirrors.append(k)
+                bearings_rad.append(mirrored_rad)
+        found = [*found, *(found[k] for k in mirrors[len(found) :] if k is not None)]
         return RangeScan(
             radar=patch.radar,
             is_patch=True,
             moved=(dx * (1.0 + s), dy * (1.0 + s), turn * (1.0 + w)),  # as the wheels report it
             ranges_m=tuple([one.range_m for one in found]),
             sigmas_m=tuple([math.sqrt(one.sigma_m**2 + along + noise.sigma_m**2) for one in found]),
-            bearings_rad=tuple([one.bearing_rad for one in found]),
+            bearings_rad=tuple(bearings_rad),
+            mirrors=tuple(mirrors),
             bearing_sigmas_rad=tuple(
                 [
                     share * math.sqrt(one.bearing_sigma_rad**2 + heading + noise.sigma_rad**2)

@@ -262,6 +262,10 @@ class RunLog:
         self._causal.append(self._stored_pose)
         self.since_solved += 1
 
+    def heading_at(self, pose: int) -> float:
+        """Return the heading [rad] of a pose as it was reported, or solved for since."""
+        return float(self._causal.rows[pose, 2])
+
     def set_causal(self, pose: Array) -> None:
         """Store the filter's newest pose, its measurements included."""
         self._causal.rows_to_write(self.n_poses - 1)[0] = pose

@@ -184,6 +184,55 @@ def test_a_near_wall_is_one_line() -> None:
     assert [line.distance_m for line in patch_lines(patch)] == pytest.approx([0.55], abs=1e-3)
 
 
+def looking_ahead() -> Array:
+    """Return body poses (n, 3) along x, on which the antenna looks along x, too."""
+    return straight() - [0.0, 0.0, MOUNT.yaw_rad]
+
+
+def turning(lever_m: float = math.hypot(MOUNT.x_m, MOUNT.y_m)) -> Array:
+    """Return body poses (n, 3) of a turn on the spot, on which the antenna makes as much way."""
+    turns = (np.arange(25) - MIDDLE) * 0.01 / lever_m - MOUNT.yaw_rad
+    return np.column_stack([np.zeros(25), np.zeros(25), turns])
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_what_is_beside_a_way_looks_like_its_mirror_image_to_an_antenna_ahead(side: float) -> None:
+    """The antenna is 0.1 m right of the body; the rod 0.4 m beside its way, 1 m ahead."""
+    poses = looking_ahead()
+    (point,) = patch_points(patch_of(of_point(poses, (1.2, -0.1 + side * 0.4)) + noise(6), poses))
+    assert point.mirrored_rad is not None
+    bearings_rad = sorted([point.bearing_rad, point.mirrored_rad])
+    assert bearings_rad == pytest.approx([-math.atan(0.4), math.atan(0.4)], abs=0.02)
+    turns = turning()
+    (point,) = patch_points(patch_of(of_point(turns, (1.2, -0.1 + side * 0.4)) + noise(6), turns))
+    assert point.mirrored_rad is None
+    assert point.bearing_rad == pytest.approx(side * math.atan(0.4), abs=0.02)
+
+
+def test_an_antenna_that_looks_aside_has_no_mirror_images_in_its_beam() -> None:
+    for place in ((0.1, 1.1), (0.45, 1.0), (-0.3, 1.3)):
+        (point,) = patch_points(patch_of(of_point(straight(), place) + noise(7)))
+        assert point.mirrored_rad is None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_near_the_way_a_point_and_its_mirror_image_are_one(seed: int) -> None:
+    """It is on the way, and its bearing as uncertain as both are away from that."""
+    poses = looking_ahead()
+    (point,) = patch_points(patch_of(of_point(poses, (1.3, -0.04)) + noise(seed), poses))
+    assert point.mirrored_rad == point.bearing_rad == pytest.approx(0.0, abs=1e-9)
+    assert math.atan2(0.06, 1.1) < 2.0 * point.bearing_sigma_rad
+    assert (point.x_m, point.y_m) == pytest.approx((0.2 + point.range_m, -0.1))
+
+
+def test_ahead_nothing_is_a_wall() -> None:
+    """There a point and a plane have one wavefront."""
+    poses = looking_ahead()
+    ranges_m = 1.4 - antennas_of(poses)[:, 0]
+    assert not patch_lines(patch_of(rf_frames(ranges_m, 0.04 / ranges_m) + noise(8), poses))
+    assert not patch_lines(patch_of(of_point(poses, (1.3, 0.0), 0.04) + noise(8), poses))
+
+
 def test_a_point_has_no_line() -> None:
     assert not patch_lines(patch_of(of_point(straight(), (0.1, 1.1))))
 

@@ -26,10 +26,18 @@ from slam.imaging.imager import ImagedPatch, Imager
 from slam.imaging.patches import Patch
 from slam.imaging.points import PatchLine, PatchPoint
 from slam.results import Belief
-from slam.robust.association import RangeScan, View, antennas_of, find_points, view
+from slam.robust.association import (
+    MirrorWay,
+    RangeScan,
+    View,
+    antennas_of,
+    find_points,
+    view,
+)
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import body_point, detections_of
-from slam.robust.parameters import BackEndParameters, ImagedPointRule, RangeNoise
+from slam.robust.map import Existence
+from slam.robust.parameters import BackEndParameters, ImagedPointRule, MapRule, RangeNoise
 from slam.robust.pipeline import PatchScans, PointNoise, RobustSlam
 from slam.robust.state import State, SymmetricMatrix
 
@@ -415,6 +423,83 @@ def test_single_ranges_of_what_a_patch_has_out_of_view_are_used() -> None:
             patches = [replace(seen_from(pose, radar=radar), moved=away) for radar in (0, 1)]
         report = back_end.update([*ranges_at(pose), *patches])
     assert {radar for radar, _, _ in report.continued} == {0, 1}
+
+
+RIG_AHEAD = replace(RIG, mounts=(replace(RIG.mounts[0], yaw_rad=0.0),))
+
+
+def seen_ahead(pose: Array, rod: Array, *, first: bool = True) -> RangeScan:
+    """Return the scan of a patch of a radar that looks along its way, and shows a rod (2,).
+
+    Its mirror image is the second of the two points, or the ``first``.
+    """
+    mount = RIG_AHEAD.mounts[0]
+    x, y = transform(between(pose, np.zeros(3)), rod) - (mount.x_m, mount.y_m)
+    bearings_rad = (math.atan2(y, x), math.atan2(-y, x))
+    return RangeScan(
+        radar=0,
+        is_patch=True,
+        ranges_m=(math.hypot(x, y),) * 2,
+        sigmas_m=(1e-3,) * 2,
+        bearings_rad=bearings_rad if first else bearings_rad[::-1],
+        bearing_sigmas_rad=(5e-3,) * 2,
+        mirrors=(1, 0),
+    )
+
+
+def driven(*moves: tuple[tuple[float, float, float], bool]) -> tuple[RobustBackEnd, list[int]]:
+    """Return a back end after moves with a patch behind each, and its landmarks reported then."""
+    back_end, pose, n_reported = RobustBackEnd(RIG_AHEAD, PARAMETERS), np.zeros(3), list[int]()
+    for move, first in moves:
+        back_end.predict(np.array(move))
+        pose = compose(pose, np.array(move))
+        back_end.update([seen_ahead(pose, AHEAD_ROD, first=first)])
+        n_reported.append(len(back_end.reported_rows()))
+    return back_end, n_reported
+
+
+AHEAD_ROD = np.array([1.6, 0.5])
+ALONG, TURNED = (0.1, 0.0, 0.0), (0.1, 0.0, 0.3)
+
+
+def test_a_point_is_reported_once_its_mirror_image_is_refuted() -> None:
+    """On a straight way it is a landmark, which holds the pose; a turn shows on which side."""
+    back_end, n_reported = driven(*[(ALONG, True)] * 4, (TURNED, True))
+    assert n_reported == [0, 0, 0, 0, 1]
+    (place,) = back_end.state.landmarks_m
+    assert place == pytest.approx(AHEAD_ROD, abs=0.01)
+    assert len(back_end._log._ranges.rows) == 5  # each patch once
+
+
+def test_a_mirror_image_is_never_reported() -> None:
+    """What is there is, from ways in three directions."""
+    moves = [(ALONG, False)] * 4 + [(TURNED, True), (ALONG, True)] * 2
+    back_end, n_reported = driven(*moves)
+    assert n_reported[:6] == [0] * 6
+    (row,) = back_end.reported_rows()
+    assert back_end.state.landmarks_m[row] == pytest.approx(AHEAD_ROD, abs=0.02)
+
+
+def test_a_known_landmark_is_known_by_its_mirror_image() -> None:
+    """From ways that cross, whichever of the two the patch has found first."""
+    moves = [(ALONG, True), (TURNED, True)] + [(ALONG, False), (ALONG, True)] * 3
+    back_end, n_reported = driven(*moves)
+    assert n_reported[2:] == [1] * 6  # by three patches
+    assert len(back_end.state.landmark_ids) == 1
+    assert len(back_end._log._ranges.rows) == 8
+
+
+def test_of_two_landmarks_that_are_one_both_must_be_mirrored() -> None:
+    way = MirrorWay(x_m=1.0, y_m=0.0, variance=1e-4)
+    for is_other, expected in ((False, True), (True, False)):
+        existence = Existence(MapRule(), 1, 0.9)
+        for id_ in (0, 1):
+            existence.hit(id_, 5)
+        existence.begin_mirrored(0, [way])
+        existence.begin_mirrored(1, [way] if is_other else [way, None])
+        assert not existence.is_reported(0)
+        existence.merge(0, 1)
+        assert existence.is_reported(0) == expected
 
 
 def test_what_may_be_known_is_decided_with_two_patches() -> None:
