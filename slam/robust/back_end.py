@@ -7,6 +7,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -384,7 +385,8 @@ class RobustBackEnd:
     def _look_for_slip(self, motion: Motion, elapsed_s: float) -> None:
         """Let the pose be uncertain where the wheels may have slipped before the newest step.
 
-        Poses that were kept meanwhile are given up, and so are ranges of before.
+        Poses that were kept meanwhile are given up, and so are ranges of before. Those of meanwhile
+        were assigned from a pose that was not known: in the whole run they are of nothing.
         """
         slip = self._slips.take(motion, elapsed_s)
         if slip is None:
@@ -393,6 +395,8 @@ class RobustBackEnd:
         first = self._log.n_poses - slip.n_since - len(slip.covariances)
         for pose, covariance in enumerate(slip.covariances, start=first):
             self._log.loosen(pose, covariance)
+        waiting = {one.log_id for one in self._waiting.values()}
+        self._log.leave_out_since(first, {*self._landmark_of_label.values(), *waiting})
         n_sure = sum(number < first for number in self.state.past_numbers)
         self._marginalise_past(slice(n_sure, None))
         self._move(slip.since)
@@ -460,7 +464,7 @@ class RobustBackEnd:
         """Take in the scans of one time; a radar without a frame is absent, not empty.
 
         Without ``solve`` merges and the solution over all poses wait for a later time. With
-        ``decide`` what is unclear is taken for the likeliest; without it, questions stay open. With
+        ``decide`` what is unclear is taken for new; without it, questions stay open. With
         ``may_wait`` the solution of a long run is left to the caller (``awaits_solution``).
         """
         patches = [scan for scan in scans if scan.is_patch]
@@ -523,9 +527,14 @@ class RobustBackEnd:
             )
 
     def _decide(self) -> None:
-        """Take what is unclear for the likeliest."""
+        """Take what is unclear for new.
+
+        A landmark that is mapped twice may be merged later, if the whole run allows it; a pose that
+        a wrong one has corrected is wrong and sure.
+        """
         while (question := self.question()) is not None:
-            self.answer(question, question.options[0])
+            is_new = (one.row is None and not one.is_jump for one in question.options)
+            self.answer(question, next(compress(question.options, is_new)))
 
     @property
     def _is_long(self) -> bool:

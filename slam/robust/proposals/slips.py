@@ -16,7 +16,8 @@ Wheels that turn less than the robot moves are not seen.
 
 Where the motion changes, as where a turn on the spot begins, a step may be any mixture of the
 motion before and the one behind it: the robot slows down from the one and comes into the other.
-What goes beyond all of these is a possible slip, once both motions were kept for two steps.
+What goes beyond all of these is a possible slip, once both motions were kept for two steps. It may
+be off by what it has beyond that of the two which it is less like.
 """
 
 from __future__ import annotations
@@ -157,9 +158,10 @@ class SlipDetector:
         return self._possible_slip(between, excess, [last])
 
     def _slip_at_change(self, last: _Step) -> PossibleSlip | None:
-        """Return what steps report beyond any mixture of the motions before and after them.
+        """Return what steps report beyond one of the motions before and after them.
 
-        Each of the two was kept for two steps, and they differ.
+        Each of the two was kept for two steps, they differ, and the steps are no mixture of them.
+        Which of the two the robot made is not known: the one is taken that the steps are less like.
         """
         steps = [step for step in self._steps if step is not None]
         for n in range(1, min(self._rule.most_steps, len(steps) - 3) + 1):
@@ -170,9 +172,13 @@ class SlipDetector:
             if self._is_kept(first, after):
                 break
             rates = [[value / step.took_s for value in step.motion] for step in (first, after)]
-            excess = self._excess(between, rates, [first, *between, after])
-            if excess is not None:
-                return self._possible_slip(between, excess, [after, last])
+            if self._excess(between, rates, [first, *between, after]) is not None:
+                errors = [
+                    [_change(kept, step, step.took_s) for step in between]
+                    for kept in (first, after)
+                ]
+                largest = max(errors, key=lambda one: self._square(_sum(one)))
+                return self._possible_slip(between, largest, [after, last])
         return None
 
     def _is_kept(self, before: _Step, after: _Step) -> bool:

@@ -369,6 +369,13 @@ class RunLog:
         bad &= np.isnan(ranges["bearing_rad"]) & np.isin(ranges["landmark"], named)
         ranges["landmark"][bad] = _OF_NOTHING
 
+    def leave_out_since(self, pose: int, named: Collection[int]) -> None:
+        """Leave out all that was measured from a pose on, but of landmarks with labels."""
+        ranges = self._ranges.rows_to_write()
+        names = [name for id_ in named for name in self._all_names(id_)]
+        bad = (ranges["pose"] >= pose) & ~np.isin(ranges["landmark"], names)
+        ranges["landmark"][bad] = _OF_NOTHING
+
     def seen_from(self, poses: Collection[int]) -> Counter[int]:
         """Return from how many of some poses each landmark was seen with a bearing, by its id."""
         ranges = self._ranges.rows

@@ -502,25 +502,30 @@ def test_of_two_landmarks_that_are_one_both_must_be_mirrored() -> None:
         assert existence.is_reported(0) == expected
 
 
-def test_what_may_be_known_is_decided_with_two_patches() -> None:
-    """The pose is known to 0.3 m only: a rod 20 cm from a known one is taken for that."""
+@pytest.mark.parametrize(("sigma_m", "away_m", "is_new"), [(0.3, 0.2, True), (0.04, 0.05, False)])
+def test_what_may_be_known_is_that_if_it_is_much_likelier(
+    sigma_m: float, away_m: float, is_new: bool
+) -> None:
+    """A pose known to 0.3 m: a rod 20 cm from a known one is 1.4 times as likely that as new.
+
+    One is new per square metre. With 4 cm, 5 cm away, it is 46 times as likely the known one.
+    """
     back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
     for _ in range(2):
         back_end.predict(STEP)
         pose = compose(pose, STEP)
         back_end.update([seen_from(pose, ROD)])
-    back_end.predict(STEP, np.diag([0.09, 0.09, 0.01]))
+    back_end.predict(STEP, np.diag([sigma_m**2, sigma_m**2, 1e-6]))
     pose = compose(pose, STEP)
-    other, counts, off_m = np.array([0.5, 0.9]), [], []
+    other, counts, off_m = ROD + [away_m, 0.0], [], []
     for _ in range(4):
         back_end.update([seen_from(pose, other)])
         counts.append(len(back_end.state.landmark_ids))
         off_m.append(float(back_end.pose[0] - pose[0]))
         back_end.predict(STEP)
         pose = compose(pose, STEP)
-    assert counts == [1] * 4
-    assert off_m[0] == pytest.approx(0.0, abs=1e-3)
-    assert off_m[1:] == pytest.approx([ROD[0] - other[0]] * 3, abs=0.03)
+    assert counts == [1] + [2 if is_new else 1] * 3
+    assert off_m == pytest.approx([0.0 if is_new else -away_m] * 4, abs=0.01)
 
 
 def test_a_landmark_that_is_predicted_out_of_view_is_a_rival() -> None:
