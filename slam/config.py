@@ -455,6 +455,7 @@ REMOVED_KEYS: Mapping[str, str | float] = {
     "leakage.filter": "none",
     "leakage.max_range_m": 0.45,
     "leakage.memory_frames": 50.0,
+    "matched_filter.static_range_m": 0.0,
     "robust.calibrated_offset_sigma_m": 0.0,
     "robust.misfit_share": 0.0,
     "robust.predicted_share": 1.0,

@@ -84,6 +84,14 @@ def transform(pose: Array, points: Array) -> Array:
     return result
 
 
+def mirrored(point: Array, places: Array) -> Array:
+    """Return the mirror image of a point (2,) across the line closest to some places (k, 2)."""
+    middle = places.mean(axis=0)
+    along = np.linalg.svd(places - middle, full_matrices=False)[2][0]
+    away = point - middle
+    return np.asarray(middle + 2.0 * float(along @ away) * along - away)
+
+
 def align_se2(points: Array, targets: Array) -> Array:
     """Return the rigid motion (3,) that brings points closest to targets, row by row.
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import WheelNoise
+from slam.geometry import mirrored
 from slam.imaging.patches import Patch, seen_from
 from slam.imaging.reflectors import Reflectors, SeparationRule
 
@@ -226,8 +227,8 @@ def _flatness_sigma(patch: Patch, reflectors: Reflectors, k: int, sight: Array) 
     fitted = np.column_stack([np.ones_like(across), across]) * weights[:, np.newaxis]
     left = weights * phases
     left = left - fitted @ np.linalg.lstsq(fitted, left)[0]
-    known = float(reflectors.snr[k] * np.linalg.norm(left) / np.linalg.norm(weights))
-    return 1.0 / known if known else math.inf
+    size, of_shape = np.linalg.norm(weights), reflectors.snr[k] * np.linalg.norm(left)
+    return float(size / of_shape) if of_shape > 0.0 else math.inf
 
 
 def in_view(patch: Patch, places: Array) -> Array:
@@ -248,17 +249,14 @@ def _way_to_mirror_rad(patch: Patch, place: Array, rule: PointRule) -> float | N
     It is seen from the antenna in the middle; None if what answers cannot be at the mirror image.
     """
     antennas = patch.aperture.antennas_m
-    middle = antennas[patch.middle]
-    _, _, (along, across) = np.linalg.svd(antennas - antennas.mean(axis=0))
-    away = place - middle
-    mirrored = middle + (away @ along) * along - (away @ across) * across
-    one_m, other_m = (np.linalg.norm(at - antennas, axis=1) for at in (place, mirrored))
+    other = mirrored(place, antennas)
+    one_m, other_m = (np.linalg.norm(at - antennas, axis=1) for at in (place, other))
     phases = patch.profiles.wave_number_rad_per_m * (one_m - other_m)
     is_alike = float(phases.std()) <= rule.alike_rad
-    if not is_alike or in_view(patch, mirrored[np.newaxis])[0] < rule.least_in_view:
+    if not is_alike or in_view(patch, other[np.newaxis])[0] < rule.least_in_view:
         return None
-    x, y = mirrored - middle
-    return math.atan2(away[0] * y - away[1] * x, away[0] * x + away[1] * y)
+    (ax, ay), (bx, by) = place - antennas[patch.middle], other - antennas[patch.middle]
+    return math.atan2(ax * by - ay * bx, ax * bx + ay * by)
 
 
 def _are_points(

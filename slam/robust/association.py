@@ -99,6 +99,10 @@ class RangeScan:
                 )
         if self.faces_m is not None and (self.bearings_rad is None or not self.is_patch):
             raise ValueError(f"{self}: faces_m are of a patch, and have bearings_rad")
+        if self.mirrors_of([one for one in self.mirrors or () if one is not None]) != [
+            index for index, one in enumerate(self.mirrors or ()) if one is not None
+        ]:
+            raise ValueError(f"{self}: mirrors must be indices of each other")
         sigmas = (*(self.sigmas_m or ()), *(self.bearing_sigmas_rad or ()))
         numbers = (*self.ranges_m, *(self.moved or ()), *self.blurred_m, *(self.bearings_rad or ()))
         numbers += tuple([end_m for stretch in self.faces_m or () for end_m in stretch])
@@ -117,6 +121,12 @@ class RangeScan:
         """Return index and label of each range that has a label."""
         labels = enumerate(self.labels or ())
         return tuple((index, label) for index, label in labels if label is not None)
+
+    @property
+    def n_seen(self) -> int:
+        """Return how many things are seen; a point and its mirror image are one."""
+        mirrors = enumerate(self.mirrors or ())
+        return len(self.ranges_m) - sum(one is not None and one < index for index, one in mirrors)
 
     def mirrors_of(self, indices: Sequence[int]) -> list[int | None]:
         """Return the mirror image of each of some detections, by index."""
@@ -150,7 +160,10 @@ class MirrorWay:
     variance: float  # of either of them [m^2]
 
     def is_like(self, other: MirrorWay | None) -> bool:
-        """Return whether two ways are one: of what is there, from straight ways that differ, no."""
+        """Return whether two ways are one, as they are from one straight way.
+
+        From straight ways in two directions, what is there has two mirror images.
+        """
         if other is None:
             return False
         gap = (self.x_m - other.x_m) ** 2 + (self.y_m - other.y_m) ** 2

@@ -7,7 +7,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,7 +209,7 @@ class RobustBackEnd:
     def undecided_covariance(self) -> Array:
         """Return what the newest steps add to the covariance of the pose, (3, 3), map frame.
 
-        They may be a slip (`slam.robust.proposals.slips`); if the next step shows that, the filter
+        They may be a slip (`slam.robust.proposals.slips`); if the next steps show that, the filter
         adds it.
         """
         return turned_covariance(self._slips.undecided_covariance(), self.state.heading_rad)
@@ -383,10 +382,10 @@ class RobustBackEnd:
         self._walls.tentative.move(motion)
 
     def _look_for_slip(self, motion: Motion, elapsed_s: float) -> None:
-        """Let the pose be uncertain where the wheels may have slipped before the newest step.
+        """Let the pose be uncertain where the wheels may have slipped before the newest steps.
 
-        Poses that were kept meanwhile are given up, and so are ranges of before. Those of meanwhile
-        were assigned from a pose that was not known: in the whole run they are of nothing.
+        Poses that were kept meanwhile are given up, and so are ranges of before that wait. Ranges
+        that were assigned meanwhile are left out of the whole run: the pose was not known.
         """
         slip = self._slips.take(motion, elapsed_s)
         if slip is None:
@@ -464,7 +463,7 @@ class RobustBackEnd:
         """Take in the scans of one time; a radar without a frame is absent, not empty.
 
         Without ``solve`` merges and the solution over all poses wait for a later time. With
-        ``decide`` what is unclear is taken for new; without it, questions stay open. With
+        ``decide`` what is unclear is taken for the likeliest; without it, questions stay open. With
         ``may_wait`` the solution of a long run is left to the caller (``awaits_solution``).
         """
         patches = [scan for scan in scans if scan.is_patch]
@@ -527,14 +526,9 @@ class RobustBackEnd:
             )
 
     def _decide(self) -> None:
-        """Take what is unclear for new.
-
-        A landmark that is mapped twice may be merged later, if the whole run allows it; a pose that
-        a wrong one has corrected is wrong and sure.
-        """
+        """Take what is unclear for the likeliest."""
         while (question := self.question()) is not None:
-            is_new = (one.row is None and not one.is_jump for one in question.options)
-            self.answer(question, next(compress(question.options, is_new)))
+            self.answer(question, question.options[0])
 
     @property
     def _is_long(self) -> bool:
@@ -813,7 +807,7 @@ class RobustBackEnd:
             state.range_errors.variance_share,
         )
         area = (noise.max_range_m - noise.min_range_m) * noise.field_of_view_rad
-        clutter = max(noise.clutter_per_m / noise.field_of_view_rad, len(scan.ranges_m) / area)
+        clutter = max(noise.clutter_per_m / noise.field_of_view_rad, scan.n_seen / area)
         log_n = -0.5 * np.square(white) - 0.5 * math.log(math.tau) - np.log(scales)
         log_n = log_n.reshape(-1, 2).sum(axis=1) + math.log(noise.detection_probability / clutter)
         pose = self._log.n_poses - 1
@@ -821,7 +815,7 @@ class RobustBackEnd:
             rows, detections_of(scan, indices, pose, antennas, noise), strict=True
         ):
             self._log.add_detections(ids[row], [detection])
-            self._existence.show(ids[row], self._way_to_mirror(detection))
+            self._existence.take_mirror(ids[row], self._way_to_mirror(detection))
         state.apply(gain, weighted)
         return UpdateReport(
             continued=tuple([(scan.radar, index, ids[row]) for index, row in pairs]),
@@ -947,7 +941,7 @@ class RobustBackEnd:
         if row is None:
             self._existence.begin_mirrored(landmark_id, ways)
         for way in ways:
-            self._existence.show(landmark_id, way)
+            self._existence.take_mirror(landmark_id, way)
         self._log.add_detections(landmark_id, tentative.seen)
         if tracklet is not None:
             self._use(landmark_id, tracklet.seen)
@@ -955,8 +949,11 @@ class RobustBackEnd:
     def _way_to_mirror(self, detection: PointDetection) -> MirrorWay | None:
         if detection.mirrored_rad is None:
             return None
-        heading_rad, variance = self._log.heading_at(detection.pose), self.pose_covariance[2, 2]
-        return detection.way_to_mirror(heading_rad, variance)
+        is_newest = detection.pose == self._log.n_poses - 1  # the log has it without measurements
+        heading_rad = self._log.heading_at(detection.pose)
+        if is_newest:
+            heading_rad = self.state.heading_rad
+        return detection.way_to_mirror(heading_rad, self.pose_covariance[2, 2])
 
     def _ranges_of(self, tentative: TentativePoint) -> Tracklet | None:
         """Return the unassigned single ranges of what patches hold, and use them up."""

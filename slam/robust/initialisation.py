@@ -891,8 +891,11 @@ class TentativePoint:
         return all(one.is_of_patch for one in self.seen)
 
     @property
-    def mirrored(self) -> set[tuple[int, int, float]]:
-        """Return its detections that have mirror images; these are the same ones."""
+    def looks_with_mirrors(self) -> set[tuple[int, int, float]]:
+        """Return pose, radar and range of its detections that have mirror images.
+
+        Of the point at the mirror image they are the same.
+        """
         return {
             (one.pose, one.radar, one.range_m) for one in self.seen if one.mirrored_rad is not None
         }
@@ -949,12 +952,12 @@ class TentativePoints:
         labels = {one.label for one in found if one.label is not None}
         kept = [one for one in self._without(found) if one.label not in labels]
         self._points = kept
-        # Of one label there is one landmark, and so of two mirror images.
+        # Of one label there is one landmark, and of a point and its mirror image the older one.
         return [
             one
             for k, one in enumerate(found)
             if one.label is None or one.label not in {other.label for other in found[:k]}
-            if not any(one.mirrored & other.mirrored for other in found[:k])
+            if not any(one.looks_with_mirrors & other.looks_with_mirrors for other in found[:k])
         ]
 
     def take(self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]) -> None:
@@ -981,8 +984,10 @@ class TentativePoints:
 
     def _without(self, found: Sequence[TentativePoint]) -> list[TentativePoint]:
         """Return the points but for some, and their mirror images."""
-        mirrored = set[tuple[int, int, float]]().union(*(one.mirrored for one in found))
-        return [one for one in self._points if one not in found and not one.mirrored & mirrored]
+        looks = set[tuple[int, int, float]]().union(*(one.looks_with_mirrors for one in found))
+        return [
+            one for one in self._points if one not in found and not one.looks_with_mirrors & looks
+        ]
 
     def _assigned(
         self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]

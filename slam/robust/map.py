@@ -44,7 +44,8 @@ class _Record:
     hits: int = 0
     n_heard: int = 0  # ranges of it
     n_unheard: int = 0  # how often a radar had it surely in view and did not hear it
-    # Where its mirror image lies, while that may be what is there
+    # Where its mirror image lies, while that may be what is there. A point on the way is its own,
+    # and known no better than both sides of the way allow.
     mirrored: MirrorWay | None = None
 
 
@@ -73,8 +74,11 @@ class Existence:
         if surest is not None and all(surest.is_like(way) for way in ways):
             self._records[landmark_id].mirrored = surest
 
-    def show(self, landmark_id: int, way: MirrorWay | None) -> None:
-        """Note where the mirror image of a landmark lies in another detection of it."""
+    def take_mirror(self, landmark_id: int, way: MirrorWay | None) -> None:
+        """Take where the mirror image of a landmark lies in another detection of it.
+
+        If it is elsewhere, or there is none, the landmark is no mirror image.
+        """
         record = self._records[landmark_id]
         if record.mirrored is not None and not record.mirrored.is_like(way):
             record.mirrored = None
@@ -120,7 +124,7 @@ class Existence:
         into, other = self._records[kept], self._records[gone]
         into.score = min(max(into.score, 0.0) + max(other.score, 0.0), self._rule.most)
         into.hits += other.hits
-        into.mirrored = None if other.mirrored is None else into.mirrored
+        self.take_mirror(kept, other.mirrored)
         into.n_heard += other.n_heard
         into.n_unheard += other.n_unheard
         self.forget(gone)

@@ -69,7 +69,7 @@ class PossibleSlip:
 
 
 class SlipDetector:
-    """Finds possible slips among the steps that the wheels report, one step after they ended.
+    """Finds possible slips among the steps that the wheels report, a step or two after they ended.
 
     What is less than ``outlier_sigmas`` standard deviations of the wheels' noise is none. Nor is
     what is less than as many times the third quartile of the latest changes from step to step. For
@@ -170,7 +170,7 @@ class SlipDetector:
             if not (self._is_kept(one, first) and self._is_kept(after, last)):
                 continue
             if self._is_kept(first, after):
-                break
+                break  # `_slip` has judged it
             rates = [[value / step.took_s for value in step.motion] for step in (first, after)]
             if self._excess(between, rates, [first, *between, after]) is not None:
                 errors = [

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam.geometry import mirrored
 from slam.robust.parameters import BackEndParameters, is_plausible
 from slam.robust.solver.revision import adopt, is_determined
 from slam.robust.solver.run_log import Problem, RunLog
@@ -78,14 +79,6 @@ def find_places(
     # What is closer than the noise of a range is the same minimum.
     others = ranked[np.hypot(*(ranked - first).T) > float(np.median(sigmas_m))]
     return np.array([first, *others[:1], mirrored(first, antennas_m)])
-
-
-def mirrored(point_m: Array, antennas_m: Array) -> Array:
-    """Return the mirror image of a point (2,) across the line closest to some antennas (k, 2)."""
-    middle = antennas_m.mean(axis=0)
-    along = np.linalg.svd(antennas_m - middle, full_matrices=False)[2][0]
-    away = point_m - middle
-    return np.asarray(middle + 2.0 * float(along @ away) * along - away)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -263,7 +263,10 @@ class RunLog:
         self.since_solved += 1
 
     def heading_at(self, pose: int) -> float:
-        """Return the heading [rad] of a pose as it was reported, or solved for since."""
+        """Return the heading [rad] of a pose as it was reported, or solved for since.
+
+        Of the newest pose it is that of the wheels until `set_causal`.
+        """
         return float(self._causal.rows[pose, 2])
 
     def set_causal(self, pose: Array) -> None:
@@ -370,11 +373,15 @@ class RunLog:
         ranges["landmark"][bad] = _OF_NOTHING
 
     def leave_out_since(self, pose: int, named: Collection[int]) -> None:
-        """Leave out all that was measured from a pose on, but of landmarks with labels."""
+        """Leave out what was measured from a pose on of landmarks that were seen before it.
+
+        Those with labels, ``named``, are known for certain.
+        """
         ranges = self._ranges.rows_to_write()
         names = [name for id_ in named for name in self._all_names(id_)]
-        bad = (ranges["pose"] >= pose) & ~np.isin(ranges["landmark"], names)
-        ranges["landmark"][bad] = _OF_NOTHING
+        since = ranges["pose"] >= pose
+        bad = since & np.isin(ranges["landmark"], ranges["landmark"][~since])
+        ranges["landmark"][bad & ~np.isin(ranges["landmark"], names)] = _OF_NOTHING
 
     def seen_from(self, poses: Collection[int]) -> Counter[int]:
         """Return from how many of some poses each landmark was seen with a bearing, by its id."""
@@ -385,7 +392,7 @@ class RunLog:
             ranges["landmark"][first].tolist(), ranges["pose"][first].tolist(), strict=True
         ):
             name = self.name_of(landmark)
-            if name is not None:
+            if name not in (None, _OF_NOTHING):
                 found.add((name, pose))
         return Counter(name for name, _ in found)
 

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, parameters_for, simulate
 from slam.config import WheelNoise
-from slam.geometry import Mount, Rig, paper_rig
+from slam.geometry import Mount, Rig, mirrored, paper_rig
 from slam.library.evaluation import ate_rmse_m
 from slam.results import UpdateReport
 from slam.robust.association import RangeScan
@@ -24,7 +24,7 @@ from slam.robust.parameters import (
     RangeNoise,
     RelinearisationRule,
 )
-from slam.robust.solver.beacons import find_places, mirrored
+from slam.robust.solver.beacons import find_places
 from slam.robust.state import Array
 
 SIGMA_M, STEP_M = 0.1, 0.2

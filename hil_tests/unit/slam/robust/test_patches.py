@@ -489,43 +489,74 @@ def test_a_known_landmark_is_known_by_its_mirror_image() -> None:
     assert len(back_end._log._ranges.rows) == 8
 
 
-def test_of_two_landmarks_that_are_one_both_must_be_mirrored() -> None:
-    way = MirrorWay(x_m=1.0, y_m=0.0, variance=1e-4)
-    for is_other, expected in ((False, True), (True, False)):
-        existence = Existence(MapRule(), 1, 0.9)
-        for id_ in (0, 1):
-            existence.hit(id_, 5)
-        existence.begin_mirrored(0, [way])
-        existence.begin_mirrored(1, [way] if is_other else [way, None])
-        assert not existence.is_reported(0)
-        existence.merge(0, 1)
-        assert existence.is_reported(0) == expected
+WAY = MirrorWay(x_m=1.0, y_m=0.0, variance=1e-4)
 
 
-@pytest.mark.parametrize(("sigma_m", "away_m", "is_new"), [(0.3, 0.2, True), (0.04, 0.05, False)])
-def test_what_may_be_known_is_that_if_it_is_much_likelier(
-    sigma_m: float, away_m: float, is_new: bool
+@pytest.mark.parametrize(
+    ("ways", "is_reported"),
+    [([WAY], False), ([WAY, None], True), ([replace(WAY, x_m=0.0, y_m=1.0)], True)],
+    ids=["same way", "no mirror image", "another way"],
+)
+def test_two_landmarks_that_are_one_may_be_a_mirror_image_if_they_have_one_way(
+    ways: list[MirrorWay | None], is_reported: bool
 ) -> None:
-    """A pose known to 0.3 m: a rod 20 cm from a known one is 1.4 times as likely that as new.
+    existence = Existence(MapRule(), 1, 0.9)
+    for id_ in (0, 1):
+        existence.hit(id_, 5)
+    existence.begin_mirrored(0, [WAY])
+    existence.begin_mirrored(1, ways)
+    assert not existence.is_reported(0)
+    existence.merge(0, 1)
+    assert existence.is_reported(0) == is_reported
 
-    One is new per square metre. With 4 cm, 5 cm away, it is 46 times as likely the known one.
-    """
+
+def test_on_which_side_it_is_a_turn_that_did_not_happen_does_not_show() -> None:
+    """The wheels slip; the filter has the pose from elsewhere."""
+    back_end, _ = driven(*[(ALONG, True)] * 4)
+    pose = np.array([0.5, 0.0, 0.0])
+    back_end.predict(np.array([0.1, 0.0, 0.3]), np.diag([1e-4, 1e-4, 0.1]))
+    back_end.state.set_pose(pose, np.diag([1e-6, 1e-6, 1e-6]))
+    back_end.update([seen_ahead(pose, AHEAD_ROD)])
+    assert len(back_end._log._ranges.rows) == 5
+    assert back_end.reported_rows() == []
+
+
+def test_points_that_are_their_own_mirror_images_are_one_detection() -> None:
+    """Of the others the mirror image follows behind all points."""
+    made = imaged(np.zeros(3), ROD, 1e-3)
+    (point,) = made.points
+    points = [replace(point, mirrored_rad=one) for one in (-0.3, None, point.bearing_rad, 0.2)]
+    of_three = replace(made, points=tuple(points))
+    scans, zero = PatchScans(cast("Imager", GivenPatches(lambda _: of_three)), RIG, PARAMETERS), 0.0
+    for t_ns in range(3):
+        scans.take((), {t_ns: np.full(3, zero)}, t_ns, np.zeros(3))
+    scan, _ = scans.scans(np.zeros(3))
+    assert scan.mirrors == (4, None, 2, 5, 0, 3)
+    assert scan.bearings_rad == (*[point.bearing_rad] * 4, -0.3, 0.2)
+    assert scan.n_seen == 4
+    with pytest.raises(ValueError, match="mirrors"):
+        replace(scan, mirrors=(4, None, 2, 5, 1, 3))
+
+
+def test_what_may_be_known_is_decided_with_two_patches() -> None:
+    """The pose is known to 0.3 m only: a rod 20 cm from a known one is taken for that."""
     back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
     for _ in range(2):
         back_end.predict(STEP)
         pose = compose(pose, STEP)
         back_end.update([seen_from(pose, ROD)])
-    back_end.predict(STEP, np.diag([sigma_m**2, sigma_m**2, 1e-6]))
+    back_end.predict(STEP, np.diag([0.09, 0.09, 0.01]))
     pose = compose(pose, STEP)
-    other, counts, off_m = ROD + [away_m, 0.0], [], []
+    other, counts, off_m = np.array([0.5, 0.9]), [], []
     for _ in range(4):
         back_end.update([seen_from(pose, other)])
         counts.append(len(back_end.state.landmark_ids))
         off_m.append(float(back_end.pose[0] - pose[0]))
         back_end.predict(STEP)
         pose = compose(pose, STEP)
-    assert counts == [1] + [2 if is_new else 1] * 3
-    assert off_m == pytest.approx([0.0 if is_new else -away_m] * 4, abs=0.01)
+    assert counts == [1] * 4
+    assert off_m[0] == pytest.approx(0.0, abs=1e-3)
+    assert off_m[1:] == pytest.approx([ROD[0] - other[0]] * 3, abs=0.03)
 
 
 def test_a_landmark_that_is_predicted_out_of_view_is_a_rival() -> None:

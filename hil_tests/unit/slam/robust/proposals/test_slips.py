@@ -24,6 +24,7 @@ from slam.robust.branches import Branches
 from slam.robust.parameters import BranchRule, LagRule, SlipRule
 from slam.robust.proposals.doubts import covered_share
 from slam.robust.proposals.slips import PossibleSlip, SlipDetector
+from slam.robust.solver.run_log import RunLog
 from slam.robust.state import calibrated_motion
 
 SIGMA_M = 3e-3
@@ -217,6 +218,15 @@ def test_a_mixture_of_the_motions_around_it_is_no_slip(
     assert not [one for one in found if one.n_since == 2]
 
 
+@given(share=st.floats(0.0, 1.0))
+def test_a_mixture_may_be_half_as_much_again(share: float) -> None:
+    """Times that are a little off make one step shorter and another one longer."""
+    most = RULE.most_share * (share * AHEAD + (1.0 - share) * TURN)
+    assert slips_of([AHEAD] * 3 + [most] + [TURN] * 3) == []
+    beyond = most + np.array([0.0, 1.5 * RULE.steady_m, 0.0])
+    assert [one.n_since for one in slips_of([AHEAD] * 3 + [beyond] + [TURN] * 3)] == [2]
+
+
 @pytest.mark.parametrize("parts", [(1.0,), (0.5, 0.5), (0.3, 1.1, 0.6)], ids=str)
 @pytest.mark.parametrize("motions", [(AHEAD, TURN), (0.0 * TURN, AHEAD), (TURN, -TURN)], ids=str)
 def test_a_slip_where_the_motion_changes_is_seen_two_steps_later(
@@ -386,6 +396,35 @@ def test_a_slip_in_a_corner_leaves_its_own_step_uncertain(run: Run) -> None:
     assert sigmas_rad[-1] == pytest.approx(error_rad / math.sqrt(2.0), rel=0.05)
     loosened = [k for k, noise in enumerate(back_end._log._covariances.rows) if noise[2, 2] > 0.01]
     assert loosened == [corner - 1]
+
+
+def test_what_was_assigned_in_a_slip_is_left_out_of_the_whole_run() -> None:
+    """From its pose on, but for landmarks with labels and those that were first seen then."""
+    log = RunLog(WheelNoise(), 5)
+    motion = calibrated_motion(AHEAD, np.zeros(3), WheelNoise())
+    for pose in range(4):
+        log.add_motion(AHEAD, motion)
+        for landmark in (0, 1, 2) if pose > 1 else (0, 1):
+            log.add_range(
+                pose, 0, landmark, antenna=(0.0, 0.0), turn_rad=0.0, range_m=1.0, sigma_m=0.01
+            )
+    log.leave_out_since(2, [1])
+    rows = log._ranges.rows
+    kept = [(pose, id_) for pose, id_ in rows[["pose", "landmark"]].tolist() if id_ >= 0]
+    assert kept == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 1), (2, 2), (3, 1), (3, 2)]
+
+
+def test_ranges_of_a_slip_are_left_out(run: Run) -> None:
+    """Those of the step that slipped; the step after it has shown it."""
+    step = max(straight_steps(run), key=lambda k: n_in_view(run, k))
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    n = step + 2
+    for _ in follow(branches, slipped(run, step)[:n], run.scans[:n]):
+        pass
+    rows = branches.main._log._ranges.rows
+    left_out = set(rows["pose"][rows["landmark"] < 0].tolist())
+    assert left_out == {step + 1}
+    assert step in rows["pose"][rows["landmark"] >= 0]
 
 
 def test_a_slip_in_sight_of_landmarks_is_corrected_by_their_ranges(run: Run) -> None:
