@@ -49,6 +49,8 @@ from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end reports.
 LONGEST_M = 1e6
+# What a scan has one of for each range, if it has it
+_OF_EACH_RANGE = ("sigmas_m", "labels", "bearings_rad", "bearing_sigmas_rad", "faces_m", "mirrors")
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
 
@@ -88,10 +90,7 @@ class RangeScan:
     def __post_init__(self) -> None:
         """Raise ValueError if a number is not finite, or missing for one of the ranges."""
         n = len(self.ranges_m)
-        for name in (
-            *("sigmas_m", "bearings_rad", "bearing_sigmas_rad"),
-            *("labels", "faces_m", "mirrors"),
-        ):
+        for name in _OF_EACH_RANGE:
             values = getattr(self, name)
             if values is not None and len(values) != n:
                 raise ValueError(
@@ -99,9 +98,8 @@ class RangeScan:
                 )
         if self.faces_m is not None and (self.bearings_rad is None or not self.is_patch):
             raise ValueError(f"{self}: faces_m are of a patch, and have bearings_rad")
-        if self.mirrors_of([one for one in self.mirrors or () if one is not None]) != [
-            index for index, one in enumerate(self.mirrors or ()) if one is not None
-        ]:
+        pairs = [(index, one) for index, one in enumerate(self.mirrors or ()) if one is not None]
+        if {(one, index) for index, one in pairs} != set(pairs):
             raise ValueError(f"{self}: mirrors must be indices of each other")
         sigmas = (*(self.sigmas_m or ()), *(self.bearing_sigmas_rad or ()))
         numbers = (*self.ranges_m, *(self.moved or ()), *self.blurred_m, *(self.bearings_rad or ()))

@@ -949,10 +949,9 @@ class RobustBackEnd:
     def _way_to_mirror(self, detection: PointDetection) -> MirrorWay | None:
         if detection.mirrored_rad is None:
             return None
-        is_newest = detection.pose == self._log.n_poses - 1  # the log has it without measurements
-        heading_rad = self._log.heading_at(detection.pose)
-        if is_newest:
-            heading_rad = self.state.heading_rad
+        heading_rad = self.state.heading_rad
+        if detection.pose < self._log.n_poses - 1:  # of the newest the log has the wheels' only
+            heading_rad = self._log.heading_at(detection.pose)
         return detection.way_to_mirror(heading_rad, self.pose_covariance[2, 2])
 
     def _ranges_of(self, tentative: TentativePoint) -> Tracklet | None:
