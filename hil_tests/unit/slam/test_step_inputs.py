@@ -222,7 +222,7 @@ SCAN = RangeScan(
     bearings_rad=(0.1, 0.2),
     bearing_sigmas_rad=(0.0, 0.01),
 )
-OTHERS = ("radar", "labels", "is_patch", "is_imaged", "faces_m")
+OTHERS = ("radar", "labels", "is_patch", "is_imaged", "faces_m", "mirrors")
 NUMBERS = [each.name for each in fields(RangeScan) if each.name not in OTHERS]
 
 
