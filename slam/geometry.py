@@ -85,7 +85,7 @@ def transform(pose: Array, points: Array) -> Array:
 
 
 def mirrored(point: Array, places: Array) -> Array:
-    """Return the mirror image of a point (2,) across the line closest to some places (k, 2)."""
+    """Return the mirror image of a point (2,) across the line closest to places (k, 2), in m."""
     middle = places.mean(axis=0)
     along = np.linalg.svd(places - middle, full_matrices=False)[2][0]
     away = point - middle

@@ -947,6 +947,7 @@ class RobustBackEnd:
             self._use(landmark_id, tracklet.seen)
 
     def _way_to_mirror(self, detection: PointDetection) -> MirrorWay | None:
+        """Return the way from a detection to its mirror image in the map, if it has one."""
         if detection.mirrored_rad is None:
             return None
         heading_rad = self.state.heading_rad

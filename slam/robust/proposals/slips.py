@@ -182,12 +182,14 @@ class SlipDetector:
         return None
 
     def _is_kept(self, before: _Step, after: _Step) -> bool:
+        """Return whether two steps are of one motion."""
         change = _change(before, after, 0.5 * (before.took_s + after.took_s))
         return self._is_steady(change, [before, after], 2.0)
 
     def _possible_slip(
         self, slipped: Sequence[_Step], excess: Sequence[Vector], since: Sequence[_Step]
     ) -> PossibleSlip:
+        """Return the slip of steps that may be off by their excess, and steps since then."""
         # All of its steps have one error: together they are more uncertain than by separate ones
         share = self._square(_sum(excess)) / sum(self._square(one) for one in excess)
         error = _error_after([*slipped, *since], [*excess, *(_ZERO for _ in since)])
