@@ -9,25 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from xethru_protocol.cli.arguments import raw_config
-from xethru_protocol.cli.output import (
-    CommandFailed,
-    Progress,
-    counted,
-    module_at,
-    print_json,
-    print_line,
-    print_warnings,
-    warn,
-)
-from xethru_protocol.cli.record.modes import POLL_S, Listen, RawFrames, profile_of
-from xethru_protocol.cli.record.output_files import RecordingFiles, writer_options
-from xethru_protocol.cli.record.session import record_session
-from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.cli.output import CommandFailed, print_json, print_line, warn
+from xethru_protocol.cli.record.modes import Listen, RawFrames, profile_of
+from xethru_protocol.cli.record.output_files import writer_options
+from xethru_protocol.cli.record.session import Session
 from xethru_protocol.operating_system import StopFlag
-from xethru_protocol.wire.errors import (
-    ResponseTimeout,
-    XeThruError,
-)
+
+_MOST_MODULES = 8
 
 
 def record(arguments: Namespace) -> int:
@@ -45,81 +33,55 @@ def record(arguments: Namespace) -> int:
         mode = RawFrames(config=config, fps=arguments.fps)
     elif profile is not None:
         mode = profile
-    if arguments.out is not None and Path(arguments.out).suffix == ".mcap":
-        return record_session(arguments, mode)
-    if len(arguments.ports) > 1 or arguments.text:
+    is_mcap = arguments.out is not None and Path(arguments.out).suffix == ".mcap"
+    if is_mcap:
+        _check_sources(arguments)
+    elif len(arguments.ports) > 1 or arguments.text:
         arguments.refuse("several --port, and --text, need one file for all: --out FILE.mcap")
-    ((_, arguments.port),) = arguments.ports
-    options = writer_options(arguments)
+    options = writer_options(arguments, has_directory=arguments.out is not None and not is_mcap)
+    session = Session(arguments, mode, None if is_mcap else options)
     stop = StopFlag("previous")
-    with RecordingFiles(arguments, mode.profile_id, options) as recorder:
-        recorder.check()
-        try:
-            with module_at(arguments.port, arguments.baudrate) as radar:
-                radar.raw_listeners.add(recorder.take_bytes)
-                mode.prepare(radar)
-                print_warnings(radar)
-                recorder.open(mode.parameter_file)
-                with stop:
-                    _record_from(radar, recorder, mode, arguments.duration, stop)
-        except XeThruError as error:
-            recorder.fail(error)
+    session.record(stop)
     if stop.received is None:
-        _print_end(recorder, stop, arguments)
-        return 0
+        return _print_end(session, arguments, is_stopped=False)
     with suppress(CommandFailed, BrokenPipeError):  # the terminal may have closed
-        _print_end(recorder, stop, arguments)
+        _print_end(session, arguments, is_stopped=True)
     return 128 + stop.received
 
 
-def _print_end(recorder: RecordingFiles, stop: StopFlag, arguments: Namespace) -> None:
+def _print_end(session: Session, arguments: Namespace, *, is_stopped: bool) -> int:
     """Print what was recorded; CommandFailed if not all could be, and no signal was the reason."""
-    targets = " and ".join(str(path) for path in recorder.paths)
+    failure = session.failure
     if arguments.json:
-        print_json(recorder.summary() | {"ended_by": _end(recorder, stop)})
-    elif recorder.failure is None and recorder.messages:
-        print_line(f"{targets}: {recorder.numbers()}")
-    elif recorder.failure is None:
+        print_json(session.summary() | {"ended_by": "failure" if failure else session.ended_by})
+    elif failure is None and not session.is_empty:
+        print_line(f"{session.targets}: {session.numbers()}")
+    elif failure is None:
         warn("xethru record: nothing came, so nothing was written")
-    if recorder.failure is not None:
-        text = str(recorder.failure)
-        if recorder.messages:
-            text += f"; kept {counted(recorder.messages, 'message')} in {targets}"
-        if stop.received is None:
+    if failure is not None:
+        text = str(failure) if session.is_empty else f"{failure}; {session.kept()}"
+        if not is_stopped:
             raise CommandFailed(text)
         warn(f"xethru record: {text}")
+    return 1 if any(source.failure for source in session.sources) else 0
 
 
-def _record_from(
-    radar: X4M300, recorder: RecordingFiles, mode: Listen, duration_s: float | None, stop: StopFlag
-) -> None:
-    progress = Progress("xethru record")
-    recorder.listen_to(radar)
-    try:
-        silence_s = mode.start(radar)
-        print_warnings(radar)
-        recorder.describe(mode.about(radar))
-        while not (stop.requested or recorder.is_enough):
-            if duration_s is not None and recorder.elapsed_s >= duration_s:
-                if not recorder.messages:
-                    raise ResponseTimeout(f"the module sent nothing to record in {duration_s:g} s")
-                break
-            if recorder.silent_s > silence_s:
-                likely = "it has restarted meanwhile" if radar.reboots else "did it stop?"
-                raise ResponseTimeout(
-                    f"the module sent nothing to record for {silence_s:g} s; {likely}"
-                )
-            left_s = POLL_S if duration_s is None else duration_s - recorder.elapsed_s
-            mode.wait(radar, min(POLL_S, left_s))  # the recorder gets what comes
-            progress.show(recorder.numbers)
-    finally:
-        recorder.stop_listening(radar)
-        progress.finish(recorder.numbers)
-
-
-def _end(recorder: RecordingFiles, stop: StopFlag) -> str:
-    if recorder.failure is not None:
-        return "failure"
-    if stop.requested:
-        return "signal"
-    return "count" if recorder.is_enough else "duration"
+def _check_sources(arguments: Namespace) -> None:
+    """End the program if several sources make no sense together."""
+    ports = [port for _, port in arguments.ports]
+    sources = [source for _, source, _ in arguments.text]
+    if len(ports) > _MOST_MODULES:
+        arguments.refuse(f"at most {_MOST_MODULES} modules are recorded together")
+    if arguments.wire is not None:
+        arguments.refuse("--wire is for one module, with --out DIR or alone")
+    for what, given in (
+        ("port", ports + [source for source in sources if source != "-"]),
+        ("module", [name for name, _ in arguments.ports]),
+        ("--text", [name for name, _, _ in arguments.text]),
+    ):
+        twice = sorted({each for each in given if given.count(each) > 1})
+        if twice:
+            remedy = "; name them: --port NAME=PORT" if what == "module" else ""
+            arguments.refuse(f"{what} {twice[0]} is given twice{remedy}")
+    if sources.count("-") > 1:
+        arguments.refuse("only one --text can be standard input")

@@ -1,4 +1,4 @@
-"""Several modules, and lines of other sensors, recorded into one MCAP file."""
+"""What is recorded and until when: modules, and lines of other sensors."""
 
 import os
 import re
@@ -7,7 +7,7 @@ import threading
 import time
 from argparse import Namespace
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from copy import copy
 from pathlib import Path
 from typing import Any
@@ -15,30 +15,24 @@ from typing import Any
 from xethru_protocol.cli.output import (
     CommandFailed,
     Progress,
+    bytes_text,
     counted,
     module_at,
-    print_json,
-    print_line,
     print_warnings,
     rate_text,
     warn,
 )
 from xethru_protocol.cli.record.modes import ANSWERS, POLL_S, Listen
-from xethru_protocol.cli.record.output_files import writer_options
+from xethru_protocol.cli.record.output_files import ModuleFiles
 from xethru_protocol.cli.recordings import files_to_replace, remove_older, remove_unfinished
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.operating_system import StopFlag
-from xethru_protocol.recordings import (
-    SessionRecorder,
-)
+from xethru_protocol.recordings import SessionRecorder, WriterOptions
 from xethru_protocol.transport import open_line
-from xethru_protocol.wire.errors import (
-    ResponseTimeout,
-    XeThruError,
-)
+from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
+from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.table import Response
 
-_MOST_MODULES = 8
 _LONGEST_LINE = 65536  # bytes; a line without end is cut there
 
 
@@ -47,9 +41,8 @@ class _Source:
 
     noun = ""
 
-    session: "_Session"
-
-    def __init__(self, name: str, port: str) -> None:
+    def __init__(self, session: "Session", name: str, port: str) -> None:
+        self.session = session
         self.name = name
         self.port = port
         self.recorded = 0
@@ -68,7 +61,10 @@ class _Source:
             self._thread.join()
 
     def fail(self, error: XeThruError) -> None:
+        """Keep the reason of the end; of the only module it is raised, else it is reported here."""
         self.failure = self.failure or error
+        if self.session.is_of_one:
+            return
         others = any(each.is_running for each in self.session.modules if each is not self)
         kept = f"{counted(self.recorded, self.noun)} kept"
         warn(f"xethru record: {self.name}: {error}; {kept}{'; the others go on' * others}")
@@ -93,42 +89,61 @@ class _Source:
 class _RecordedModule(_Source):
     noun = "message"
 
-    def __init__(self, name: str, port: str, *, radar: X4M300, mode: Listen, serial: str) -> None:
-        super().__init__(name, port)
-        self._radar = radar
-        self._mode = mode
-        self._serial = serial
+    def __init__(self, session: "Session", name: str, port: str, mode: Listen) -> None:
+        super().__init__(session, name, port)
+        self.statistics = LinkStatistics()
+        self.mode = mode
+        self._about: dict[str, Any] = {}
         self._silence_s = float("inf")
         self._began_ns = self._newest_ns = time.monotonic_ns()
-        self._early: list[tuple[Response, int]] | None = []  # before it is described
+        # before it is described, which a file of several radars needs first
+        self._early: list[tuple[Response, int]] | None = None if session.is_of_one else []
 
-    def let_it_send(self) -> None:
-        """Start what it sends, which is recorded from now on."""
+    @property
+    def span_s(self) -> float:
+        """Time to the newest message."""
+        return (self._newest_ns - self._began_ns) * 1e-9
+
+    def open(self, opened: ExitStack, arguments: Namespace) -> None:
+        """Bring it to where it sends nothing yet."""
+        self._radar: X4M300 = opened.enter_context(module_at(self.port, arguments.baudrate))
+        self.statistics = self._radar.statistics
+        if isinstance(self.session.recorder, ModuleFiles):
+            self._radar.raw_listeners.add(self.session.recorder.take_bytes)
+        self.mode.prepare(self._radar)
+        if not self.session.is_of_one:
+            serial = None if arguments.profile == "none" else self._radar.info().serial_number
+            self._about = {"serial": serial or "", "port": self.port}
+        print_warnings(self._radar)
+
+    def let_it_send(self, opened: ExitStack) -> None:
+        """Start what it sends, which is recorded from now on until it is closed."""
         self._began_ns = self._newest_ns = time.monotonic_ns()
         self._radar.listeners.add(self._take)
+        opened.callback(self._radar.listeners.remove, self._take)
         try:
-            self._silence_s = self._mode.start(self._radar)
+            self._silence_s = self.mode.start(self._radar)
         finally:
             print_warnings(self._radar)
-        about = {"serial": self._serial, "port": self.port} | self._mode.about(self._radar)
-        self.session.recorder.add_radar(self.name, about)
+        about = self._about | self.mode.about(self._radar)
+        self.session.opened_recorder.add_radar(self.name, about)
         early, self._early = self._early or [], None
         for message, arrival_ns in early:
             self._take(message, arrival_ns)
 
     def numbers(self) -> str:
-        rate = rate_text(self.recorded, (self._newest_ns - self._began_ns) * 1e-9)
-        return f"{super().numbers()}{rate}, {self._radar.frames_lost} lost"
+        rate = rate_text(self.recorded, self.span_s)
+        return f"{super().numbers()}{rate}, {self.statistics.frames_lost} lost"
 
     def summary(self) -> dict[str, Any]:
-        return super().summary() | {"link": self._radar.statistics.summary()}
+        return super().summary() | {"link": self.statistics.summary()}
 
     def _take(self, message: Response, arrival_ns: int) -> None:
         if self._is_enough or isinstance(message, ANSWERS):
             return
         if self._early is not None:
             self._early.append((message, arrival_ns))
-        elif self.session.recorder.write(self.name, message, arrival_ns):
+        elif self.session.opened_recorder.write(self.name, message, arrival_ns):
             self.recorded += 1
             self._newest_ns = arrival_ns
 
@@ -137,15 +152,13 @@ class _RecordedModule(_Source):
         return self.session.count is not None and self.recorded >= self.session.count
 
     def _run(self) -> None:
-        try:
-            while not (self.session.ends.is_set() or self._is_enough):
-                self._mode.wait(self._radar, POLL_S)
-                if time.monotonic_ns() - self._newest_ns > self._silence_s * 1e9:
-                    raise ResponseTimeout(
-                        f"the module sent nothing to record for {self._silence_s:g} s; did it stop?"
-                    )
-        finally:
-            self._radar.listeners.remove(self._take)
+        while not (self.session.ends.is_set() or self._is_enough):
+            self.mode.wait(self._radar, POLL_S)
+            if time.monotonic_ns() - self._newest_ns > self._silence_s * 1e9:
+                likely = "it has restarted meanwhile" if self._radar.reboots else "did it stop?"
+                raise ResponseTimeout(
+                    f"the module sent nothing to record for {self._silence_s:g} s; {likely}"
+                )
 
 
 class _RecordedText(_Source):
@@ -153,11 +166,13 @@ class _RecordedText(_Source):
 
     noun = "line"
 
-    def __init__(self, name: str, port: str, session: "_Session", baudrate: int) -> None:
-        super().__init__(name, port)
-        self.session = session
+    def __init__(
+        self, session: "Session", recorder: SessionRecorder, name: str, port: str, baudrate: int
+    ) -> None:
+        super().__init__(session, name, port)
+        self._recorder = recorder
         self._line = None if port == "-" else open_line(port, baudrate)
-        session.recorder.add_text(name)
+        recorder.add_text(name)
 
     def close(self) -> None:
         if self._line is not None:
@@ -181,7 +196,7 @@ class _RecordedText(_Source):
 
     def _take(self, line: bytes, arrival_ns: int) -> None:
         text = line.decode("utf-8", "replace").replace("\0", "").strip()
-        if text and self.session.recorder.write_line(self.name, text, arrival_ns):
+        if text and self._recorder.write_line(self.name, text, arrival_ns):
             self.recorded += 1
 
 
@@ -198,19 +213,42 @@ def _standard_input(timeout_s: float) -> bytes | None:
         return None
 
 
-class _Session:
-    """What is recorded into one file, and until when."""
+class Session:
+    """What is recorded: one module into files of its own, or all into one MCAP file.
 
-    def __init__(self, path: Path, count: int | None, modules: list[_RecordedModule]) -> None:
-        self.path = path
-        self.count = count
-        self.modules = modules
-        for module in modules:
-            module.session = self
+    Older files are removed only when all modules are set up: one that does not answer must not cost
+    an older recording.
+
+    Parameters
+    ----------
+    options
+        Of a module's own files; None: one MCAP file.
+    """
+
+    def __init__(self, arguments: Namespace, mode: Listen, options: WriterOptions | None) -> None:
+        self.is_of_one = options is not None
+        self.count: int | None = arguments.count
+        self.recorder: ModuleFiles | SessionRecorder | None = None  # an MCAP file is made later
+        paths = [Path(arguments.out)] if arguments.out else []
+        if options is not None:
+            self.recorder = files = ModuleFiles(arguments, mode.profile_id, options)
+            paths = [path for path in (files.directory, files.wire_path) if path is not None]
+        self.modules = [
+            _RecordedModule(self, name, port, copy(mode)) for name, port in arguments.ports
+        ]
         self.texts: list[_RecordedText] = []
         self.ends = threading.Event()
-        self.recorder = SessionRecorder(path)
+        self.ended_by = "failure"
+        self._arguments = arguments
+        self._paths = paths
+        self._were_there: dict[Path, bool] = {}
+        self._failure: XeThruError | None = None
         self._began_s = self._ended_s = time.monotonic()
+
+    @property
+    def opened_recorder(self) -> ModuleFiles | SessionRecorder:
+        assert self.recorder is not None, "opened before"
+        return self.recorder
 
     @property
     def sources(self) -> list[_Source]:
@@ -220,129 +258,137 @@ class _Session:
     def is_empty(self) -> bool:
         return not any(source.recorded for source in self.sources)
 
-    def run(self, duration_s: float | None, stop: StopFlag) -> str:
-        """Record until something ends it; returns what."""
-        progress = Progress("xethru record")
-        self._began_s = time.monotonic()
-        for source in self.sources:
-            source.start()
-        try:
-            while not stop.requested:
-                self._ended_s = time.monotonic()
-                if duration_s is not None and self._ended_s - self._began_s >= duration_s:
-                    return "duration"
-                if not any(module.is_running for module in self.modules):
-                    failed = any(module.failure for module in self.modules)
-                    return "failure" if failed else "count"
-                if self.recorder.failure is not None:
-                    return "failure"
-                progress.show(self.numbers)
-                time.sleep(POLL_S / 4)
-            return "signal"
-        finally:
-            self.ends.set()
-            for source in self.sources:
-                source.join()
-            progress.finish(self.numbers)
+    @property
+    def failure(self) -> XeThruError | None:
+        """Why it could not go on; what ended one of several sources is its own."""
+        return self._failure or (None if self.recorder is None else self.recorder.failure)
+
+    @property
+    def targets(self) -> str:
+        return " and ".join(map(str, self._paths))
+
+    @property
+    def elapsed_s(self) -> float:
+        return time.monotonic() - self._began_s
+
+    def record(self, stop: StopFlag) -> None:
+        """Record until something ends it; RecordingError if something is in the way."""
+        if isinstance(self.recorder, ModuleFiles):
+            self.recorder.check()
+        files_to_replace(self._paths, replace=self._arguments.force)
+        with closing(self):
+            try:
+                with ExitStack() as opened:
+                    for module in self.modules:
+                        with self._naming(module):
+                            module.open(opened, self._arguments)
+                    self._open_files(opened)
+                    with stop:
+                        for module in self.modules:
+                            with self._naming(module):
+                                module.let_it_send(opened)
+                        self.ended_by = self._run(stop)
+            except XeThruError as error:
+                self._failure = error
+
+    def close(self) -> None:
+        """Complete the files; those without records are removed."""
+        if self.recorder is not None:
+            self.recorder.close()
+        if self.is_empty:
+            # the wire capture first: it may lie in the directory
+            for path, was_there in reversed(self._were_there.items()):
+                remove_unfinished(path, was_there=was_there)
 
     def numbers(self) -> str:
-        parts = "; ".join(source.numbers() for source in self.sources)
-        return f"{parts}; in {self._ended_s - self._began_s:.1f} s"
+        if not self.is_of_one:
+            parts = "; ".join(source.numbers() for source in self.sources)
+            return f"{parts}; in {self._ended_s - self._began_s:.1f} s"
+        (module,) = self.modules
+        rate = rate_text(module.recorded, module.span_s)
+        return (
+            f"{counted(module.recorded, 'message')} in {module.span_s:.1f} s{rate}, "
+            f"{bytes_text(module.statistics.bytes)}, {module.statistics.frames_lost} lost"
+        )
+
+    def kept(self) -> str:
+        """Return what is there after a failure."""
+        if self.is_of_one:
+            return f"kept {counted(self.modules[0].recorded, 'message')} in {self.targets}"
+        return f"all but the last second of {self.numbers()} is kept"
 
     def summary(self) -> dict[str, Any]:
+        if isinstance(self.recorder, ModuleFiles):
+            (module,) = self.modules
+            directory, wire = self.recorder.directory, self.recorder.wire_path
+            return {
+                "directory": None if directory is None else str(directory),
+                "wire": None if wire is None else str(wire),
+                "messages": module.recorded,
+                "duration_s": module.span_s,
+                "link": module.statistics.summary(),
+            }
         return {
-            "file": str(self.path),
+            "file": self.targets,
             "radars": {module.name: module.summary() for module in self.modules},
             "texts": {text.name: text.summary() for text in self.texts},
             "duration_s": self._ended_s - self._began_s,
         }
 
-
-def record_session(arguments: Namespace, mode: Listen) -> int:
-    """Record modules and other sensors into one MCAP file."""
-    _check_session(arguments)
-    path = Path(arguments.out)
-    files_to_replace((path,), replace=arguments.force)
-    stop = StopFlag("previous")
-    ended_by = "failure"
-    with ExitStack() as opened:
-        modules = [
-            _opened_module(opened, name, port, arguments, copy(mode))
-            for name, port in arguments.ports
-        ]
-        remove_older((path,), replace=arguments.force)
-        session = _Session(path, arguments.count, modules)
+    @contextmanager
+    def _naming(self, module: _RecordedModule) -> Iterator[None]:
         try:
-            for name, port, baudrate in arguments.text:
-                session.texts.append(_RecordedText(name, port, session, baudrate))
-                opened.callback(session.texts[-1].close)
-            with stop:
-                for module in modules:
-                    with _naming(module.name):
-                        module.let_it_send()
-                ended_by = session.run(arguments.duration, stop)
+            yield
+        except XeThruError as error:
+            if self.is_of_one:
+                raise
+            raise CommandFailed(f"{module.name}: {error}") from error
+
+    def _open_files(self, opened: ExitStack) -> None:
+        """Remove older files if that is allowed, and make new ones; RecordingError if not."""
+        remove_older(self._paths, replace=self._arguments.force)
+        self._were_there = {path: path.exists() for path in self._paths}
+        if isinstance(self.recorder, ModuleFiles):
+            (module,) = self.modules
+            self.recorder.open(module.port, module.mode.parameter_file)
+            return
+        self.recorder = recorder = SessionRecorder(self._paths[0])
+        for name, port, baudrate in self._arguments.text:
+            self.texts.append(_RecordedText(self, recorder, name, port, baudrate))
+            opened.callback(self.texts[-1].close)
+
+    def _run(self, stop: StopFlag) -> str:
+        """Let the sources run until something ends it; returns what."""
+        progress = Progress("xethru record")
+        self._began_s = time.monotonic()
+        for source in self.sources:
+            source.start()
+        try:
+            ended_by = self._await_end(stop, progress)
         finally:
-            session.recorder.close()
-            if session.is_empty:
-                remove_unfinished(path, was_there=False)
-    failure = session.recorder.failure
-    if arguments.json:
-        print_json(session.summary() | {"ended_by": "failure" if failure else ended_by})
-    elif failure is None and not session.is_empty:
-        print_line(f"{path}: {session.numbers()}")
-    elif failure is None:
-        warn("xethru record: nothing came, so nothing was written")
-    if failure is not None:
-        warn(f"xethru record: {failure}; all but the last second of {session.numbers()} is kept")
-    if stop.received is not None:
-        return 128 + stop.received
-    if failure is not None:
-        return 1
-    silent = [module.name for module in session.modules if not module.recorded]
-    if ended_by == "duration" and silent:
-        raise CommandFailed(f"{', '.join(silent)} sent nothing to record")
-    return 1 if any(source.failure for source in session.sources) else 0
+            self.ends.set()
+            for source in self.sources:
+                source.join()
+            progress.finish(self.numbers)
+        for module in self.modules:
+            if ended_by == "duration" and not module.recorded:
+                limit = f"{self._arguments.duration:g} s"
+                module.fail(ResponseTimeout(f"the module sent nothing to record in {limit}"))
+            if self.is_of_one and module.failure is not None:
+                raise module.failure
+        return ended_by
 
-
-def _opened_module(
-    opened: ExitStack, name: str, port: str, arguments: Namespace, mode: Listen
-) -> "_RecordedModule":
-    """Open a module and bring it to where it sends nothing yet."""
-    with _naming(name):
-        radar = opened.enter_context(module_at(port, arguments.baudrate))
-        mode.prepare(radar)
-        serial = None if arguments.profile == "none" else radar.info().serial_number
-        print_warnings(radar)
-    return _RecordedModule(name, port, radar=radar, mode=mode, serial=serial or "")
-
-
-@contextmanager
-def _naming(name: str) -> Iterator[None]:
-    try:
-        yield
-    except XeThruError as error:
-        raise CommandFailed(f"{name}: {error}") from error
-
-
-def _check_session(arguments: Namespace) -> None:
-    """End the program on wrong usage."""
-    ports = [port for _, port in arguments.ports]
-    sources = [source for _, source, _ in arguments.text]
-    if len(ports) > _MOST_MODULES:
-        arguments.refuse(f"at most {_MOST_MODULES} modules are recorded together")
-    if arguments.wire is not None:
-        arguments.refuse("--wire is for one module, with --out DIR or alone")
-    for what, given in (
-        ("port", ports + [source for source in sources if source != "-"]),
-        ("module", [name for name, _ in arguments.ports]),
-        ("--text", [name for name, _, _ in arguments.text]),
-    ):
-        twice = sorted({each for each in given if given.count(each) > 1})
-        if twice:
-            remedy = "; name them: --port NAME=PORT" if what == "module" else ""
-            arguments.refuse(f"{what} {twice[0]} is given twice{remedy}")
-    if sources.count("-") > 1:
-        arguments.refuse("only one --text can be standard input")
-    out, arguments.out = arguments.out, None
-    writer_options(arguments)
-    arguments.out = out
+    def _await_end(self, stop: StopFlag, progress: Progress) -> str:
+        duration_s = self._arguments.duration
+        while not stop.requested:
+            self._ended_s = time.monotonic()
+            if duration_s is not None and self.elapsed_s >= duration_s:
+                return "duration"
+            if not any(module.is_running for module in self.modules):
+                failed = any(module.failure for module in self.modules)
+                return "failure" if failed else "count"
+            if self.opened_recorder.failure is not None:
+                return "failure"
+            progress.show(self.numbers)
+            time.sleep(POLL_S / 4)
+        return "signal"

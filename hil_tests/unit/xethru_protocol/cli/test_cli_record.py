@@ -19,7 +19,7 @@ from hil_tests.unit.xethru_protocol.recordings.messages import counters
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
-from xethru_protocol.cli.record.output_files import RecordingFiles
+from xethru_protocol.cli.record.session import Session
 from xethru_protocol.recordings import (
     describe_recording,
     read_note,
@@ -55,8 +55,8 @@ def test_count_is_kept_to_the_message(module: PtyModule, tmp_path: Path, capsys:
 def test_duration_ends_it(
     module: PtyModule, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    of_the_frames = property(lambda recorder: 0.05 * recorder.messages)
-    monkeypatch.setattr(RecordingFiles, "elapsed_s", of_the_frames)
+    of_the_frames = property(lambda session: 0.05 * session.modules[0].recorded)
+    monkeypatch.setattr(Session, "elapsed_s", of_the_frames)
     out = tmp_path / "recording"
     arguments = ["--out", str(out), "--duration", "0.3", "--json", "--session-id", "first try"]
     assert main(["record", "--port", module.path, *arguments]) == 0
