@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO, TypedDict
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -277,30 +277,15 @@ def _text(value: Any, whole: bool) -> str:  # noqa: ANN401 - any JSON value
     return text if whole or len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 
 
-class _LoadOptions(TypedDict, total=False):
-    """What is known of the frames of a recording that does not say it."""
-
-    area_m: tuple[float, float]
-    downconversion: bool
-
-
-def _given(arguments: Namespace) -> _LoadOptions:
-    given: _LoadOptions = {}
-    if arguments.frame_area is not None:
-        start_m, end_m = arguments.frame_area
-        given["area_m"] = start_m, end_m
-    if arguments.frames in _DOWNCONVERSION:
-        given["downconversion"] = _DOWNCONVERSION[arguments.frames]
-    return given
-
-
 def convert(arguments: Namespace) -> int:
     """Write a recording in another format; 1 if a part of it could not be read."""
     source, target = arguments.source, arguments.target
     if not is_array_file(Path(source)):
         recording_facts(source)  # raises before anything is removed
     path = Path(target)
-    if _given(arguments) and suffix_of(path) not in SUFFIXES:
+    area_m, downconversion = arguments.frame_area, _DOWNCONVERSION.get(arguments.frames)
+    is_given = area_m is not None or downconversion is not None
+    if is_given and suffix_of(path) not in SUFFIXES:
         arguments.refuse(f"--frame-area and --frames are for {', '.join(SUFFIXES)}, not {target}")
     if is_part_of(Path(source), path):
         raise RecordingError(f"{source} cannot be converted into itself")
@@ -316,7 +301,12 @@ def convert(arguments: Namespace) -> int:
     with _whole(path, replace=arguments.force) as fresh:
         try:
             done = convert_recording(
-                source, str(fresh), show, radar=arguments.radar, **_given(arguments)
+                source,
+                str(fresh),
+                show,
+                radar=arguments.radar,
+                area_m=area_m,
+                downconversion=downconversion,
             )
         finally:
             progress.finish(lambda: f"{newest} messages")

@@ -139,7 +139,7 @@ def test_what_was_left_out_and_what_was_damaged_is_reported(
 def test_a_conversion_that_fails_leaves_nothing(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stopped(source: object, target: str, show: object, *, radar: object) -> None:
+    def stopped(source: object, target: str, show: object, **given: object) -> None:
         Path(target).write_bytes(b"half")
         raise KeyboardInterrupt
 
@@ -173,7 +173,7 @@ def test_a_conversion_that_fails_brings_the_older_one_back(
     assert main(["convert", str(RECORDINGS / "single"), str(target)]) == 0
     before = snapshot(tmp_path)
 
-    def fails(source: str, target: str, on_progress: object, *, radar: object) -> None:
+    def fails(source: str, target: str, on_progress: object, **given: object) -> None:
         convert(IQ, target)
         raise RecordingError("the disk is full")
 
