@@ -117,34 +117,6 @@ def numbers() -> dict[str, int]:
     return found | {name: int(value) for name, value in _OTHERS.items()}
 
 
-class DataType:
-    """Bits of the kinds of recorded data; `start_recording` takes several, joined by ``|``."""
-
-    PerformanceStatusType = 1 << 4
-    BasebandApDataType: int
-    BasebandIqDataType: int
-    SleepDataType: int
-    RespirationDataType: int
-    StringDataType: int
-    PulseDopplerFloatDataType: int
-    PulseDopplerByteDataType: int
-    NoiseMapFloatDataType: int
-    NoiseMapByteDataType: int
-    FloatDataType: int
-    ByteDataType: int
-    PresenceSingleDataType: int
-    PresenceMovingListDataType: int
-    RespirationDetectionListDataType: int
-    RespirationMovingListDataType: int
-    VitalSignsDataType: int
-    SleepStageDataType: int
-    RespirationNormalizedMovementListDataType: int
-    RadarRfDataType: int
-    RadarRfNormalizedDataType: int
-    RadarBasebandFloatDataType: int
-    RadarBasebandQ15DataType: int
-
-
 # Where the vendor's name of the bit is not that of our message.
 _TYPE_NAMES = {
     m.SleepStatus: "Sleep",
@@ -153,10 +125,19 @@ _TYPE_NAMES = {
     m.DataFloat: "Float",
     m.DataByte: "Byte",
 }
-for _kind in KINDS:
-    _name = _TYPE_NAMES.get(_kind.message, _kind.message.__name__)
-    setattr(DataType, f"{_name}DataType", _kind.data_type)
 
+DataType: Any = type(
+    "DataType",
+    (),
+    {
+        "PerformanceStatusType": 1 << 4,
+        **{
+            f"{_TYPE_NAMES.get(kind.message, kind.message.__name__)}DataType": kind.data_type
+            for kind in KINDS
+        },
+    },
+)
+"""Bits of the kinds of recorded data; `start_recording` takes several, joined by ``|``."""
 InvalidDataType = 0
 AllDataTypes = ALL_BITS
 
