@@ -610,15 +610,9 @@ class Link:
                 )
 
     def x4_settings(self) -> Steps[dict[X4Setting, m.X4Value | None]]:
-        without_getter = {
-            X4Setting.ENABLE,
-            X4Setting.SPIREGISTER,
-            X4Setting.PIFREGISTER,
-            X4Setting.XIFREGISTER,
-        }
         values: dict[X4Setting, m.X4Value | None] = {}
         for setting in X4Setting:
-            if setting not in without_getter:
+            if setting not in m.REGISTERS | {X4Setting.ENABLE}:  # which have no getter
                 try:
                     values[setting] = yield from self.x4_get(setting)
                 except DeviceError:

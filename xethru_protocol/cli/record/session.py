@@ -36,36 +36,24 @@ from xethru_protocol.wire.table import Response
 _LONGEST_LINE = 65536  # bytes; a line without end is cut there
 
 
-class _Source:
-    """A module or a text column while it is recorded, by a thread of its own."""
+class _Source(threading.Thread):
+    """A module or a text column while it is recorded."""
 
     noun = ""
 
     def __init__(self, session: "Session", name: str, port: str) -> None:
+        super().__init__(name=name)
         self.session = session
-        self.name = name
         self.port = port
         self.recorded = 0
         self.failure: XeThruError | None = None
-        self._thread = threading.Thread(target=self._run_to_end, name=name)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    @property
-    def is_running(self) -> bool:
-        return self._thread.is_alive()
-
-    def join(self) -> None:
-        if self._thread.ident is not None:
-            self._thread.join()
 
     def fail(self, error: XeThruError) -> None:
         """Keep the reason of the end; of the only module it is raised, else it is reported here."""
         self.failure = self.failure or error
         if self.session.is_of_one:
             return
-        others = any(each.is_running for each in self.session.modules if each is not self)
+        others = any(each.is_alive() for each in self.session.modules if each is not self)
         kept = f"{counted(self.recorded, self.noun)} kept"
         warn(f"xethru record: {self.name}: {error}; {kept}{'; the others go on' * others}")
 
@@ -76,13 +64,13 @@ class _Source:
         failure = None if self.failure is None else str(self.failure)
         return {"port": self.port, f"{self.noun}s": self.recorded, "failure": failure}
 
-    def _run_to_end(self) -> None:
+    def run(self) -> None:
         try:
-            self._run()
+            self._record()
         except XeThruError as error:
             self.fail(error)
 
-    def _run(self) -> None:
+    def _record(self) -> None:
         raise NotImplementedError
 
 
@@ -151,7 +139,7 @@ class _RecordedModule(_Source):
     def _is_enough(self) -> bool:
         return self.session.count is not None and self.recorded >= self.session.count
 
-    def _run(self) -> None:
+    def _record(self) -> None:
         while not (self.session.ends.is_set() or self._is_enough):
             self.mode.wait(self._radar, POLL_S)
             if time.monotonic_ns() - self._newest_ns > self._silence_s * 1e9:
@@ -178,7 +166,7 @@ class _RecordedText(_Source):
         if self._line is not None:
             self._line.close()
 
-    def _run(self) -> None:
+    def _record(self) -> None:
         waiting = b""
         try:
             while not self.session.ends.is_set():
@@ -361,14 +349,15 @@ class Session:
         """Let the sources run until something ends it; returns what."""
         progress = Progress("xethru record")
         self._began_s = time.monotonic()
-        for source in self.sources:
-            source.start()
         try:
+            for source in self.sources:
+                source.start()
             ended_by = self._await_end(stop, progress)
         finally:
             self.ends.set()
             for source in self.sources:
-                source.join()
+                if source.ident is not None:  # it was started
+                    source.join()
             progress.finish(self.numbers)
         for module in self.modules:
             if ended_by == "duration" and not module.recorded:
@@ -384,7 +373,7 @@ class Session:
             self._ended_s = time.monotonic()
             if duration_s is not None and self.elapsed_s >= duration_s:
                 return "duration"
-            if not any(module.is_running for module in self.modules):
+            if not any(module.is_alive() for module in self.modules):
                 failed = any(module.failure for module in self.modules)
                 return "failure" if failed else "count"
             if self.opened_recorder.failure is not None:
