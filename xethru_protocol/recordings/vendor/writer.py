@@ -12,6 +12,7 @@ import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta, tzinfo
+from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypedDict
 
@@ -103,21 +104,6 @@ class WriterOptions(TypedDict, total=False):
     on_meta_file: MetaFileListener | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Options:
-    """How each directory of a recording is written."""
-
-    parameter_file: bytes | None
-    user_header: bytes
-    split: Split
-    split_directories: Split | None
-    basenames: Mapping[type[Response], str]
-    flush_on_write: bool
-    timezone: tzinfo | None
-    on_file: FileListener | None
-    on_meta_file: MetaFileListener | None
-
-
 class _DataFileWriter(GrowingFile):
     """One data file being written; ``number`` is its place in the list of files."""
 
@@ -137,36 +123,40 @@ class _OpenDirectory:
 
     directory: Path
     meta: Meta
-    options: _Options
+    user_header: bytes
+    split: Split
+    basenames: Mapping[type[Response], str]
+    flush_on_write: bool
+    timezone: tzinfo | None
+    on_file: FileListener | None
+    on_meta_file: MetaFileListener | None
     records: int = 0
     last_ms: int = 0  # of the last record, since the start
     meta_file: GrowingFile = field(init=False)
     files: dict[int, _DataFileWriter] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        flush = self.options.flush_on_write
-        self.meta_file = GrowingFile(self.directory / META_NAME, flush=flush)
+        self.meta_file = GrowingFile(self.directory / META_NAME, flush=self.flush_on_write)
         self.meta_file.append(self.meta.pack_head())
 
     def write(self, message: Response, kind: DataFileKind, time_ms: int) -> None:
-        options = self.options
         since_ms = self.since(time_ms)
-        data = kind.record(message, self.meta.start_ms + since_ms, options.timezone)
+        data = kind.record(message, self.meta.start_ms + since_ms, self.timezone)
         file = self.files.get(kind.data_type)
-        if file is not None and options.split.is_over(file.first_ms, time_ms, options.timezone):
+        if file is not None and self.split.is_over(file.first_ms, time_ms, self.timezone):
             self._close_file(file, since_ms)
             file = None
         if file is None:
             file = self._open_file(kind, since_ms)
-            if options.user_header:
-                self._append(file, options.user_header, kind.data_type ^ ALL_BITS, since_ms)
+            if self.user_header:
+                self._append(file, self.user_header, kind.data_type ^ ALL_BITS, since_ms)
             if kind.titles:
                 self._append(file, kind.titles, kind.data_type, since_ms)
         self._append(file, data, kind.data_type, since_ms)
         file.records += 1
         self.records += 1
         self.last_ms = max(self.last_ms, since_ms)
-        if options.split.is_full(file.records, file.size):
+        if self.split.is_full(file.records, file.size):
             self._close_file(file, since_ms)
 
     def close(self, stopped_ms: int, closed_ms: int, next_name: str = "") -> None:
@@ -181,16 +171,16 @@ class _OpenDirectory:
         finally:
             # The head's bytes exist already, so this works on a full disk, too.
             self.meta_file.finish(meta.pack_head())
-        if self.options.on_meta_file is not None:
-            self.options.on_meta_file(meta.session_id.decode(), self.meta_file.path)
+        if self.on_meta_file is not None:
+            self.on_meta_file(meta.session_id.decode(), self.meta_file.path)
 
     def since(self, time_ms: int) -> int:
         return min(max(time_ms - self.meta.start_ms, 0), ALL_BITS)
 
     def _open_file(self, kind: DataFileKind, since_ms: int) -> _DataFileWriter:
         time_ms = self.meta.start_ms + since_ms
-        base = self.options.basenames.get(kind.message, kind.file_prefix.removesuffix("_"))
-        stem = f"{base}_{local_time(time_ms, self.options.timezone):%Y%m%d_%H%M%S}"
+        base = self.basenames.get(kind.message, kind.file_prefix.removesuffix("_"))
+        stem = f"{base}_{local_time(time_ms, self.timezone):%Y%m%d_%H%M%S}"
         name = stem + kind.suffix
         again_ms = time_ms % 1000
         # Several files within one second; the vendor's recorder takes the time of their end.
@@ -202,7 +192,7 @@ class _OpenDirectory:
             kind,
             len(self.meta.files),
             time_ms,
-            flush=self.options.flush_on_write,
+            flush=self.flush_on_write,
         )
         self.meta.files.append(name)
         self.files[kind.data_type] = file
@@ -223,8 +213,8 @@ class _OpenDirectory:
         end = self.meta.size
         data_type = file.kind.data_type
         self._index(Entry(since_ms, CLOSED, data_type, 0, file.number, file.size, end))
-        if self.options.on_file is not None:
-            self.options.on_file(file.kind.message, file.path)
+        if self.on_file is not None:
+            self.on_file(file.kind.message, file.path)
 
     def _index(self, entry: Entry) -> None:
         self.meta_file.append(entry.pack())
@@ -298,13 +288,15 @@ class RecordingWriter:
         self.directory = Path(directory)
         self.session_id = session_id or new_session_id()
         self._profile_id = profile_id or 0
-        self._options = _Options(
-            parameter_file=parameter_file.encode()
-            if isinstance(parameter_file, str)
-            else parameter_file,
+        self._parameter_file = (
+            parameter_file.encode() if isinstance(parameter_file, str) else parameter_file
+        )
+        self._split_directories = split_directories
+        self._timezone = timezone
+        self._open_directory = partial(
+            _OpenDirectory,
             user_header=user_header,
             split=split or Split(),
-            split_directories=split_directories,
             basenames=_checked_basenames(basenames or {}),
             flush_on_write=flush_on_write,
             timezone=timezone,
@@ -384,7 +376,7 @@ class RecordingWriter:
 
     def _part_at(self, time_ms: int) -> _OpenDirectory:
         """Return the directory that takes the next record; a new one where the last is full."""
-        part, split, zone = self._part, self._options.split_directories, self._options.timezone
+        part, split, zone = self._part, self._split_directories, self._timezone
         if part is not None and split is None:
             return part
         if (
@@ -407,13 +399,13 @@ class RecordingWriter:
             session_id=self.session_id.encode(), profile_id=self._profile_id, start_ms=time_ms
         )
         self._parts += 1
-        self._part = _OpenDirectory(directory, meta, self._options)
+        self._part = self._open_directory(directory, meta)
         return self._part
 
     def _store_parameter_file(self, directory: Path) -> None:
-        if self._options.parameter_file is not None:
+        if self._parameter_file is not None:
             with GrowingFile(directory / PARAMETER_FILE_NAME) as file:
-                file.append(self._options.parameter_file)
+                file.append(self._parameter_file)
 
 
 def _holds_recording(directory: Path) -> bool:
