@@ -485,7 +485,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
     )
     convert.add_argument(
         "--preset",
-        help="settings of SLAM (default: a session's own; for a bag robust, for a .mat paper)",
+        help="settings of SLAM (default: for a bag robust, for a .mat paper)",
     )
     convert.add_argument("--radar", metavar="NAME", help="whose raw bytes, for .xtwire")
 
@@ -779,12 +779,11 @@ _COMMANDS = (
     _Subcommand(
         "convert",
         "slam.app.convert.convert:run_convert",
-        "sessions from and to rosbags and .mat, in the layout of the paper's data set",
+        "sessions from and to rosbags, and from .mat, in the layout of the paper's data set",
         _add_convert,
-        "IN is a session, then OUT is a MATLAB file of detections if its name "
-        "ends in .mat, the raw bytes of one port if in .xtwire, a bag of ROS 1 if in .bag, or "
-        "else a new folder with a bag of ROS 2; or IN is a .mat or a bag, then OUT is a "
-        "session, which replay, view and report take.",
+        "IN is a session, then OUT is the raw bytes of one port if its name ends in .xtwire, a bag "
+        "of ROS 1 if in .bag, or else a new folder with a bag of ROS 2; or IN is a bag or a .mat "
+        "of detections, then OUT is a session, which replay, view and report take.",
     ),
     _Subcommand(
         "calibrate",

@@ -9,10 +9,12 @@ import pytest
 from emulator.scene.wheels import scene_odometry
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.convert.authors_bag import AuthorsBag
+from hil_tests.unit.slam.app.convert.authors_mat import write_detections
 from slam.app.cli import main
 from slam.app.commands.evaluate import evaluate
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
-from slam.live.odometry_track import OdometryTrack, read_tum
+from slam.live.odometry_track import OdometryTrack, Trajectory, read_tum
+from slam.live.session.reader import open_session
 from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow
@@ -57,12 +59,15 @@ def test_whoever_downloads_it_can_run_it(
     assert summary["seed"] is None
     assert summary["ate_rmse_m"] < 0.005
     assert summary["ate_rmse_m"] < summary["odometry_ate_rmse_m"] * 1.5
-    # and once more as detections alone, the other file of the data set
+    # and once more as detections alone, the other file of the data set, which has no stamps
     detections, again = tmp_path / "dataset.mat", tmp_path / "again.mcap"
-    assert main(["convert", str(session), str(detections), "--preset", "paper"]) == 0
-    assert main(["convert", str(detections), str(again)]) == 0
+    recorded = open_session(session)
+    write_detections(recorded, detections)
+    assert main(["convert", str(detections), str(again), "--rig", "lab"]) == 0
     assert main(["replay", str(again), "--out", str(tmp_path / "fixes")]) == 0
-    judged = evaluate(read_tum(tmp_path / "fixes" / "estimate.tum"), read_tum(out / "truth.tum"))
+    true_poses = np.array([scan.truth for scan in recorded.scans()])
+    truth = Trajectory(stamps_ns=200_000_000 * np.arange(N_SCANS), poses=true_poses)
+    judged = evaluate(read_tum(tmp_path / "fixes" / "estimate.tum"), truth)
     ate_m, pairs = judged["ate_rmse_m"], judged["pairs"]
     assert isinstance(ate_m, float)
     assert isinstance(pairs, int)

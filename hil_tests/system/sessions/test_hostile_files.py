@@ -200,7 +200,7 @@ def test_text_of_a_session_reaches_no_terminal_with_control_characters(
     assert end_of(capfd, "view", session, "--out", tmp_path / "view.rrd")[0] == 0
     end_of(capfd, "calibrate", session)
     end_of(capfd, "calibrate", session, "--json")
-    for name in ("ros.bag", "found.mat", "bytes.xtwire", "folder"):
+    for name in ("ros.bag", "bytes.xtwire", "folder"):
         end_of(capfd, "convert", session, tmp_path / name)
     for number, at in enumerate((0.4, 0.7)):
         content = bytearray(session.read_bytes())

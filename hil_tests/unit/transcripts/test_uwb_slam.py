@@ -104,9 +104,8 @@ TABLES: dict[str, dict[str, object]] = {
     "five": AUTHORS | {"obsLHS": np.zeros((5, 5, 2))},
     "not_finite": AUTHORS | {"obsRHS": np.full((STATES, 5, 2), np.nan)},
     "cube": AUTHORS | {"R2": np.zeros((STATES, 5, 2))},
-    "standstill": AUTHORS | {"t": np.zeros((STATES, 1))},
-    "no_length": AUTHORS | {"bins": np.zeros((4, 2))},
     "words": AUTHORS | {"odom": "text"},
+    "detections": AUTHORS,
 }
 
 # Files of data sets: damaged, but for those in `good`

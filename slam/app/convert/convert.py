@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from slam.app.convert.matlab import convert_mat, write_detections
+from slam.app.convert.matlab import MAT_RIG, convert_mat
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import UsageError, naming
 from slam.app.rig.rig_files import load_rig
 from slam.app.run.output import note, print_text
 from slam.app.run.result_files import made_folder
-from slam.config import ConfigError, SlamConfig, load_preset
+from slam.config import ConfigError, load_preset
 from slam.live.errors import AppError, refuse_pipe
 from slam.live.session.reader import RecordedSession, begins_with, open_session
 from xethru_protocol.operating_system import PathInUseError, StopFlag, built_aside, sync
@@ -54,9 +54,8 @@ def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: St
 
 
 _SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
-_OF_SESSION = (_MAT_SUFFIX, _WIRE_SUFFIX, ".bag")
+_OF_SESSION = (_WIRE_SUFFIX, ".bag")
 _USES = {
-    "to .mat": ("--preset",),
     "to .xtwire": ("--radar",),
     "to a bag": (),
     "of a .mat": ("--preset", "--rig", "--rate"),
@@ -80,7 +79,7 @@ def run_convert(
     preset: str | None,
     radar: str | None,
 ) -> None:
-    """Convert a session to a bag or MATLAB file, or such a file to a session; names say which.
+    """Convert a session to a bag, or a bag or MATLAB file to a session; names say which.
 
     Options that it does not use are refused. After an error, what was begun is removed.
     """
@@ -98,29 +97,38 @@ def run_convert(
         )
     warnings: list[str] = []
     if is_session and out.suffix != _SESSION_SUFFIX:
-        known = out.suffix in (_MAT_SUFFIX, _WIRE_SUFFIX)
-        _refuse_unused(f"to {out.suffix}" if known else "to a bag", given)
+        is_wire = out.suffix == _WIRE_SUFFIX
+        _refuse_unused("to .xtwire" if is_wire else "to a bag", given)
         with _whole(out) as fresh:
-            result = _from_session(open_session(source, stop), fresh, preset, radar, stop)
+            session = open_session(source, stop)
+            if is_wire:
+                result = _write_wire(session, fresh, radar, stop)
+            else:
+                result = write_bag(session, fresh, stop)
     elif out.suffix != _SESSION_SUFFIX:
         raise UsageError(
             f"{out}: of a bag or MATLAB file a session is made; give a name that ends in .mcap"
         )
     elif is_session and _is_session(source, stop):
         raise UsageError(
-            f"{source}: is a session already; name an OUT that ends in .mat, .xtwire or .bag, or "
-            "a new folder for a bag of ROS 2"
+            f"{source}: is a session already; name an OUT that ends in .xtwire or .bag, or a "
+            "new folder for a bag of ROS 2"
         )
     else:
         is_mat = source.suffix == _MAT_SUFFIX or begins_with(source, MAT_MAGIC)
         _refuse_unused("of a .mat" if is_mat else "of a bag", given)
         name = preset or (_MAT_PRESET if is_mat else _PRESET)
-        _config(name)  # reports a wrong name before anything is read
+        _check_preset(name)  # before anything is read
         given_rig = None if rig is None else load_rig(rig).rig
         with _whole(out) as fresh:
             if is_mat:
                 result = convert_mat(
-                    source, fresh, stop, preset=name, rig=given_rig, rate_hz=rate_hz or _RATE_HZ
+                    source,
+                    fresh,
+                    stop,
+                    preset=name,
+                    rig=given_rig or MAT_RIG,
+                    rate_hz=rate_hz or _RATE_HZ,
                 )
             else:
                 result, warnings = convert_bag(
@@ -176,22 +184,8 @@ def _whole(out: Path) -> Iterator[Path]:
         raise type(error)(str(error).replace(str(fresh), str(out))) from None
 
 
-def _from_session(
-    session: RecordedSession, out: Path, preset: str | None, radar: str | None, stop: StopFlag
-) -> str:
-    if out.suffix == _WIRE_SUFFIX:
-        return _write_wire(session, out, radar, stop)
-    if out.suffix != _MAT_SUFFIX:
-        return write_bag(session, out, stop)
-    if preset is None and session.info.config_json:
-        config = session.config
-    else:
-        config = _config(preset or _PRESET)
-    return write_detections(session, out, config, stop)
-
-
-def _config(preset: str) -> SlamConfig:
+def _check_preset(preset: str) -> None:
     try:
-        return load_preset(preset)
+        load_preset(preset)
     except ConfigError as error:
         raise UsageError(str(error)) from None

@@ -19,7 +19,7 @@ import json
 import math
 import re
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -63,25 +63,19 @@ _FRAMES = re.compile(r"/?(UWBradar\d+)(/readings)?")
 _INFO = re.compile(r"/?(UWBradar\d+)/info")
 
 
-def rig_of(mounts: Iterable[Sequence[float]]) -> Rig:
-    """Return the rig of radars UWBradar1 and on, each at x [m], y [m], boresight [rad]."""
-    return Rig(
-        mounts=tuple(
-            Mount(name=f"UWBradar{number}", x_m=x, y_m=y, yaw_rad=yaw)
-            for number, (x, y, yaw) in enumerate(mounts, start=1)
-        )
-    )
-
-
 def authors_rig(ahead_m: float, aside_m: float) -> Rig:
     """Return the authors' four radars, so far ahead of or behind the middle, and to its side."""
     right, left = -math.pi / 2, math.pi / 2
-    return rig_of(
-        (
-            (ahead_m, -aside_m, right),
-            (-ahead_m, aside_m, left),
-            (-ahead_m, -aside_m, right),
-            (ahead_m, aside_m, left),
+    places = (
+        (ahead_m, -aside_m, right),
+        (-ahead_m, aside_m, left),
+        (-ahead_m, -aside_m, right),
+        (ahead_m, aside_m, left),
+    )
+    return Rig(
+        mounts=tuple(
+            Mount(name=f"UWBradar{number}", x_m=x, y_m=y, yaw_rad=yaw)
+            for number, (x, y, yaw) in enumerate(places, start=1)
         )
     )
 

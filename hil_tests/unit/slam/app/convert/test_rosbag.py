@@ -157,7 +157,6 @@ def problem(capsys: pytest.CaptureFixture[str], bag: Path, *options: object, cod
 @pytest.mark.parametrize(
     ("source", "out", "used"),
     [
-        ("s.mcap", "a.mat", {"--preset"}),
         ("s.mcap", "a.xtwire", {"--radar"}),
         ("s.mcap", "a.bag", set()),
         ("s.mcap", "a", set()),
