@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, StrictFloat
 from threadpoolctl import threadpool_limits
 
 from emulator.scene.scene import Scene, SceneError, load_scene
@@ -37,10 +37,12 @@ from slam.library.rig_files import RigFile, RigRadar, RigWheels
 from slam.live.errors import AppError
 from slam.live.odometry_track import OdometryTrack, TumSample
 from slam.live.session.reader import RecordedSession, open_session
-from xethru_protocol.operating_system import StopFlag, json_text, one_line, read_bounded
+from xethru_protocol.operating_system import StopFlag, json_text, one_line
 from xethru_protocol.transport import is_network_port
+from xethru_protocol.validation import load_toml
 
 Array = NDArray[np.float64]
+_Place = Annotated[StrictFloat, Field(allow_inf_nan=False)]
 
 _FRONT_END = override(
     SlamConfig(),
@@ -155,42 +157,31 @@ def _report_of(drive: Drive, known_m: Array | None, pulses: PulseEstimator) -> _
         )
 
 
+class _Reflector(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    x_m: _Place
+    y_m: _Place
+    name: str = ""
+
+
+class _Reflectors(BaseModel):
+    """A file of places, or a scene, whose keys are other ones."""
+
+    reflectors: tuple[_Reflector, ...] | None = None
+
+
 def _read_reflectors(name: str) -> Array:
     """Return known reflectors, shape (k, 2) [m], from a TOML file or a scene.
 
     The file holds `[[reflectors]]` tables with x_m and y_m, in a frame in which the robot starts
     at the origin and looks along x, to about 10 cm and 6 degrees.
     """
-    path = Path(name)
-    table: dict[str, Any] = {}
+    path, file = Path(name), _Reflectors()
     if path.suffix == ".toml" and path.is_file():
-        try:
-            table = tomllib.loads(read_bounded(path).decode())
-        except OSError as error:
-            raise AppError(f"{path}: cannot be read: {error.strerror}") from None
-        except ValueError as error:
-            raise AppError(f"{path}: not valid TOML: {error}") from None
-    if "reflectors" not in table:
-        return np.array([(t.x_m, t.y_m) for t in _scene(name).targets]).reshape(-1, 2)
-    places = []
-    rows = table["reflectors"] if isinstance(table["reflectors"], list) else [None]
-    for index, row in enumerate(rows):
-        is_place = isinstance(row, dict) and set(row) <= {"name", "x_m", "y_m"}
-        values = [row.get(key) for key in ("x_m", "y_m")] if is_place else [None]
-        if not all(_is_number(value) for value in values):
-            raise AppError(
-                f"{path}: reflectors[{index}]: must be a table with x_m and y_m, numbers [m] "
-                "(and a name, if you like)"
-            )
-        places.append(values)
-    return np.array(places, dtype=np.float64).reshape(-1, 2)
-
-
-def _is_number(value: object) -> bool:
-    """Return whether a TOML value is a finite number, not a boolean."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return math.isfinite(value)
+        file = load_toml(_Reflectors, path, source=name, what="reflectors", error=AppError)
+    places = _scene(name).targets if file.reflectors is None else file.reflectors
+    return np.array([(one.x_m, one.y_m) for one in places]).reshape(-1, 2)
 
 
 def _rig_file(session: RecordedSession, report: _CalibrationReport) -> RigFile:
