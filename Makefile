@@ -66,7 +66,7 @@ bench: $(VENV)/installed-bench
 # goes on where it was.
 sweep: $(VENV)/installed-sweep
 	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
-	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
+	$(BIN)/python docs/studies/sweep_result.py consistency out/sweep.json
 
 SCENES := lab classroom lab_six lab_three symmetric smoke calibration two_rooms walls corridor store hall
 FAMILIES := pillars office dense loop sparse people rig
@@ -75,20 +75,20 @@ MODEL_ERRORS := pulse_wide pulse wander_3 wander_10 rod_rod bursts slip mounts s
 STRESSES := outliers dropped skew walk silent all dead carried $(MODEL_ERRORS)
 
 # What each hardship costs preset robust, on two laps and five seeds: 200 runs. `make stress
-# STRESSES="wander_10 slip"` runs some rows only. Stopped, it goes on where it was; picture and table
-# in out/experiments.
+# STRESSES="wander_10 slip"` runs some rows only. Stopped, it goes on where it was; the picture
+# is in out/studies.
 stress: $(VENV)/installed-slam
 	$(BIN)/uwb-slam sweep --scene lab classroom --laps 2 --seeds 5 --json out/stress.json \
 		--stress $(STRESSES)
-	$(BIN)/uwb-slam experiment stress --sweep out/stress.json
+	$(BIN)/python docs/studies/sweep_result.py stress out/stress.json
 
 # Preset robust in every scene that has wheels and something to map, five seeds each, and in ten
 # rooms of every random family: 130 runs, in two sweeps that go on likewise.
 scenes: $(VENV)/installed-slam
 	$(BIN)/uwb-slam sweep --seeds 5 --json out/scenes.json --scene $(SCENES)
-	$(BIN)/uwb-slam experiment scenes --sweep out/scenes.json
+	$(BIN)/python docs/studies/sweep_result.py scenes out/scenes.json
 	$(BIN)/uwb-slam sweep --seeds 1 --json out/rooms.json --scene $(FAMILIES:=:0-9)
-	$(BIN)/uwb-slam experiment scenes --sweep out/rooms.json --out out/experiments/rooms
+	$(BIN)/python docs/studies/sweep_result.py scenes out/rooms.json --out out/studies/rooms
 
 # Every scene and three rooms of every family under every hardship, a run each: 660 runs, whose last
 # line counts those that are worse than their wheels, lost, or carried and not found.

@@ -579,39 +579,6 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_experiment(experiment: argparse.ArgumentParser) -> None:
-    names = experiment.add_subparsers(required=True, metavar="NAME", dest="name")
-    for name, default, made_by, text in (
-        (
-            "consistency",
-            "out/sweep.json",
-            "`uwb-slam sweep`, like `make sweep`",
-            "mean NEES and NIS of a sweep at ten times, against their bands",
-        ),
-        (
-            "stress",
-            "out/stress.json",
-            "`uwb-slam sweep --stress ...`",
-            "what each hardship of a sweep costs, in units of its clean runs",
-        ),
-        (
-            "scenes",
-            "out/scenes.json",
-            "`uwb-slam sweep --scene ...`",
-            "what one preset does in each scene of a sweep",
-        ),
-    ):
-        parser = names.add_parser(name, help=text, description=text)
-        _add_out(parser, "out/experiments")
-        parser.add_argument(
-            "--sweep",
-            type=Path,
-            default=Path(default),
-            metavar="JSON",
-            help=f"result of {made_by} (default: %(default)s)",
-        )
-
-
 def _add_map(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
     for name, text, count, written in (
@@ -836,13 +803,6 @@ _COMMANDS = (
         "STRESS is one of: "
         + "; ".join(f"{name}: {stress.help}" for name, stress in STRESSES.items())
         + f". The families of random rooms are {', '.join(FAMILIES)}; statistics are of families.",
-    ),
-    _Subcommand(
-        "experiment",
-        "slam.app.sweep.pictures:run_experiment",
-        "draw the result of a sweep",
-        _add_experiment,
-        "Draws the result of a sweep; writes NAME.png and NAME.json. All numbers are simulated.",
     ),
 )
 

@@ -1,9 +1,11 @@
 """The scripts of `docs/studies`: what they measure, and that each makes its picture."""
 
+import json
 import math
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +14,18 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.scene.scene import load_scene
-from hil_tests.paths import STUDIES, real_recording, study
+from hil_tests.paths import FIXTURES, STUDIES, real_recording, study
 from hil_tests.system.short_scene import write_short_scene
+from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
+from slam.app.sweep.run import make_case
+from slam.app.sweep.statistics import summarise_groups
 from slam.config import FrontEnd
 from slam.geometry import transform
 
-figure7, outlier_filter, recording, smoke = (
-    study(name) for name in ("figure7", "outlier_filter", "recording", "smoke")
+figure7, outlier_filter, recording, smoke, sweep_result = (
+    study(name) for name in ("figure7", "outlier_filter", "recording", "smoke", "sweep_result")
 )
+BASELINES = FIXTURES / "baselines"
 RARE, THOROUGH = pytest.mark.rare, pytest.mark.thorough
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
@@ -232,6 +238,43 @@ def test_a_recording_without_enough_frames_is_one_line(tmp_path: Path) -> None:
         recording.read(path)
 
 
+@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
+def test_a_sweep_without_any_error_is_drawn(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ideal wheels give no ratio, and a logarithmic axis has no place for zero."""
+    clean = replace(
+        run_of(make_case("lab", "robust", 0)), ate_rmse_m=0.0, odometry_ate_rmse_m=0.0, bound=None
+    )
+    path = tmp_path / "sweep.json"
+    path.write_text(
+        json.dumps({"groups": summarise_groups([clean, replace(clean, stress="skew")])})
+    )
+    monkeypatch.setattr("sys.argv", ["", name, str(path), "--out", str(tmp_path)])
+    sweep_result.main()
+    assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "No such file"),
+        ("{", "is not a result of"),
+        ("[]", "is not a result of"),
+        ('{"groups": []}', "has no runs that stress shows"),
+    ],
+)
+def test_a_file_without_a_sweep_is_one_line(
+    content: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "sweep.json"
+    if content is not None:
+        path.write_text(content)
+    monkeypatch.setattr("sys.argv", ["", "stress", str(path), "--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match=message):
+        sweep_result.main()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "picture", "options"),
@@ -242,6 +285,13 @@ def test_a_recording_without_enough_frames_is_one_line(tmp_path: Path) -> None:
         pytest.param("limits", "limits", ("--trials", "10"), marks=THOROUGH),
         pytest.param(
             "recording", "recording", ("--runs", "2", "--recording", "{recording}"), marks=RARE
+        ),
+        ("sweep_result", "consistency", ("consistency", str(BASELINES / "sweep.json"))),
+        pytest.param(
+            "sweep_result", "stress", ("stress", str(BASELINES / "stress.json")), marks=RARE
+        ),
+        pytest.param(
+            "sweep_result", "scenes", ("scenes", str(BASELINES / "scenes.json")), marks=RARE
         ),
     ],
 )

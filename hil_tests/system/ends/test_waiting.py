@@ -47,7 +47,6 @@ ROWS = [
     (UWB_SLAM, "sweep --scene PIPE --json OUT", False),
     (UWB_SLAM, "evaluate PIPE TRACK", False),
     (UWB_SLAM, "evaluate TRACK TRACK", True),
-    (UWB_SLAM, "experiment stress --sweep PIPE --out OUT", False),
     (UWB_SLAM, "benchmark plaza --data OUT", True),
     (UWB_SLAM, "calibrate SESSION --rig PIPE", False),
     (UWB_SLAM, "calibrate SESSION --reflectors PIPE", False),

@@ -80,8 +80,6 @@ FOREIGN = {
     "text.bag": b"hello\n" * 99,
     "brace.json": b"{",
     "list.json": b"[]",
-    "no_runs.json": b'{"runs": [], "groups": []}',
-    "no_numbers.json": b'{"groups": [{"scene": "lab"}]}',
     "places.toml": b"[[reflectors]]\nx_m = 1.0\ny_m = 2\n[[reflectors]]\nx_m = true\ny_m = 0.0\n",
 }
 BAGS: dict[str, dict[str, Any]] = {
@@ -180,12 +178,8 @@ def write_format(path: Path, number: str | None) -> None:
 
 
 def files_of(place: Path) -> dict[Path, bytes | None]:
-    """Return the content of every file, None for what is no file; results have folders."""
-    return {
-        path: path.read_bytes() if path.is_file() else None
-        for path in place.rglob("*")
-        if path != place / "out" / "experiments" and path != place / "out"
-    }
+    """Return the content of every file, None for what is no file."""
+    return {path: path.read_bytes() if path.is_file() else None for path in place.rglob("*")}
 
 
 @pytest.mark.parametrize("path", sorted(TEXTS.glob("*.txt")), ids=lambda path: path.stem)

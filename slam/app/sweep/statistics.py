@@ -178,9 +178,3 @@ def in_band(group: Group) -> int:
     """Return at how many of the ten times the mean NEES lies in its 95 % band."""
     low, high = group["anees_band_95"]
     return sum(low <= value <= high for _, value in group["anees_pose"])
-
-
-def nis_in_band(group: Group) -> int:
-    """Return at how many of the ten times the mean NIS lies in its 95 % band."""
-    known = [row for row in group["nis_times"] if row[1] is not None]
-    return sum(low <= mean <= high for _, mean, low, high in known)

@@ -8,7 +8,7 @@ from slam.app.run.output import mm_text, share_text
 from slam.app.run.summary import ratio
 from slam.app.sweep import CLEAN
 from slam.app.sweep.outcomes import FOUND_WITHIN_S
-from slam.app.sweep.statistics import HARMED, Group, in_band, nis_in_band
+from slam.app.sweep.statistics import HARMED, Group, in_band
 
 PrintedTable = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Title, header and rows, for `print_table`."""
@@ -113,11 +113,8 @@ def _median_of(path: str, key: str, text: Callable[[float], str]) -> Callable[[G
     return lambda group: "-" if group[path] is None else text(group[path][key]["median"])
 
 
-COLUMNS: Mapping[str, Callable[[Group], str]] = {
-    "group": group_name,
+_STRESS_COLUMNS: Mapping[str, Callable[[Group], str]] = {
     "stress": lambda group: str(group["stress"]),
-    "seeds": lambda group: str(group["runs"]),
-    "wheels": lambda group: mm_text(group["odometry_ate_rmse_m"]["median"]),
     "SLAM": lambda group: mm_text(group["ate_rmse_m"]["median"]),
     "p90": lambda group: mm_text(group["ate_rmse_m"]["p90"]),
     "lagged": _median_of("lagged", "ate_rmse_m", mm_text),
@@ -130,34 +127,12 @@ COLUMNS: Mapping[str, Callable[[Group], str]] = {
     "carries found": carries_text,
     "mean NEES": lambda group: f"{group['anees_mean']:.2f}",
     "ANEES in band": in_band_text,
-    "known association": lambda group: in_band_text(group["bound"]),
-    "NIS in band": lambda group: str(nis_in_band(group)),
-    "mean NIS": lambda group: share_text(group["nis_mean"]),
-    "precision": lambda group: share_text(group["landmark_medians"]["precision"]),
-    "recall": lambda group: share_text(group["landmark_medians"]["recall"]),
     "no duplicate": lambda group: f"{group['without_duplicates']:.0%}",
+    "recall": lambda group: share_text(group["landmark_medians"]["recall"]),
     "false per run": lambda group: f"{group['false_per_run']:.2f}",
     "confident": lambda group: str(group["confident_false"]),
 }
-"""What each column shows of a group; errors, precision and recall are medians over the runs."""
-
-_ERRORS = ("SLAM", "p90", "lagged", "smoothed", "of wheels", "smoothed, of wheels")
-_FAILURES = ("worse", "lost", "confidently wrong", "carries found", "mean NEES", "ANEES in band")
-CONSISTENCY_COLUMNS = (
-    *("group", "seeds", "ANEES in band", "known association", "NIS in band", "mean NIS"),
-)
-SCENES_COLUMNS = (
-    *("group", "seeds", "wheels", *_ERRORS, *_FAILURES, "mean NIS"),
-    *("precision", "recall", "no duplicate", "confident"),
-)
-_STRESS_COLUMNS = (
-    *("stress", *_ERRORS, *_FAILURES),
-    *("no duplicate", "recall", "false per run", "confident"),
-)
-
-
-def table_of(title: str, groups: Sequence[Group], columns: Sequence[str]) -> PrintedTable:
-    return title, columns, [[COLUMNS[name](group) for name in columns] for group in groups]
+"""What each column shows of a group; errors and recall are medians over the runs."""
 
 
 def stress_tables(groups: Sequence[Group]) -> list[tuple[Group, list[Group]]]:
@@ -180,10 +155,8 @@ def stress_table(clean: Group, groups: Sequence[Group]) -> PrintedTable:
     title = (
         f"{group_name(clean)}, {clean['runs']} runs, with the same seeds in every row: simulated"
     )
-    _, header, rows = table_of(title, groups, _STRESS_COLUMNS)
-    times = [f"{times_clean(group, clean, 'median'):.2f}" for group in groups]
-    return (
-        title,
-        [header[0], "x clean", *header[1:]],
-        [[row[0], times_of_row, *row[1:]] for row, times_of_row in zip(rows, times, strict=True)],
-    )
+    header, rows = list(_STRESS_COLUMNS), []
+    for group in groups:
+        stress, *cells = (of(group) for of in _STRESS_COLUMNS.values())
+        rows.append([stress, f"{times_clean(group, clean, 'median'):.2f}", *cells])
+    return title, [header[0], "x clean", *header[1:]], rows

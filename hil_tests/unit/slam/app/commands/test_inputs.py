@@ -111,7 +111,6 @@ INDOOR = {
         ("replay", "session.mcap", "--out", "NEW"),
         ("convert", "session.mcap", "NEW/bag"),
         ("benchmark", "uwb-indoor", "--data", ".", "--out", "NEW"),
-        ("experiment", "consistency", "--sweep", "none.json", "--out", "NEW"),
     ],
     ids=lambda command: command[0],
 )
