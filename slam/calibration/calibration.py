@@ -44,7 +44,7 @@ from slam.calibration.tracks import (
     well_seen,
 )
 from slam.config import WheelNoise
-from slam.geometry import Rig
+from slam.geometry import Rig, between
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -129,8 +129,6 @@ def make_drive(
     stamps_ns: NDArray[np.int64],
     poses: Array,
     ranges: RangeSet,
-    *,
-    wheels: WheelNoise = UNKNOWN_WHEELS,
 ) -> Drive:
     """Cut odometry into steps for the batch.
 
@@ -138,7 +136,8 @@ def make_drive(
     """
     poses = poses.copy()
     poses[:, 2] = np.unwrap(poses[:, 2])
-    variances = np.vstack([np.zeros(3), wheels.step_sigmas(steps_of(poses)) ** 2]).cumsum(axis=0)
+    sigmas = UNKNOWN_WHEELS.step_sigmas(steps_of(poses))
+    variances = np.vstack([np.zeros(3), sigmas**2]).cumsum(axis=0)
     chosen = [0]
     for index in range(1, len(stamps_ns)):
         if stamps_ns[index] - stamps_ns[chosen[-1]] >= _LEAST_STEP_NS:
@@ -414,14 +413,7 @@ class _Estimator:
 
 def _at_origin(path: PathNodes) -> PathNodes:
     """Return the path moved so that it starts at the origin and looks along x."""
-    x, y, heading = path.poses[0]
-    cosine, sine = math.cos(heading), math.sin(heading)
-    away = path.poses[:, :2] - (x, y)
-    moved = np.column_stack(
-        [
-            cosine * away[:, 0] + sine * away[:, 1],
-            cosine * away[:, 1] - sine * away[:, 0],
-            path.poses[:, 2] - heading,
-        ]
-    )
+    start = path.poses[0]
+    moved = np.array([between(start, pose) for pose in path.poses])
+    moved[:, 2] = path.poses[:, 2] - start[2]  # continuous, as it was
     return PathNodes(t_ns=path.t_ns, poses=moved)
