@@ -16,6 +16,7 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, replace
+from datetime import timedelta
 from itertools import product
 from pathlib import Path
 
@@ -350,7 +351,8 @@ def _run(
             remaining_s = elapsed_s / (len(part.runs) - n_done) * to_do
             print_progress(
                 f"{len(part.runs)} of {len(cases)}: {_run_line(run)}; "
-                f"{_clock(elapsed_s)} elapsed, {_clock(remaining_s)} remaining"
+                f"{timedelta(seconds=round(elapsed_s))} elapsed, "
+                f"{timedelta(seconds=round(remaining_s))} remaining"
             )
         by_key = {run.key: run for run in part.runs}
         runs = [by_key[case.key] for case in cases]
@@ -387,16 +389,6 @@ def _run_line(run: SweepRun) -> str:
         f"ATE {1e3 * run.ate_rmse_m:.1f} mm "
         f"({run.ate_ratio:.2f} of odometry's {1e3 * run.odometry_ate_rmse_m:.1f} mm){smoothed}"
     )
-
-
-def _clock(seconds: float) -> str:
-    """Return a duration as hours, minutes and seconds.
-
-    >>> _clock(3723.4)
-    '1:02:03'
-    """
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
 def _results(
