@@ -17,7 +17,7 @@ from emulator.echo.people import people_truth
 from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
 from emulator.module.memory import Identity
-from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
+from emulator.module.settings import STOCK_MODEL, DeviceOptions
 from emulator.playback import PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket, People
 from emulator.ports.event_loop import Server, Service
@@ -166,20 +166,16 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             zero_ns = time.monotonic_ns()
             session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
             stays = links.port_on_reset == "stay"
+            asked = {"model": options.model, "firmware": options.firmware}
             changes = {"port_on_reset": "stay" if stays else "vanish"} | dict(options.option)
-            if options.firmware is not None:
-                changes["firmware"] = options.firmware
+            changes |= {name: value for name, value in asked.items() if value is not None}
             devices = []
             serials = _serials(options, [radar.serial for radar in scene.radars])
             for index, (radar, serial) in enumerate(zip(scene.radars, serials, strict=True)):
-                model = options.model or radar.model or STOCK_MODEL
-                device_options = DeviceOptions.of_model(model, **changes)
-                if device_options.shipped_profile not in device_options.profiles:
-                    raise CannotServeError(
-                        "--option: shipped_profile must be one of profiles", exit_code=2
-                    )
+                of_radar = {"model": radar.model or STOCK_MODEL}
+                device_options = DeviceOptions.model_validate(of_radar | changes)
                 device = radar_device(
-                    Identity(serial=serial, order_code=MODELS[model].order_code),
+                    Identity(serial=serial, order_code=device_options.product.order_code),
                     echo_source(scene, index, options.seed),
                     options.pace,
                     scene_time_zero_ns=zero_ns,

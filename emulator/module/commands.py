@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from emulator.chip.chip import Refusal, Silence
 from emulator.module.memory import FileKey, part_limits, stored_part
 from emulator.module.modes import Group, ModuleState, check_permission, group_of
-from emulator.module.settings import ZONE_LIMITS_M
+from emulator.module.settings import BAD_VALUE, ZONE_LIMITS_M
 from emulator.module.state import CRASH_DUMP, NOISE_MAPS, PARAMETER_FILE, Module, Wait
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import versions, x4
@@ -40,6 +40,8 @@ from xethru_protocol.wire.codes import (
 HIGHEST_TRACE_LEVEL = 9
 SLOWEST_BAUDRATE, FASTEST_BAUDRATE = 600, 10_000_000
 """The firmware acknowledges and ignores any other rate."""
+FILE_DELETE_NS = 100_000_000
+"""How long DELETE_FILE takes to answer (4.11)."""
 TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
 LONGEST_READ = 4096
@@ -186,6 +188,7 @@ HANDLERS: dict[type[m.Message], Handler] = {
         module.profile.debug_outputs, c.feature
     ),
     # X4 driver (4.9); this emulator's frames come from its scene
+    m.X4DriverInit: lambda module, _: module.chip.init(),
     m.X4DriverSet: lambda module, c: module.chip.set(c.setting, c.value),
     m.PrepareInjectFrame: _accepted,
     m.InjectFrame: _accepted,
@@ -223,21 +226,11 @@ def _start_bootloader(module: Module, command: m.StartBootloader) -> None:
 
 @answers(m.SetMode)
 def _set_mode(module: Module, command: m.SetMode) -> None:
-    options, modes = module.options, module.modes
-    if options.profile_switch == "restart" and modes.switches_profile(command.mode):
-        modes.restart_with_profile()
-        module.save()
-        module.request_restart()
-        raise Refusal(ErrorCode.XTS_SPRE_RESTARTING)
-    before = module.state
     without_profile = not module.modes.profile_id
     module.set_mode(command.mode)
     stops_nothing = command.mode == SensorMode.XTID_SM_STOP and without_profile
     if stops_nothing and not versions.STOP_WITHOUT_PROFILE.is_in(module.firmware):
         raise Silence
-    entered = module.state is not before
-    if entered and module.state is ModuleState.MANUAL and options.manual_settings == "init":
-        module.chip.init()
     module.trace(TraceLevel.INFO, f"Mode {SensorMode(command.mode).label}.")
 
 
@@ -250,7 +243,7 @@ def _load_app(module: Module, command: m.LoadApp) -> None:
 @answers(m.DebugLevel)
 def _debug_level(module: Module, command: m.DebugLevel) -> None:
     if command.level > HIGHEST_TRACE_LEVEL:
-        raise Refusal(module.options.bad_value_error)
+        raise Refusal(BAD_VALUE)
     module.trace_level = command.level
 
 
@@ -286,7 +279,7 @@ def _find_all(module: Module, command: m.FindAllFiles) -> m.Response:
 @answers(m.DeleteFile)
 def _delete(module: Module, command: m.DeleteFile) -> None:
     module.files.delete(_key(command))
-    module.wait = Wait(duration_ns=module.options.file_delete_ns, before_reply=True)
+    module.wait = Wait(duration_ns=FILE_DELETE_NS, before_reply=True)
     module.save()
 
 
@@ -333,13 +326,7 @@ def _get_parameter_file(module: Module, command: m.GetParameterFile) -> m.Respon
     data, name = module.files.get(PARAMETER_FILE), _as_text(command.name)
     if data is None or name != module.parameter_file_name:
         raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    text, content_id = data.decode("latin-1"), AppObject.PROFILE_PARAMETERFILE
-    replies: dict[str, m.Response] = {
-        "string": m.ReplyString(content_id=content_id, text=text),
-        "appdata": m.ParameterFile(name=name, data=text),
-        "byte": m.ReplyByte(content_id=content_id, values=data),
-    }
-    return replies[module.options.parameter_file_reply]
+    return m.ReplyString(content_id=AppObject.PROFILE_PARAMETERFILE, text=data.decode("latin-1"))
 
 
 @answers(m.NoiseMapSetPeriodicStore)
@@ -413,13 +400,6 @@ def _system_test(module: Module, command: m.SystemTest) -> m.Response:
 
 
 # --- X4 driver (4.9)
-
-
-@answers(m.X4DriverInit)
-def _x4_init(module: Module, command: m.X4DriverInit) -> None:
-    module.chip.init()
-    if module.options.x4_init_ns:
-        module.wait = Wait(duration_ns=module.options.x4_init_ns, before_reply=True)
 
 
 @answers(m.X4DriverGet)

@@ -350,7 +350,7 @@ class SavedState(BaseModel):
     format: Literal["xethru-emulator state"] = "xethru-emulator state"
     version: Literal[1] = 1
     serial: str
-    start: Literal["RUN", "LOADED", "STOPPED"]
+    start: Literal["RUN", "STOPPED"]
     profile_id: U32
     profiles: list[ProfileSettings]
     files: list[StoredFile] = Field(max_length=MAX_FILES)

@@ -17,7 +17,13 @@ from dataclasses import dataclass
 from enum import Enum
 
 from emulator.chip.chip import Refusal, Silence
-from emulator.module.settings import VOLATILE, DeviceOptions
+from emulator.module.settings import (
+    BUSY_PROFILE,
+    RUN_WITHOUT_PROFILE,
+    VOLATILE,
+    DeviceOptions,
+    ProductModel,
+)
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import ErrorCode, ProfileId, SensorMode
 
@@ -67,8 +73,6 @@ TRANSITIONS: dict[ModuleState, dict[Request, ModuleState]] = {
 
 The other states know no modes.
 """
-JUMPS = frozenset({(ModuleState.RUN, Request.MANUAL), (ModuleState.IDLE, Request.MANUAL)})
-"""Steps that option run_to_manual may refuse."""
 
 _REQUESTS: dict[int, Request] = {
     SensorMode.XTID_SM_RUN: Request.RUN,
@@ -97,7 +101,7 @@ STREAMING = frozenset(s for s, mode in _MODES.items() if mode is SensorMode.XTID
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """What a module remembers over a reset: the state to enter (RUN, LOADED, STOPPED), a profile.
+    """What a module remembers over a reset: the state to enter (RUN, STOPPED), a profile.
 
     The default is a stock X4M300, whose profile runs.
     """
@@ -109,8 +113,8 @@ class Start:
 class ModeMachine:
     """Mode and loaded profile (0 for none) of one module."""
 
-    def __init__(self, options: DeviceOptions, start: Start) -> None:
-        self._options = options
+    def __init__(self, product: ProductModel, start: Start) -> None:
+        self._product = product
         self.start = start
         self.power_up(None)
 
@@ -121,8 +125,8 @@ class ModeMachine:
     def power_up(self, into: ModuleState | None) -> None:
         """Enter a state after a restart; None for the one that the start asks for."""
         self.state = into or self.start.state
-        loaded = self.state in (ModuleState.RUN, ModuleState.LOADED)
-        self.profile_id = self.start.profile_id if loaded else int(ProfileId.XTS_ID_APP_NONE)
+        runs = self.state is ModuleState.RUN
+        self.profile_id = self.start.profile_id if runs else int(ProfileId.XTS_ID_APP_NONE)
 
     def set_mode(self, mode: int) -> None:
         """Change the mode, or raise `Refusal`."""
@@ -139,30 +143,16 @@ class ModeMachine:
 
     def load_profile(self, profile_id: int) -> None:
         """Load a profile without running it, or raise `Refusal` for one this product lacks."""
-        if profile_id not in self._options.profiles:
+        if profile_id not in self._product.profiles:
             raise Refusal(ErrorCode.XTS_SPRE_APP_INVALID)
         self._enter(Request.LOAD)
         self.profile_id = profile_id
         self.start = Start(state=ModuleState.STOPPED, profile_id=self.start.profile_id)
 
-    def switches_profile(self, mode: int) -> bool:
-        """Whether a SETMODE would run another profile than the last one."""
-        return (
-            mode == SensorMode.XTID_SM_RUN
-            and self.state is ModuleState.LOADED
-            and self.profile_id != self.start.profile_id
-        )
-
-    def restart_with_profile(self) -> None:
-        """Let the next power-up find the loaded profile loaded."""
-        self.start = Start(state=ModuleState.LOADED, profile_id=self.profile_id)
-
     def _enter(self, request: Request) -> None:
         target = TRANSITIONS[self.state].get(request)
         if target is None:
-            raise Refusal(self._options.run_without_profile_error)
-        if (self.state, request) in JUMPS and self._options.run_to_manual == "refuse":
-            raise Refusal(self._options.busy_profile_error)
+            raise Refusal(RUN_WITHOUT_PROFILE)
         self.state = target
 
 
@@ -177,7 +167,6 @@ def state_diagram() -> str:
     for state, steps in TRANSITIONS.items():
         lines += [
             f"    {state.name} --> {target.name}: {request.value}"
-            + " (option)" * ((state, request) in JUMPS)
             for request, target in steps.items()
         ]
         refused = [request.value for request in Request if request not in steps]
@@ -204,19 +193,17 @@ class Group(Enum):
 
 
 class Verdict(Enum):
-    """How a command is answered; all but TAKEN end it, unless an option takes it."""
+    """How a command is answered; all but TAKEN end it, but for an X4M200's RUNNING_OUTPUT."""
 
     TAKEN = "ok"
     UNKNOWN = "ERROR 1"
-    BUSY_PROFILE = "ERROR, option busy_profile_error"
-    NO_PROFILE = "ERROR, option no_profile_error"
-    QUIET = "option get_without_profile"
-    RUNNING_OUTPUT = "option presence_output_while_running"
+    BUSY_PROFILE = "ERROR 21h"
+    RUNNING_OUTPUT = "ERROR 21h, X4M200: ok"
     NO_ANSWER = "no answer"
 
 
 _OK, _UNKNOWN, _NO_ANSWER = Verdict.TAKEN, Verdict.UNKNOWN, Verdict.NO_ANSWER
-_BUSY, _NONE, _QUIET = Verdict.BUSY_PROFILE, Verdict.NO_PROFILE, Verdict.QUIET
+_BUSY = Verdict.BUSY_PROFILE
 _ORDER = (
     ModuleState.RUN,
     ModuleState.IDLE,
@@ -239,13 +226,14 @@ _ROWS: dict[Group, tuple[Verdict, ...]] = {
     Group.RADAR:           _EVERYWHERE,
     Group.SENSOR:          _SENSOR_ONLY,
     Group.MODES:           _SENSOR_ONLY,
-    Group.PROFILE_SET:     (_BUSY, _BUSY, _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
-    Group.PROFILE_ACTION:  (_OK,   _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
+    Group.PROFILE_SET:     (_BUSY, _BUSY, _OK,   _UNKNOWN, _BUSY, _BUSY, *_FIRMWARE_LACKS),
+    Group.PROFILE_ACTION:  (_OK,   _OK,   _OK,   _UNKNOWN, _BUSY, _BUSY, *_FIRMWARE_LACKS),
     Group.PROFILE_GET:     (_OK,   _OK,   _OK,   _UNKNOWN, _UNKNOWN, _UNKNOWN, *_FIRMWARE_LACKS),
-    Group.QUIET_GET:       (_OK,   _OK,   _OK,   _QUIET, _QUIET, _QUIET, *_FIRMWARE_LACKS),
+    Group.QUIET_GET:       (_OK,   _OK,   _OK,   _NO_ANSWER, _NO_ANSWER, _NO_ANSWER,
+                            *_FIRMWARE_LACKS),
     Group.PRESENCE_OUTPUT: (Verdict.RUNNING_OUTPUT,
-                                   _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
-    Group.STREAM_OUTPUT:   (_OK,   _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
+                                   _OK,   _OK,   _UNKNOWN, _BUSY, _BUSY, *_FIRMWARE_LACKS),
+    Group.STREAM_OUTPUT:   (_OK,   _OK,   _OK,   _UNKNOWN, _BUSY, _BUSY, *_FIRMWARE_LACKS),
     Group.UNHANDLED:       _NOWHERE,
 }
 # fmt: on
@@ -325,15 +313,12 @@ def check_permission(command: m.Message, state: ModuleState, options: DeviceOpti
     verdict = PERMISSIONS[group_of(command)][state]
     if verdict is Verdict.TAKEN:
         return
-    if verdict is Verdict.RUNNING_OUTPUT and options.presence_output_while_running:
+    if verdict is Verdict.RUNNING_OUTPUT and options.product.output_while_running:
         return
-    silent = verdict is Verdict.QUIET and options.get_without_profile == "silence"
-    if verdict is Verdict.NO_ANSWER or silent:
+    if verdict is Verdict.NO_ANSWER:
         raise Silence
-    if verdict is Verdict.NO_PROFILE:
-        raise Refusal(options.no_profile_error)
     if verdict in (Verdict.BUSY_PROFILE, Verdict.RUNNING_OUTPUT):
-        raise Refusal(options.busy_profile_error)
+        raise Refusal(BUSY_PROFILE)
     raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
 
 

@@ -7,10 +7,8 @@ and 11, row 5.
 from __future__ import annotations
 
 import math
-import os.path
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 from operator import itemgetter
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
@@ -38,6 +36,8 @@ from xethru_protocol.wire.codes import (
 )
 from xethru_protocol.wire.versions import FIRMWARE_NAMES, firmware_named
 
+ModelName = Literal["x4m300", "x4m200"]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProductModel:
@@ -45,51 +45,45 @@ class ProductModel:
 
     Attributes
     ----------
-    profile, output
-        The profile and the message that are on as shipped.
-    more_profiles
-        Others that it has.
+    profiles
+        What LOADAPP accepts (4.3); the first one runs as shipped (8.2).
+    output
+        The message that is on as shipped (15, question 3).
     output_while_running
         Whether it takes OUTPUT control of profile messages after RUN. Of an X4M200 the vendor's
         example X4M200_sleep_record.py and public scripts expect it.
     """
 
     order_code: str
-    profile: ProfileId
+    profiles: tuple[ProfileId, ...]
     output: OutputFeature
-    more_profiles: tuple[ProfileId, ...] = ()
     output_while_running: bool = False
 
 
-MODELS = {
+MODELS: dict[ModelName, ProductModel] = {
     "x4m300": ProductModel(
         order_code="X4M300",
-        profile=ProfileId.XTS_ID_APP_PRESENCE_2,
+        profiles=(ProfileId.XTS_ID_APP_PRESENCE_2,),
         output=OutputFeature.PRESENCE_SINGLE,
     ),
     "x4m200": ProductModel(
         order_code="X4M200",
-        profile=ProfileId.XTS_ID_APP_RESPIRATION_2,
+        profiles=(ProfileId.XTS_ID_APP_RESPIRATION_2, ProfileId.XTS_ID_APP_RESPIRATION_3),
         output=OutputFeature.RESP_STATUS,
-        more_profiles=(ProfileId.XTS_ID_APP_RESPIRATION_3,),
         output_while_running=True,
     ),
 }
-RESPIRATION_PROFILES = frozenset(
-    {
-        ProfileId.XTS_ID_APP_RESPIRATION_2,
-        ProfileId.XTS_ID_APP_RESPIRATION_3,
-        ProfileId.XTS_ID_APP_RESPIRATION_4,
-        ProfileId.XTS_ID_APP_RESPIRATION_5,
-        ProfileId.XTS_ID_APP_HEARTRATE,
-        ProfileId.XTS_ID_APP_RESP,
-        ProfileId.XTS_ID_APP_SLEEP,
-    }
-)
+RESPIRATION_PROFILES = frozenset(MODELS["x4m200"].profiles)
 """Profiles whose messages are those of the respiration family; all others report presence."""
-STOCK_MODEL = "x4m300"
+STOCK_MODEL: ModelName = "x4m300"
 """Where neither the scene nor the user names one."""
-X4M300_PROFILES = frozenset({MODELS["x4m300"].profile})
+BAD_VALUE = BUSY_PROFILE = ErrorCode.XTS_SPRE_COMMAND_FAILED
+"""Assumed: ERROR of a profile setting out of its range, and of one in RUN, IDLE or MANUAL (8.3; 15,
+question 1)."""
+RUN_WITHOUT_PROFILE = ErrorCode.XTS_SPRE_APP_INVALID
+"""Assumed: ERROR of RUN and IDLE without a loaded profile (8.3)."""
+BASEBAND_SAMPLING_HZ = 2.916e9
+"""Sampling-frequency field of baseband messages (15, question 9)."""
 BITS_PER_BYTE = 10
 """Start, eight data bits, stop."""
 _FALLING = b"\x01\x00"
@@ -125,11 +119,7 @@ def _known_firmware(name: str) -> str:
 
 
 class DeviceOptions(BaseModel):
-    """How one emulated module behaves where the reference allows more than one answer.
-
-    A question that the reference answers has no option. Where it marks a guess, the default is that
-    guess; where it reports an observation of hardware, the default is the observation.
-    """
+    """How one emulated module behaves where modules differ, or sources disagree."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -137,12 +127,8 @@ class DeviceOptions(BaseModel):
     """"sensor": a stock X4M300. "xep": the bare base firmware, which has no profiles and no modes.
     The newest of each; "sensor-1.5.10" or "xep-3.3.0" plays that version, as far as its place in
     the table of versions says (17)."""
-    profiles: frozenset[ProfileId] = X4M300_PROFILES
-    """What LOADAPP accepts (4.3)."""
-    shipped_profile: ProfileId = ProfileId.XTS_ID_APP_PRESENCE_2
-    """The profile that runs in a module as shipped (8.2)."""
-    default_output: OutputFeature = OutputFeature.PRESENCE_SINGLE
-    """The message that is on in a module as shipped (15, question 3)."""
+    model: ModelName = STOCK_MODEL
+    """Product: with the presence profile, or with the respiration profile."""
     parser: Literal["strict", "vendor"] = "strict"
     """How commands are found in received bytes. "strict": a packet has its start byte, a command
     its fields (3, 1.4). "vendor": as the firmware's parser, which needs no start byte, goes on
@@ -161,64 +147,21 @@ class DeviceOptions(BaseModel):
     port_on_reset: Literal["stay", "vanish"] = "stay"
     """Whether a reset keeps the port ("stay") or takes it away until the USB is back ("vanish")."""
     bad_value: Literal["refuse", "clamp"] = "refuse"
-    """What a profile setting out of its range gets (15, question 1): "refuse" answers
-    `bad_value_error`, "clamp" takes the nearest value."""
-    bad_value_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
-    """ERROR of a refused value."""
-    busy_profile_error: ErrorCode = ErrorCode.XTS_SPRE_COMMAND_FAILED
-    """ERROR of a profile setting while the profile runs, is paused, or in MANUAL (8.3)."""
-    no_profile_error: ErrorCode = ErrorCode.XTS_SPRE_NOT_RECOGNIZED
-    """ERROR of a profile setting without a loaded profile (8.3)."""
-    run_without_profile_error: ErrorCode = ErrorCode.XTS_SPRE_APP_INVALID
-    """ERROR of RUN and IDLE without a loaded profile (8.3)."""
-    get_without_profile: Literal["silence", "error"] = "silence"
-    """Whether GETs other than of sensitivity and band stay without answer ("silence", as observed)
-    or get ERROR 1 ("error") when no profile is loaded (4.4)."""
-    presence_output_while_running: bool = False
-    """Whether OUTPUT control takes presence and respiration messages while the profile runs;
-    baseband, pulse-Doppler and noise maps are taken in any case (8.3). true with --model x4m200."""
+    """What a profile setting out of its range gets (15, question 1): an ERROR, or the nearest value
+    is taken."""
     matrix_messages: Literal["whole", "halves"] = "whole"
     """Whether a range bin of a pulse-Doppler matrix or noise map comes in one message (7.2), or in
     two, of the negative and of the other frequencies, as two of the vendor's Python examples put
     them together."""
-    run_to_manual: Literal["accept", "refuse"] = "accept"
-    """Whether SETMODE MANUAL is taken from a running profile ("accept") or answered with
-    `busy_profile_error` ("refuse") (8.3)."""
-    profile_switch: Literal["direct", "restart"] = "direct"
-    """"direct", or "restart": RUN of another profile than the last one answers 22h, and the module
-    resets itself (8.2)."""
-    manual_settings: Literal["keep", "init"] = "keep"
-    """Whether X4 settings survive MANUAL, STOP, MANUAL ("keep") or INIT is carried out on entering
-    MANUAL ("init") (15, question 4)."""
-    parameter_file_reply: Literal["string", "appdata", "byte"] = "string"
-    """As what a parameter file is answered (4.4, 16)."""
-    baseband_sampling_hz: float = 2.916e9
-    """Sampling-frequency field of baseband messages [Hz] (15, question 9)."""
     storage_bytes: int = 0x48000
     """Size of the file storage: 0x48000, or 0x18000 with the small microcontroller (4.11)."""
     board_offset_m: float = x4.DEFAULT_OFFSET_M
     """FRAMEAREAOFFSET stored on the board, which INIT restores [module metres] (9.3). The echoes
     stay where they are: another value moves their ranges."""
-    noise_map_store_ns: int = 100_000_000
-    """How long a noise map takes to store; another store meanwhile is refused (4.4)."""
-    x4_init_ns: int = 0
-    """How long INIT takes to answer (4.9); 0 because emulated time is the host's time too."""
-    file_delete_ns: int = 100_000_000
-    """How long DELETE_FILE takes to answer (4.11)."""
-    watchdog_memory_ns: int = 300_000_000_000
-    """Time without fault after which the count of consecutive faults is cleared (8.5)."""
 
-    @classmethod
-    def of_model(cls, model: str, **changes: Any) -> DeviceOptions:  # noqa: ANN401 - of any field
-        """Return the options of a product of `MODELS`, with changes."""
-        shipped = MODELS[model]
-        of_product: dict[str, Any] = {
-            "profiles": frozenset({shipped.profile, *shipped.more_profiles}),
-            "shipped_profile": shipped.profile,
-            "default_output": shipped.output,
-            "presence_output_while_running": shipped.output_while_running,
-        }
-        return cls(**of_product | changes)
+    @property
+    def product(self) -> ProductModel:
+        return MODELS[self.model]
 
 
 # --- options as text
@@ -237,7 +180,7 @@ def option_texts() -> list[OptionText]:
     return [
         OptionText(
             name=name,
-            default=_text_of(field.default),
+            default=str(field.default),
             allowed=_allowed(_OPTION_TYPES[name]),
             meaning=" ".join((field.description or "").split()),
         )
@@ -272,16 +215,10 @@ def option_of(text: str) -> tuple[str, object]:
 
 
 def _value_of(kind: Any, text: str) -> object:  # noqa: ANN401 - a type, or a form of typing
-    if get_origin(kind) is Literal or kind is bool:
-        values = get_args(kind) or (False, True)
-        return values[[_text_of(value) for value in values].index(text)]
-    if get_origin(kind) is frozenset:
-        (member,) = get_args(kind)
-        return frozenset(_value_of(member, part) for part in text.split(","))
-    if issubclass(kind, IntEnum):
-        names = {name: member for member, name in _member_names(kind).items()}
-        member = names.get(text.upper()) or kind.__members__.get(text.upper())
-        return member or kind(int(text, 0))
+    if get_origin(kind) is Literal:
+        if text not in get_args(kind):
+            raise ValueError
+        return text
     number = int(text, 0) if kind is int else float(text)
     if not (math.isfinite(number) and (number >= 0 or kind is float)) or abs(number) > 2**63:
         raise ValueError
@@ -289,27 +226,9 @@ def _value_of(kind: Any, text: str) -> object:  # noqa: ANN401 - a type, or a fo
 
 
 def _allowed(kind: Any) -> str:  # noqa: ANN401 - a type, or a form of typing
-    if get_origin(kind) is Literal or kind is bool:
-        return " or ".join(_text_of(value) for value in get_args(kind) or (True, False))
-    if get_origin(kind) is frozenset:
-        return f"one or more, with commas between, of {_allowed(get_args(kind)[0])}"
-    if issubclass(kind, IntEnum):
-        return ", ".join(_member_names(kind).values())
+    if get_origin(kind) is Literal:
+        return " or ".join(get_args(kind))
     return "a whole number >= 0" if kind is int else "a number"
-
-
-def _text_of(value: Any) -> str:  # noqa: ANN401 - a default of any field
-    if isinstance(value, frozenset):
-        return ",".join(sorted(_text_of(member) for member in value))
-    if isinstance(value, IntEnum):
-        return _member_names(type(value))[value]
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _member_names(kind: type[IntEnum]) -> dict[IntEnum, str]:
-    """Return the vendor's names without what they have in common."""
-    prefix = os.path.commonprefix([member.name for member in kind])  # noqa: RUF071 - no paths
-    return {member: member.name.removeprefix(prefix[: prefix.rfind("_") + 1]) for member in kind}
 
 
 _OPTION_TYPES: dict[str, Any] = {
@@ -462,7 +381,7 @@ class ProfileSettings(BaseModel):
     def shipped(cls, profile_id: int, options: DeviceOptions) -> ProfileSettings:
         # the vendor's example X4M200_sleep_record.py reads sleep messages without switching them on
         sleep = profile_id == ProfileId.XTS_ID_APP_RESPIRATION_3
-        outputs = {options.default_output, *([OutputFeature.SLEEP_STATUS] if sleep else [])}
+        outputs = {options.product.output, *([OutputFeature.SLEEP_STATUS] if sleep else [])}
         return cls(profile_id=profile_id, outputs={int(output): 1 for output in outputs})
 
     def after_reset(self) -> ProfileSettings:
@@ -476,7 +395,7 @@ class ProfileSettings(BaseModel):
     def set_zone(self, start_m: float, end_m: float, options: DeviceOptions) -> None:
         """Choose the zone; what was read back of a zone may be written again."""
         if not (math.isfinite(start_m) and math.isfinite(end_m)):
-            raise Refusal(options.bad_value_error)
+            raise Refusal(BAD_VALUE)
         lowest_m, highest_m = snapped_zone(*ZONE_LIMITS_M)
         tolerance_m = _GRID_TOLERANCE * x4.BASEBAND_BIN_M
         if abs(start_m - lowest_m) < tolerance_m:
@@ -490,7 +409,7 @@ class ProfileSettings(BaseModel):
             start_m = min(start_m, ZONE_LIMITS_M[1] - SMALLEST_ZONE_M)
             end_m = max(end_m, start_m + SMALLEST_ZONE_M)
         elif not SMALLEST_ZONE_M - tolerance_m <= end_m - start_m:
-            raise Refusal(options.bad_value_error)
+            raise Refusal(BAD_VALUE)
         self.zone_m = snapped_zone(start_m, end_m)
 
     def set_sensitivity(self, value: int, options: DeviceOptions) -> None:
@@ -523,5 +442,5 @@ def _checked(value: float, lowest: float, highest: float, options: DeviceOptions
     tolerance = 1e-6 * max(abs(highest), 1.0)
     inside = lowest - tolerance <= value <= highest + tolerance
     if not inside and options.bad_value != "clamp":
-        raise Refusal(options.bad_value_error)
+        raise Refusal(BAD_VALUE)
     return min(max(value, lowest), highest)

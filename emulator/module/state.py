@@ -43,6 +43,10 @@ SAFE_MODE_FAULTS = 10
 """Consecutive faults that start safe mode."""
 BOOTLOADER_FAULTS = 15
 """Faults that are still answered with safe mode; the next one ends in the bootloader."""
+WATCHDOG_MEMORY_NS = 300 * NS_PER_S
+"""Time without fault after which the count of consecutive faults is cleared (8.5)."""
+NOISE_MAP_STORE_NS = NS_PER_S // 10
+"""How long a noise map takes to store; another store meanwhile is refused (4.4)."""
 APP_START_NS = NS_PER_S // 10
 """From the answer to START_APP to the start of the application."""
 LARGE_STORAGE = 0x48000
@@ -78,7 +82,7 @@ def _as_shipped(identity: Identity, options: DeviceOptions) -> SavedState:
     return SavedState(
         serial=identity.serial,
         start="RUN",
-        profile_id=options.shipped_profile,
+        profile_id=options.product.profiles[0],
         profiles=[],
         files=[] if firmware_named(options.firmware).sensor is None else [parameters],
         parameter_file_name="",
@@ -92,7 +96,7 @@ class Module:
     Parameters
     ----------
     options
-        How it answers what the reference leaves open; the documented defaults if None.
+        How it differs from a stock X4M300; not at all if None.
     memory
         Where its flash is kept; None forgets it with the module.
 
@@ -140,9 +144,10 @@ class Module:
         saved = (None if memory is None else memory.load()) or _as_shipped(identity, self.options)
         self._saved_profiles = {one.profile_id: one for one in saved.profiles}
         start = Start(state=ModuleState[saved.start], profile_id=saved.profile_id)
-        if start.profile_id not in self.options.profiles:  # of another model
-            start = Start(profile_id=int(self.options.shipped_profile))
-        self.modes = ModeMachine(self.options, start)
+        profiles = self.options.product.profiles
+        if start.profile_id not in profiles:  # of another model
+            start = Start(profile_id=int(profiles[0]))
+        self.modes = ModeMachine(self.options.product, start)
         self.files = FileSystem(self.options.storage_bytes, saved.files)
         self.certification = saved.certification
         small = self.options.storage_bytes < LARGE_STORAGE
@@ -204,7 +209,7 @@ class Module:
             raise Refusal(ErrorCode.XTS_SPRE_BUSY)
         for key, data in zip(NOISE_MAPS, self.noise_maps(), strict=True):
             self.files.replace(key, data or ERASED)  # no file is empty
-        self._noise_map_busy_until_ns = self.now_ns + self.options.noise_map_store_ns
+        self._noise_map_busy_until_ns = self.now_ns + NOISE_MAP_STORE_NS
         self.save()
 
     def change_baudrate(self, baudrate: int) -> None:
@@ -227,7 +232,7 @@ class Module:
         """Fail as by a watchdog or a hard fault: leave a crash dump and restart at once."""
         if self.state is ModuleState.BOOTLOADER or self.asleep:
             return
-        if now_ns - self._last_fault_ns >= self.options.watchdog_memory_ns:
+        if now_ns - self._last_fault_ns >= WATCHDOG_MEMORY_NS:
             self._faults = 0
         self._faults += 1
         self._last_fault_ns = now_ns

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from emulator.chip import Pace
 from emulator.chip.chip import NS_PER_S, EchoSource, ModuleClock, Refusal
 from emulator.module.outbox import MessageStream
-from emulator.module.settings import RESPIRATION_PROFILES
+from emulator.module.settings import BASEBAND_SAMPLING_HZ, RESPIRATION_PROFILES
 from emulator.module.state import NOISE_MAPS, Module
 from emulator.profiles import respiration
 from emulator.profiles.doppler import (
@@ -101,14 +101,13 @@ def baseband(
     iq: NDArray[np.complex128],
     *,
     counter: int,
-    sampling_hz: float,
 ) -> m.BasebandIq | m.BasebandAp:
     """Return a frame as I and Q, or as amplitude and phase [rad, -pi ... pi]."""
     header: dict[str, Any] = {
         "counter": counter & 0xFFFFFFFF,
         "num_bins": sweep.n_bins,
         "bin_length_m": x4.BASEBAND_BIN_M,
-        "sampling_frequency_hz": sampling_hz,
+        "sampling_frequency_hz": BASEBAND_SAMPLING_HZ,
         "carrier_frequency_hz": sweep.carrier_hz,
         "range_offset_m": float(sweep.range_m[0]),
     }
@@ -292,10 +291,8 @@ class ProfileRun:
         iq = self._sweep.frame(self._first_index + self._taken)
         self.processing.add(iq)
         self._taken += 1
-        sampling_hz = self._module.options.baseband_sampling_hz
         for feature in filter(self._on, _BASEBAND):
-            message = baseband(feature, self._sweep, iq, counter=counter, sampling_hz=sampling_hz)
-            self._ready.append(message)
+            self._ready.append(baseband(feature, self._sweep, iq, counter=counter))
         if self._taken % FRAMES_PER_TICK == 0:
             self._tick(counter)
         self._release()

@@ -244,18 +244,18 @@ class InProcessTarget(RadarTarget):
         from emulator.chip import Pace
         from emulator.echo.echo import echo_source
         from emulator.module.memory import Identity
-        from emulator.module.settings import MODELS, STOCK_MODEL, DeviceOptions
+        from emulator.module.settings import STOCK_MODEL, DeviceOptions
         from emulator.x4m300 import radar_device
         from hil_tests.faulty import FaultyLine
 
         radar = self._scene.radars[self._index]
-        model = radar.model or STOCK_MODEL
+        options = DeviceOptions(model=radar.model or STOCK_MODEL, firmware=self.spec.firmware)
         device = radar_device(
-            Identity(serial=radar.serial, order_code=MODELS[model].order_code),
+            Identity(serial=radar.serial, order_code=options.product.order_code),
             echo_source(self._scene, self._index, self.spec.seed),
             Pace.REALTIME,
             clock=radar.clock,
-            options=DeviceOptions.of_model(model, firmware=self.spec.firmware),
+            options=options,
         )
         self._line = FaultyLine(device)
         self.clock_ns = self._line.clock_ns

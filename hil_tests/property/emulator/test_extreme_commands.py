@@ -212,8 +212,9 @@ class Trial:
             "parser": self._rng.choice(("strict", "vendor")),
             "after_damage": self._rng.choice(("answer", "error")),
             "matrix_messages": self._rng.choice(("whole", "halves")),
+            "model": self._rng.choice(list(MODELS)),
         }
-        self._options = DeviceOptions.of_model(self._rng.choice(list(MODELS)), **changes)
+        self._options = DeviceOptions.model_validate(changes)
         self._flash = KeptFlash()
         self._findings = findings
         self._now_ns = 0

@@ -1,7 +1,6 @@
 """Profile settings, noise maps and output control. Protocol reference 4.4 to 4.7, 8.2, 11, 16."""
 
 import math
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -14,10 +13,10 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, ProfileId, SensorMode
 
 SECOND = 1_000_000_000
-PRESENCE_2, PRESENCE_3 = 0x014D4AB8, 0x114D4AB8
 STOP = m.SetMode(mode=SensorMode.XTID_SM_STOP)
-RUN = m.SetMode(mode=SensorMode.XTID_SM_RUN)
-LOAD = m.LoadApp(profile_id=PRESENCE_2)
+LOAD = m.LoadApp(profile_id=0x014D4AB8)
+LOAD_RESPIRATION_2 = m.LoadApp(profile_id=ProfileId.XTS_ID_APP_RESPIRATION_2)
+LOAD_RESPIRATION_3 = m.LoadApp(profile_id=ProfileId.XTS_ID_APP_RESPIRATION_3)
 IQ, AP = OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE
 PD_FLOAT, PD_BYTE = OutputFeature.PULSEDOPPLER_FLOAT, OutputFeature.PULSEDOPPLER_BYTE
 
@@ -145,14 +144,12 @@ def test_values_out_of_range_are_refused(command: m.Command[m.Ack]) -> None:
 
 def test_gets_without_a_profile() -> None:
     """4.4: sensitivity and band ERROR 1, several others no reply at all."""
-    for silence in ("silence", "error"):
-        options = DeviceOptions(get_without_profile=silence)
-        host = BareHost(device(options))
-        assert host.ask(STOP) == m.Ack()
-        assert host.ask(m.GetSensitivity()) == m.Error(code=1)
-        assert host.ask(m.GetTxCenterFrequency()) == m.Error(code=1)
-        host.send(m.GetDetectionZone())
-        assert host.hear() == ([] if silence == "silence" else [m.Error(code=1)])
+    host = BareHost(device())
+    assert host.ask(STOP) == m.Ack()
+    assert host.ask(m.GetSensitivity()) == m.Error(code=1)
+    assert host.ask(m.GetTxCenterFrequency()) == m.Error(code=1)
+    host.send(m.GetDetectionZone())
+    assert host.hear() == []
 
 
 def outputs(host: BareHost) -> dict[int, int]:
@@ -205,7 +202,7 @@ def test_a_running_profile_takes_baseband_output_only() -> None:
     host = BareHost(device())
     assert host.ask(m.OutputSetControl(feature=IQ, control=1)) == m.Ack()
     assert host.ask(command) == m.Error(code=0x21)
-    host = BareHost(device(DeviceOptions(presence_output_while_running=True)))
+    host = BareHost(device(DeviceOptions(model="x4m200")))
     assert host.ask(command) == m.Ack()
 
 
@@ -223,44 +220,20 @@ def test_noise_maps_are_files() -> None:
     assert host.ask(m.DeleteNoiseMap()) == m.Ack(), "also if there is none"
 
 
-@pytest.mark.parametrize("form", ["string", "appdata", "byte"])
-def test_parameter_file(form: Literal["string", "appdata", "byte"]) -> None:
-    """4.4, 7.6, 16."""
-    options = DeviceOptions(parameter_file_reply=form)
-    host = loaded(options)
+def test_parameter_file() -> None:
+    """4.4, 16."""
+    host = loaded()
     assert host.ask(m.GetParameterFile(name="p.txt")) == m.Error(code=1)
     assert host.ask(m.SetParameterFile(name="p.txt", data="a=1")) == m.Ack()
     reply = host.ask(m.GetParameterFile(name="p.txt"))
-    assert (
-        reply
-        == {
-            "string": m.ReplyString(content_id=0x32BA7623, text="a=1"),
-            "appdata": m.ParameterFile(name="p.txt", data="a=1"),
-            "byte": m.ReplyByte(content_id=0x32BA7623, values=b"a=1"),
-        }[form]
-    )
+    assert reply == m.ReplyString(content_id=0x32BA7623, text="a=1")
     assert host.ask(m.GetParameterFile(name="other")) == m.Error(code=1)
     assert host.ask(m.GetFileLength(file_type=0x037DD98C, identifier=0)) == m.ReplyInt(values=(3,))
 
 
-TWO_PROFILES = frozenset({ProfileId.XTS_ID_APP_PRESENCE_2, ProfileId.XTS_ID_APP_PRESENCE_3})
-
-
 def test_each_profile_has_its_own_settings() -> None:
-    host = loaded(DeviceOptions(profiles=TWO_PROFILES))
-    host.command(m.SetSensitivity(sensitivity=8), m.LoadApp(profile_id=PRESENCE_3))
+    host = BareHost(device(DeviceOptions(model="x4m200")))
+    host.command(STOP, LOAD_RESPIRATION_2, m.SetSensitivity(sensitivity=8), LOAD_RESPIRATION_3)
     assert host.ask(m.GetSensitivity()) == m.ReplyInt(content_id=0x10A5112B, values=(5,))
-    assert host.ask(LOAD) == m.Ack()
+    assert host.ask(LOAD_RESPIRATION_2) == m.Ack()
     assert host.ask(m.GetSensitivity()) == m.ReplyInt(content_id=0x10A5112B, values=(8,))
-
-
-def test_a_profile_switch_may_restart_the_module() -> None:
-    """8.2: RUN answers 22h, the module resets itself, a later try succeeds."""
-    host = loaded(DeviceOptions(profiles=TWO_PROFILES, profile_switch="restart"))
-    assert host.ask(m.LoadApp(profile_id=PRESENCE_3)) == m.Ack()
-    assert host.ask(RUN) == m.Error(code=0x22)
-    host.now_ns += 3 * SECOND
-    host.device.advance(host.now_ns)
-    assert host.hear(2) == [m.System(code=0x10), m.System(code=0x11)]
-    assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_3,))
-    assert host.ask(RUN) == m.Ack()

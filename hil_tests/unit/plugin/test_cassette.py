@@ -8,7 +8,6 @@ import pytest
 from emulator.chip import Pace
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity
-from emulator.module.settings import DeviceOptions
 from emulator.scene.scene import empty_room
 from emulator.x4m300 import radar_device
 from hil_tests.faulty import PATH, FaultyLine
@@ -89,20 +88,19 @@ def test_other_files_are_named(tmp_path: Path, content: str) -> None:
 
 
 def test_an_emulator_that_changed_its_mind_is_caught() -> None:
-    """Protocol reference 4.4: without a profile some GETs get no answer at all; here, ERROR 1."""
+    """Protocol reference 4.10: an X4M300 says so; here, another product answers."""
     recorded = Cassette.read(EMULATED)
     device = radar_device(
-        Identity(serial="100000000000"),
+        Identity(serial="100000000000", order_code="X4M200"),
         echo_source(empty_room(), 0, 0),
         Pace.REALTIME,
-        options=DeviceOptions(get_without_profile="error"),
     )
     line = FaultyLine(device)
     with line.radar() as radar:
         radar.request(SetMode(mode=SensorMode.XTID_SM_STOP))
     port = line.open(PATH, 115200)
     (found,) = differences(recorded.exchanges, ask_all(port, line.clock_ns, recorded.exchanges))
-    assert found.startswith("zone without profile: module nothing, emulator ERROR")
+    assert found.startswith("info ordercode: module REPLY STRING")
 
 
 def test_questions_have_names_of_their_own_and_write_no_flash() -> None:

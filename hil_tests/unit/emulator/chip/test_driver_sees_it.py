@@ -85,7 +85,7 @@ def test_settings_of_a_host_reach_the_profile() -> None:
 
 def test_an_x4m200_is_set_up_by_the_same_methods() -> None:
     """Its start takes 20 s with a noise map at hand; Protocol reference 4.6, 7.4."""
-    transport = transport_of_the_corridor(DeviceOptions.of_model("x4m200"))
+    transport = transport_of_the_corridor(DeviceOptions(model="x4m200"))
     with X4M300(transport, clock=transport.clock_ns) as radar:
         radar.profile.load(ProfileId.XTS_ID_APP_RESPIRATION_2)
         radar.profile.set_noise_map(NoiseMapControl(6))
@@ -109,7 +109,7 @@ def test_the_respiration_profile_knows_who_is_at_rest(
     name: str, distance_m: float, rate: float, wander: float
 ) -> None:
     """The nearest person of a scene; rates wander in a band, and 20 s resolve 3 a minute."""
-    transport = transport_of_the_corridor(DeviceOptions.of_model("x4m200"), name)
+    transport = transport_of_the_corridor(DeviceOptions(model="x4m200"), name)
     with X4M300(transport, clock=transport.clock_ns) as radar:
         radar.profile.load(ProfileId.XTS_ID_APP_RESPIRATION_2)
         radar.profile.set_noise_map(NoiseMapControl(6))

@@ -6,7 +6,6 @@ import pytest
 
 from emulator.cli import main
 from emulator.module.settings import DeviceOptions, option_of, option_texts
-from xethru_protocol.wire.codes import ErrorCode, OutputFeature, ProfileId
 
 
 def test_every_field_is_listed_with_a_default_that_can_be_set() -> None:
@@ -21,17 +20,8 @@ def test_every_field_is_listed_with_a_default_that_can_be_set() -> None:
     ("text", "value"),
     [
         ("bad_value=clamp", "clamp"),
-        ("bad_value_error=BUSY", ErrorCode.XTS_SPRE_BUSY),
-        ("bad_value_error=0x20", ErrorCode.XTS_SPRE_APP_INVALID),
-        ("presence_output_while_running=true", True),
         ("storage_bytes=0x18000", 0x18000),
-        ("baseband_sampling_hz=23.328e9", 23.328e9),
         ("board_offset_m=-0.05", -0.05),
-        ("default_output=presence_movinglist", OutputFeature.PRESENCE_MOVINGLIST),
-        (
-            "profiles=PRESENCE_2,XTS_ID_APP_RESPIRATION_2",
-            {ProfileId.XTS_ID_APP_PRESENCE_2, ProfileId.XTS_ID_APP_RESPIRATION_2},
-        ),
     ],
 )
 def test_values_are_typed_by_the_field(text: str, value: object) -> None:
@@ -44,12 +34,9 @@ def test_values_are_typed_by_the_field(text: str, value: object) -> None:
         ("bad_valu=clamp", "bad_value"),
         ("bad_value", "refuse or clamp"),
         ("bad_value=", "refuse or clamp"),
-        ("presence_output_while_running=maybe", "true or false"),
-        ("x4_init_ns=-1", "a whole number >= 0"),
-        ("x4_init_ns=1e3", "a whole number >= 0"),
+        ("storage_bytes=-1", "a whole number >= 0"),
+        ("storage_bytes=1e3", "a whole number >= 0"),
         ("board_offset_m=inf", "a number"),
-        ("bad_value_error=0x99", "BUSY"),
-        ("profiles=PRESENCE_2,", "RESPIRATION_2"),
     ],
 )
 def test_a_bad_option_is_one_line_that_names_what_is_allowed(
@@ -68,10 +55,3 @@ def test_options_are_listed_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     listed = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in listed] == list(DeviceOptions.model_fields)
     assert listed[0].keys() == {"name", "default", "allowed", "meaning"}
-
-
-def test_a_shipped_profile_that_is_none_of_the_profiles_is_refused(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(["serve", "--bare", "--option", "shipped_profile=RESPIRATION_2"]) == 2
-    assert "shipped_profile must be one of profiles" in capsys.readouterr().err

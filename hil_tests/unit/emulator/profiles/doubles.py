@@ -6,7 +6,7 @@ from typing import Any
 from emulator.chip import Pace
 from emulator.chip.chip import Chip, ModuleClock
 from emulator.echo.echo import SceneEcho
-from emulator.module.settings import DeviceOptions, ProfileSettings
+from emulator.module.settings import DeviceOptions, ModelName, ProfileSettings
 from emulator.module.state import Module
 from emulator.profiles.running_profile import ProfileStream
 from emulator.scene.people import PersonSpec
@@ -46,10 +46,10 @@ def profile(
     outputs: dict[int, int] | None = None,
     pace: Pace = Pace.REALTIME,
     zero_ns: int = 0,
-    model: str = "x4m300",
+    model: ModelName = "x4m300",
     **settings: Any,  # noqa: ANN401 - whatever ProfileSettings takes
 ) -> tuple[ProfileStream, Module]:
-    module = Module(IDENTITY, Chip(RampSource()), DeviceOptions.of_model(model))
+    module = Module(IDENTITY, Chip(RampSource()), DeviceOptions(model=model))
     shipped: dict[str, Any] = {"outputs": module.profile.outputs, "noise_map_control": DEFAULT_MAP}
     module.profile = ProfileSettings(**(shipped | settings))
     if outputs is not None:

@@ -7,7 +7,7 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.echo.echo import SceneEcho
-from emulator.module.settings import RESPIRATION_PROFILES, DeviceOptions
+from emulator.module.settings import RESPIRATION_PROFILES, DeviceOptions, ModelName
 from emulator.profiles.doppler import SLOW, NoiseMap, ProfileSweep
 from emulator.profiles.presence import PresenceProcessing
 from emulator.profiles.respiration import (
@@ -235,7 +235,7 @@ def test_normalized_movement_is_0_at_an_excess_of_3_db_and_1_at_40() -> None:
 
 @pytest.mark.parametrize("profile_id", sorted(RESPIRATION_PROFILES))
 def test_every_respiration_profile_reports_breathing(profile_id: ProfileId) -> None:
-    options = DeviceOptions.of_model("x4m200", profiles=frozenset({profile_id}))
+    options = DeviceOptions(model="x4m200")
     host = BareHost(ramp_device(Pace.REALTIME, options=options))
     host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP), m.LoadApp(profile_id=profile_id))
     host.command(m.SetMode(mode=SensorMode.XTID_SM_RUN))
@@ -246,21 +246,20 @@ def test_every_respiration_profile_reports_breathing(profile_id: ProfileId) -> N
 
 
 @pytest.mark.parametrize(("model", "taken"), [("x4m200", True), ("x4m300", False)])
-def test_outputs_after_run_are_taken_by_an_x4m200(model: str, taken: bool) -> None:
-    options = DeviceOptions.of_model(model)
+def test_outputs_after_run_are_taken_by_an_x4m200(model: ModelName, taken: bool) -> None:
+    options = DeviceOptions(model=model)
+    load = m.LoadApp(profile_id=options.product.profiles[0])
+    switch = m.OutputSetControl(feature=options.product.output, control=1)
     host = BareHost(ramp_device(Pace.REALTIME, options=options))
     host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP))
-    host.command(m.LoadApp(profile_id=options.shipped_profile), m.SetMode(mode=1))
-    answer = host.ask(m.OutputSetControl(feature=options.default_output, control=1))
-    assert answer == (m.Ack() if taken else m.Error(code=0x21))
+    host.command(load, m.SetMode(mode=1))
+    assert host.ask(switch) == (m.Ack() if taken else m.Error(code=0x21))
     # before RUN both take it
-    host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP))
-    host.command(m.LoadApp(profile_id=options.shipped_profile))
-    host.command(m.OutputSetControl(feature=options.default_output, control=1))
+    host.command(m.SetMode(mode=SensorMode.XTID_SM_STOP), load, switch)
 
 
 def test_an_x4m200_runs_the_respiration_profile_and_an_x4m300_refuses_it() -> None:
-    host = BareHost(ramp_device(Pace.REALTIME, options=DeviceOptions.of_model("x4m200")))
+    host = BareHost(ramp_device(Pace.REALTIME, options=DeviceOptions(model="x4m200")))
     host.now_ns = 5 * SECOND
     profile_id = ProfileId.XTS_ID_APP_RESPIRATION_2
 
