@@ -105,7 +105,7 @@ What it asks for is done to every radar, unless --radar names one.
   unplug [SECONDS] | plug        take the port away, give it back
   reset                          restart the module, as by its watchdog
   people [SECONDS]               what is true of the scene's people, now or at a scene time
-  pause | resume | rate R | seek SECONDS | loop on|off | filter [KIND...]   of a playback
+  pause | resume | rate R | seek SECONDS | loop on|off   of a playback
 
 Prints the answer as one JSON line. Exit 1 when the emulator refuses. For example:
 
@@ -218,8 +218,6 @@ def request_of(words: Sequence[str]) -> dict[str, Any]:  # noqa: PLR0911 - one r
             return {"verb": verb, "seconds": _number(seconds)}
         case ["loop", "on" | "off" as loop]:
             return {"verb": "loop", "value": loop == "on"}
-        case ["filter", *names]:
-            return {"verb": "filter", "kinds": names or None}
     raise ValueError(f"{' '.join(words)!r} is not a request; see xethru-emulator ctl --help")
 
 
@@ -468,22 +466,6 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="multiple of real time; 0: as fast as the port takes it (default 1)",
     )
     play.add_argument("--loop", action="store_true", help="begin again at the end")
-    play.add_argument(
-        "--from",
-        dest="from_s",
-        type=_seconds,
-        default=0.0,
-        metavar="S",
-        help="leave out the first S seconds, in every round of a loop",
-    )
-    play.add_argument(
-        "--only",
-        nargs="+",
-        type=_kind,
-        metavar="KIND",
-        help="play messages of these kinds only, named as by `xethru dump`; the time of what is "
-        "left out passes all the same",
-    )
     _add_link_dir(play)
 
     proxy = commands.add_parser(
@@ -611,8 +593,6 @@ def _whole(least: int, most: int, limit: str | None = None) -> Callable[[str], f
 
 
 _rate = number(float, lambda value: 0 <= value < math.inf, "a finite number >= 0")
-# longer than any recording
-_seconds = number(float, lambda value: 0 <= value <= 1e9, "seconds in 0...1e9")
 
 
 def _firmware(text: str) -> str:
@@ -655,16 +635,6 @@ def _link(text: str) -> tuple[str, float | None]:
     least, most = _LINKS[kind]
     allowed = f"in {least}...{most} after {kind}:"
     return kind, number(float, lambda value: least <= value <= most, allowed)(rate)
-
-
-def _kind(text: str) -> str:
-    from emulator.playback import kinds
-
-    try:
-        (kind,) = kinds([text])
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return kind
 
 
 if __name__ == "__main__":

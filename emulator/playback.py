@@ -42,7 +42,6 @@ from xethru_protocol.recordings import (
     recording_radars,
 )
 from xethru_protocol.recordings.recorded_messages import TimedMessages
-from xethru_protocol.validation import choices, shown
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import BootloaderReply, ResponseCode, SensorMode, X4Setting
 from xethru_protocol.wire.messages import (
@@ -66,7 +65,6 @@ _ONLY_NAME = "player"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _SERIAL = re.compile(r"[0-9]{12}")
 _NO_SERIAL = "0" * 12
-_UNKNOWN = "unknown"
 _ANSWERS = frozenset(
     (
         ResponseCode.XTS_SPR_ACK,
@@ -137,77 +135,10 @@ class PlayClock:
             self.anchor_ns = now_ns
 
 
-class KindSteps:
-    """Which kinds are played from which position of the recording on.
-
-    The kinds in force when the clock passes a message decide about it, even where a slow host
-    has made it wait since.
-    """
-
-    def __init__(self, kinds: frozenset[str] | None) -> None:
-        self._steps: list[tuple[int, frozenset[str] | None]] = [(0, kinds)]
-
-    @property
-    def newest(self) -> frozenset[str] | None:
-        return self._steps[-1][1]
-
-    def change(self, kinds: frozenset[str] | None, position_ns: int) -> None:
-        while len(self._steps) > 1 and self._steps[-1][0] >= position_ns:
-            self._steps.pop()
-        self._steps.append((position_ns, kinds))
-
-    def forget(self) -> None:
-        """Have the newest kinds in force everywhere, as after a seek."""
-        self._steps = [(0, self.newest)]
-
-    def forget_before(self, position_ns: int) -> None:
-        while len(self._steps) > 1 and self._steps[1][0] <= position_ns:
-            del self._steps[0]
-
-    def passes(self, position_ns: int, message: Response) -> bool:
-        _, kinds = self._steps[0]
-        for begin_ns, later in self._steps[1:]:
-            if begin_ns <= position_ns:
-                kinds = later
-        unknown = isinstance(message, UnknownMessage)
-        kind = _UNKNOWN if unknown else _slug(ROWS[type(message)].name)
-        return kinds is None or kind in kinds
-
-
-def kinds(names: Iterable[str]) -> frozenset[str]:
-    """Return the kinds that names mean; case, spaces, ``-`` and ``_`` do not matter.
-
-    Raises
-    ------
-    ValueError
-        When a name is not a kind that can be played; the message lists them.
-
-    Examples
-    --------
-    >>> sorted(kinds(["DATA FLOAT", "baseband_iq"]))
-    ['baseband-iq', 'data-float']
-    """
-    wanted = frozenset(map(_slug, names))
-    for name in sorted(wanted - _KINDS):
-        raise ValueError(f"{shown(name)} is not a kind of message; {choices(name, sorted(_KINDS))}")
-    return wanted
-
-
 def is_answer(message: Response) -> bool:
     if isinstance(message, UnknownMessage):
         return message.code in _ANSWERS
     return not ROWS[type(message)].opcodes.isdisjoint(_ANSWERS)
-
-
-def _slug(name: str) -> str:
-    return name.strip().lower().replace(" ", "-").replace("_", "-")
-
-
-_KINDS = frozenset(
-    _slug(row.name)
-    for kind, row in ROWS.items()
-    if issubclass(kind, Response) and row.opcodes.isdisjoint(_ANSWERS)
-) | {_UNKNOWN}
 
 
 class TimedMessage(NamedTuple):
@@ -245,23 +176,19 @@ class PlayStream(MessageStream):
     """The messages of a recording, due one after the other while a host has the port open.
 
     Where the system does not report who opens the port, a host's first command counts as opening.
-    No control brings a message twice or out of order, or loses one, but for what a seek leaves out
-    and a filter passes over. Pause, rate, loop and filter outlast the host.
+    No control brings a message twice or out of order, or loses one, but for what a seek leaves out.
+    Pause, rate and loop outlast the host.
 
     Parameters
     ----------
     timed
-        What to play, as from `schedule`; gone through anew for every host, round, seek and
-        filter, one message ahead, so that it need not lie in memory.
+        What to play, as from `schedule`; gone through anew for every host, round and seek, one
+        message ahead, so that it need not lie in memory.
     loop_gap_ns
         Time of the recording between the last message and the first when playing in a loop; None
         to play once.
     rate
         Multiple of real time; 0 for as fast as the port takes it.
-    from_ns
-        Where every host and round begins, ns since the first message.
-    kinds
-        What to play, as from `kinds`; None for all. What is left out takes its time all the same.
     """
 
     def __init__(
@@ -270,19 +197,13 @@ class PlayStream(MessageStream):
         *,
         loop_gap_ns: int | None = None,
         rate: float = 1.0,
-        from_ns: int = 0,
-        kinds: frozenset[str] | None = None,
     ) -> None:
         self._timed = timed
         self._loop = loop_gap_ns is not None
         self._gap_ns = NOMINAL_PERIOD_NS if loop_gap_ns is None else loop_gap_ns
-        self._from_ns = from_ns
         self._clock = PlayClock(rate)
-        self._kinds = KindSteps(kinds)
-        self._coming: Iterator[tuple[int, TimedMessage]] = iter(())
-        self._first = (0, 0)  # least index and time of what is still to be played of this round
+        self._coming: Iterator[TimedMessage] = iter(())
         self._next: TimedMessage | None = None
-        self._next_index = 0
         self._last_ns = 0  # time of the last message gone through
         self._round_waits = False  # whether a further round was entered and none of it is played
         self._listening = False
@@ -300,9 +221,7 @@ class PlayStream(MessageStream):
         assert taken is not None
         self._begun = True
         self._round_waits = False
-        self._first = (self._next_index + 1, 0)
         self._clock.reached(taken.time_ns)
-        self._kinds.forget_before(taken.time_ns)
         self._advance()
         if self._next is None and self._loop:
             self._next_round()
@@ -324,7 +243,7 @@ class PlayStream(MessageStream):
         """Play from the beginning, or from where a seek without a host went, soon."""
         self._begun = False
         self._listening = True
-        self._go(self._from_ns if self._sought_ns is None else self._sought_ns, now_ns + QUIET_NS)
+        self._go(self._sought_ns or 0, now_ns + QUIET_NS)
         self._sought_ns = None
 
     def port_closed(self, now_ns: int) -> None:
@@ -338,14 +257,12 @@ class PlayStream(MessageStream):
         ``playing``: a host has the port and something is left to play. ``position_s``, since the
         first message, lies below 0 in the gap between two rounds.
         """
-        kinds = self._kinds.newest
         return {
             "playing": self._listening and self._next is not None,
             "paused": self._clock.paused,
             "position_s": self._clock.position_ns(now_ns) / NS_PER_S,
             "rate": self._clock.rate,
             "loop": self._loop,
-            "kinds": None if kinds is None else sorted(kinds),
         }
 
     def pause(self, now_ns: int) -> None:
@@ -392,58 +309,34 @@ class PlayStream(MessageStream):
         if not self._listening:
             return
         if loop and self._next is None:
-            self._go(self._from_ns, now_ns)
+            self._go(0, now_ns)
         elif not loop and self._round_waits:
             self._next = None
 
-    def set_filter(self, kinds: frozenset[str] | None, now_ns: int) -> None:
-        """Play other kinds, as from `kinds`, None for all, from the position of now on.
-
-        Where a loop had nothing to play, it begins again.
-        """
-        over = self._next is None
-        self._kinds.change(kinds, self._clock.position_ns(now_ns))
-        if not self._listening:
-            return
-        if over and self._loop:
-            self._go(self._from_ns, now_ns)
-            return
-        self._open()
-        if self._next is None and self._loop:
-            self._next_round()
-
     def _go(self, position_ns: int, at_ns: int) -> None:
-        self._kinds.forget()
-        self._first = (0, position_ns)
         self._round_waits = False
-        self._open()
+        self._open(position_ns)
         past_the_end = self._next is None and self._last_ns < position_ns
         self._clock.start(self._last_ns if past_the_end else position_ns, at_ns)
         if self._next is None and self._loop:
             self._next_round()
 
     def _next_round(self) -> None:
-        self._clock.wrap(self._last_ns + self._gap_ns - self._from_ns)
-        self._kinds.forget()
-        self._first = (0, self._from_ns)
+        self._clock.wrap(self._last_ns + self._gap_ns)
         self._round_waits = True
-        self._open()
+        self._open(0)
 
-    def _open(self) -> None:
-        self._coming = enumerate(self._timed)
+    def _open(self, position_ns: int) -> None:
+        self._coming = iter(self._timed)
         self._last_ns = 0
         self._advance()
+        while self._next is not None and self._next.time_ns < position_ns:
+            self._advance()
 
     def _advance(self) -> None:
-        first_index, first_ns = self._first
-        for index, item in self._coming:
-            self._last_ns = item.time_ns
-            if index < first_index or item.time_ns < first_ns:
-                continue
-            if self._kinds.passes(item.time_ns, item.message):
-                self._next, self._next_index = item, index
-                return
-        self._next = None
+        self._next = next(self._coming, None)
+        if self._next is not None:
+            self._last_ns = self._next.time_ns
 
 
 def _starts_radar(command: Command[Response]) -> bool:
@@ -509,8 +402,6 @@ def played_radars(
     *,
     rate: float = 1.0,
     loop: bool = False,
-    from_ns: int = 0,
-    kinds: frozenset[str] | None = None,
     on_fault: Callable[[RecordingFault], None],
     warn: Callable[[str], None] = lambda line: None,
 ) -> tuple[PlayedRadar, ...]:
@@ -524,7 +415,7 @@ def played_radars(
     ----------
     recording
         Anything that `read_recording` takes, and sessions of several radars.
-    rate, from_ns, kinds
+    rate
         As of `PlayStream`.
     on_fault
         Called with what could not be read; the rest plays.
@@ -541,7 +432,7 @@ def played_radars(
         surveys.append(_Survey(recording, facts, on_fault))
         on_fault = _reported_already
     zero_ns = min((s.first_ns for s in surveys if s.first_ns is not None), default=0)
-    _check(recording, surveys, zero_ns, rate=rate, loop=loop, from_ns=from_ns)
+    _check(recording, surveys, zero_ns, rate=rate, loop=loop)
     end_ns = max(survey.offset_ns(zero_ns) + survey.lasts_ns for survey in surveys)
     playing = [survey for survey in surveys if survey.plays]
     names = _port_names([survey.facts.name for survey in playing])
@@ -553,8 +444,6 @@ def played_radars(
             # rounds of all radars are equally long, so that a loop keeps them in step
             loop_gap_ns=end_ns - offset_ns - survey.lasts_ns + NOMINAL_PERIOD_NS,
             rate=rate,
-            from_ns=from_ns,
-            kinds=kinds,
         )
         stream.set_loop(loop, 0)
         serial = survey.facts.serial or ""
@@ -608,15 +497,12 @@ def _check(
     *,
     rate: float,
     loop: bool,
-    from_ns: int,
 ) -> None:
     if not any(survey.messages for survey in surveys):
         raise RecordingError(f"{recording}: the recording holds no messages")
     if not any(survey.plays for survey in surveys):
         raise RecordingError(f"{recording}: the recording holds answers only, nothing to play")
     last_ns = max(s.offset_ns(zero_ns) + s.lasts_ns for s in surveys if s.plays)
-    if from_ns > last_ns:
-        raise RecordingError(f"{recording} is over after {last_ns / NS_PER_S:.3f} s")
     longest_ns = max(last_ns, NOMINAL_PERIOD_NS if loop else 0)
     if rate and longest_ns > _LONGEST_S * NS_PER_S * rate:
         raise RecordingError(

@@ -247,8 +247,6 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                 options.recording,
                 rate=options.rate,
                 loop=options.loop,
-                from_ns=round(options.from_s * 1e9),
-                kinds=None if options.only is None else frozenset(options.only),
                 on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
                 warn=warn,
             )

@@ -13,7 +13,6 @@
 | rate | value, radar | multiple of real time; 0: as fast as the port takes it |
 | seek | seconds, radar | time of the recording |
 | loop | value, radar | true or false |
-| filter | kinds, radar | which kinds of messages are played; null: all |
 | people | seconds, radar | what is true of the people of a scene, at a scene time or now |
 
 ``stream`` in the state is the newest stream of radar frames: its number from 0 (INIT, a reset and
@@ -46,7 +45,7 @@ from emulator.chip.chip import NS_PER_S
 from emulator.echo.people import PersonTruth
 from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlanError, parse_fault
-from emulator.playback import PlayStream, kinds
+from emulator.playback import PlayStream
 from emulator.ports.sockets import SocketClient, SocketService
 from emulator.scene.people import SleepDepth
 from emulator.x4m300 import Device
@@ -59,7 +58,7 @@ MOST_UNREAD = 1 << 20
 _READ = 65_536
 _LONGEST_S = 86_400.0 * 365
 _LATEST_TRUTH_S = 86_400.0 * 7
-_KEYS = ("verb", "radar", "fault", "id", "seconds", "value", "kinds")
+_KEYS = ("verb", "radar", "fault", "id", "seconds", "value")
 
 
 People = Callable[[NDArray[np.int64]], Sequence[PersonTruth]]
@@ -208,16 +207,6 @@ class Control:
         for player in self._played(asked):
             player.set_loop(value, now_ns)
 
-    def _filter(self, asked: Mapping[str, Any], now_ns: int) -> None:
-        names = asked.get("kinds")
-        if names is not None and not (
-            isinstance(names, list) and all(isinstance(name, str) for name in names)
-        ):
-            raise _RefusedError("kinds: must be a list of names, or null for all")
-        chosen = None if names is None else kinds(names)
-        for player in self._played(asked):
-            player.set_filter(chosen, now_ns)
-
 
 VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any] | None]] = {
     "state": Control._state,
@@ -232,7 +221,6 @@ VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any] | No
     "rate": Control._rate,
     "seek": Control._seek,
     "loop": Control._loop,
-    "filter": Control._filter,
     "people": Control._truth,
 }
 

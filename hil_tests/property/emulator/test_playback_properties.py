@@ -22,7 +22,6 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role
 
 MS = 1_000_000
-TEXT = "data-string"
 RATES = st.sampled_from([0.0, 0.25, 0.5, 1.0, 2.0, 8.0])
 
 
@@ -84,9 +83,6 @@ def control(stream: PlayStream, verb: str, value: object, now_ns: int) -> None:
             stream.set_rate(rate, now_ns)
         case "seek", int(position_ms):
             stream.seek(position_ms * MS, now_ns)
-        case "filter", kinds:
-            assert kinds is None or isinstance(kinds, frozenset)
-            stream.set_filter(kinds, now_ns)
 
 
 @given(gaps=GAPS, steps=st.lists(CONTROLS, max_size=20))
@@ -128,55 +124,9 @@ def test_pause_rate_and_a_slow_reader_change_nothing_but_times(
     assert heard == [item.message for item in items]
 
 
-KINDS = st.sampled_from([None, frozenset({"presence-single"}), frozenset({TEXT}), frozenset[str]()])
-
-
-@given(gaps=GAPS, changes=st.lists(st.tuples(st.integers(1, 90), KINDS), max_size=6))
-def test_the_filter_in_force_when_a_message_falls_due_decides(
-    gaps: list[int], changes: list[tuple[int, frozenset[str] | None]]
-) -> None:
-    """Even when nobody reads until the end, which must not change what is played."""
-    items = recording(gaps)
-    played = []
-    for reads_meanwhile in (True, False):
-        line = Line(PlayStream(items))
-        line.stream.port_opened(-QUIET_NS)
-        heard: list[m.Response] = []
-        expected: list[m.Response] = []
-        kinds: frozenset[str] | None = None
-        at_ns = -1
-        for wait_ms, change in [*changes, (10_000, None)]:
-            # a message due at the very instant of a change belongs to either; keep off it
-            until_ns = line.now_ns + wait_ms * MS + 1
-            expected += [
-                item.message
-                for item in items
-                if at_ns < item.time_ns < until_ns
-                and (
-                    kinds is None or ("string" in str(kinds)) == (number_of(item.message) % 3 == 2)
-                )
-                and kinds != frozenset()
-            ]
-            at_ns = until_ns - 1
-            line.now_ns = until_ns
-            if reads_meanwhile:
-                heard += line.drain()
-            line.stream.set_filter(change, until_ns)
-            kinds = change
-        heard += line.drain()
-        assert heard == expected
-        played.append(heard)
-    assert played[0] == played[1]
-
-
 @given(
     gaps=GAPS,
-    steps=st.lists(
-        CONTROLS
-        | st.tuples(st.just("seek"), st.integers(0, 1000))
-        | st.tuples(st.just("filter"), KINDS),
-        max_size=25,
-    ),
+    steps=st.lists(CONTROLS | st.tuples(st.just("seek"), st.integers(0, 1000)), max_size=25),
 )
 def test_no_message_comes_twice_or_out_of_order_but_after_a_seek(
     gaps: list[int], steps: list[tuple[str, object]]

@@ -60,14 +60,3 @@ def test_every_radar_plays_at_a_port_of_its_own(session: Path) -> None:
                 assert frame.counter == counter
                 assert np.array_equal(frame.samples, samples(2, counter))
         assert served.end() == 0
-
-
-@pytest.mark.rare
-def test_from_and_only(session: Path) -> None:
-    arguments = ("--from", "27.5", "--rate", "0")
-    with emulator("play", session, *arguments, "--only", "data-float") as served:
-        expected = [sent(number, range(28, 30)) for number in range(4)]
-        assert heard(served.paths, len(expected[0])) == expected
-    with emulator("play", session, "--rate", "0", "--only", "BASEBAND_IQ") as served:
-        (silent,) = heard(served.paths[:1], 0)
-        assert silent == b""

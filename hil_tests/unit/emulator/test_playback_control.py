@@ -14,11 +14,9 @@ from emulator.playback import (
     QUIET_NS,
     PlayedRadar,
     PlayStream,
-    kinds,
     played_radars,
     schedule,
 )
-from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import BareHost
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -154,30 +152,6 @@ def test_a_loop_is_turned_on_and_off() -> None:
     assert played.at(100) == []
 
 
-def test_a_filter_lets_time_pass_and_brings_back_what_has_not_come() -> None:
-    frames = kinds(["data-float"])
-    played = Played(kinds=frames)
-    assert played.stream.next_due_ns() is None
-    assert played.at(2.5) == []
-    played.stream.set_filter(None, s(2.5))
-    assert played.at(4) == [3, 4]
-
-
-def test_a_loop_without_anything_to_play_waits_for_another_filter() -> None:
-    played = Played(kinds=frozenset(), loop_gap_ns=SECOND)
-    assert played.at(1000) == []
-    played.stream.set_filter(kinds(["DATA STRING"]), s(1000))
-    assert played.at(1004) == [0, 1, 2, 3, 4]
-    assert played.at(1005) == [0]
-
-
-def test_a_host_and_a_round_begin_where_they_shall() -> None:
-    played = Played(from_ns=s(3.5), loop_gap_ns=SECOND)
-    assert played.at(0.5) == [4]
-    assert played.at(1.5) == []
-    assert played.at(2.0) == [4]
-
-
 def test_a_start_command_ends_the_wait_of_a_paused_host_too() -> None:
     played = Played()
     played.stream.port_opened(0)
@@ -186,11 +160,6 @@ def test_a_start_command_ends_the_wait_of_a_paused_host_too() -> None:
     assert played.at(5) == []
     played.stream.resume(s(6))
     assert played.at(6) == [0]
-
-
-def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"x-ray.*data-float"):
-        kinds(["X ray"])
 
 
 def write_session(path: Path, starts_ns: dict[str, int], n_frames: int = 6) -> None:
@@ -319,8 +288,3 @@ def test_an_info_that_makes_no_sense_costs_only_itself(tmp_path: Path) -> None:
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
     (facts,) = recording_radars(tmp_path / "x.mcap")
     assert (facts.name, facts.serial, facts.area_m) == ("a", None, None)
-
-
-def test_a_start_behind_the_end_is_refused() -> None:
-    with pytest.raises(RecordingError, match=r"is over after \d+\.\d\d\d s"):
-        played_radars(FIXTURES / "recordings" / "iq", from_ns=10**15, on_fault=lambda fault: None)

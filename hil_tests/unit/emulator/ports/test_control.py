@@ -142,7 +142,6 @@ def test_people_are_as_their_table_says(line: FaultyLine) -> None:
         ({"verb": "people"}, "there is no scene here"),
         ({"verb": "rate", "value": "fast"}, "value: "),
         ({"verb": "loop", "value": 1}, "value: "),
-        ({"verb": "filter", "kinds": [1]}, "kinds: "),
     ],
 )
 def test_what_cannot_be_done_names_the_place(asked: dict[str, Any], place: str) -> None:
@@ -168,8 +167,6 @@ def test_no_line_breaks_it(line: bytes) -> None:
         ("people", {"verb": "people"}),
         ("people 90", {"verb": "people", "seconds": 90.0}),
         ("loop off", {"verb": "loop", "value": False}),
-        ("filter", {"verb": "filter", "kinds": None}),
-        ("filter data-float", {"verb": "filter", "kinds": ["data-float"]}),
     ],
 )
 def test_words_become_requests(words: str, request_line: dict[str, Any]) -> None:
