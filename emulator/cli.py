@@ -43,8 +43,7 @@ MOST_BARE = 64
 LAST_SERIAL = 10**12 - MOST_BARE
 """From which so many modules count on within 12 digits."""
 LAST_PORT = 65535
-_LINKS = {"usb": (0, 1000), "uart": (600, 10_000_000)}
-"""Links and the numbers they take: latency in ms, baud rate."""
+_BAUD_RATES = 600, 10_000_000
 
 _SERVE_HELP = """\
 Each radar of the scene becomes a stock X4M300 on a pseudo-terminal, published as a link in the
@@ -67,10 +66,10 @@ real module. pace asap: as fast as the host reads, nothing is lost.
 is one that comes while a host has the module's pseudo-terminal open. While a client is connected,
 the pseudo-terminal takes and sends nothing.
 
---link usb: bytes pass at once; usb:MS: transfers of at most 512 bytes, MS milliseconds under way.
+--link usb: bytes pass at once.
 --link uart: ten bits per byte at the speed that the host sets its terminal to; a host at another
 speed than the module's (115200 after power-up, then what SETBAUDRATE set) receives and sends
-garbage. uart:BAUD: the host's side runs at BAUD, whatever its terminal is set to.
+garbage.
 
 --port-on-reset vanish: a reset takes the port away for two seconds, as USB does: whoever has it
 open sees it hang up, its name is gone. rename: it returns as NAME-2, NAME-3 and so on; running
@@ -428,9 +427,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     serve.add_argument(
         "--link",
-        type=_link,
-        default=("usb", None),
-        metavar="{usb[:MS],uart[:BAUD]}",
+        choices=["usb", "uart"],
+        default="usb",
         help="what the modules are connected by (default usb)",
     )
     serve.add_argument(
@@ -479,7 +477,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     proxy.add_argument(
         "--baud",
-        type=_whole(*_LINKS["uart"]),
+        type=_whole(*_BAUD_RATES),
         default=115_200,
         metavar="B",
         help="of a UART (default 115200)",
@@ -624,17 +622,6 @@ def _host(text: str) -> str:
     if not text.strip():
         raise argparse.ArgumentTypeError("a name or address is missing")
     return text
-
-
-def _link(text: str) -> tuple[str, float | None]:
-    kind, colon, rate = text.partition(":")
-    if kind not in _LINKS:
-        raise argparse.ArgumentTypeError(f"{shown(text)} is neither usb nor uart")
-    if not colon:
-        return kind, None
-    least, most = _LINKS[kind]
-    allowed = f"in {least}...{most} after {kind}:"
-    return kind, number(float, lambda value: least <= value <= most, allowed)(rate)
 
 
 if __name__ == "__main__":

@@ -44,7 +44,6 @@ from xethru_protocol.transport import is_loopback, open_line
 from xethru_protocol.validation import choices, shown
 from xethru_protocol.wire.errors import PortUnavailable
 
-NS_PER_MS = 1_000_000
 SOCKET_NAME = "odometry.sock"
 CONTROL_NAME = "control.sock"
 PROXY_NAME = "proxy"
@@ -314,11 +313,8 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
 def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
     if options.tcp is not None and not is_loopback(options.tcp_host):
         warn(f"--tcp-host {options.tcp_host}: everyone who reaches it can command the modules")
-    kind, number = options.link
     return LinkOptions(
-        kind=kind,
-        usb_latency_ns=round(number * NS_PER_MS) if kind == "usb" and number is not None else None,
-        host_baud=round(number) if kind == "uart" and number is not None else None,
+        kind=options.link,
         port_on_reset=options.port_on_reset,
         tcp_base=options.tcp,
         tcp_host=options.tcp_host,

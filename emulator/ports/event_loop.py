@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from emulator.chip.chip import NS_PER_S
-from emulator.ports.usb_and_uart import Line
+from emulator.ports.uart import UartLine
 from emulator.x4m300 import ByteDevice
 
 PACKETS_PER_TURN = 8
@@ -83,7 +83,7 @@ class Port:
         When it is to be served next, None: when its line is ready; as of its last turn.
     """
 
-    def __init__(self, link: ByteLink, device: ByteDevice, line: Line | None = None) -> None:
+    def __init__(self, link: ByteLink, device: ByteDevice, line: UartLine | None = None) -> None:
         self.link = link
         self.device = device
         self._line = line
@@ -172,7 +172,7 @@ class Port:
                     return False
                 self._unsent = memoryview(packet)
             self._unsent = self._unsent[self.link.write(self._unsent) :]
-            if self._unsent and self._line is not None and not self._line.waits_for_host:
+            if self._unsent and self._line is not None:
                 self._unsent = memoryview(b"")  # or an old backlog would meet the next host
             elif self._unsent:
                 self._blocked = True

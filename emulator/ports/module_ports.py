@@ -21,7 +21,7 @@ from typing import Literal
 from emulator.ports.event_loop import Port, Service, wait_for
 from emulator.ports.pty import LinkError, PortWatch, PtyLink
 from emulator.ports.tcp import TcpLink
-from emulator.ports.usb_and_uart import UartLine, UsbLine
+from emulator.ports.uart import UartLine
 from emulator.x4m300 import ByteDevice
 from xethru_protocol.wire.codes import POWER_UP_BAUD
 
@@ -150,11 +150,6 @@ class LinkOptions:
 
     Attributes
     ----------
-    usb_latency_ns
-        How long USB transfers of at most 512 bytes are under way; None: bytes pass at once.
-    host_baud
-        Rate of the host's side of a UART, bit/s; None: what it sets its terminal to, and for a
-        TCP client the module's.
     port_on_reset
         Whether a restart keeps the port, takes it away for a while, or has it return under
         another name.
@@ -163,8 +158,6 @@ class LinkOptions:
     """
 
     kind: Literal["usb", "uart"] = "usb"
-    usb_latency_ns: int | None = None
-    host_baud: int | None = None
     port_on_reset: Literal["stay", "vanish", "rename"] = "stay"
     tcp_base: int | None = None
     tcp_host: str = "127.0.0.1"
@@ -222,11 +215,11 @@ class DevicePorts:
         options: LinkOptions,
         cleanup: contextlib.ExitStack,
     ) -> None:
-        line = _line(named, options)
-        flushed = line.flush_output if isinstance(line, UartLine) else None
+        line = self._line(named)
+        flushed = None if line is None else line.flush_output
         link = PtyLink(path, flushed=flushed)
         cleanup.callback(link.close)
-        if isinstance(line, UartLine) and options.host_baud is None:
+        if line is not None:
             line.host_baud = link.host_baud
         watch = PortWatch(link.terminal, closed=lambda now_ns: link.admit())
         cleanup.callback(watch.close)
@@ -239,7 +232,7 @@ class DevicePorts:
             has_client = partial(_is_open, tcp)
             device = DeviceSide(named.device, lambda: not has_client())
             guest = DeviceSide(named.device, has_client)
-            self.ports.append(Port(tcp, guest, _line(named, options)))
+            self.ports.append(Port(tcp, guest, self._line(named)))
             self.services.append(tcp)
         self.ports.append(Port(link, device, line))
         plug = Plug(
@@ -253,11 +246,9 @@ class DevicePorts:
         self.services.append(plug)
         self._lines.append((named, link, tcp))
 
-
-def _line(named: NamedDevice, options: LinkOptions) -> UsbLine | UartLine | None:
-    if options.kind == "uart":
-        return UartLine(named.uart_baud, lambda: options.host_baud)
-    return None if options.usb_latency_ns is None else UsbLine(options.usb_latency_ns)
+    def _line(self, named: NamedDevice) -> UartLine | None:
+        """Return a line at whose end a host has no rate of its own, as a TCP client."""
+        return UartLine(named.uart_baud, lambda: None) if self._is_uart else None
 
 
 def _is_open(link: PtyLink | TcpLink) -> bool:

@@ -1,7 +1,6 @@
 """Usage, exit codes and clear lines of xethru-emulator, without serving anything."""
 
 import json
-import math
 import os
 import shlex
 import signal
@@ -162,18 +161,3 @@ def test_a_number_out_of_range_is_wrong_usage(
         main(arguments)
     assert ended.value.code == 2
     assert allowed in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("kind", "least", "most", "step"), [("uart", 600, 10**7, 1), ("usb", 0, 1000, 0.5)]
-)
-def test_both_ends_of_a_range_belong_to_it(
-    kind: str, least: float, most: float, step: float, tmp_path: Path
-) -> None:
-    for value in (least, most):  # accepted, and then there is no such scenario
-        options = ["--link", f"{kind}:{value}", "--faults", str(tmp_path / "none.toml")]
-        assert main(["serve", "--bare", *options]) == 1
-    for value in (least - step, most + step, math.nan):
-        with pytest.raises(SystemExit) as ended:
-            main(["serve", "--bare", "--link", f"{kind}:{value}"])
-        assert ended.value.code == 2

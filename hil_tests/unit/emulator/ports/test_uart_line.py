@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from emulator.chip import Pace
 from emulator.module.settings import received_bytes
 from emulator.ports.event_loop import Port
-from emulator.ports.usb_and_uart import Line, UartLine, UsbLine
+from emulator.ports.uart import UartLine
 from emulator.x4m300 import Device
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol.wire import messages as m
@@ -86,7 +86,7 @@ class Descriptor:
 class Bench:
     """One port in virtual time, which jumps from deadline to deadline as the loop would."""
 
-    def __init__(self, device: Device, line: Line) -> None:
+    def __init__(self, device: Device, line: UartLine) -> None:
         self.device = device
         self.now_ns = 0
         self.end = Descriptor()
@@ -216,19 +216,6 @@ def test_a_uart_sends_on_without_a_reader() -> None:
     bench.end.heard.clear()
     bench.host = Connection(Role.HOST)
     assert bench.ask(m.Ping()) == [m.Pong(value=0xAAEEAEEA)]
-
-
-def test_usb_transfers_are_delayed_and_short() -> None:
-    device = ramp_device()
-    bench = Bench(device, UsbLine(3_000_000))
-    bench.say(bench.host.send(m.Ping()))
-    bench.run(5_999_999)
-    assert bench.heard() == []
-    bench.run(6_000_000)
-    assert bench.heard() == [m.Pong(value=0xAAEEAEEA)]
-    line = UsbLine(0)
-    line.from_module(bytes(1300), 0)
-    assert [len(line.to_host.take(0)) for _ in range(4)] == [512, 512, 276, 0]
 
 
 def test_a_flush_loses_what_was_not_sent_yet() -> None:

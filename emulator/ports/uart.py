@@ -1,27 +1,21 @@
-"""What happens to bytes between a module and its port: USB, UART, delays, rates.
+"""What happens to bytes between a module and its port on a UART: time, rates.
 
-A line is pure: bytes and times in, bytes out. A port without one passes bytes at once. A USB line
-only delays; a baud rate means nothing to it. On a UART, what the module sends goes at the module's
-rate and is received at the host's, and the other way round. Each packet is followed by an idle
-line, which is where a receiver that lost synchronisation finds it again.
+A line is pure: bytes and times in, bytes out. A port without one passes bytes at once, as USB does.
+What the module sends goes at the module's rate and is received at the host's, and the other way
+round. Each packet is followed by an idle line, which is where a receiver that lost synchronisation
+finds it again.
 
 Source: protocol reference 4.10 and chapter 10; field notes 4.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from typing import ClassVar
 
 from emulator.chip.chip import NS_PER_S
 from emulator.module.settings import BITS_PER_BYTE, received_bytes
 
-LARGEST_TRANSFER = 512
-"""Bytes, on USB."""
-MOST_UNDER_WAY = 65536
-"""Bytes in one direction on USB; more wait at the sender."""
 SLICE_NS = 4_000_000
 """A UART's bytes are handed over in pieces of so much line time, as adapters do."""
 UART_MOST_UNDER_WAY = 4096
@@ -31,8 +25,7 @@ UART_MOST_UNDER_WAY = 4096
 class Flight:
     """Pieces of bytes under way in one direction, in order, each with its time of arrival."""
 
-    def __init__(self, most_at_once: int | None = None) -> None:
-        self._most_at_once = most_at_once
+    def __init__(self) -> None:
         self._pieces: deque[tuple[int, bytes]] = deque()
         self._size = 0
 
@@ -41,9 +34,9 @@ class Flight:
         self._size += len(piece)
 
     def take(self, now_ns: int) -> bytes:
-        """Return what has arrived and was not taken before, of at most ``most_at_once`` pieces."""
+        """Return what has arrived and was not taken before."""
         arrived: list[bytes] = []
-        while self._pieces and self._pieces[0][0] <= now_ns and len(arrived) != self._most_at_once:
+        while self._pieces and self._pieces[0][0] <= now_ns:
             arrived.append(self._pieces.popleft()[1])
         data = b"".join(arrived)
         self._size -= len(data)
@@ -66,68 +59,10 @@ class Flight:
         return self._size
 
 
-class Line(ABC):
-    """What connects a module and the host's side of its port."""
-
-    waits_for_host: ClassVar[bool]
-    """Whether bytes for which the host's side has no room wait; if not, they are lost."""
-
-    def __init__(self, most_at_once: int | None = None) -> None:
-        self.to_host = Flight(most_at_once)
-        self.to_module = Flight(most_at_once)
-
-    @property
-    @abstractmethod
-    def takes_packet(self) -> bool:
-        """Whether the module may send another packet."""
-
-    @property
-    @abstractmethod
-    def takes_bytes(self) -> bool:
-        """Whether more should be read from the host."""
-
-    @abstractmethod
-    def from_module(self, packet: bytes, now_ns: int) -> None: ...
-
-    @abstractmethod
-    def from_host(self, data: bytes, now_ns: int) -> None: ...
-
-    def clear(self) -> None:
-        """Lose all that is under way: the line is cut."""
-        self.to_host.clear()
-        self.to_module.clear()
-
-
-class UsbLine(Line):
-    """A line that delays every transfer by ``latency_ns`` in either direction."""
-
-    waits_for_host = True  # the host's controller fetches bytes when it has room for them
-
-    def __init__(self, latency_ns: int) -> None:
-        super().__init__(most_at_once=1)
-        self._latency_ns = latency_ns
-
-    @property
-    def takes_packet(self) -> bool:
-        return len(self.to_host) < MOST_UNDER_WAY
-
-    @property
-    def takes_bytes(self) -> bool:
-        return len(self.to_module) < MOST_UNDER_WAY
-
-    def from_module(self, packet: bytes, now_ns: int) -> None:
-        self._send_off(self.to_host, packet, now_ns)
-
-    def from_host(self, data: bytes, now_ns: int) -> None:
-        self._send_off(self.to_module, data, now_ns)
-
-    def _send_off(self, flight: Flight, data: bytes, now_ns: int) -> None:
-        for begin in range(0, len(data), LARGEST_TRANSFER):
-            flight.put(now_ns + self._latency_ns, data[begin : begin + LARGEST_TRANSFER])
-
-
-class UartLine(Line):
+class UartLine:
     """A line with a rate at each end.
+
+    It has no flow control: the bits come whether the host reads them or not.
 
     Parameters
     ----------
@@ -137,20 +72,21 @@ class UartLine(Line):
         Returns the host's, bit/s; None where it has none: then it is always the module's.
     """
 
-    waits_for_host = False  # without flow control the bits come whether they are read or not
-
     def __init__(self, module_baud: Callable[[], int], host_baud: Callable[[], int | None]) -> None:
-        super().__init__()
+        self.to_host = Flight()
+        self.to_module = Flight()
         self._module_baud = module_baud
         self.host_baud = host_baud
         self._host_done_ns = 0
 
     @property
     def takes_packet(self) -> bool:
+        """Whether the module may send another packet."""
         return self.to_host.is_empty  # a UART has no room for two
 
     @property
     def takes_bytes(self) -> bool:
+        """Whether more should be read from the host."""
         return len(self.to_module) < UART_MOST_UNDER_WAY
 
     def from_module(self, packet: bytes, now_ns: int) -> None:
@@ -168,6 +104,7 @@ class UartLine(Line):
         self._host_done_ns = 0
 
     def clear(self) -> None:
+        """Lose all that is under way: the line is cut."""
         self.to_host.clear()
         self.flush_output()
 
