@@ -154,7 +154,7 @@ from emulator.echo.paths import (
     viewpoint,
 )
 from emulator.echo.people import mover_scatterer, person_scatterer
-from emulator.echo.pulse import PulseShape, sum_of_pulses
+from emulator.echo.pulse import sum_of_pulses
 from emulator.echo.receiver import CarrierJitter, Receiver, one_count
 from emulator.echo.targets import Targets, mirrored_reflections
 from emulator.echo.walls import (
@@ -255,8 +255,7 @@ class SceneEcho:
     def __init__(self, scene: Scene, radar: RadarSpec, seed: int) -> None:
         self._radar = radar
         self._paths = ScenePaths(scene, radar, seed)
-        self._pulse = PulseShape.of(radar.pulse)
-        self._bursts = Bursts(radar, self._pulse, seed)
+        self._bursts = Bursts(radar, seed)
         self._stamps = StampError(radar, seed)
         self._others = OtherModules(scene.other_modules, radar)
         self._clock = radar.clock
@@ -295,7 +294,7 @@ class SceneEcho:
             phase_rad=phase_rad,
             tx_center_frequency=capture.tx_center_frequency,
             shape=(len(amplitude), capture.n_samples),
-            pulse=self._pulse,
+            pulse=self._radar.pulse,
         )
 
     def rf_counters(

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from emulator.chip.chip import CaptureSettings
 from emulator.echo.paths import Reflections, Scatterers, Viewpoint
-from emulator.echo.pulse import PulseShape, sum_of_pulses
+from emulator.echo.pulse import sum_of_pulses
 from emulator.scene.philox import (
     UNITS_PER_SIGMA,
     WORDS_PER_BLOCK,
@@ -98,9 +98,9 @@ class TargetPairs:
 class Bursts:
     """What other modules send into the frames of one radar, each frame by its index alone."""
 
-    def __init__(self, radar: RadarSpec, pulse: PulseShape, seed: int) -> None:
+    def __init__(self, radar: RadarSpec, seed: int) -> None:
         self._spec = radar.bursts
-        self._pulse = pulse
+        self._pulse = radar.pulse
         self._seed = seed
         serial = int(radar.serial)
         self._chances, self._noise = (stream_of(serial, Purpose.BURSTS, part) for part in (0, 1))

@@ -3,7 +3,7 @@
 One pulse is ``A exp(-(t - tau)**2 / (2 sigma**2)) cos(2 pi fc (t - tau) + phase)``: a Gaussian
 envelope on a carrier, sampled at 23.328 GHz. The carrier is an exact fraction of the sampling
 rate, 5/16 or 3/8 (protocol reference 9.2). The -10 dB bandwidth of 1.4 GHz is assumed, as that
-reference proposes. `PulseShape` holds how a module's own pulse differs from that.
+reference proposes. `PulseSpec` holds how a module's own pulse differs from that.
 
 Arithmetic is float64 additions and multiplications per sample; cosines are taken once per pulse.
 """
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -64,54 +63,37 @@ RINGING_PHASE_RAD = 1.0
 """How far the carrier of the copy is ahead."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PulseShape:
-    """The pulse of one module: standard deviations in those of the nominal one, ringing, carrier.
+NOMINAL_PULSE = PulseSpec()
 
-    The envelope is that of a Gaussian of ``before`` up to its peak and of ``after`` from there on;
-    a copy of the whole, ``ringing`` times as strong, follows by ``RINGING_SIGMAS``. The carrier's
-    frequency is ``carrier_offset_hz`` above that of the setting.
+
+def _deviations(pulse: PulseSpec) -> tuple[float, float]:
+    """Return the envelope's standard deviations before and after its peak, in the nominal one's."""
+    return pulse.width * (1 - pulse.skew), pulse.width * (1 + pulse.skew)
+
+
+def _half_window(pulse: PulseSpec) -> int:
+    """Return the samples evaluated on either side; beyond, it is below 1.6e-8 of its amplitude."""
+    return math.ceil(6 * _SIGMA_SAMPLES * max(_deviations(pulse)))
+
+
+def _envelope(pulse: PulseSpec, shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the envelopes of pulses ``shift`` samples after a whole sample.
+
+    Shape (p, 2 half_window + 1), without the ringing; ``shift`` has the shape (p, 1) and lies
+    within +-0.5.
     """
-
-    before: float = 1.0
-    after: float = 1.0
-    ringing: float = 0.0
-    carrier_offset_hz: float = 0.0
-
-    @classmethod
-    def of(cls, spec: PulseSpec) -> PulseShape:
-        return cls(
-            before=spec.width * (1 - spec.skew),
-            after=spec.width * (1 + spec.skew),
-            ringing=spec.ringing,
-            carrier_offset_hz=spec.carrier_offset_hz,
-        )
-
-    @property
-    def half_window(self) -> int:
-        """Samples evaluated on either side; beyond, it is below 1.6e-8 of its amplitude."""
-        return math.ceil(6 * _SIGMA_SAMPLES * max(self.before, self.after))
-
-    def envelope(self, shift: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the envelopes of pulses ``shift`` samples after a whole sample.
-
-        Shape (p, 2 half_window + 1), without the ringing; ``shift`` has the shape (p, 1) and lies
-        within +-0.5.
-        """
-        if self.before == self.after == 1.0:
-            wave = shift * _ENVELOPE[-1]
-            for coefficients in _ENVELOPE[-2:0:-1]:
-                wave += coefficients
-                wave *= shift
-            wave += _ENVELOPE[0]
-            return wave
-        after_peak = _offsets(self.half_window) - shift
-        after_peak /= _SIGMA_SAMPLES * np.where(after_peak < 0, self.before, self.after)
-        bell: NDArray[np.float64] = np.exp(-0.5 * after_peak * after_peak)
-        return bell
-
-
-NOMINAL_PULSE = PulseShape()
+    before, after = _deviations(pulse)
+    if before == after == 1.0:
+        wave = shift * _ENVELOPE[-1]
+        for coefficients in _ENVELOPE[-2:0:-1]:
+            wave += coefficients
+            wave *= shift
+        wave += _ENVELOPE[0]
+        return wave
+    after_peak = _offsets(_half_window(pulse)) - shift
+    after_peak /= _SIGMA_SAMPLES * np.where(after_peak < 0, before, after)
+    bell: NDArray[np.float64] = np.exp(-0.5 * after_peak * after_peak)
+    return bell
 
 
 def _offsets(half_window: int) -> NDArray[np.int64]:
@@ -140,7 +122,7 @@ def sum_of_pulses(
     phase_rad: NDArray[np.float64],
     tx_center_frequency: int,
     shape: tuple[int, int],
-    pulse: PulseShape = NOMINAL_PULSE,
+    pulse: PulseSpec = NOMINAL_PULSE,
 ) -> NDArray[np.float64]:
     """Return frames that are sums of pulses, of a shape (n_frames, n_samples), float64.
 
@@ -158,7 +140,7 @@ def sum_of_pulses(
         Shape (p,), float64: phase of the carrier at the pulse's centre.
     """
     n_frames, n_samples = shape
-    half_window = pulse.half_window
+    half_window = _half_window(pulse)
     offset_rad = math.tau * pulse.carrier_offset_hz / SAMPLING_RATE_HZ
     if pulse.ringing:
         frame = np.repeat(frame, 2)
@@ -189,7 +171,7 @@ def sum_of_pulses(
             continue
         part = slice(begin, end)
         bins = ((frame[part] - done) * width + first[part])[:, np.newaxis] + _offsets(half_window)
-        waves = pulse.envelope(shift[part, np.newaxis])
+        waves = _envelope(pulse, shift[part, np.newaxis])
         cosine, sine = _carrier(tx_center_frequency, half_window, offset_rad)
         waves *= _on_carrier(in_phase[part], quadrature[part], cosine, sine)
         padded = np.bincount(

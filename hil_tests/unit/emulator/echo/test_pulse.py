@@ -12,7 +12,6 @@ from emulator.echo.pulse import (
     HALF_WINDOW,
     NOMINAL_PULSE,
     SIGMA_S,
-    PulseShape,
     sum_of_pulses,
 )
 from emulator.scene.scene import PulseSpec
@@ -40,7 +39,7 @@ def one_pulse(
     setting: int,
     n_samples: int,
     *,
-    pulse: PulseShape = NOMINAL_PULSE,
+    pulse: PulseSpec = NOMINAL_PULSE,
 ) -> NDArray[np.float64]:
     frames = sum_of_pulses(
         frame=np.array([0]),
@@ -63,7 +62,7 @@ def test_sigma_is_the_papers_pulse() -> None:
 
 @pytest.mark.parametrize(("setting", "width"), [(3, 1.0), (4, 1.0), (3, 1.1)])
 def test_bandwidth_at_minus_10_db_is_1_4_ghz_over_the_width(setting: int, width: float) -> None:
-    n, shape = 1 << 16, PulseShape.of(PulseSpec(width=width))
+    n, shape = 1 << 16, PulseSpec(width=width)
     power = np.abs(np.fft.rfft(one_pulse(700.0, 1.0, 0.3, setting, 1400, pulse=shape), n)) ** 2
     frequency_hz = np.fft.rfftfreq(n, 1 / SAMPLING_RATE_HZ)
     inside = frequency_hz[power >= power.max() / 10]
@@ -137,7 +136,7 @@ def test_no_pulses_give_zeros_of_the_right_type() -> None:
 def test_a_modules_own_pulse_is_two_sided_and_rings(position: float) -> None:
     """Widths w (1 -+ s) before and after the peak; r of it 3.2 sigma later, 1 rad ahead."""
     w, s, r, phase_rad = 1.15, 0.2, 0.25, 0.7
-    shape = PulseShape.of(PulseSpec(width=w, skew=s, ringing=r))
+    shape = PulseSpec(width=w, skew=s, ringing=r)
     got = one_pulse(position, 2.0, phase_rad, 3, 400, pulse=shape)
     t = (np.arange(400) - position) / SAMPLING_RATE_HZ
 
@@ -155,7 +154,7 @@ def test_a_modules_own_pulse_is_two_sided_and_rings(position: float) -> None:
 
 @pytest.mark.parametrize("position", [200.0, 199.50001, 312.123])
 def test_a_pulse_with_an_offset_of_its_carrier_is_its_formula(position: float) -> None:
-    got = one_pulse(position, 1.0, 0.7, 3, 400, pulse=PulseShape(carrier_offset_hz=-1.9e8))
+    got = one_pulse(position, 1.0, 0.7, 3, 400, pulse=PulseSpec(carrier_offset_hz=-1.9e8))
     t_s = (np.arange(400) - position) / SAMPLING_RATE_HZ
     expected = np.exp(-0.5 * (t_s / SIGMA_S) ** 2) * np.cos(2 * np.pi * 7.1e9 * t_s + 0.7)
     np.testing.assert_allclose(got, expected, atol=2e-8)

@@ -16,7 +16,7 @@ from scipy.signal import hilbert
 from scipy.stats import norm
 
 from emulator.echo.echo import SceneEcho, echo_source
-from emulator.echo.pulse import PulseShape, sum_of_pulses
+from emulator.echo.pulse import sum_of_pulses
 from emulator.echo.receiver import CarrierJitter
 from emulator.scene.scene import (
     RECORDED,
@@ -291,7 +291,7 @@ def test_what_is_measured_is_what_was_emulated() -> None:
         phase_rad=rng.uniform(0, math.tau, len(frame)),
         tx_center_frequency=3,
         shape=counts.shape,
-        pulse=PulseShape.of(like("pulse", name)),
+        pulse=like("pulse", name),
     )
     one_count = 1 / (1024 * WIDE.iterations * WIDE.pulses_per_step)
     rf = (counts + np.rint(echoes / one_count)) * one_count
