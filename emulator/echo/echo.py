@@ -51,11 +51,9 @@ Scintillation (``emulator.echo.targets``)
     correlation in time. g and h are stationary Gaussian processes (``emulator.echo.receiver``) of
     variance 1, keyed by the target and alike for all radars.
 Antenna
-    A path appears sin2_m sin(angle)**2, and what a table gives at the angle off boresight, farther;
-    ways out and back each count half. For an antenna whose phase centre lies d before the place
-    that its ranges are calibrated for, the path is longer by d (1 - cos(angle)), near d / 2
-    sin(angle)**2; in general a table by angle is measured, as the antennas of satellite navigation
-    have it (Rothacher and Schmid, ANTEX format). Shape and bandwidth of the pulse stay.
+    A path appears sin2_m sin(angle)**2 farther; ways out and back each count half. For an antenna
+    whose phase centre lies d before the place that its ranges are calibrated for, the path is
+    longer by d (1 - cos(angle)), near d / 2 sin(angle)**2. Shape and bandwidth of the pulse stay.
 Floor, ceiling (``emulator.echo.targets``)
     Horizontal mirrors at the distance h from the antenna, phase pi each. Rods and cylinders stand
     from floor to ceiling and make a right angle with it, which sends back what comes: half path

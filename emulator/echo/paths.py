@@ -115,12 +115,7 @@ class Viewpoint:
 
     def antenna_m(self, cos_angle: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how much farther a path appears whose ways out and back leave at an angle."""
-        law = self.antenna
-        farther_m = law.sin2_m * (1 - cos_angle * cos_angle)
-        if law.angle_deg:
-            angle_deg = np.degrees(np.arccos(np.clip(cos_angle, -1.0, 1.0)))
-            farther_m += np.interp(angle_deg, law.angle_deg, law.range_m)
-        return farther_m
+        return self.antenna.sin2_m * (1 - cos_angle * cos_angle)
 
     def take(self, frame: NDArray[np.int64]) -> Viewpoint:
         """Return where the radar is in some frames, shape (m,) each."""

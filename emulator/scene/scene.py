@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -131,21 +130,10 @@ class BurstSpec(Table):
 class AntennaSpec(Table):
     """How much farther than on boresight an echo appears at an angle off it.
 
-    It is ``sin2_m`` times the squared sine of the angle, plus a table: ``range_m`` at the angles
-    ``angle_deg``, linear between them (``emulator.echo.echo``).
+    It is ``sin2_m`` times the squared sine of the angle (``emulator.echo.echo``).
     """
 
     sin2_m: Annotated[Number, Field(ge=-0.1, le=0.1)] = 0.0
-    angle_deg: tuple[Annotated[Number, Field(ge=0, le=180)], ...] = ()
-    range_m: tuple[Annotated[Number, Field(ge=-0.1, le=0.1)], ...] = ()
-
-    @model_validator(mode="after")
-    def _is_a_table(self) -> AntennaSpec:
-        if len(self.range_m) != len(self.angle_deg):
-            raise ValueError("range_m: must have one number for each of angle_deg")
-        if any(low >= high for low, high in pairwise(self.angle_deg)):
-            raise ValueError("angle_deg: must ascend")
-        return self
 
 
 class RadarSpec(Table):
