@@ -27,7 +27,6 @@ from emulator.module.outbox import (
     Outbox,
     StreamBegin,
 )
-from emulator.module.parser import VendorConnection
 from emulator.module.settings import DeviceOptions
 from emulator.module.state import ACK_WAIT_NS, Module
 from emulator.profiles.running_profile import ProfileStream
@@ -329,21 +328,19 @@ class Device:
                 self._outbox.put(MessageKind.REPLY, decode_response(payload), now_ns)
             self._plan_restart(now_ns)
             return
-        self._received.receive_data(data)
+        self._connection.receive_data(data)
         if self._held is not None:
             self._waiting_bytes += len(data)
         self._carry_out_commands(now_ns)
 
     def _start_line(self) -> None:
         self._connection = Connection(Role.MODULE)
-        vendor = self.module.options.parser == "vendor"
-        self._received = VendorConnection() if vendor else self._connection
         self._damaged = False  # by a wrong checksum, since the last command
 
     def _carry_out_commands(self, now_ns: int) -> None:
         left = COMMANDS_AT_ONCE
         while self._takes_commands and left:
-            event = self._received.next_event()
+            event = self._connection.next_event()
             if isinstance(event, NeedData):
                 self._backlog = False
                 return
@@ -356,7 +353,7 @@ class Device:
                 if isinstance(event, FramingFault) and event.kind is FaultKind.CHECKSUM:
                     self._damaged = True
         waits = self._held is not None or self.module.asleep
-        self._backlog = self._received.buffered > 0 and not waits
+        self._backlog = self._connection.buffered > 0 and not waits
 
     @property
     def _takes_commands(self) -> bool:

@@ -1,34 +1,26 @@
-"""The vendor's packet parser: that of the bootloader, and of the firmware as an option.
+"""The vendor's packet parser, as the bootloader has it.
 
 It needs no start byte, and its buffer keeps what earlier packets left, which commands that are too
 short read on in.
 
-Source: protocol reference 1.2, 3 and 4.12.
+Source: protocol reference 1.2 and 4.12.
 """
 
 from __future__ import annotations
 
 import re
-from collections import deque
 from collections.abc import Iterator
 
-from xethru_protocol.wire.codec import decode_command
 from xethru_protocol.wire.codes import BootloaderFraming
-from xethru_protocol.wire.connection import Event
 from xethru_protocol.wire.framing import (
     END,
     ESCAPE,
-    NEED_DATA,
     NO_ESCAPE_START,
     START,
-    FaultKind,
-    FramingFault,
     xor,
 )
-from xethru_protocol.wire.messages import UnknownMessage
 
 BUFFER_BYTES = 2048
-FIRMWARE_BUFFER_BYTES = 8000
 _FAST_START = 0x51  # a deprecated framing, which the parser still knows
 _SPECIAL = re.compile(rb"[\x7d-\x7f]")
 _NO_ESCAPE_HEADER = 5  # length and reserved
@@ -128,32 +120,3 @@ class PacketParser:
         self._length = 0
         self._fast = self._no_escape = False
         self.buffer[0] = 0
-
-
-class VendorConnection:
-    """The module's end of the line as the vendor's firmware receives; see `Connection`."""
-
-    def __init__(self) -> None:
-        self._parser = PacketParser(FIRMWARE_BUFFER_BYTES)
-        self._events: deque[Event] = deque()
-
-    @property
-    def buffered(self) -> int:
-        """Commands and faults that `next_event` has not returned yet."""
-        return len(self._events)
-
-    def receive_data(self, data: bytes) -> None:
-        for found in self._parser.receive(data):
-            if isinstance(found, BootloaderFraming):
-                is_sum = found is BootloaderFraming.CRC
-                kind = FaultKind.CHECKSUM if is_sum else FaultKind.GARBAGE
-                self._events.append(FramingFault(kind=kind, offset=0))
-                continue
-            buffer, length = found
-            command = decode_command(bytes(buffer[:length]))
-            if isinstance(command, UnknownMessage) and length:
-                command = decode_command(bytes(buffer))  # whatever is left there
-            self._events.append(command)
-
-    def next_event(self) -> Event:
-        return self._events.popleft() if self._events else NEED_DATA

@@ -129,11 +129,6 @@ class DeviceOptions(BaseModel):
     the table of versions says (17)."""
     model: ModelName = STOCK_MODEL
     """Product: with the presence profile, or with the respiration profile."""
-    parser: Literal["strict", "vendor"] = "strict"
-    """How commands are found in received bytes. "strict": a packet has its start byte, a command
-    its fields (3, 1.4). "vendor": as the firmware's parser, which needs no start byte, goes on
-    reading in what earlier packets left in its buffer where a command is too short, and takes four
-    7C, or 51 at the start, for other framings (1.2, 3)."""
     after_damage: Literal["answer", "error"] = "answer"
     """What the first command after a wrong checksum gets: what it asks for, or ERROR 1 without
     being carried out. The firmware's source has no such error. Public logs of a real X4M03 show it:

@@ -209,7 +209,6 @@ class Trial:
         self._what = what
         changes: dict[str, object] = {
             "firmware": firmware,
-            "parser": self._rng.choice(("strict", "vendor")),
             "after_damage": self._rng.choice(("answer", "error")),
             "matrix_messages": self._rng.choice(("whole", "halves")),
             "model": self._rng.choice(list(MODELS)),

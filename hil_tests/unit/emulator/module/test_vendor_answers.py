@@ -241,39 +241,16 @@ def test_a_rate_is_noted_although_the_chip_is_off(host: BareHost) -> None:
 # --- options for what the reference leaves to the emulator
 
 
-PONG = m.Pong(value=0xAAEEAEEA)
-
-
 def answers_to(host: BareHost, *data: bytes) -> list[m.Message]:
     for one in data:
         host.device.receive_data(one, host.now_ns)
     return host.hear()
 
 
-def test_the_vendors_parser_needs_no_start_and_reads_on() -> None:
-    strict, vendor = host_with(), host_with(parser="vendor")
-    ping, short = encode_normal(bytes.fromhex("01 AEEAAAEE")), encode_normal(b"\x01")
-    part = m.SetFileData(**KEY, offset=0, data=b"abcd")
-    declared = bytes.fromhex("90 67 01000080 00000000 00000000 04000000") + b"ab"
-    for host, expected in ((strict, m.Error(code=1)), (vendor, PONG)):
-        assert answers_to(host, short) == [expected]
-        assert answers_to(host, ping[1:]) == ([] if host is strict else [PONG])
-        assert answers_to(host, ping) == [PONG]
-        host.command(m.CreateFile(**KEY, length=10))
-        assert host.ask(part) == ACK
-        short_file = [ACK] if host is vendor else [m.Error(code=1)]
-        assert answers_to(host, encode_normal(declared)) == short_file
-    # the rest of the data is what lies in the buffer: the checksum, then an earlier packet
-    reply = vendor.ask(m.GetFileData(**KEY, offset=0, length=4))
-    assert isinstance(reply, m.ReplyByte)
-    assert reply.values[:2] == b"ab"
-
-
-@pytest.mark.parametrize("parser", ["strict", "vendor"])
 @pytest.mark.parametrize("option", ["answer", "error"])
-def test_the_first_command_after_damage(option: str, parser: str) -> None:
+def test_the_first_command_after_damage(option: str) -> None:
     """Public logs of an X4M03 show ERROR 1 to INIT behind a wrong checksum."""
-    host = host_with(firmware="xep", after_damage=option, parser=parser)
+    host = host_with(firmware="xep", after_damage=option)
     assert answers_to(host, b"\x00\x01\x02") == []
     assert host.ask(m.X4DriverInit()) == ACK, "other bytes are no wrong checksum"
     damaged = encode_normal(b"\x50\x20")[:-2] + b"\x00\x7e"
