@@ -520,7 +520,7 @@ def radar_device(
     module.noise_maps = profile.noise_map_files
     chip_stream = ChipStream(module, pace=pace, clock=clock, scene_time_zero_ns=scene_time_zero_ns)
     stream = CombinedStream(chip_stream, profile)
-    known = BASE_FIRMWARE_FRAMES if firmware.sensor is None else FirmwareOutbox.SLOTS
-    frames = options.waiting_frames or known
+    # of the sensor firmware's pool nothing is known: as many frames wait as the queue has slots
+    frames = BASE_FIRMWARE_FRAMES if firmware.sensor is None else FirmwareOutbox.SLOTS
     outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox(frames)
     return Device(module, stream, outbox)
