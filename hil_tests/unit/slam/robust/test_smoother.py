@@ -157,7 +157,28 @@ def white_radius(rho: complex, *, is_exact: bool) -> complex:
     return rho / math.sqrt(rho.real * (tau + rho.real))
 
 
-def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool = False) -> Complex:
+def motion_whitenings(problem: Problem) -> list[Array]:
+    """Return what makes the error of each motion between keyframes white."""
+    whitenings = []
+    for first, last in pairwise(problem.keys):
+        steps = problem.steps[first:last]
+
+        def noisy(e: Complex, steps: Array = steps) -> Complex:
+            return along(steps, np.zeros(3, dtype=np.complex128), e.reshape(-1, 3))
+
+        A = complex_step(noisy, np.zeros(3 * len(steps)))
+        blocks = problem.step_covariances[first:last]
+        C = sum(
+            A[:, 3 * i : 3 * i + 3] @ block @ A[:, 3 * i : 3 * i + 3].T
+            for i, block in enumerate(blocks)
+        )
+        whitenings.append(np.linalg.inv(np.linalg.cholesky(C)))
+    return whitenings
+
+
+def white_residuals(
+    problem: Problem, whitenings: list[Array], n_cal: int, x: Complex, *, is_exact: bool = False
+) -> Complex:
     """Return the white residuals of the prior, all motions and all measurements.
 
     Of the radii's prior they are those of the quadratic that touches it, unless ``is_exact``.
@@ -174,20 +195,9 @@ def white_residuals(problem: Problem, n_cal: int, x: Complex, *, is_exact: bool 
     for k in range(n_poses - 1):
         own = slice(keys[k], keys[k + 1])
         c = calibration[k if n_cal > 1 else 0]
-        steps = problem.steps[own]
-
-        def noisy(e: Complex, steps: Array = steps) -> Complex:
-            return along(steps, np.zeros(3, dtype=np.complex128), e.reshape(-1, 3))
-
-        A = complex_step(noisy, np.zeros(3 * len(steps)))
-        blocks = problem.step_covariances[own]
-        C = sum(
-            A[:, 3 * i : 3 * i + 3] @ block @ A[:, 3 * i : 3 * i + 3].T
-            for i, block in enumerate(blocks)
-        )
         way = turn(poses[k, 2]).T @ (poses[k + 1, :2] - poses[k, :2])
-        step = np.append(way, poses[k + 1, 2] - poses[k, 2]) - along(steps, c)
-        result.append(np.linalg.inv(np.linalg.cholesky(C)) @ step)
+        step = np.append(way, poses[k + 1, 2] - poses[k, 2]) - along(problem.steps[own], c)
+        result.append(whitenings[k] @ step)
         if n_cal > 1:
             walks = problem.walks[own].sum(axis=0)
             result.append((calibration[k + 1] - calibration[k]) / np.sqrt(walks))
@@ -274,13 +284,14 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(
     smoother = Smoother(problem, RULE)
     solution = smoother.solve(start, tolerance=1e-14)
     assert solution is not None
-    n_cal = len(start.calibration)
+    n_cal, whitenings = len(start.calibration), motion_whitenings(problem)
 
     def residuals(y: Complex) -> Complex:
-        return white_residuals(problem, n_cal, y)
+        return white_residuals(problem, whitenings, n_cal, y)
 
     def real(x: Array) -> Array:
-        return white_residuals(problem, n_cal, x.astype(np.complex128), is_exact=True).real
+        y = x.astype(np.complex128)
+        return white_residuals(problem, whitenings, n_cal, y, is_exact=True).real
 
     oracle = least_squares(real, packed(start), xtol=1e-15, ftol=1e-15, gtol=1e-12, x_scale="jac")
     assert solution.cost == pytest.approx(2.0 * oracle.cost, rel=1e-6)
@@ -310,10 +321,11 @@ def test_huber_weights_are_those_of_the_solution_itself() -> None:
     problem = replace(problem, ranges_m=ranges_m, huber_sigmas=2.0)
     solution = Smoother(problem, RULE).solve(start, tolerance=1e-13)
     assert solution is not None
-    n_rows = len(ranges_m) + len(problem.with_bearing)
+    n_rows, whitenings = len(ranges_m) + len(problem.with_bearing), motion_whitenings(problem)
 
     def real(x: Array) -> Array:
-        white = white_residuals(problem, 1, x.astype(np.complex128), is_exact=True).real
+        y = x.astype(np.complex128)
+        white = white_residuals(problem, whitenings, 1, y, is_exact=True).real
         tail = white[-n_rows:]
         huber = np.where(np.abs(tail) <= 2.0, tail, np.sqrt(np.abs(4.0 * np.abs(tail) - 4.0)))
         return np.concatenate([white[:-n_rows], huber])
