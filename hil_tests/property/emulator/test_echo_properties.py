@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -13,6 +13,7 @@ from emulator.chip.chip import CaptureSettings
 from emulator.echo.echo import SceneEcho, echo_source
 from emulator.echo.pulse import sum_of_pulses
 from emulator.scene.scene import ClutterSpec, LeakageSpec, Scene, load_scene
+from hil_tests.property.examples import examples
 from hil_tests.unit.emulator.rooms import PAPER
 
 CAPTURE = replace(PAPER, n_samples=400)
@@ -147,6 +148,7 @@ def test_echoes_of_a_room_are_the_sum_of_its_parts(step: int, split: int) -> Non
     np.testing.assert_allclose(echo(first) + echo(rest), echo(LAB), atol=1e-15)
 
 
+@settings(max_examples=examples(20, 100))
 @given(order=st.permutations(range(4)), seed=st.integers(0, 2**64 - 1))
 def test_the_order_of_radars_changes_nothing(order: list[int], seed: int) -> None:
     shuffled = LAB.model_copy(update={"radars": tuple(LAB.radars[index] for index in order)})

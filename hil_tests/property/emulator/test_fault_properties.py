@@ -4,7 +4,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.chip import Pace
@@ -26,6 +26,7 @@ from emulator.module.memory import Identity
 from emulator.scene.philox import Rng
 from emulator.scene.scene import empty_room
 from emulator.x4m300 import PortDevice, radar_device
+from hil_tests.property.examples import examples
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
@@ -139,6 +140,7 @@ def effect_of(kind: KindOfFault, packet: bytes, seed: int) -> Any:  # noqa: ANN4
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if KINDS[k].target is not Target.MOMENT])
+@settings(max_examples=examples(20, 100))  # of each kind
 @given(packet=PACKETS, seed=st.integers(0, 2**64 - 1))
 def test_effects_are_pure_and_take_any_bytes(kind: str, packet: bytes, seed: int) -> None:
     row = KINDS[kind]

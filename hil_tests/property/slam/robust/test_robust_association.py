@@ -207,12 +207,13 @@ def test_true_ranges_pass_their_gates_as_often_as_they_say(n_radars: int) -> Non
     # So little clutter that the gate alone decides.
     noise = replace(NOISE, clutter_per_m=1e-12)
     state = one_landmark(prior)
-    predicted = view(state, antennas_of(paper_rig(), (), np.zeros(3))).ranges_m[:n_radars, 0]
+    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+    parameters = BackEndParameters(ranges=noise)
     root = np.linalg.cholesky((prior + noise.sigma_m**2 * np.eye(2))[:n_radars, :n_radars])
     whole = 0
-    for z in predicted + rng.standard_normal((TRIALS, n_radars)) @ root.T:
+    for z in seen.ranges_m[:n_radars, 0] + rng.standard_normal((TRIALS, n_radars)) @ root.T:
         scans = [RangeScan(radar=k, ranges_m=(range_m,)) for k, range_m in enumerate(z.tolist())]
-        whole += len(known_of(state, scans, noise).assigned) == n_radars
+        whole += len(find_known(state, seen, scans, SIDE_OF, parameters).assigned) == n_radars
     assert whole / TRIALS == pytest.approx(1.0 - TAIL_PROBABILITY, abs=0.002)
 
 
