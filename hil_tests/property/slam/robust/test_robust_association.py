@@ -21,6 +21,7 @@ from slam.geometry import paper_rig
 from slam.robust.association import (
     Known,
     RangeScan,
+    View,
     antennas_of,
     correspondence,
     find_known,
@@ -229,7 +230,7 @@ def test_a_gate_ends_where_it_says(sigmas: float, n_used: int) -> None:
 
 
 def camera_sees(
-    state: State, points: Sequence[tuple[float, float]], noise: RangeNoise
+    state: State, seen: View, points: Sequence[tuple[float, float]], noise: RangeNoise
 ) -> list[tuple[int, int]]:
     """Return index and row of what a scan of radar 0 sees, by range and bearing."""
     scan = RangeScan(
@@ -237,7 +238,6 @@ def camera_sees(
         ranges_m=tuple(range_m for range_m, _ in points),
         bearings_rad=tuple(bearing for _, bearing in points),
     )
-    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
     parameters = BackEndParameters(ranges=noise)
     found = find_points(state, seen, scan, (range(len(points)), (), {}), parameters)
     return sorted(found.pairs)
@@ -248,11 +248,14 @@ def test_true_points_pass_their_gate_as_often_as_it_says() -> None:
     rng = np.random.default_rng(12)
     noise = replace(NOISE, clutter_per_m=1e-12, bearing_sigma_rad=0.02)
     state = one_landmark(1e-6 * np.array([[2.0, 1.0], [1.0, 3.0]]))
-    of = point_view(state, view(state, antennas_of(paper_rig(), (), np.zeros(3))), 0, np.array([0]))
+    seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
+    of = point_view(state, seen, 0, np.array([0]))
     S = of.H[0] @ state.P.block(of.at) @ of.H[0].T
     S += np.diag([noise.sigma_m**2, noise.bearing_sigma_rad**2])
     noisy = of.predicted[0] + rng.standard_normal((TRIALS // 4, 2)) @ np.linalg.cholesky(S).T
-    passed = sum(camera_sees(state, [(z[0], z[1])], noise) == [(0, 0)] for z in noisy.tolist())
+    passed = sum(
+        camera_sees(state, seen, [(z[0], z[1])], noise) == [(0, 0)] for z in noisy.tolist()
+    )
     assert passed / len(noisy) == pytest.approx(1.0 - TAIL_PROBABILITY, abs=0.002)
 
 
@@ -287,7 +290,7 @@ def test_sure_points_are_assigned_as_the_best_of_all_assignments(
         for choice in product([None, *range(n)], repeat=n_points)
         if len(used := [k for k in choice if k is not None]) == len(set(used))
     )
-    found = dict(camera_sees(state, [(z[0], z[1]) for z in points.tolist()], noise))
+    found = dict(camera_sees(state, seen, [(z[0], z[1]) for z in points.tolist()], noise))
     assert total([found.get(i) for i in range(n_points)]) == pytest.approx(best, abs=1e-9)
 
 
@@ -298,7 +301,7 @@ def test_a_point_of_an_unsure_landmark_is_taken_only_where_it_is_certain() -> No
         state = one_landmark(sigma_m**2 * np.eye(2))
         seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
         z = float(seen.ranges_m[0, 0]), float(seen.off_boresight_rad[0, 0])
-        assert (camera_sees(state, [z], noise) == [(0, 0)]) == is_taken
+        assert (camera_sees(state, seen, [z], noise) == [(0, 0)]) == is_taken
 
 
 def test_an_unsure_landmark_is_neither_of_two_points() -> None:
@@ -307,8 +310,8 @@ def test_an_unsure_landmark_is_neither_of_two_points() -> None:
     seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
     range_m, bearing = float(seen.ranges_m[0, 0]), float(seen.off_boresight_rad[0, 0])
     one, other = (range_m - 0.02, bearing), (range_m + 0.02, bearing)
-    assert camera_sees(state, [one], noise) == [(0, 0)]
-    assert camera_sees(state, [one, other], noise) == []
+    assert camera_sees(state, seen, [one], noise) == [(0, 0)]
+    assert camera_sees(state, seen, [one, other], noise) == []
 
 
 @few
