@@ -69,9 +69,13 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return Drive(folder=folder, truth=truth)
 
 
-def lost_until(drive: Drive, state: int | None) -> RunRecord:
+@pytest.fixture(scope="module")
+def played(drive: Drive) -> RunRecord:
+    return play_states(open_session(drive.session), [], StopFlag())
+
+
+def lost_until(record: RunRecord, state: int | None) -> RunRecord:
     """Return the record of a drive as of a robot that was lost until a state, or all the time."""
-    record = play_states(open_session(drive.session), [], StopFlag())
     assert record.last is not None
     lost, estimate = np.zeros(len(record.states), dtype=bool), record.states.estimate.copy()
     lost[:state], estimate[:state] = True, 9.0  # a guess
@@ -119,7 +123,12 @@ def test_the_brightest_cells_of_a_session_are_within_two_cells_of_true_rods(made
 
 
 @pytest.mark.parametrize(
-    "path", ["estimate", "odometry", pytest.param("truth", marks=pytest.mark.rare)]
+    "path",
+    [
+        pytest.param("estimate", marks=pytest.mark.rare),  # `--area` has it
+        "odometry",
+        pytest.param("truth", marks=pytest.mark.rare),
+    ],
 )
 def test_other_paths_show_the_same_rods(
     drive: Drive, path: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -130,14 +139,16 @@ def test_other_paths_show_the_same_rods(
         assert np.abs(brightest_m(tmp_path, rod) - rod).max() < 0.06
 
 
-def test_the_path_of_wheels_is_laid_on_the_first_pose_that_was_found(drive: Drive) -> None:
+def test_the_path_of_wheels_is_laid_on_the_first_pose_that_was_found(
+    drive: Drive, played: RunRecord
+) -> None:
     session = open_session(drive.session)
-    record = lost_until(drive, 5)
+    record = lost_until(played, 5)
     path = path_of(record, session.odometry(), session.info, "odometry")
     assert path.frame == "world"
     expected = compose(record.world_from_map, record.states.estimate[5])
     np.testing.assert_allclose(path.place_at(int(record.states.t_ns[5])), expected, atol=1e-9)
-    path = path_of(lost_until(drive, None), session.odometry(), session.info, "odometry")
+    path = path_of(lost_until(played, None), session.odometry(), session.info, "odometry")
     assert path.frame == "odom"
     np.testing.assert_array_equal(path.poses[0], session.odometry().pose_at(int(path.t_ns[0])))
 
@@ -177,7 +188,8 @@ def test_cells_and_area_are_as_asked_for(
     drive: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     more = ("--cell", "0.05", "--area", "-0.5", "0.5", "1.0", "1.5", "--range", "1.5")
-    assert run(capsys, "image", drive.folder, *more, "--out", tmp_path)[0] == 0
+    along = ("--path", "estimate", "--out", tmp_path)
+    assert run(capsys, "image", drive.folder, *more, *along)[0] == 0
     with np.load(tmp_path / "image.npz") as arrays:
         assert arrays["image"].shape == (20, 30)
         assert (float(arrays["x_m"]), float(arrays["y_m"])) == (-0.5, 0.5)
@@ -295,11 +307,12 @@ class TestErrors:
     def test_a_robot_that_was_lost_all_the_time(
         self,
         drive: Drive,
+        played: RunRecord,
         tmp_path: Path,
         capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
-        record = lost_until(drive, None)
+        record = lost_until(played, None)
         monkeypatch.setattr("slam.app.commands.image.play_states", lambda *_: record)
         code, printed, errors = run(capsys, "image", drive.folder, "--out", tmp_path / "out")
         assert (code, printed, errors.count("\n")) == (1, "", 1)
