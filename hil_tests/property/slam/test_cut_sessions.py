@@ -25,7 +25,7 @@ from xethru_protocol.recordings.mcap import McapMessage as StoredMessage
 
 N_BINS = 32
 MESSAGE_INDEX = 7
-N_SCANS = 16
+N_SCANS = 10
 
 McapMessage = tuple[str, int, int, int, bytes]
 

@@ -18,7 +18,7 @@ from slam.live.session_records import LogLine
 from xethru_protocol.operating_system import StopFlag
 
 N_BINS = 16
-N_SCANS = 20
+N_SCANS = 12
 INFO = replace(
     session_info(), radars=tuple(replace(radar, n_bins=N_BINS) for radar in session_info().radars)
 )
