@@ -22,6 +22,12 @@ IN_SOURCE_TREE = (HERE.parent / "pyproject.toml").exists()
 FOR_USERS = {"device", "plugin"}
 SLOW_TIMEOUT_S = 120.0
 
+if IN_SOURCE_TREE:
+    # No threads for linear algebra: those of several processes wait for each other most of the
+    # time. Here, since a conftest.py below this one loads numpy, which looks at them once.
+    for library in ("OPENBLAS", "OMP"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
 if importlib.util.find_spec("hypothesis") is not None:
     from hypothesis import HealthCheck, settings
 
@@ -50,8 +56,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
     `nohup` and a shell's background jobs ignore some signals, and all children would inherit that.
     Workers and the hundreds of processes that tests start share bytecode, also where the
-    environment forbids to write it: each would compile all sources again. None of them starts
-    threads for linear algebra: those of several processes wait for each other most of the time.
+    environment forbids to write it: each would compile all sources again.
     """
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -60,8 +65,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if IN_SOURCE_TREE:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         sys.dont_write_bytecode = False
-        for library in ("OPENBLAS", "OMP"):
-            os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     if IN_SOURCE_TREE and getattr(config.option, "numprocesses", None):
         _compile_once()  # workers load what is compiled; each would compile all
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
