@@ -199,8 +199,11 @@ def test_clutter_goes_and_the_chest_stays(clutter: str, tmp_path: Path) -> None:
 
 
 def test_a_switched_filter_is_that_of_all_frames_shown(tmp_path: Path) -> None:
-    """Behind 25 s of frames a switch from one gives the picture of the other."""
-    iq = target(breathing(25))
+    """Behind 10 s of frames a switch from one gives the picture of the other.
+
+    They are more than the 64 frames that a filter looks back on.
+    """
+    iq = target(breathing(10))
     iq[:, 60:63] += np.complex64(0.05)
     path = recording(tmp_path / "wall.npz", iq)
     arguments = parse(["view", str(path), "--rate", "0"])
