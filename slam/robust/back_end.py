@@ -145,9 +145,8 @@ class RobustBackEnd:
             self._side_of[list(side)] = number
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
-        window = max(rule.window, rule.long_window)
         self._unassigned = UnassignedRanges(
-            window,
+            max(rule.window, rule.long_window),
             len(rig.mounts),
             parameters.ranges.sigma_m,
             scale,
@@ -963,7 +962,7 @@ class RobustBackEnd:
         side = self._sides[self._side_of[tentative.seen[-1].radar]]
         search = Search(radars=side, window=rule.long_window, min_frames=rule.min_hits_per_radar)
         guess = Guess(target=tentative.point.point_m, covariance=tentative.point.covariance)
-        tracklet = self._walls.tracker(is_wall=False).follow(guess, self._unassigned, search)
+        tracklet = self._walls.tracker().follow(guess, self._unassigned, search)
         if tracklet is not None:
             self._unassigned.use_up(tracklet.members)
         return tracklet
@@ -980,29 +979,16 @@ class RobustBackEnd:
             radars = [
                 radar
                 for radar in side
-                if radar not in self._images.radars
-                and self._silent[radar] <= rule.single_min_frames
+                if radar not in self._images.radars and self._silent[radar] <= rule.window
             ]
-            if not radars or not all(self._unassigned.newest(radar) for radar in radars):
+            # The ranges of one radar alone do not show where on its arcs a point is.
+            if len(radars) < 2 or not all(self._unassigned.newest(radar) for radar in radars):
                 continue
-            is_single = len(radars) == 1
             guesses = point_guesses(self._unassigned, radars, self.parameters.ranges, rule)
             if not guesses:
                 continue
-            for wall in self._walls.find(self._unassigned, radars):
-                wall_id = self._walls.place(wall)
-                if wall_id is not None:
-                    self._use(wall_id, wall.seen)
             search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
-            if is_single:
-                search = Search(
-                    radars=radars,
-                    window=rule.long_window,
-                    min_frames=rule.single_min_frames,
-                    most_sigma_m=rule.single_max_sigma_m,
-                )
-            tracker = self._walls.tracker(is_wall=False)
-            is_point = None if is_single else self._walls.is_point
+            tracker, is_point = self._walls.tracker(), self._walls.is_point
             for tracklet in tracker.find(guesses, self._unassigned, search, is_point):
                 nats = tracklet.evidence(self.parameters.ranges)
                 evidence.append((self._place(tracklet), nats))

@@ -12,10 +12,11 @@ antenna's position a; a point's is a hyperbola::
     point at b:     r = |b - a|
     wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
 
-For ranges, a corner of two walls is a point. Both laws have two unknowns, so the difference of
-their chi-squares is twice the logarithm of the likelihood ratio (and that of their BIC). Over a
-short displacement, or at a great distance, it is near zero. Source: Leonard and Durrant-Whyte,
-"Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
+What fits the law of a wall better is no landmark; walls are found by patches
+(:mod:`slam.robust.walls`). For ranges, a corner of two walls is a point. Both laws have two
+unknowns, so the difference of their chi-squares is twice the logarithm of the likelihood ratio (and
+that of their BIC). Over a short displacement, or at a great distance, it is near zero. Source:
+Leonard and Durrant-Whyte, "Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
 
 A point b with noise n and known dependence D_b on the unknowns of the radars measures
 
@@ -212,13 +213,10 @@ class UnassignedRanges:
         offsets_m: Array,
         radar_covariance: Array,
         limits: Sequence[float],
-        *,
-        is_wall: bool,
     ) -> tuple[Array, Array, Indices, Indices]:
         """Return what `slam.robust.kernels.follow` does; ``limits`` are its without the drift."""
         (xx, xy), (_, yy) = guess.covariance.tolist()
         return kernels.follow(
-            is_wall,
             np.array([*guess.target, xx, xy, yy]),
             self._places,
             self._poses,
@@ -444,7 +442,7 @@ class Guess:
 class Tracklet:
     """A target at rest in the newest body frame, and the ranges that it explains."""
 
-    target: Array  # shape (2,): a point [m], or phi [rad] and d [m] of a wall
+    target: Array  # shape (2,) [m]
     covariance: Array  # shape (2, 2), for the unknowns of the radars as in the state
     by_offsets: Array  # shape (2, q), d(target) / d(unknowns of the radars)
     members: Indices  # shape (k, 3): (back, radar, index), newest first
@@ -475,9 +473,7 @@ class Tracklet:
 def point_guesses(
     unassigned: UnassignedRanges, radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
 ) -> list[Guess]:
-    """Return the fixes of all pairs of new ranges, or for a radar alone points on their arcs."""
-    if len(radars) == 1:
-        return _guesses_on_arcs(unassigned, radars[0], noise, rule)
+    """Return the fixes of all pairs of new ranges."""
     guesses = []
     spread = rule.prior_sigma_m**2 * np.eye(2)
     limit = noise.field_of_view_rad / 2 + rule.edge_rad
@@ -493,25 +489,6 @@ def point_guesses(
     return guesses
 
 
-def _guesses_on_arcs(
-    unassigned: UnassignedRanges, radar: int, noise: RangeNoise, rule: TrackletRule
-) -> list[Guess]:
-    """Return guesses in directions of equal distance within the field of view of a radar."""
-    guesses = []
-    n_steps = math.floor(noise.field_of_view_rad / 2 / rule.single_step_rad)
-    steps = sorted(range(-n_steps, n_steps + 1), key=abs)
-    x, y, yaw = unassigned.antenna(radar)
-    for range_m in unassigned.newest(radar):
-        for off in (step * rule.single_step_rad for step in steps):
-            u = np.array([math.cos(yaw + off), math.sin(yaw + off)])
-            across = (rule.single_spread_rad * range_m) ** 2
-            along = rule.single_range_sigma_m**2
-            spread = across * np.eye(2) + (along - across) * np.outer(u, u)
-            target = np.array([x + range_m * float(u[0]), y + range_m * float(u[1])])
-            guesses.append(Guess(target=target, covariance=spread))
-    return guesses
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
     """Where tracklets are looked for, and what they must hold."""
@@ -519,26 +496,19 @@ class Search:
     radars: Sequence[int]  # those of one side
     window: int  # frames looked back
     min_frames: int  # distinct ones
-    most_sigma_m: float = math.inf  # largest standard deviation in any direction
 
 
 class Tracker:
-    """Follows guesses of points, or of walls, back in time.
+    """Follows guesses of points back in time.
 
     ``offsets_m`` (r,) and ``radar_covariance`` (q, q) are of the unknowns of the radars in the
     state: r offsets and, where they are unknown, r places of antennas.
     """
 
     def __init__(
-        self,
-        parameters: BackEndParameters,
-        offsets_m: Array,
-        radar_covariance: Array,
-        *,
-        is_wall: bool = False,
+        self, parameters: BackEndParameters, offsets_m: Array, radar_covariance: Array
     ) -> None:
         self._noise, self._rule = parameters.ranges, parameters.tracklets
-        self._wheels, self._is_wall = parameters.wheels, is_wall
         self._offsets_m, self._radar_covariance = offsets_m, np.ascontiguousarray(radar_covariance)
         half_view = self._noise.field_of_view_rad / 2
         self._limits = (
@@ -592,12 +562,7 @@ class Tracker:
     def follow(self, guess: Guess, unassigned: UnassignedRanges, search: Search) -> Tracklet | None:
         """Return the ranges that follow a guess, or None if they do not suffice."""
         found, by_offsets, members, hits = unassigned.follow(
-            guess,
-            search,
-            self._offsets_m,
-            self._radar_covariance,
-            self._limits,
-            is_wall=self._is_wall,
+            guess, search, self._offsets_m, self._radar_covariance, self._limits
         )
         x, y, xx, xy, yy, chi_square, in_view, hit = found.tolist()
         counts = [n for n in hits.tolist() if n]
@@ -620,10 +585,6 @@ class Tracker:
             tracklet = self._with_free_radars(tracklet, guess.covariance)
         if not is_plausible(tracklet.chi_square, tracklet.dof):
             return None
-        if float(np.linalg.eigvalsh(tracklet.covariance)[-1]) > search.most_sigma_m**2:
-            return None
-        if self._is_wall:
-            tracklet.covariance[0, 0] += self._turned(tracklet.seen)
         return tracklet
 
     def _with_free_radars(self, tracklet: Tracklet, spread: Array) -> Tracklet:
@@ -633,8 +594,7 @@ class Tracker:
         target may miss all ranges alike. The target is returned for the unknowns of the state,
         moved along d(target) / d(unknowns) from the least-squares solution.
         """
-        law = wall_law if self._is_wall else point_law
-        fit = fit_law(tracklet.seen, tracklet.target, law, self._free_covariance)
+        fit = fit_law(tracklet.seen, tracklet.target, point_law, self._free_covariance)
         weighted = fit.by_law.T / tracklet.seen.variances
         covariance = np.asarray(np.linalg.inv(weighted @ fit.by_law + np.linalg.inv(spread)))
         by_offsets = np.zeros((2, len(self._radar_covariance)))
@@ -647,19 +607,10 @@ class Tracker:
             chi_square=fit.chi_square,
         )
 
-    def _turned(self, seen: Sightings) -> float:
-        """Return the variance of the heading over the way of the members."""
-        way_m = math.hypot(*(seen.antennas_m[0] - seen.antennas_m[-1]).tolist())
-        return self._wheels.heading_rad_per_sqrt_m**2 * way_m / 3.0
-
     def excess_of_wall(self, tracklet: Tracklet) -> float:
         """Return by how much chi-square is larger under the law of a wall than under a point's."""
-        if self._is_wall:
-            phi = float(tracklet.target[0])
-        else:
-            x, y = tracklet.target - tracklet.seen.antennas_m.mean(axis=0)
-            phi = math.atan2(y, x)
-        point, wall = compare(tracklet.seen, phi, self._free_covariance)
+        x, y = tracklet.target - tracklet.seen.antennas_m.mean(axis=0)
+        point, wall = compare(tracklet.seen, math.atan2(y, x), self._free_covariance)
         return wall - point
 
 

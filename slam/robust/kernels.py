@@ -22,11 +22,10 @@ _LEAST_ENTRY = 1e-60
 
 @kernel(
     "Tuple((f8[::1], f8[:,::1], i8[:,::1], i8[::1]))"
-    "(b1, f8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,::1],"
+    "(f8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,::1],"
     " i8, i8, i8[::1], f8[::1], f8[:,::1], f8[::1])"
 )
 def follow(
-    is_wall: bool,
     guess: Array,
     places: Array,
     poses: Array,
@@ -85,19 +84,12 @@ def follow(
                 )
                 ax, ay = c0 * dx + s0 * dy, c0 * dy - s0 * dx
                 yaw = places[f, radar, 2] - poses[newest, 2]
-                if is_wall:
-                    dx, dy = math.cos(x), math.sin(x)
-                    distance = y - dx * ax - dy * ay
-                    ux, uy = dy * ax - dx * ay, 1.0
-                    bearing = x
-                else:
-                    dx, dy = x - ax, y - ay
-                    distance = math.sqrt(dx * dx + dy * dy)
-                    if distance == 0.0:
-                        continue
-                    dx, dy = dx / distance, dy / distance
-                    ux, uy = dx, dy
-                    bearing = math.atan2(dy, dx)
+                dx, dy = x - ax, y - ay
+                distance = math.sqrt(dx * dx + dy * dy)
+                if distance == 0.0:
+                    continue
+                dx, dy = dx / distance, dy / distance
+                bearing = math.atan2(dy, dx)
                 off = bearing - yaw
                 off = abs(off - math.tau * np.rint(off / math.tau))
                 if off <= limits[0] and limits[2] <= distance <= limits[3]:
@@ -121,15 +113,15 @@ def follow(
                     own += 2.0 * h2 * radar_covariance[radar, m2]
                     own += h1 * h1 * radar_covariance[m1, m1] + h2 * h2 * radar_covariance[m2, m2]
                     own += 2.0 * h1 * h2 * radar_covariance[m1, m2]
-                px, py = cxx * ux + cxy * uy, cxy * ux + cyy * uy
-                s = ux * px + uy * py + sigmas[f, radar, nearest] ** 2 + drift + own
+                px, py = cxx * dx + cxy * dy, cxy * dx + cyy * dy
+                s = dx * px + dy * py + sigmas[f, radar, nearest] ** 2 + drift + own
                 if nu * nu > limits[4] * s:
                     continue
                 kx, ky = px / s, py / s
                 x, y = x + kx * nu, y + ky * nu
                 cxx, cxy, cyy = cxx - kx * px, cxy - kx * py, cyy - ky * py
                 for other in range(by_radar.shape[1]):
-                    change = ux * by_radar[0, other] + uy * by_radar[1, other]
+                    change = dx * by_radar[0, other] + dy * by_radar[1, other]
                     if other == radar:
                         change += 1.0
                     elif other == m1:

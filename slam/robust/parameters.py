@@ -125,8 +125,7 @@ class TrackletRule:
     min_hits_per_radar: Annotated[int, Origin.CHOSEN, "ranges"] = 4
     """Fewest ranges of each radar."""
     prior_sigma_m: Annotated[float, Origin.CHOSEN] = 0.3
-    """Spread about a first fix: of a point, of a wall's distance and, at a metre, of its
-    direction."""
+    """Spread of a point about a first fix."""
     gate_sigmas: Annotated[float, Origin.QUANTILE] = 3.0
     """How far from its prediction a range may lie, in standard deviations: 99.7 % of normal errors
     are less. Further off, it is no member of a tracklet, a landmark is missed in spite of it, and
@@ -141,28 +140,12 @@ class TrackletRule:
     """Half the width of the edge of the field of view: a first fix or a range from further outside
     is no member of a tracklet, and a landmark must lie further inside to be missed."""
     long_window: Annotated[int, Origin.BUDGET, "frames"] = 40
-    """How far back ranges are looked for of walls, and of points that only one radar sees."""
-    single_min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 20
-    """Fewest frames that hit a point that only one radar sees; a radar whose partner has sent
-    nothing for longer is alone."""
-    single_max_sigma_m: Annotated[float, Origin.CHOSEN] = 0.1
-    """Largest standard deviation, in any direction, with which such a point is used."""
-    single_step_rad: Annotated[float, Origin.BUDGET] = 0.25
-    """Angle between the directions in which such a point is guessed."""
-    single_spread_rad: Annotated[float, Origin.CHOSEN] = 0.2
-    """Standard deviation of a guessed direction."""
-    single_range_sigma_m: Annotated[float, Origin.CHOSEN] = 0.05
-    """Standard deviation of a guess along its direction."""
+    """How far back single ranges are looked for of a point that patches show."""
 
     @property
     def min_frames(self) -> int:
         """Return the fewest frames that must hit a point: the least share of the window."""
         return math.ceil(self.min_share * self.window)
-
-    @property
-    def prior_sigma_rad(self) -> float:
-        """Return the spread of a wall's direction: that of a point, seen from a metre."""
-        return self.prior_sigma_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,18 +181,8 @@ class MapRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WallRule:
-    """When ranges are a wall's, and when a wall is a known one.
+    """When a wall is a known one."""
 
-    A point must fit its ranges no worse than a wall does.
-    """
-
-    min_frames: Annotated[int, Origin.CHOSEN, "frames"] = 25
-    """Fewest frames of `TrackletRule.long_window` that hit a wall. This and the next two are for
-    radars without images."""
-    min_way_m: Annotated[float, Origin.CHOSEN] = 0.25
-    """How far its echo must have moved along it."""
-    wall_margin: Annotated[float, Origin.CHOSEN] = 30.0
-    """By how much chi-square must be less under the law of a wall than under that of a point."""
     cell_m: Annotated[float, Origin.BUDGET] = 0.1
     """Length of the cells in which it is stored where along it a wall gave echoes."""
     reach_m: Annotated[float, Origin.CHOSEN] = 1.0

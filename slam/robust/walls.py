@@ -1,10 +1,8 @@
-"""Walls: shown by patches, or found among ranges; recognised, and predicted where they are known.
+"""Walls: shown by patches, recognised, and predicted where they are known.
 
 Patches show walls, as they show points, with range and bearing; two patches that agree make one.
-Of radars without images, walls are found among unassigned ranges, as points are
-(:mod:`slam.robust.initialisation`): a small Kalman filter follows a guess back through the frames;
-here its state is a line (phi, d) in the newest body frame, whose range is d - n . a. The ranges
-must follow the wall's law, and the point's clearly less well.
+Ranges alone make no wall, but what follows a wall's law is no point
+(:mod:`slam.robust.initialisation`).
 
 A wall in the body frame, (phi_b, d_b) with noise n and known dependence D on the radars' range
 offsets, measures
@@ -22,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
 
 import numpy as np
 from scipy.special import chdtri
@@ -33,54 +30,18 @@ from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
     BodyTarget,
     FeatureRows,
-    Guess,
     PointDetection,
-    Search,
     Tracker,
     Tracklet,
-    UnassignedRanges,
     certain_row,
     fused,
 )
 from slam.robust.parameters import (
     TAIL_PROBABILITY,
     BackEndParameters,
-    RangeNoise,
-    TrackletRule,
     WallRule,
 )
 from slam.robust.state import HEAD_SIZE, Array, Motion, State, quarter_turn, rotation
-
-
-def wall_guesses(
-    unassigned: UnassignedRanges, radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
-) -> list[Guess]:
-    """Return the lines (phi, d) that touch both circles of every pair of new ranges."""
-    guesses = []
-    spread = np.diag([rule.prior_sigma_rad**2, rule.prior_sigma_m**2])
-    limit = noise.field_of_view_rad / 2 + rule.edge_rad
-    for one, two in combinations(radars, 2):
-        x, y, yaw = unassigned.antenna(one)
-        dx, dy = unassigned.antenna(two)[0] - x, unassigned.antenna(two)[1] - y
-        base, along = math.hypot(dx, dy), math.atan2(dy, dx)
-        for a, b in product(unassigned.newest(one), unassigned.newest(two)):
-            cosine = (a - b) / base if base else math.inf
-            if abs(cosine) > 1.0:
-                continue
-            angles = (along + math.acos(cosine), along - math.acos(cosine))
-            phi = min(angles, key=lambda angle: abs(math.remainder(angle - yaw, math.tau)))
-            if abs(math.remainder(phi - yaw, math.tau)) <= limit:
-                d = a + math.cos(phi) * x + math.sin(phi) * y
-                guesses.append(Guess(target=np.array([phi, d]), covariance=spread))
-    return guesses
-
-
-def way_along_m(tracklet: Tracklet) -> float:
-    """Return how far the echo of a wall moved along it, the most that a radar has seen."""
-    phi = float(tracklet.target[0])
-    along = tracklet.seen.antennas_m @ np.array([-math.sin(phi), math.cos(phi)])
-    radars = tracklet.seen.radars
-    return max(float(np.ptp(along[radars == radar])) for radar in np.unique(radars))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -389,8 +350,7 @@ class WallKeeper:
         What goes on where a mapped wall does is not known to be a point yet: over a few frames both
         laws fit.
         """
-        excess = self.tracker(is_wall=False).excess_of_wall(tracklet)
-        return excess >= 0.0 and not self._is_on_a_wall(tracklet)
+        return self.tracker().excess_of_wall(tracklet) >= 0.0 and not self._is_on_a_wall(tracklet)
 
     def _is_on_a_wall(self, tracklet: Tracklet) -> bool:
         """Return whether a mapped wall nearby explains the ranges, too."""
@@ -408,26 +368,9 @@ class WallKeeper:
                 return True
         return False
 
-    def tracker(self, *, is_wall: bool) -> Tracker:
+    def tracker(self) -> Tracker:
         state = self._state
-        block = state.P.block(state.radar_columns)
-        return Tracker(self._parameters, state.offsets_m, block, is_wall=is_wall)
-
-    def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[Tracklet]:
-        """Return the walls among the unassigned ranges of one side, and use these up."""
-        if len(radars) < 2:
-            return []
-        rule, tracker = self._rule, self.tracker(is_wall=True)
-
-        def is_wall(tracklet: Tracklet) -> bool:
-            if way_along_m(tracklet) < rule.min_way_m:
-                return False
-            return -tracker.excess_of_wall(tracklet) >= rule.wall_margin
-
-        tracklets = self._parameters.tracklets
-        guesses = wall_guesses(unassigned, radars, self._parameters.ranges, tracklets)
-        search = Search(radars=radars, window=tracklets.long_window, min_frames=rule.min_frames)
-        return tracker.find(guesses, unassigned, search, is_wall)
+        return Tracker(self._parameters, state.offsets_m, state.P.block(state.radar_columns))
 
     def take(
         self, faces: Sequence[Face], antennas: Antennas
@@ -448,7 +391,7 @@ class WallKeeper:
         found = list(hits.items())
         new = [(face[0], body_wall(state, antennas, face, rule)) for face in others]
         for one in self.tentative.take(new):
-            wall_id = self.place_seen(one.wall)
+            wall_id = self.place(one.wall)
             if wall_id is not None:
                 found.append((wall_id, one.seen))
         return found
@@ -464,21 +407,8 @@ class WallKeeper:
         places = along_wall(self._state, row, seen.in_map(self._state))
         self.cells.add(self._state.wall_ids[row], places)
 
-    def place(self, tracklet: Tracklet) -> int | None:
+    def place(self, seen: BodyWall) -> int | None:
         """Bring a wall into the map; return its id, or None if it is too near to another one."""
-        phi, d = tracklet.target
-        n = np.array([np.cos(phi), np.sin(phi)])
-        antennas = tracklet.seen.antennas_m
-        seen = BodyWall(
-            wall=tracklet.target,
-            covariance=tracklet.covariance,
-            by_offsets=tracklet.by_offsets,
-            feet_m=antennas + np.outer(d - antennas @ n, n),
-        )
-        return self.place_seen(seen)
-
-    def place_seen(self, seen: BodyWall) -> int | None:
-        """Do what ``place`` does, with a wall that was seen."""
         state = self._state
         row = match_wall(state, seen, self.cells, self._parameters)
         if row is not None:
@@ -491,7 +421,7 @@ class WallKeeper:
         return wall_id
 
     def place_saved(self, wall: SavedWall, covariance: Array) -> int | None:
-        """Do what ``place`` does, with a wall of a map that is given in the body frame."""
+        """Do the same with a wall of a map that is given in the body frame."""
         n = np.array([math.cos(wall.phi_rad), math.sin(wall.phi_rad)])
         along_m = (np.array(wall.cells) + 0.5) * self._rule.cell_m
         seen = BodyWall(
@@ -500,7 +430,7 @@ class WallKeeper:
             by_offsets=np.zeros((2, len(self._state.radar_columns))),
             feet_m=wall.d_m * n + np.outer(along_m, (-n[1], n[0])),
         )
-        return self.place_seen(seen)
+        return self.place(seen)
 
     def spans_m(self, row: int) -> Array:
         """Return the ends of the known stretches of a wall, shape (k, 2, 2), map frame."""

@@ -29,6 +29,8 @@ from slam.robust.state import HEAD_SIZE, Array, State, quarter_turn, rotation
 _ANYWHERE_M2 = 1.0
 # Steps of the search for places, its damping, and what keeps directions finite
 _STEPS, _DAMPING, _LEAST_M = 30, 1e-3, 1e-9
+# Directions in which the search begins, from each of some antennas
+_ANGLES_RAD = np.arange(0.0, math.tau, 0.25)
 
 
 @dataclass(slots=True)
@@ -49,8 +51,7 @@ def find_places(
     antennas, and the mirror image of the first one across the way of the antennas.
     """
     k, huber = len(ranges_m), parameters.ranges.huber_sigmas
-    angles = np.arange(0.0, math.tau, parameters.tracklets.single_step_rad)
-    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    ring = np.column_stack([np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)])
     points = np.concatenate(
         [antennas_m[i] + ranges_m[i] * ring for i in sorted({0, k // 2, k - 1})]
     )

@@ -30,7 +30,6 @@ from slam.robust.initialisation import (
     point_guesses,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule
-from slam.robust.pipeline import belief_of
 from slam.robust.state import Array, calibrated_motion
 
 SIGMA_M = 5e-3
@@ -141,7 +140,6 @@ def test_ranges_from_before_a_turn_are_less_sure_by_the_drift_per_radian() -> No
         np.zeros(4),
         np.zeros((4, 4)),
         limits,
-        is_wall=False,
     )
     assert len(members) == 2 * len(TURNS_RAD)
     seen = unassigned.sightings(members, np.zeros(4))
@@ -180,20 +178,6 @@ def test_a_new_landmark_is_worth_the_densities_of_its_ranges_over_those_of_false
     expected = -0.5 * np.log(2.0 * math.pi * variances)
     expected += math.log(NOISE.detection_probability / per_m)
     assert nats == pytest.approx(float(expected.sum()), abs=1e-3)
-
-
-@pytest.mark.parametrize("dead", [0, 1])
-def test_a_radar_initialises_landmarks_where_its_partner_is_dead(dead: int) -> None:
-    rng = np.random.default_rng(0)
-    poses = true_path(LAB)[:90]
-    target = np.array([[0.5, 0.8]])
-    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
-    increments = reported(poses, LAB, rng, 0.0)
-    list(follow(back_end, increments, scans_of(poses, target, rng, SIGMA_M, radars=(1 - dead,))))
-    belief = belief_of(back_end)
-    (miss,) = belief.landmarks - target[0]
-    assert np.hypot(*miss) < 0.06
-    assert miss @ np.linalg.solve(belief.landmark_covariance(0), miss) < 13.8
 
 
 def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> None:

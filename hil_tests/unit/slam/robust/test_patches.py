@@ -361,18 +361,6 @@ def test_the_first_patch_leaves_out_no_ranges_of_before_the_images() -> None:
     assert max(kept) <= 31
 
 
-def test_a_mount_of_ranges_beside_an_imaged_one_begins_landmarks() -> None:
-    """Radars 0 and 1 look to one side; only the first has images, and shows nothing."""
-    back_end, pose = RobustBackEnd(RIG, PARAMETERS), np.zeros(3)
-    for _ in range(45):
-        back_end.predict(STEP)
-        pose = compose(pose, STEP)
-        first, second = ranges_at(pose)
-        back_end.update([first, replace(second, is_imaged=False)])
-    assert back_end.reported_rows() == [0]
-    np.testing.assert_allclose(back_end.state.landmarks_m[0], ROD, atol=0.02)
-
-
 def single_ranges(back_end: RobustBackEnd, radar: int) -> set[int]:
     """Return the poses of the single ranges of a radar that a solution over all poses takes."""
     ranges, known = back_end._log._ranges.rows, back_end.state.landmark_ids

@@ -23,11 +23,7 @@ from slam.robust.association import Antennas, RangeScan, antennas_of, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
     PointDetection,
-    Search,
     Sightings,
-    Tracker,
-    Tracklet,
-    UnassignedRanges,
     compare,
     detections_of,
 )
@@ -43,7 +39,6 @@ from slam.robust.walls import (
     is_unresolved,
     match_wall,
     update_with_wall,
-    wall_guesses,
 )
 
 OFFSETS = (0.01, 0.01, 0.01, 0.01)
@@ -219,16 +214,16 @@ def test_cells_tell_where_a_wall_answered() -> None:
     assert cells.spans_m(7) == []
 
 
-def faces_from(pose: Array, wall: tuple[float, float]) -> RangeScan:
-    """Return the scan of a patch of radar 0 that shows a wall (phi, d) of the map from a pose.
+def faces_from(pose: Array, wall: tuple[float, float], radar: int = 0) -> RangeScan:
+    """Return the scan of a patch of a radar that shows a wall (phi, d) of the map from a pose.
 
     Its echo came from 5 cm to either side of the perpendicular.
     """
-    mount, (phi, d) = paper_rig().mounts[0], wall
+    mount, (phi, d) = paper_rig().mounts[radar], wall
     x, y = transform(pose, np.array([mount.x_m, mount.y_m])).tolist()
     off = math.remainder(phi - pose[2] - mount.yaw_rad, math.tau)
     return RangeScan(
-        radar=0,
+        radar=radar,
         is_patch=True,
         ranges_m=(d - math.cos(phi) * x - math.sin(phi) * y,),
         sigmas_m=(2e-3,),
@@ -378,34 +373,54 @@ def test_a_robot_that_patches_show_a_wall_keeps_its_heading() -> None:
     assert abs(back_end.pose[2] - pose[2]) < 0.03
 
 
-def bare_room(path: Array, rng: np.random.Generator) -> list[list[RangeScan]]:
+PATCH_EVERY = 8  # frames
+IN_BARE_ROOM = BackEndParameters(
+    ranges=RangeNoise(sigma_m=SIGMA_M, detection_probability=0.98, clutter_per_m=0.02)
+)
+
+
+def bare_room(path: Array, rng: np.random.Generator, *, is_imaged: bool) -> list[list[RangeScan]]:
     """Return what four radars hear of four walls 1 m beyond the path's square, and nothing else."""
     walls = np.array([[0.0, 3.0], [math.pi / 2, 3.0], [math.pi, 1.0], [-math.pi / 2, 1.0]])
     n = np.column_stack([np.cos(walls[:, 0]), np.sin(walls[:, 0])])
     frames = []
-    for x, y, heading in path[1:]:
+    for number, (x, y, heading) in enumerate(path[1:]):
         c, s = math.cos(heading), math.sin(heading)
-        scans = []
+        scans, patches = list[RangeScan](), list[RangeScan]()
         for radar, mount in enumerate(paper_rig().mounts):
             q = np.array([x + c * mount.x_m - s * mount.y_m, y + s * mount.x_m + c * mount.y_m])
             ranges = walls[:, 1] - n @ q
             off = np.abs((walls[:, 0] - heading - mount.yaw_rad + math.pi) % math.tau - math.pi)
-            heard = ranges[(off < math.radians(32.5)) & (ranges < 1.5) & (ranges > 0.2)]
-            noisy = heard + SIGMA_M * rng.standard_normal(len(heard))
-            scans.append(RangeScan(radar=radar, ranges_m=tuple(noisy.tolist())))
-        frames.append(scans)
+            is_heard = (off < math.radians(32.5)) & (ranges < 1.5) & (ranges > 0.2)
+            noisy = ranges[is_heard] + SIGMA_M * rng.standard_normal(np.count_nonzero(is_heard))
+            ranges_m = tuple(noisy.tolist())
+            scans.append(RangeScan(radar=radar, ranges_m=ranges_m, is_imaged=is_imaged))
+            if is_imaged and number % PATCH_EVERY == 0:
+                pose = np.array([x, y, heading])
+                patches += [
+                    faces_from(pose, (phi, d), radar) for phi, d in walls[is_heard].tolist()
+                ]
+        frames.append([*scans, *patches])
     return frames
 
 
-def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
+def test_ranges_of_bare_walls_become_no_points() -> None:
+    rng = np.random.default_rng(5)
+    path = true_path(LAB)[:1064:3]
+    increments = reported(path, LAB, rng, walk=0.0)
+    back_end = RobustBackEnd(paper_rig(), IN_BARE_ROOM)
+    list(follow(back_end, increments, bare_room(path, rng, is_imaged=False)))
+    assert back_end.state.feature_ids == []
+    wheels = odometry_path(increments)[-1]
+    assert between(wheels, back_end.pose) == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_four_bare_walls_hold_the_robot() -> None:
     rng = np.random.default_rng(5)
     path = true_path(LAB)[:1064:3]  # a lap and the first wall again
     increments = reported(path, LAB, rng, walk=0.0)
-    parameters = BackEndParameters(
-        ranges=RangeNoise(sigma_m=SIGMA_M, detection_probability=0.98, clutter_per_m=0.02)
-    )
-    back_end = RobustBackEnd(paper_rig(), parameters)
-    list(follow(back_end, increments, bare_room(path, rng)))
+    back_end = RobustBackEnd(paper_rig(), IN_BARE_ROOM)
+    list(follow(back_end, increments, bare_room(path, rng, is_imaged=True)))
     assert back_end.reported_rows() == []
     rough = dict.fromkeys(back_end.state.wall_ids, WallRule().roughness_m)
     assert back_end.state.added_sigmas_m == rough
@@ -432,11 +447,13 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
 
 STEP_M = 0.01
 WALL_Y_M, WALL_END_M = 1.1, 0.8
-OFFSET_M = 0.02
 
 
 def past_the_end_of_a_wall(n: int, rng: np.random.Generator) -> list[list[RangeScan]]:
-    """Return what the radars hear along y = 0: a wall on the left, then its edge."""
+    """Return what the radars hear along y = 0: a wall on the left, then its edge.
+
+    Patches show the wall.
+    """
     frames = []
     for k in range(1, n + 1):
         scans = []
@@ -447,15 +464,16 @@ def past_the_end_of_a_wall(n: int, rng: np.random.Generator) -> list[list[RangeS
             left = mount.yaw_rad > 0.0
             heard = left and math.atan2(beyond, WALL_Y_M - y) < math.radians(32.5)
             noisy = (range_m + SIGMA_M * float(rng.standard_normal()),) if heard else ()
-            scans.append(RangeScan(radar=radar, ranges_m=noisy))
+            scans.append(RangeScan(radar=radar, ranges_m=noisy, is_imaged=True))
+        if k % PATCH_EVERY == 0 and k * STEP_M + paper_rig().mounts[0].x_m < WALL_END_M:
+            scans.append(faces_from(np.array([k * STEP_M, 0.0, 0.0]), (math.pi / 2, WALL_Y_M)))
         frames.append(scans)
     return frames
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_edge_of_a_wall_turns_neither_wall_nor_robot(seed: int) -> None:
-    noise = RangeNoise(sigma_m=SIGMA_M, detection_probability=0.98, clutter_per_m=0.02)
-    back_end = RobustBackEnd(paper_rig(), BackEndParameters(ranges=noise))
+    back_end = RobustBackEnd(paper_rig(), IN_BARE_ROOM)
     n = 140
     for k, scans in enumerate(past_the_end_of_a_wall(n, np.random.default_rng(seed)), start=1):
         back_end.predict(np.array([STEP_M, 0.0, 0.0]))
@@ -466,39 +484,6 @@ def test_the_edge_of_a_wall_turns_neither_wall_nor_robot(seed: int) -> None:
     ((phi_rad, _),) = back_end.state.walls
     assert phi_rad == pytest.approx(math.pi / 2, abs=0.01)
     assert back_end.wall_spans_m()[:, :, 0].max() < WALL_END_M + 0.2
-
-
-def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[list[Tracklet], Array]:
-    """Return the walls found in ranges that miss a wall by a shape, newest first."""
-    parameters = BackEndParameters(ranges=RangeNoise(sigma_m=SIGMA_M, offset_sigma_m=0.02))
-    unassigned = UnassignedRanges(len(shape), 2, SIGMA_M, 0.0, 0.0)
-    step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
-    mounts = paper_rig().mounts[:2]
-    for k, miss in enumerate(shape[::-1].tolist()):
-        unassigned.move(step)
-        ranges_m = [WALL_Y_M - mount.y_m + OFFSET_M + miss for mount in mounts]
-        scans = [RangeScan(radar=r, ranges_m=(range_m,)) for r, range_m in enumerate(ranges_m)]
-        seen_from = antennas_of(replace(paper_rig(), mounts=mounts), scans, np.zeros(3))
-        unassigned.keep(k, seen_from, scans, set())
-    covariance = offset_sigma_m**2 * np.ones((2, 2))
-    tracker = Tracker(parameters, np.zeros(2), covariance, is_wall=True)
-    (first, *_) = wall_guesses(unassigned, (0, 1), parameters.ranges, parameters.tracklets)
-    guess = replace(first, target=np.array([math.pi / 2, WALL_Y_M + OFFSET_M]))
-    search = Search(radars=(0, 1), window=len(shape), min_frames=25)
-    return tracker.find([guess], unassigned, search), covariance
-
-
-def test_an_unknown_offset_is_one_number_and_no_noise_of_each_range() -> None:
-    """A wall is found under an offset of 20 mm; ranges that scatter by half as much are none."""
-    rng = np.random.default_rng(1)
-    (wall,), covariance = tracklet_of(SIGMA_M * rng.standard_normal(40), OFFSET_M)
-    by_point, by_wall = compare(wall.seen, math.pi / 2, covariance)
-    assert by_point - by_wall >= WallRule().wall_margin
-    assert wall.target == pytest.approx([math.pi / 2, WALL_Y_M + OFFSET_M], abs=2e-3)
-    # d is right for the offsets of the state, zero; as they are corrected, so is d.
-    assert wall.by_offsets[1].sum() == pytest.approx(-1.0, abs=1e-3)
-    assert wall.covariance[1, 1] < SIGMA_M**2
-    assert tracklet_of(5 * SIGMA_M * rng.standard_normal(40), OFFSET_M)[0] == []
 
 
 SHARP_SIGMA_M = 1e-3
