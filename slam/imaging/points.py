@@ -8,6 +8,9 @@ Covariance
     the frames. The increments of odometry between frames err independently, but for three constants
     (`slam.config.WheelNoise`); each error moves all antennas behind it, seen from the middle of the
     patch, so its share in the bearing is a sum over them.
+Radius
+    Range, bearing and curvature of the wavefront are one least-squares fit to the phases, so noise
+    and wheels err in the curvature as in the bearing, with other weights.
 Mirror images
     From a straight way, what is left of it and what is right of it look alike. Only the beam says
     which is there, and a beam along the way does not. Near the way the two are one.
@@ -31,6 +34,7 @@ Array = NDArray[np.float64]
 # From which way across the line of sight on a bearing is computed
 _LEAST_SPREAD_M = 1e-6
 _PULSE_M = 0.052  # s, of a module with 1.4 GHz
+_ANY_RADIUS_M = 1e3  # standard deviation of a radius of which nothing is known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +76,8 @@ class PointRule:
     two_sigmas: float = 4.0
     range_floor_m: float = 1e-3
     bearing_floor_rad: float = 1e-3
+    # What the wavefronts of bodies that are no cylinders add to the deviation of flatness
+    flatness_floor: float = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,6 +96,8 @@ class PatchPoint:
         Its largest in the patch, at 1 m under the law of a rod, in units of the frames.
     snr
         Root of its energy over what is left beside it.
+    radius_m, radius_sigma_m
+        Of something round, by the curvature of its wavefront, and the standard deviation of that.
     mirrored_rad
         Bearing of its mirror image across the way of the antenna, where that may be what is there,
         and its own where the two are one; None: it is on this side.
@@ -103,6 +111,8 @@ class PatchPoint:
     bearing_sigma_rad: float
     amplitude: float
     snr: float
+    radius_m: float
+    radius_sigma_m: float
     mirrored_rad: float | None = None
 
 
@@ -161,6 +171,7 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
             apart_rad = 0.0
             c, s = math.cos(bearing_rad), math.sin(bearing_rad)
             places[k] = antenna + range_m * (turn @ (c, s))
+        radius_m, radius_sigma_m = _radius(patch, reflectors, k, lines, rule)
         points.append(
             PatchPoint(
                 x_m=float(places[k, 0]),
@@ -171,6 +182,8 @@ def points_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pa
                 bearing_sigma_rad=bearing_sigma_rad,
                 amplitude=float(reflectors.amplitude[k]),
                 snr=float(reflectors.snr[k]),
+                radius_m=radius_m,
+                radius_sigma_m=radius_sigma_m,
                 mirrored_rad=None if apart_rad is None else bearing_rad + apart_rad,
             )
         )
@@ -196,7 +209,7 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
         feet = antennas + (distance_m - antennas @ normal)[:, np.newaxis] * normal
         if in_view(patch, feet[patch.middle][np.newaxis])[0] < rule.least_in_view:
             continue
-        if _flatness_sigma(patch, reflectors, k, normal) > rule.most_flatness_sigma:
+        if _flatness(patch, reflectors, k, normal)[0] > rule.most_flatness_sigma:
             continue
         sight = np.broadcast_to(normal, antennas.shape)
         sigma_m, bearing_sigma_rad = _sigmas(patch, reflectors, k, sight, rule)
@@ -216,10 +229,11 @@ def lines_of(patch: Patch, reflectors: Reflectors, rule: PointRule) -> tuple[Pat
     return tuple(lines)
 
 
-def _flatness_sigma(patch: Patch, reflectors: Reflectors, k: int, sight: Array) -> float:
+def _flatness(patch: Patch, reflectors: Reflectors, k: int, sight: Array) -> tuple[float, Array]:
     """Return the standard deviation of the flatness of a reflector in direction ``sight`` (2,).
 
-    Range and bearing are fitted, too.
+    It is that of noise. Returns as well the flatness per error of the range at each frame [1/m],
+    (n,). Range and bearing are fitted, too.
     """
     antennas, weights = patch.aperture.antennas_m, reflectors.levels[k]
     across = (antennas - antennas[patch.middle]) @ (-sight[1], sight[0])
@@ -227,8 +241,29 @@ def _flatness_sigma(patch: Patch, reflectors: Reflectors, k: int, sight: Array) 
     fitted = np.column_stack([np.ones_like(across), across]) * weights[:, np.newaxis]
     left = weights * phases
     left = left - fitted @ np.linalg.lstsq(fitted, left)[0]
-    size, of_shape = np.linalg.norm(weights), reflectors.snr[k] * np.linalg.norm(left)
-    return float(size / of_shape) if of_shape > 0.0 else math.inf
+    snr, of_shape = float(reflectors.snr[k]), float(left @ left)
+    if snr * of_shape <= 0.0:
+        return math.inf, np.zeros_like(left)
+    sigma = float(np.linalg.norm(weights)) / (snr * math.sqrt(of_shape))
+    return sigma, weights * left * patch.profiles.wave_number_rad_per_m / of_shape
+
+
+def _radius(
+    patch: Patch, reflectors: Reflectors, k: int, lines: Array, rule: PointRule
+) -> tuple[float, float]:
+    """Return the radius of a reflector [m] and its standard deviation.
+
+    With f its flatness the centre of its wavefronts is r / (1 - f) away. ``lines`` (n, 2) are the
+    directions to where it answers, at each antenna.
+    """
+    range_m, flatness = float(reflectors.range_m[k]), float(reflectors.flatness[k])
+    of_noise, of_range = _flatness(patch, reflectors, k, lines[patch.middle])
+    variance = of_noise**2 + rule.flatness_floor**2
+    variance += _wheel_variance(patch, of_range[:, np.newaxis] * lines, rule.wheels)
+    if not math.isfinite(variance):
+        return 0.0, _ANY_RADIUS_M
+    rest = max(1.0 - flatness, 0.5)  # less only where the flatness is not known
+    return range_m * flatness / rest, range_m * math.sqrt(variance) / rest**2
 
 
 def in_view(patch: Patch, places: Array) -> Array:
@@ -277,7 +312,7 @@ def _are_points(
     may_be &= ~fades | (reflectors.flatness <= rule.flatness[0])
     for k in np.flatnonzero(reflectors.flatness > rule.flatness[1]).tolist():
         sight = (places[k] - patch.aperture.antennas_m[patch.middle]) / reflectors.range_m[k]
-        may_be[k] |= _flatness_sigma(patch, reflectors, k, sight) > rule.most_flatness_sigma
+        may_be[k] |= _flatness(patch, reflectors, k, sight)[0] > rule.most_flatness_sigma
     chosen = may_be & (amplitude >= rule.least_share * amplitude.max(where=may_be, initial=0.0))
     chosen &= stand_out(reflectors, rule, are_cut)
     chosen &= in_view(patch, places) >= rule.least_in_view

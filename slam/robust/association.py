@@ -50,7 +50,16 @@ from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 # No radar ranges as far; keeps squares finite whatever a front end reports.
 LONGEST_M = 1e6
 # What a scan has one of for each range, if it has it
-_OF_EACH_RANGE = ("sigmas_m", "labels", "bearings_rad", "bearing_sigmas_rad", "faces_m", "mirrors")
+_OF_EACH_RANGE = (
+    "sigmas_m",
+    "labels",
+    "bearings_rad",
+    "bearing_sigmas_rad",
+    "faces_m",
+    "radii_m",
+    "radius_sigmas_m",
+    "mirrors",
+)
 # Keeps the direction to what stands at an antenna finite.
 _LEAST_RANGE_M = 1e-9
 
@@ -81,6 +90,10 @@ class RangeScan:
     # Of flat faces in a patch: the stretch (from, to) along each that gave the echo, counted to the
     # left from the foot of the perpendicular, whose range and bearing are given. None: of points
     faces_m: tuple[tuple[float, float], ...] | None = None
+    # Of points of a patch the radius, as the curvature of the wavefront shows it, and the standard
+    # deviation of that
+    radii_m: tuple[float, ...] | None = None
+    radius_sigmas_m: tuple[float, ...] | None = None
     # Of each point of a patch the index of its mirror image, which may be itself; only one of the
     # two is there
     mirrors: tuple[int | None, ...] | None = None
@@ -101,8 +114,15 @@ class RangeScan:
         pairs = [(index, one) for index, one in enumerate(self.mirrors or ()) if one is not None]
         if {(one, index) for index, one in pairs} != set(pairs):
             raise ValueError(f"{self}: mirrors must be indices of each other")
-        sigmas = (*(self.sigmas_m or ()), *(self.bearing_sigmas_rad or ()))
+        if (self.radii_m is None) != (self.radius_sigmas_m is None):
+            raise ValueError(f"{self}: radii_m and radius_sigmas_m must be given together")
+        sigmas = (
+            *(self.sigmas_m or ()),
+            *(self.bearing_sigmas_rad or ()),
+            *(self.radius_sigmas_m or ()),
+        )
         numbers = (*self.ranges_m, *(self.moved or ()), *self.blurred_m, *(self.bearings_rad or ()))
+        numbers += self.radii_m or ()
         numbers += tuple([end_m for stretch in self.faces_m or () for end_m in stretch])
         if (
             self.radar < 0

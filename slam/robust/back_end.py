@@ -928,7 +928,8 @@ class RobustBackEnd:
         if tracklet is not None:
             point = self._body_point(tracklet)
         if row is None:
-            landmark_id = initialise_landmark(state, point)
+            radius = tentative.radius(state.radius_sigma_m) if state.radius_sigma_m else None
+            landmark_id = initialise_landmark(state, point, radius)
             if tentative.label is not None:
                 self._landmark_of_label[tentative.label] = landmark_id
         else:

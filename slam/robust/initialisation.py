@@ -59,6 +59,7 @@ from slam.robust.association import (
 )
 from slam.robust.parameters import (
     NEIGHBOURHOOD_M,
+    SIGMA_PER_MEDIAN,
     TAIL_PROBABILITY,
     BackEndParameters,
     RangeNoise,
@@ -84,6 +85,8 @@ _KNOWN_SHARE = 0.1
 SEEN = -1
 # Room for ranges of one radar in one frame, at first
 _FEWEST_SLOTS = 8
+# What many measurements of one radius count as at most
+_MOST_INDEPENDENT = 10
 # Gauss-Newton steps of a fit of a law, its damping, the smallest share of a step that is tried, and
 # the decrease of chi-square that ends a fit; what keeps matrices regular
 _STEPS, _DAMPING, _LEAST_SHARE, _LEAST_DECREASE, _FLOOR = 8, 1e-6, 1e-3, 1e-4, 1e-12
@@ -277,6 +280,25 @@ class BodyPoint(BodyTarget):
     outward: Array | None = None
 
 
+def pooled(values: Array, sigmas: Array) -> tuple[float, float]:
+    """Return the median of measurements (k,) of one thing, and its standard deviation.
+
+    Some of them are of something else. They err as they scatter about the median, or as is stated
+    if that is more; a part of the errors is alike, as if there were `_MOST_INDEPENDENT`.
+    """
+    middle = float(np.median(values))
+    scatter = SIGMA_PER_MEDIAN * float(np.median(np.abs(values - middle)))
+    sigma = max(scatter, float(np.median(sigmas)))
+    return middle, sigma * math.sqrt(1.0 / len(values) + 1.0 / _MOST_INDEPENDENT)
+
+
+def is_thick(
+    radius_m: float | Array, sigma_m: float | Array, prior_sigma_m: float | Array
+) -> bool | NDArray[np.bool_]:
+    """Return whether a radius, of some standard deviation, is more than the prior has of it."""
+    return radius_m > 2.0 * np.hypot(prior_sigma_m, sigma_m)
+
+
 def fused(
     before: BodyTarget, new: BodyTarget, residual: Array
 ) -> tuple[Array, Array, Array, float]:
@@ -412,7 +434,14 @@ def update_with_point(state: State, row: int, point: BodyPoint) -> float:
     return state.update(rows.at, rows.H, rows.residual, point.covariance)
 
 
-def initialise_landmark(state: State, point: BodyPoint) -> int:
+def initialise_landmark(
+    state: State, point: BodyPoint, radius: tuple[float, float] | None = None
+) -> int:
+    """Add a landmark that is seen at a point; return its id.
+
+    ``radius`` is its radius [m] and the standard deviation of that; None: as the state's prior has
+    it.
+    """
     R = rotation(state.heading_rad)
     at = np.arange(state.n_fixed)
     columns = state.P.columns(at)
@@ -421,13 +450,18 @@ def initialise_landmark(state: State, point: BodyPoint) -> int:
     G[:, HEAD_SIZE:] = R @ point.by_offsets
     cross = columns @ G.T
     corner = G @ cross[at] + R @ point.covariance @ R.T
+    place_m, radius_m = state.position_m + R @ point.point_m, 0.0
     if state.radius_sigma_m:
         # A point whose range and bearing were measured is where it was seen.
-        sigma_m = 0.0 if point.outward is None else state.radius_sigma_m
-        along = np.append(np.zeros(2) if point.outward is None else R @ point.outward, 1.0)
+        outward, sigma_m = np.zeros(2), 0.0
+        if point.outward is not None:
+            outward = R @ point.outward
+            radius_m, sigma_m = radius or (0.0, state.radius_sigma_m)
+        place_m = place_m + radius_m * outward
+        along = np.append(outward, 1.0)
         cross = np.column_stack([cross, np.zeros(len(cross))])
         corner = np.pad(corner, (0, 1)) + sigma_m**2 * np.outer(along, along)
-    return state.augment(state.position_m + R @ point.point_m, cross, (corner + corner.T) / 2)
+    return state.augment(place_m, cross, (corner + corner.T) / 2, radius_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -749,6 +783,9 @@ class PointDetection:
     bearing_rad: float  # in the body frame of the sample
     bearing_sigma_rad: float
     is_of_patch: bool = False
+    # Radius [m] by the curvature of the wavefront, and its standard deviation
+    radius_m: float = 0.0
+    radius_sigma_m: float = math.inf
     # Bearing of its mirror image, where that is a detection of the scan, too
     mirrored_rad: float | None = None
 
@@ -791,6 +828,10 @@ def detections_of(
             bearing_rad=yaw_rad + scan.bearings_rad[index],
             bearing_sigma_rad=bearing_sigma_rad,
             is_of_patch=scan.is_patch,
+            radius_m=0.0 if scan.radii_m is None else scan.radii_m[index],
+            radius_sigma_m=(
+                math.inf if scan.radius_sigmas_m is None else scan.radius_sigmas_m[index]
+            ),
             mirrored_rad=None if mirror is None else yaw_rad + scan.bearings_rad[mirror],
         )
         for index, mirror, (sigma_m, bearing_sigma_rad) in zip(
@@ -836,6 +877,20 @@ class TentativePoint:
     @property
     def label(self) -> int | None:
         return self.seen[0].label
+
+    def radius(self, prior_sigma_m: float) -> tuple[float, float]:
+        """Return its radius [m] and the standard deviation of that.
+
+        Most things are thin, as the prior has it; what is seen to be thicker has any radius.
+        """
+        radius_m, sigma_m = pooled(
+            np.array([one.radius_m for one in self.seen]),
+            np.array([one.radius_sigma_m for one in self.seen]),
+        )
+        if is_thick(radius_m, sigma_m, prior_sigma_m):
+            return radius_m, sigma_m
+        share = prior_sigma_m**2 / (prior_sigma_m**2 + sigma_m**2)
+        return max(share * radius_m, 0.0), prior_sigma_m * math.sqrt(1.0 - share)
 
     @property
     def is_of_patches(self) -> bool:

@@ -226,12 +226,6 @@ class RelinearisationRule:
     radius_scale_m: Annotated[float, Origin.CHOSEN] = 1e-3
     """Scale of the prior of radii; smaller ones are alike."""
 
-    thick_price: Annotated[float, Origin.CHOSEN] = 0.2
-    """Share of the price of a radius that counts once the constants of a run in which everything is
-    thin are implausible."""
-    nearer: Annotated[float, Origin.CHOSEN] = 0.8
-    """What is left, at most, of how implausible the constants are, if that is to remain so."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlipRule:

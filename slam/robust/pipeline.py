@@ -454,6 +454,11 @@ class PatchScans:
                 mirrors.append(k)
                 bearings_rad.append(mirrored_rad)
         found = [*found, *(found[k] for k in mirrors[len(found) :] if k is not None)]
+        radii_m, radius_sigmas_m = None, None
+        if faces_m is None:
+            points = [one for one in found if isinstance(one, PatchPoint)]
+            radii_m = tuple([one.radius_m for one in points])
+            radius_sigmas_m = tuple([one.radius_sigma_m for one in points])
         return RangeScan(
             radar=patch.radar,
             is_patch=True,
@@ -469,6 +474,8 @@ class PatchScans:
                 ]
             ),
             faces_m=faces_m,
+            radii_m=radii_m,
+            radius_sigmas_m=radius_sigmas_m,
         )
 
 

@@ -270,7 +270,6 @@ class RangeErrors:
     # By how much the variance of a range must be larger where many are averaged: those of one
     # passage err alike. Below 1, errors are smaller than their standard deviations
     variance_share: float = 1.0
-    radius_price: float = 1.0  # share of the price of a radius that counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -484,7 +483,7 @@ class State:
         self.P.subtract_gram(W)
         self.correct(W @ whitened)
 
-    def augment(self, point_m: Array, cross: Array, corner: Array) -> int:
+    def augment(self, point_m: Array, cross: Array, corner: Array, radius_m: float = 0.0) -> int:
         """Append a landmark and return its id.
 
         ``cross`` (m, k) is the covariance with the rest, ``corner`` (k, k) its own, k = 3 with the
@@ -493,7 +492,7 @@ class State:
         self._insert(self.layout.landmarks.stop, cross, corner)
         self.landmarks_m = np.vstack([self.landmarks_m, point_m])
         if self.radius_sigma_m:
-            self.radii_m = np.append(self.radii_m, 0.0)
+            self.radii_m = np.append(self.radii_m, radius_m)
         self.landmark_ids.append(self.next_id)
         self.next_id += 1
         return self.landmark_ids[-1]

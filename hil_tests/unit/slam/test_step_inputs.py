@@ -221,6 +221,8 @@ SCAN = RangeScan(
     labels=(7, None),
     bearings_rad=(0.1, 0.2),
     bearing_sigmas_rad=(0.0, 0.01),
+    radii_m=(0.0, 0.1),
+    radius_sigmas_m=(0.03, 0.05),
 )
 OTHERS = ("radar", "labels", "is_patch", "is_imaged", "faces_m", "mirrors")
 NUMBERS = [each.name for each in fields(RangeScan) if each.name not in OTHERS]

@@ -23,7 +23,6 @@ from slam.robust.solver.smoother import (
 from slam.robust.state import (
     HEAD_SIZE,
     Array,
-    RangeErrors,
     State,
 )
 
@@ -46,34 +45,12 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
 def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
     """Solve for all poses and replace the belief by the result; return whether it worked."""
     log.since_solved = 0
-    errors = state.range_errors
-    found = _with_errors(log, state, errors, parameters)
-    if found is not None and found[2] > 1.0 and state.layout.has_radii:
-        # Wheels and radars have constants that their makers vouch for. Ranges at odds with these
-        # are of thicker bodies than was expected, if these bring the constants nearer.
-        rule = parameters.relinearisation
-        thick = replace(errors, radius_price=rule.thick_price)
-        of_bodies = None if errors == thick else _with_errors(log, state, thick, parameters)
-        if of_bodies is not None and of_bodies[2] < rule.nearer * found[2]:
-            found, errors = of_bodies, thick
-    if found is None:
-        return False
-    problem, solution, _ = found
-    state.range_errors = errors
-    adopt(log, state, problem, solution, parameters)
-    return True
-
-
-def _with_errors(
-    log: RunLog, state: State, errors: RangeErrors, parameters: BackEndParameters
-) -> tuple[Problem, Solution, float] | None:
-    """Return problem, solution and misfit of the constants if ranges err so; None if it failed."""
-    problem = replace(log.problem(state, parameters), radius_price=errors.radius_price)
+    problem = log.problem(state, parameters)
     solution = _solved(log, state, problem, parameters)
     if solution is None or not is_determined(solution.information):
-        return None
-    misfit = Smoother(problem, parameters.relinearisation).misfit_of_constants(solution.estimate)
-    return problem, solution, misfit
+        return False
+    adopt(log, state, problem, solution, parameters)
+    return True
 
 
 def adopt(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import between, compose, wrap_angle, wrap_angles
-from slam.robust.initialisation import PointDetection, Sightings
+from slam.robust.initialisation import PointDetection, Sightings, pooled
 from slam.robust.map import SURE, MapPrior, fixed_values
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.solver.growing_arrays import PackedRows
@@ -40,6 +40,10 @@ _OF_NOTHING = -1  # in place of a landmark's id
 
 def _no_unknowns() -> Indices:
     return np.zeros(0, dtype=np.intp)
+
+
+def _no_radii() -> Array:
+    return np.zeros(0)
 
 
 def _no_information() -> Array:
@@ -85,10 +89,13 @@ class Problem:
     huber_sigmas: float = math.inf  # residuals beyond it weigh less
     # see `RangeErrors`
     variance_share: float = 1.0
-    radius_price: float = 1.0
     # The unknowns (k,) whose prior is that of a map, and their information; these have no sigmas
     known_at: Indices = field(default_factory=_no_unknowns)
     known_information: Array = field(default_factory=_no_information)
+    # Radii of the landmarks as wavefronts show them, and their noise, inf of those not seen: (n,)
+    # each, or none
+    radii_m: Array = field(default_factory=_no_radii)
+    radius_sigmas_m: Array = field(default_factory=_no_radii)
 
     @property
     def is_walking(self) -> bool:
@@ -226,7 +233,8 @@ class RunLog:
         where = [("radar", np.int16), ("antenna", np.float64, 2), ("turn_rad", np.float32)]
         measured = [("range_m", np.float64), ("sigma_m", np.float32)]
         bearing = [("bearing_rad", np.float64), ("bearing_sigma_rad", np.float32)]
-        self._ranges = PackedRows(np.dtype([*whose, *where, *measured, *bearing]))
+        radius = [("radius_m", np.float32), ("radius_sigma_m", np.float32)]
+        self._ranges = PackedRows(np.dtype([*whose, *where, *measured, *bearing, *radius]))
         self._names: dict[int, int | None] = {}
         self._last_seen: dict[int, int] = {}  # by landmark, the newest pose that has a range of it
         self.since_solved = 0
@@ -290,6 +298,8 @@ class RunLog:
         turn_rad: float = 0.0,
         bearing_rad: float = math.nan,
         bearing_sigma_rad: float = math.nan,
+        radius_m: float = 0.0,
+        radius_sigma_m: float = math.inf,
     ) -> None:
         """Append a range used, with its bearing in the body frame of the sample if it has one.
 
@@ -298,8 +308,8 @@ class RunLog:
         """
         self._last_seen[landmark_id] = max(pose, self._last_seen.get(landmark_id, pose))
         whose = (pose, landmark_id, radar)
-        bearing = bearing_rad, bearing_sigma_rad
-        self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m, *bearing))
+        shape = bearing_rad, bearing_sigma_rad, radius_m, radius_sigma_m
+        self._ranges.append((*whose, antenna, turn_rad, range_m, sigma_m, *shape))
 
     def add_detections(self, landmark_id: int, seen: Iterable[PointDetection]) -> None:
         for one in seen:
@@ -313,6 +323,8 @@ class RunLog:
                 sigma_m=one.sigma_m,
                 bearing_rad=one.bearing_rad,
                 bearing_sigma_rad=one.bearing_sigma_rad,
+                radius_m=one.radius_m,
+                radius_sigma_m=one.radius_sigma_m,
             )
 
     def add_sightings(self, landmark_id: int, seen: Sightings) -> None:
@@ -446,6 +458,7 @@ class RunLog:
         sigmas_m = ranges["sigma_m"].astype(np.float64)
         if state.added_sigmas_m:
             sigmas_m = np.hypot(sigmas_m, state.feature_added_sigmas_m[of_range])
+        radii_m, radius_sigmas_m = _shown_radii(ranges, of_range, len(state.landmark_ids))
         keys = self._keys(parameters.relinearisation)
         steps = self._steps.rows.copy()
         chain = chain_of(steps, keys, state.calibration[None, :])
@@ -482,9 +495,10 @@ class RunLog:
             range_sigmas_m=sigmas_m,
             range_bearings_rad=ranges["bearing_rad"].copy(),
             range_bearing_sigmas_rad=ranges["bearing_sigma_rad"].astype(np.float64),
+            radii_m=radii_m,
+            radius_sigmas_m=radius_sigmas_m,
             huber_sigmas=parameters.ranges.huber_sigmas,
             variance_share=state.range_errors.variance_share,
-            radius_price=state.range_errors.radius_price,
         )
 
     def starts(self, state: State, problem: Problem) -> list[Estimate]:
@@ -514,6 +528,17 @@ class RunLog:
         """Store the trajectory of a solution."""
         self._causal.rows_to_write()[:] = all_poses(problem, estimate)[0]
         self._stored_pose = estimate.poses[-1].copy()
+
+
+def _shown_radii(ranges: NDArray[np.void], of_range: Indices, n: int) -> tuple[Array, Array]:
+    """Return radii (n,) of landmarks as wavefronts show them, and their standard deviations."""
+    radii_m, sigmas_m = np.zeros(n), np.full(n, math.inf)
+    is_seen = np.isfinite(ranges["radius_sigma_m"])
+    rows, seen = of_range[is_seen], ranges[["radius_m", "radius_sigma_m"]][is_seen]
+    for row in np.unique(rows).tolist():
+        mine = seen[rows == row]
+        radii_m[row], sigmas_m[row] = pooled(mine["radius_m"], mine["radius_sigma_m"])
+    return radii_m, sigmas_m
 
 
 def _rows_of(

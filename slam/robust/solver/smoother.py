@@ -20,11 +20,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpbtrf, dtbtrs
-from scipy.special import chdtri
 
 from slam.geometry import wrap_angles
 from slam.robust import kernels
-from slam.robust.parameters import CONSTANTS_TAIL, RelinearisationRule
+from slam.robust.initialisation import is_thick
+from slam.robust.parameters import RelinearisationRule
 from slam.robust.solver.run_log import (
     Estimate,
     Problem,
@@ -461,6 +461,15 @@ class Smoother:
         radii = layout.radii if layout.has_radii else slice(0, 0)
         # Those of a map have its prior.
         self._radii = np.setdiff1d(np.arange(layout.size)[radii], problem.known_at)
+        # Radii and deviations as wavefronts show them; of what is not thin, these are all there is
+        self._shown, self._shown_sigmas = np.zeros(layout.size), np.full(layout.size, math.inf)
+        prices = np.ones(layout.size)
+        if layout.has_radii and len(problem.radii_m):
+            self._shown[radii] = problem.radii_m
+            self._shown_sigmas[radii] = problem.radius_sigmas_m
+            thick = is_thick(problem.radii_m, problem.radius_sigmas_m, problem.prior_sigmas[radii])
+            prices[radii] = np.where(thick, _TINY, 1.0)
+        self._prices = prices[self._radii]
         chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))
         covariances = motion_covariances(chain, problem.step_covariances)
         # W with W C W^T = I, shape (k, 3, 3)
@@ -521,7 +530,7 @@ class Smoother:
         away, sigmas = self._from_prior(estimate)
         costs = (away / sigmas) ** 2
         # Of a radius the cost is 2 ln(tau + rho), and quadratic where it is less than tau.
-        tau, price = self._rule.radius_scale_m, problem.radius_price
+        tau, price = self._rule.radius_scale_m, self._prices
         radii = np.maximum(away[self._radii], tau)
         thin = np.clip(away[self._radii], 0.0, tau)
         costs[self._radii] = price * thin**2 / (2.0 * tau * tau)
@@ -529,16 +538,8 @@ class Smoother:
         below = np.minimum(away[self._radii], 0.0)
         away = away[problem.known_at]
         total += float(away @ problem.known_information @ away)
+        total += float(np.sum((self._from_shown(estimate) / self._shown_sigmas) ** 2))
         return total + float(np.sum(costs) + np.sum((below / tau) ** 2))
-
-    def misfit_of_constants(self, estimate: Estimate) -> float:
-        """Return how implausible the constants of wheels and radars are under their priors.
-
-        It is chi-square of the wheels' first calibration and the range offsets over the quantile
-        that one in a hundred exceeds.
-        """
-        away, sigmas = self.constants(estimate)
-        return float(np.sum((away / sigmas) ** 2)) / float(chdtri(len(away), CONSTANTS_TAIL))
 
     def constants(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return how far the constants are from their priors' means, (k,), and the priors' sigmas.
@@ -580,9 +581,14 @@ class Smoother:
         away, sigmas = first - problem.prior_mean, problem.prior_sigmas.copy()
         radii = away[self._radii]
         least = np.maximum(radii, tau)
-        rounded = np.sqrt(least * (tau + least) / problem.radius_price)
+        rounded = np.sqrt(least * (tau + least) / self._prices)
         sigmas[self._radii] = np.where(radii < 0.0, tau, rounded)
         return away, sigmas
+
+    def _from_shown(self, estimate: Estimate) -> Array:
+        """Return how far radii are from those that wavefronts show, and zeros for all else."""
+        first = np.concatenate([estimate.poses[0], estimate.calibration[0], estimate.fixed])
+        return np.where(np.isfinite(self._shown_sigmas), first - self._shown, 0.0)
 
     def weights(self, residual: Array, limit: float) -> Array:
         """Return roots of the weights of white residuals, shape (m,)."""
@@ -611,6 +617,7 @@ class Smoother:
         equations.add_rows(rows, self.weights(rows.residual, limit))
         away, sigmas = self._from_prior(estimate)
         equations.add_prior(away, sigmas)
+        equations.add_prior(self._from_shown(estimate), self._shown_sigmas)
         if len(problem.known_at):
             equations.add_known(problem.known_at, away, problem.known_information)
         return equations

@@ -225,6 +225,12 @@ def test_near_the_way_a_point_and_its_mirror_image_are_one(seed: int) -> None:
     assert (point.x_m, point.y_m) == pytest.approx((0.2 + point.range_m, -0.1))
 
 
+def test_along_the_way_no_radius_is_known() -> None:
+    poses = looking_ahead()
+    (point,) = patch_points(patch_of(of_point(poses, (1.3, 0.0), 0.04) + noise(8), poses))
+    assert point.radius_sigma_m > 0.5
+
+
 def test_ahead_nothing_is_a_wall() -> None:
     """There a point and a plane have one wavefront."""
     poses = looking_ahead()
@@ -290,6 +296,25 @@ def test_a_wide_cylinder_is_a_point_at_its_surface() -> None:
     ranges_m = np.linalg.norm(centre - antennas_of(straight()), axis=1) - radius_m
     (point,) = patch_points(patch_of(rf_frames(ranges_m, 0.01 / ranges_m)))
     assert (point.x_m, point.y_m) == pytest.approx((0.1, 0.65), abs=1e-3)
+    assert point.radius_m == pytest.approx(radius_m, abs=0.01)
+
+
+@pytest.mark.parametrize(("radius_m", "most"), [(0.0, 2.5), (0.05, 3.0), (0.15, 5.0), (0.4, 6.0)])
+def test_the_radius_of_a_cylinder_scatters_no_more_than_stated(
+    radius_m: float, most: float
+) -> None:
+    """What the model of a point leaves of a thick one counts as noise, too."""
+    rule = PointRule(wheels=NO_WHEELS, flatness_floor=0.0)
+    centre = np.array([0.15, 1.0 + radius_m])
+    ranges_m = np.linalg.norm(centre - antennas_of(straight()), axis=1) - radius_m
+    frames = rf_frames(ranges_m, 0.01 / ranges_m)
+    found = [patch_points(patch_of(frames + noise(seed, 1e-3)), rule)[0] for seed in range(40)]
+    seen = np.array([one.radius_m for one in found])
+    middle = float(np.median(seen))
+    scatter = 1.48 * float(np.median(np.abs(seen - middle)))
+    stated = float(np.median([one.radius_sigma_m for one in found]))
+    assert middle == pytest.approx(radius_m, abs=0.5 * scatter)
+    assert scatter < stated < most * scatter
 
 
 def test_only_what_is_in_view_for_half_of_the_frames_is_a_point() -> None:
@@ -369,7 +394,7 @@ def test_covariance_of_a_wrong_constant_of_the_wheels_is_what_it_does(
         turn_scale_sigma=turn,
         curvature_sigma_rad_per_m=5.0 * curvature,
     )
-    rule = PointRule(wheels=wheels, range_floor_m=0.0, bearing_floor_rad=0.0)
+    rule = PointRule(wheels=wheels, range_floor_m=0.0, bearing_floor_rad=0.0, flatness_floor=0.0)
 
     def path(scale: float, turn: float, curvature: float) -> Array:
         """Return a curve of 24 steps of 1 cm and 0.02 rad as the wheels report it."""
@@ -386,6 +411,11 @@ def test_covariance_of_a_wrong_constant_of_the_wheels_is_what_it_does(
     assert abs(wrong.bearing_rad - point.bearing_rad) == pytest.approx(
         point.bearing_sigma_rad, rel=0.1, abs=1.5e-4
     )
+    off_m = abs(wrong.radius_m - point.radius_m)
+    if scale:  # stretches the curve and its curvature, which cancel here
+        assert off_m < point.radius_sigma_m
+    else:
+        assert off_m == pytest.approx(point.radius_sigma_m, rel=0.15, abs=3e-3)
 
 
 def noise_gain() -> float:

@@ -79,6 +79,8 @@ def imaged(origin: Array, rod: Array, sigma_m: float) -> ImagedPatch:
         bearing_sigma_rad=sigma_m / math.hypot(*away),
         amplitude=0.015,
         snr=30.0,
+        radius_m=0.0,
+        radius_sigma_m=0.03,
     )
     # Scans take the radar, the mount and the origin of a patch, and no profile.
     patch = Patch(
@@ -286,13 +288,15 @@ def seen_from(pose: Array, *rods: Array, radar: int = 0) -> RangeScan:
 STEP = np.array([0.01, 0.0, 0.0])
 
 
-def ranges_at(pose: Array, *, is_imaged: bool = True) -> list[RangeScan]:
-    """Return what radars 0 and 1 measure of the rod."""
+def ranges_at(
+    pose: Array, *, is_imaged: bool = True, axis_m: Array = ROD, radius_m: float = 0.0
+) -> list[RangeScan]:
+    """Return what radars 0 and 1 measure of the rod, or of a column in its place."""
     found = []
     for radar in (0, 1):
         mount = RIG.mounts[radar]
         antenna = transform(pose, np.array([mount.x_m, mount.y_m]))
-        range_m = math.hypot(*(ROD - antenna))
+        range_m = math.hypot(*(axis_m - antenna)) - radius_m
         one = RangeScan(radar=radar, ranges_m=(range_m,), sigmas_m=(1e-3,), is_imaged=is_imaged)
         found.append(one)
     return found
@@ -317,6 +321,36 @@ def test_two_patches_make_a_landmark_with_the_single_ranges_of_before() -> None:
         back_end.predict(np.zeros(3))
         back_end.update([seen_from(pose)])
     assert back_end.reported_rows() == [0]
+
+
+def test_a_landmark_whose_wavefront_is_wide_stands_behind_its_surface() -> None:
+    """Patches show a column of 0.25 m, give or take 0.03; what answers is that much nearer."""
+    noise = replace(NOISE, radius_sigma_m=0.03)
+    back_end, pose = RobustBackEnd(RIG, replace(PARAMETERS, ranges=noise)), np.zeros(3)
+    axis_m, radius_m = np.array([0.3, 1.15]), 0.25
+    for number in range(40):
+        back_end.predict(STEP)
+        pose = compose(pose, STEP)
+        scans = ranges_at(pose, axis_m=axis_m, radius_m=radius_m)
+        if number in (20, 22, 34):
+            axis = seen_from(pose, axis_m)
+            scans.append(
+                replace(
+                    axis,
+                    ranges_m=(axis.ranges_m[0] - radius_m,),
+                    bearing_sigmas_rad=(0.02,),
+                    radii_m=(radius_m,),
+                    radius_sigmas_m=(0.03,),
+                )
+            )
+        back_end.update(scans)
+    state = back_end.state
+    for _ in range(2):
+        np.testing.assert_allclose(state.landmarks_m, [axis_m], atol=5e-3)
+        assert state.radii_m == pytest.approx([radius_m], abs=5e-3)
+        at = state.layout.columns(np.array([0]))
+        assert math.sqrt(state.P.block(at)[2, 2]) < 0.04
+        assert back_end.relinearise()
 
 
 def test_radars_without_images_begin_landmarks_beside_those_with_images() -> None:

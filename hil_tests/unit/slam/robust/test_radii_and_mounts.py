@@ -11,11 +11,18 @@ from scipy.special import chdtri
 
 from hil_tests.property.robust_oracles import rows_of
 from slam.config import WheelNoise
-from slam.geometry import paper_rig
+from slam.geometry import paper_rig, transform
 from slam.library.evaluation import nees_pose
 from slam.robust.association import RangeScan, antennas_of, find_known, view
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import BodyPoint, initialise_landmark, point_rows
+from slam.robust.initialisation import (
+    BodyPoint,
+    PointDetection,
+    TentativePoint,
+    initialise_landmark,
+    point_rows,
+    pooled,
+)
 from slam.robust.map import apply_merge
 from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.state import HEAD_SIZE, State, SymmetricMatrix, rotation
@@ -190,6 +197,64 @@ def test_a_new_landmark_stands_behind_its_surface_by_a_radius_unknown() -> None:
     at = state.layout.columns(np.array([row]))
     assert math.sqrt(state.P.block(at)[2, 2]) == pytest.approx(RADIUS_SIGMA_M)
     assert state.walls.tolist() == [[0.2, 1.4]]
+
+
+def test_of_a_new_landmark_whose_radius_is_shown_the_axis_is_known() -> None:
+    state, outward = state_with_map(), np.array([0.6, 0.8])
+    point = BodyPoint(
+        point_m=np.array([0.5, 0.9]),
+        covariance=1e-6 * np.eye(2),
+        by_offsets=np.zeros((2, 12)),
+        outward=outward,
+    )
+    row = state.landmark_ids.index(initialise_landmark(state, point, (0.3, 0.02)))
+    axis_m = transform(state.pose, point.point_m + 0.3 * outward)
+    assert state.landmarks_m[row] == pytest.approx(axis_m)
+    assert state.radii_m[row] == pytest.approx(0.3)
+    at = state.layout.columns(np.array([row]))
+    assert math.sqrt(state.P.block(at)[2, 2]) == pytest.approx(0.02)
+    rows = point_rows(state, row, point)
+    assert rows.residual == pytest.approx(np.zeros(2), abs=1e-12)
+    assert pytest.approx(2e-6 * np.eye(2), abs=1e-9) == rows.S
+
+
+def seen_with(radii_m: list[float], sigma_m: float) -> TentativePoint:
+    point = BodyPoint(point_m=np.zeros(2), covariance=np.eye(2), by_offsets=np.zeros((2, 4)))
+    one = PointDetection(
+        radar=0,
+        label=None,
+        pose=0,
+        nominal_m=(0.0, 0.0),
+        turn_rad=0.0,
+        range_m=1.0,
+        sigma_m=0.01,
+        bearing_rad=0.0,
+        bearing_sigma_rad=0.1,
+    )
+    seen = [replace(one, radius_m=radius_m, radius_sigma_m=sigma_m) for radius_m in radii_m]
+    return TentativePoint(point=point, seen=seen)
+
+
+def test_a_thin_radius_is_weighed_against_the_prior_and_a_thick_one_is_not() -> None:
+    # One detection counts for as much as a tenth less than one.
+    sigma_m = 0.03 * math.sqrt(1.1)
+    weight = 0.03**2 / (0.03**2 + sigma_m**2)
+    thin = seen_with([0.04], 0.03).radius(0.03)
+    assert thin == pytest.approx((0.04 * weight, sigma_m * math.sqrt(weight)))
+    behind = seen_with([-0.04], 0.03).radius(0.03)
+    assert behind == pytest.approx((0.0, sigma_m * math.sqrt(weight)))
+    assert seen_with([0.2], 0.03).radius(0.03) == pytest.approx((0.2, sigma_m))
+    # Where none is shown there is the prior.
+    assert seen_with([0.0], math.inf).radius(0.03) == pytest.approx((0.0, 0.03))
+
+
+@pytest.mark.parametrize(("stated", "sigma"), [(0.04, 0.04), (0.01, 0.014826)])
+def test_the_radius_of_many_detections_is_their_median(stated: float, sigma: float) -> None:
+    """One of five is of something else; half of the others are within 0.01 of the median."""
+    values = np.array([0.28, 0.29, 0.3, 0.31, 0.9])
+    middle, found = pooled(values, np.full(5, stated))
+    assert middle == 0.3
+    assert found == pytest.approx(sigma * math.sqrt(1.0 / 5.0 + 1.0 / 10.0))
 
 
 def test_a_merge_makes_one_axis_and_one_radius() -> None:

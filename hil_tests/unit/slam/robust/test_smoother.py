@@ -192,6 +192,11 @@ def white_residuals(
     if layout.has_radii:
         at = np.arange(layout.size)[layout.radii]
         result[0][at] = [white_radius(v[i], is_exact=is_exact) for i in at]
+        if len(problem.radii_m):
+            off = (v[at] - problem.radii_m) / problem.radius_sigmas_m
+            result.append(off.astype(np.complex128))
+            if v[at[0]].real > 0.0:  # of what is thick, no more than that it is not negative
+                result[0][at[0]] = 0.0
     for k in range(n_poses - 1):
         own = slice(keys[k], keys[k + 1])
         c = calibration[k if n_cal > 1 else 0]
@@ -281,6 +286,13 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(
     walk: float, *, has_radii: bool
 ) -> None:
     problem, start = short_run(1, walk, has_radii=has_radii)
+    if has_radii:
+        # Of three landmarks one is shown to be thick, one is thin, and one was not seen
+        problem = replace(
+            problem,
+            radii_m=np.array([0.08, 0.01, 0.0]),
+            radius_sigmas_m=np.array([0.01, 0.02, math.inf]),
+        )
     smoother = Smoother(problem, RULE)
     solution = smoother.solve(start, tolerance=1e-14)
     assert solution is not None
