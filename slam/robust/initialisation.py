@@ -85,8 +85,9 @@ _KNOWN_SHARE = 0.1
 SEEN = -1
 # Room for ranges of one radar in one frame, at first
 _FEWEST_SLOTS = 8
-# What many measurements of one radius count as at most
-_MOST_INDEPENDENT = 10
+# What many measurements of one radius count as at most, and how many times the least standard
+# deviation is vague; from how many on a radius is not zero
+_MOST_INDEPENDENT, _VAGUE, _THICK_SIGMAS = 10, 3.0, 3.0
 # Gauss-Newton steps of a fit of a law, its damping, the smallest share of a step that is tried, and
 # the decrease of chi-square that ends a fit; what keeps matrices regular
 _STEPS, _DAMPING, _LEAST_SHARE, _LEAST_DECREASE, _FLOOR = 8, 1e-6, 1e-3, 1e-4, 1e-12
@@ -283,20 +284,23 @@ class BodyPoint(BodyTarget):
 def pooled(values: Array, sigmas: Array) -> tuple[float, float]:
     """Return the median of measurements (k,) of one thing, and its standard deviation.
 
-    Some of them are of something else. They err as they scatter about the median, or as is stated
-    if that is more; a part of the errors is alike, as if there were `_MOST_INDEPENDENT`.
+    Some of them are of something else, and those that are vague beside the best do not count. They
+    err as they scatter about the median, or as is stated if that is more; a part of the errors is
+    alike, as if there were `_MOST_INDEPENDENT`.
     """
+    values, sigmas = np.array([values, sigmas])[:, sigmas <= _VAGUE * sigmas.min()]
     middle = float(np.median(values))
     scatter = SIGMA_PER_MEDIAN * float(np.median(np.abs(values - middle)))
     sigma = max(scatter, float(np.median(sigmas)))
     return middle, sigma * math.sqrt(1.0 / len(values) + 1.0 / _MOST_INDEPENDENT)
 
 
-def is_thick(
-    radius_m: float | Array, sigma_m: float | Array, prior_sigma_m: float | Array
-) -> bool | NDArray[np.bool_]:
-    """Return whether a radius, of some standard deviation, is more than the prior has of it."""
-    return radius_m > 2.0 * np.hypot(prior_sigma_m, sigma_m)
+def is_thick(radius_m: float | Array, sigma_m: float | Array) -> bool | NDArray[np.bool_]:
+    """Return whether a radius, of some standard deviation, is that of a thick thing.
+
+    If it is not, the prior of radii takes it for thin: that is likelier then.
+    """
+    return radius_m > _THICK_SIGMAS * sigma_m
 
 
 def fused(
@@ -881,13 +885,13 @@ class TentativePoint:
     def radius(self, prior_sigma_m: float) -> tuple[float, float]:
         """Return its radius [m] and the standard deviation of that.
 
-        Most things are thin, as the prior has it; what is seen to be thicker has any radius.
+        Most things are thin, as the prior has it; what is seen to be thick has any radius.
         """
         radius_m, sigma_m = pooled(
             np.array([one.radius_m for one in self.seen]),
             np.array([one.radius_sigma_m for one in self.seen]),
         )
-        if is_thick(radius_m, sigma_m, prior_sigma_m):
+        if is_thick(radius_m, sigma_m):
             return radius_m, sigma_m
         share = prior_sigma_m**2 / (prior_sigma_m**2 + sigma_m**2)
         return max(share * radius_m, 0.0), prior_sigma_m * math.sqrt(1.0 - share)

@@ -31,9 +31,6 @@ from slam.geometry import FieldOfView
 
 TAIL_PROBABILITY: Annotated[float, Origin.QUANTILE] = 1e-3
 """Probability with which a test rejects what is true."""
-CONSTANTS_TAIL: Annotated[float, Origin.QUANTILE] = 0.01
-"""Probability with which constants of wheels and radars are taken for implausible although they are
-drawn from their priors."""
 MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
 """Logarithm of how many times likelier than any other an explanation must be: twenty times."""
 SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude

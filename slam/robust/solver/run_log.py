@@ -458,7 +458,9 @@ class RunLog:
         sigmas_m = ranges["sigma_m"].astype(np.float64)
         if state.added_sigmas_m:
             sigmas_m = np.hypot(sigmas_m, state.feature_added_sigmas_m[of_range])
-        radii_m, radius_sigmas_m = _shown_radii(ranges, of_range, len(state.landmark_ids))
+        radii_m, radius_sigmas_m = _no_radii(), _no_radii()
+        if state.layout.has_radii:
+            radii_m, radius_sigmas_m = _shown_radii(ranges, of_range, len(state.landmark_ids))
         keys = self._keys(parameters.relinearisation)
         steps = self._steps.rows.copy()
         chain = chain_of(steps, keys, state.calibration[None, :])
@@ -535,8 +537,9 @@ def _shown_radii(ranges: NDArray[np.void], of_range: Indices, n: int) -> tuple[A
     radii_m, sigmas_m = np.zeros(n), np.full(n, math.inf)
     is_seen = np.isfinite(ranges["radius_sigma_m"])
     rows, seen = of_range[is_seen], ranges[["radius_m", "radius_sigma_m"]][is_seen]
-    for row in np.unique(rows).tolist():
-        mine = seen[rows == row]
+    order = np.argsort(rows, kind="stable")
+    of_landmark, begins = np.unique(rows[order], return_index=True)
+    for row, mine in zip(of_landmark.tolist(), np.split(seen[order], begins[1:]), strict=False):
         radii_m[row], sigmas_m[row] = pooled(mine["radius_m"], mine["radius_sigma_m"])
     return radii_m, sigmas_m
 

@@ -464,10 +464,10 @@ class Smoother:
         # Radii and deviations as wavefronts show them; of what is not thin, these are all there is
         self._shown, self._shown_sigmas = np.zeros(layout.size), np.full(layout.size, math.inf)
         prices = np.ones(layout.size)
-        if layout.has_radii and len(problem.radii_m):
+        if len(problem.radii_m):
             self._shown[radii] = problem.radii_m
             self._shown_sigmas[radii] = problem.radius_sigmas_m
-            thick = is_thick(problem.radii_m, problem.radius_sigmas_m, problem.prior_sigmas[radii])
+            thick = is_thick(problem.radii_m, problem.radius_sigmas_m)
             prices[radii] = np.where(thick, _TINY, 1.0)
         self._prices = prices[self._radii]
         chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))

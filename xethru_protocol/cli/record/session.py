@@ -47,6 +47,7 @@ class _Source(threading.Thread):
         self.port = port
         self.recorded = 0
         self.failure: XeThruError | None = None
+        self.crash: Exception | None = None  # what nobody expected; raised where the session waits
 
     def fail(self, error: XeThruError) -> None:
         """Keep the reason of the end; of the only module it is raised, else it is reported here."""
@@ -69,6 +70,8 @@ class _Source(threading.Thread):
             self._record()
         except XeThruError as error:
             self.fail(error)
+        except Exception as error:
+            self.crash = error
 
     def _record(self) -> None:
         raise NotImplementedError
@@ -154,13 +157,13 @@ class _RecordedText(_Source):
 
     noun = "line"
 
-    def __init__(
-        self, session: "Session", recorder: SessionRecorder, name: str, port: str, baudrate: int
-    ) -> None:
+    def __init__(self, session: "Session", name: str, port: str, baudrate: int) -> None:
         super().__init__(session, name, port)
-        self._recorder = recorder
         self._line = None if port == "-" else open_line(port, baudrate)
-        recorder.add_text(name)
+
+    def open(self, recorder: SessionRecorder) -> None:
+        self._recorder = recorder
+        recorder.add_text(self.name)
 
     def close(self) -> None:
         if self._line is not None:
@@ -204,8 +207,8 @@ def _standard_input(timeout_s: float) -> bytes | None:
 class Session:
     """What is recorded: one module into files of its own, or all into one MCAP file.
 
-    Older files are removed only when all modules are set up: one that does not answer must not cost
-    an older recording.
+    Older files are removed only when all modules are set up and all lines are open: one that does
+    not answer must not cost an older recording.
 
     Parameters
     ----------
@@ -270,7 +273,10 @@ class Session:
                     for module in self.modules:
                         with self._naming(module):
                             module.open(opened, self._arguments)
-                    self._open_files(opened)
+                    for name, port, baudrate in self._arguments.text:
+                        self.texts.append(_RecordedText(self, name, port, baudrate))
+                        opened.callback(self.texts[-1].close)
+                    self._open_files()
                     with stop:
                         for module in self.modules:
                             with self._naming(module):
@@ -332,7 +338,7 @@ class Session:
                 raise
             raise CommandFailed(f"{module.name}: {error}") from error
 
-    def _open_files(self, opened: ExitStack) -> None:
+    def _open_files(self) -> None:
         """Remove older files if that is allowed, and make new ones; RecordingError if not."""
         remove_older(self._paths, replace=self._arguments.force)
         self._were_there = {path: path.exists() for path in self._paths}
@@ -340,10 +346,9 @@ class Session:
             (module,) = self.modules
             self.recorder.open(module.port, module.mode.parameter_file)
             return
-        self.recorder = recorder = SessionRecorder(self._paths[0])
-        for name, port, baudrate in self._arguments.text:
-            self.texts.append(_RecordedText(self, recorder, name, port, baudrate))
-            opened.callback(self.texts[-1].close)
+        self.recorder = SessionRecorder(self._paths[0])
+        for text in self.texts:
+            text.open(self.recorder)
 
     def _run(self, stop: StopFlag) -> str:
         """Let the sources run until something ends it; returns what."""
@@ -359,8 +364,12 @@ class Session:
                 if source.ident is not None:  # it was started
                     source.join()
             progress.finish(self.numbers)
+        for source in self.sources:
+            if source.crash is not None:
+                raise source.crash
         for module in self.modules:
-            if ended_by == "duration" and not module.recorded:
+            is_silent = not module.recorded and module.failure is None
+            if ended_by == "duration" and is_silent:
                 limit = f"{self._arguments.duration:g} s"
                 module.fail(ResponseTimeout(f"the module sent nothing to record in {limit}"))
             if self.is_of_one and module.failure is not None:

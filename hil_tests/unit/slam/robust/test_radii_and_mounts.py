@@ -254,6 +254,9 @@ def test_the_radius_of_many_detections_is_their_median(stated: float, sigma: flo
     values = np.array([0.28, 0.29, 0.3, 0.31, 0.9])
     middle, found = pooled(values, np.full(5, stated))
     assert middle == 0.3
+    # Detections that know nothing do not count.
+    vague = np.append(values, [0.0] * 6), np.append(np.full(5, stated), [1e3] * 6)
+    assert pooled(*vague) == (middle, found)
     assert found == pytest.approx(sigma * math.sqrt(1.0 / 5.0 + 1.0 / 10.0))
 
 

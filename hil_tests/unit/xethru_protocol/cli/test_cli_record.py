@@ -19,6 +19,7 @@ from hil_tests.unit.xethru_protocol.recordings.messages import counters
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
+from xethru_protocol.cli.record.modes import RawFrames
 from xethru_protocol.cli.record.session import Session
 from xethru_protocol.recordings import (
     describe_recording,
@@ -453,3 +454,26 @@ def test_progress_is_a_line_now_and_then_elsewhere(capsys: Capture) -> None:
         progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc] # mypy has no type for it
     progress.finish(lambda: "done")
     assert capsys.readouterr().err == "xethru record: 1 frames\nxethru record: 3 frames\n"
+
+
+def test_an_error_that_nobody_expected_is_no_success(
+    module: PtyModule, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wait(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(RawFrames, "wait", wait)
+    with pytest.raises(ZeroDivisionError):
+        main(["record", "--port", module.path, "--out", str(tmp_path / "r"), "--duration", "5"])
+
+
+def test_a_line_of_text_that_is_not_there_costs_no_older_file(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    older = tmp_path / "all.mcap"
+    older.write_bytes(b"older")
+    text = f"imu={tmp_path / 'none'}"
+    port = f"a={module.path}"
+    assert main(["record", "--port", port, "--text", text, "--out", str(older), "--force"]) == 1
+    assert "none" in capsys.readouterr().err
+    assert older.read_bytes() == b"older"
