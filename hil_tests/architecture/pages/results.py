@@ -34,17 +34,18 @@ version but for what is named, are
   when they were so, too. A miss lowered the score of a landmark by 1 then, not by 1.5, and, but in
   the rooms with pillars, images did not know of echoes that the sampler cuts off.
 
-In all but the first, slips where one motion follows on another were not seen, and what was assigned
-in a slip stayed in the whole run.
+All of them are of before radii of landmarks were taken from their wavefronts. In all but the first,
+slips where one motion follows on another were not seen, and what was assigned in a slip stayed in
+the whole run.
 
 Of the runs in the other tables some were looked at: `lab` and `classroom` with seeds 0 to 17, 31
 and 38, from which the weight of ranges was chosen; `corridor`, `store` and `two_rooms` with seeds 0
 and 1, for the rules of walls and thick targets.
 
 The other tables of preset `robust` are older and without images, as `robust.patches=false` in their
-commands says. Since then, besides, carries are judged by all ranges and a run whose constants are
-implausible takes bodies for thicker, which `First, do no harm` has, too. All of them are of before
-slips left the pose uncertain, and of before eight constants were replaced by others.
+commands says, and had walls of single ranges. Since then, besides, carries are judged by all
+ranges, which `First, do no harm` has, too. All of them are of before slips left the pose uncertain,
+and of before eight constants were replaced by others.
 
 What the columns mean:
 
