@@ -298,10 +298,11 @@ class Trial:
         self._device.plug(self._now_ns)
         self._now_ns += 10 * SECOND
         self._timed(lambda: self._device.advance(self._now_ns))
-        while not self._module.listens or self._module.module.state is ModuleState.BOOTLOADER:
-            self._come_back()
         line, host = Connection(Role.HOST), Connection(Role.HOST)
         for _ in range(3000):  # a false NoEscape start may wait for as many bytes
+            # A command that waited behind a slow one may start the bootloader now.
+            while not self._module.listens or self._module.module.state is ModuleState.BOOTLOADER:
+                self._come_back()
             if self._device.wants_data:
                 self._timed(lambda: self._device.receive_data(line.send(Ping()), self._now_ns))
             for _ in range(60):
