@@ -58,9 +58,12 @@ from slam.robust.association import (
     point_variances,
 )
 from slam.robust.parameters import (
+    MOST_RADII,
     NEIGHBOURHOOD_M,
     SIGMA_PER_MEDIAN,
     TAIL_PROBABILITY,
+    THICK_SIGMAS,
+    VAGUE_RADIUS,
     BackEndParameters,
     RangeNoise,
     TrackletRule,
@@ -85,9 +88,6 @@ _KNOWN_SHARE = 0.1
 SEEN = -1
 # Room for ranges of one radar in one frame, at first
 _FEWEST_SLOTS = 8
-# What many measurements of one radius count as at most, and how many times the least standard
-# deviation is vague; from how many on a radius is not zero
-_MOST_INDEPENDENT, _VAGUE, _THICK_SIGMAS = 10, 3.0, 3.0
 # Gauss-Newton steps of a fit of a law, its damping, the smallest share of a step that is tried, and
 # the decrease of chi-square that ends a fit; what keeps matrices regular
 _STEPS, _DAMPING, _LEAST_SHARE, _LEAST_DECREASE, _FLOOR = 8, 1e-6, 1e-3, 1e-4, 1e-12
@@ -281,26 +281,26 @@ class BodyPoint(BodyTarget):
     outward: Array | None = None
 
 
-def pooled(values: Array, sigmas: Array) -> tuple[float, float]:
-    """Return the median of measurements (k,) of one thing, and its standard deviation.
+def median_radius(radii_m: Array, sigmas_m: Array) -> tuple[float, float]:
+    """Return the median of the radii of one landmark [m] and its standard deviation [m].
 
-    Some of them are of something else, and those that are vague beside the best do not count. They
-    err as they scatter about the median, or as is stated if that is more; a part of the errors is
-    alike, as if there were `_MOST_INDEPENDENT`.
+    Radii and their standard deviations have shape (k,). Some are of something else, and those that
+    are vague beside the best do not count. They err as they scatter about the median, or as is
+    stated if that is more; a part of the errors is alike.
     """
-    values, sigmas = np.array([values, sigmas])[:, sigmas <= _VAGUE * sigmas.min()]
-    middle = float(np.median(values))
-    scatter = SIGMA_PER_MEDIAN * float(np.median(np.abs(values - middle)))
-    sigma = max(scatter, float(np.median(sigmas)))
-    return middle, sigma * math.sqrt(1.0 / len(values) + 1.0 / _MOST_INDEPENDENT)
+    radii_m, sigmas_m = np.array([radii_m, sigmas_m])[:, sigmas_m <= VAGUE_RADIUS * sigmas_m.min()]
+    middle_m = float(np.median(radii_m))
+    scatter_m = SIGMA_PER_MEDIAN * float(np.median(np.abs(radii_m - middle_m)))
+    sigma_m = max(scatter_m, float(np.median(sigmas_m)))
+    return middle_m, sigma_m * math.sqrt(1.0 / len(radii_m) + 1.0 / MOST_RADII)
 
 
 def is_thick(radius_m: float | Array, sigma_m: float | Array) -> bool | NDArray[np.bool_]:
-    """Return whether a radius, of some standard deviation, is that of a thick thing.
+    """Return whether radii [m] with standard deviations [m], of one shape, are of thick things.
 
-    If it is not, the prior of radii takes it for thin: that is likelier then.
+    The prior of radii takes others for thin: that is likelier then.
     """
-    return radius_m > _THICK_SIGMAS * sigma_m
+    return radius_m > THICK_SIGMAS * sigma_m
 
 
 def fused(
@@ -887,7 +887,7 @@ class TentativePoint:
 
         Most things are thin, as the prior has it; what is seen to be thick has any radius.
         """
-        radius_m, sigma_m = pooled(
+        radius_m, sigma_m = median_radius(
             np.array([one.radius_m for one in self.seen]),
             np.array([one.radius_sigma_m for one in self.seen]),
         )

@@ -33,6 +33,12 @@ TAIL_PROBABILITY: Annotated[float, Origin.QUANTILE] = 1e-3
 """Probability with which a test rejects what is true."""
 MARGIN_NATS: Annotated[float, Origin.QUANTILE] = 3.0
 """Logarithm of how many times likelier than any other an explanation must be: twenty times."""
+MOST_RADII: Annotated[int, Origin.CHOSEN] = 10
+"""What any number of radii that wavefronts show of one landmark count as, at most."""
+VAGUE_RADIUS: Annotated[float, Origin.CHOSEN] = 3.0
+"""How many times the least standard deviation of such radii may be, for a radius to count."""
+THICK_SIGMAS: Annotated[float, Origin.CHOSEN] = 3.0
+"""From how many standard deviations on a radius is that of a thick thing."""
 SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 

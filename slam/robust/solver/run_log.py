@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import between, compose, wrap_angle, wrap_angles
-from slam.robust.initialisation import PointDetection, Sightings, pooled
+from slam.robust.initialisation import PointDetection, Sightings, median_radius
 from slam.robust.map import SURE, MapPrior, fixed_values
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.solver.growing_arrays import PackedRows
@@ -540,7 +540,7 @@ def _shown_radii(ranges: NDArray[np.void], of_range: Indices, n: int) -> tuple[A
     order = np.argsort(rows, kind="stable")
     of_landmark, begins = np.unique(rows[order], return_index=True)
     for row, mine in zip(of_landmark.tolist(), np.split(seen[order], begins[1:]), strict=False):
-        radii_m[row], sigmas_m[row] = pooled(mine["radius_m"], mine["radius_sigma_m"])
+        radii_m[row], sigmas_m[row] = median_radius(mine["radius_m"], mine["radius_sigma_m"])
     return radii_m, sigmas_m
 
 

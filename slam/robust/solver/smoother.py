@@ -461,7 +461,7 @@ class Smoother:
         radii = layout.radii if layout.has_radii else slice(0, 0)
         # Those of a map have its prior.
         self._radii = np.setdiff1d(np.arange(layout.size)[radii], problem.known_at)
-        # Radii and deviations as wavefronts show them; of what is not thin, these are all there is
+        # Radii and deviations as wavefronts show them; thick things have no other prior
         self._shown, self._shown_sigmas = np.zeros(layout.size), np.full(layout.size, math.inf)
         prices = np.ones(layout.size)
         if len(problem.radii_m):

@@ -20,8 +20,8 @@ from slam.robust.initialisation import (
     PointDetection,
     TentativePoint,
     initialise_landmark,
+    median_radius,
     point_rows,
-    pooled,
 )
 from slam.robust.map import apply_merge
 from slam.robust.parameters import BackEndParameters, RangeNoise
@@ -252,11 +252,11 @@ def test_a_thin_radius_is_weighed_against_the_prior_and_a_thick_one_is_not() -> 
 def test_the_radius_of_many_detections_is_their_median(stated: float, sigma: float) -> None:
     """One of five is of something else; half of the others are within 0.01 of the median."""
     values = np.array([0.28, 0.29, 0.3, 0.31, 0.9])
-    middle, found = pooled(values, np.full(5, stated))
+    middle, found = median_radius(values, np.full(5, stated))
     assert middle == 0.3
     # Detections that know nothing do not count.
     vague = np.append(values, [0.0] * 6), np.append(np.full(5, stated), [1e3] * 6)
-    assert pooled(*vague) == (middle, found)
+    assert median_radius(*vague) == (middle, found)
     assert found == pytest.approx(sigma * math.sqrt(1.0 / 5.0 + 1.0 / 10.0))
 
 
