@@ -5,7 +5,6 @@ port that another program has open must not be touched, so whatever opens the po
 checks that look for such programs.
 """
 
-import json
 import os
 import textwrap
 from argparse import Namespace
@@ -24,7 +23,7 @@ from xethru_protocol.cli.port_probe import (
     run_checks,
 )
 from xethru_protocol.operating_system import one_line
-from xethru_protocol.transport import find_ports, is_private, is_running, run_directory
+from xethru_protocol.transport import find_ports, is_private, run_directory
 from xethru_protocol.wire.codes import POWER_UP_BAUD, PongCode, ProfileId, SensorMode
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.messages import Ping
@@ -37,46 +36,6 @@ class Machine:
 
     ports: tuple[str, ...]
     run_directory: Path
-
-    @property
-    def stale(self) -> tuple[Path, ...]:
-        """Entries of emulators that have ended."""
-        return tuple(
-            entry
-            for entry in self._entries("*")
-            if (pid := _process_id(entry)) is not None and not is_running(pid)
-        )
-
-    @property
-    def damaged(self) -> tuple[Path, ...]:
-        """Entries of running emulators that cannot be read."""
-        return tuple(
-            entry
-            for entry in self._entries("*.json")
-            if entry not in self.stale and not _is_readable(entry)
-        )
-
-    def _entries(self, pattern: str) -> list[Path]:
-        folder = self.run_directory
-        return sorted(folder.glob(pattern)) if is_private(folder) else []
-
-
-def _process_id(entry: Path) -> int | None:
-    """Process an entry belongs to: ``<pid>.json`` or ``ports-<pid>-...``; None if it is neither."""
-    if entry.suffix == ".json":
-        text = entry.stem
-    elif entry.name.startswith("ports-"):
-        text = entry.name.split("-")[1]
-    else:
-        return None
-    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else None
-
-
-def _is_readable(entry: Path) -> bool:
-    try:
-        return isinstance(json.loads(entry.read_text()), dict)
-    except (OSError, ValueError, RecursionError):
-        return False
 
 
 MACHINE_CHECKS: list[Check[Machine]] = []
@@ -113,28 +72,6 @@ def _not_private(machine: Machine) -> str | None:
     if is_private(folder) or not os.path.lexists(folder):
         return None
     return f"{folder} is not this user's alone: its list of emulators is ignored"
-
-
-@_machine_check(
-    "no dead emulators",
-    looks_at="processes named in the run directory",
-    remedy="start an emulator, which removes them, or run: rm -r {stale}",
-)
-def _stale_entries(machine: Machine) -> str | None:
-    if not machine.stale:
-        return None
-    return f"{machine.run_directory} still holds entries of emulators that have died"
-
-
-@_machine_check(
-    "emulators' word readable",
-    looks_at="entries of the run directory",
-    remedy="stop that emulator and run: rm {damaged}",
-)
-def _damaged_entries(machine: Machine) -> str | None:
-    if not machine.damaged:
-        return None
-    return "the entry of a running emulator cannot be read"
 
 
 @_local_port_check(

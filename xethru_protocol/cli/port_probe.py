@@ -106,8 +106,6 @@ class _Attributes(dict[str, object]):
 
     def __missing__(self, name: str) -> object:
         value = getattr(self._named, name)
-        if isinstance(value, tuple):
-            return shlex.join(map(str, value))
         return shlex.quote(str(value)) if isinstance(value, str | Path) else value
 
 

@@ -388,26 +388,6 @@ def test_a_machine_without_modules(capsys: Capture, monkeypatch: pytest.MonkeyPa
     assert (code, report["subject"], finding["check"]) == (1, "this machine", "modules found")
 
 
-def test_what_dead_emulators_left(
-    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "xethru"
-    folder.mkdir(mode=0o700)
-    dead = 1 << 22  # above any process id
-    stale = [folder / f"{dead}.json", folder / f"ports-{dead}-abc"]
-    stale[0].write_text("{}")
-    stale[1].mkdir()
-    (folder / "notes.txt").touch()  # not an emulator's
-    (folder / f"{os.getpid()}.json").write_text("[" * 100_000)
-    code, reports = examined(capsys)
-    findings = {check["check"]: check for check in not_well(reports[-1])}
-    assert code == 1
-    found = findings["no dead emulators"]
-    assert shlex.split(found["remedy"])[-4:] == ["rm", "-r", *map(str, stale)]
-    damaged = shlex.join(["rm", str(folder / f"{os.getpid()}.json")])
-    assert damaged in findings["emulators' word readable"]["remedy"]
-
-
 def test_all_found_ports_are_examined(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
