@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,13 +34,9 @@ from emulator.module.outbox import LosslessOutbox, MessageStream
 from emulator.module.state import Module
 from emulator.scene.scene import empty_room
 from emulator.x4m300 import Device
-from xethru_protocol.recordings import (
-    RadarFacts,
-    RecordingError,
-    RecordingFault,
-    read_recording,
-    recording_radars,
-)
+from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.recordings import RecordingError, RecordingFault, read_recording
+from xethru_protocol.recordings.formats import recording_content
 from xethru_protocol.recordings.recorded_messages import TimedMessages
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import BootloaderReply, ResponseCode, SensorMode, X4Setting
@@ -428,29 +424,28 @@ def played_radars(
         When the recording cannot be read, holds nothing to play or would play for weeks.
     """
     surveys: list[_Survey] = []
-    for facts in recording_radars(recording) or (RadarFacts(),):
-        surveys.append(_Survey(recording, facts, on_fault))
+    for name, about in (recording_content(recording).radars or {"": {}}).items():
+        surveys.append(_Survey(recording, name or None, about, on_fault))
         on_fault = _reported_already
     zero_ns = min((s.first_ns for s in surveys if s.first_ns is not None), default=0)
     _check(recording, surveys, zero_ns, rate=rate, loop=loop)
     end_ns = max(survey.offset_ns(zero_ns) + survey.lasts_ns for survey in surveys)
     playing = [survey for survey in surveys if survey.plays]
-    names = _port_names([survey.facts.name for survey in playing])
+    port_names = _port_names([survey.name for survey in playing])
     played = []
-    for name, survey in zip(names, playing, strict=True):
+    for port_name, survey in zip(port_names, playing, strict=True):
         offset_ns = survey.offset_ns(zero_ns)
         stream = PlayStream(
-            _Program(recording, survey.facts.name, offset_ns, warn),
+            _Program(recording, survey.name, offset_ns, warn),
             # rounds of all radars are equally long, so that a loop keeps them in step
             loop_gap_ns=end_ns - offset_ns - survey.lasts_ns + NOMINAL_PERIOD_NS,
             rate=rate,
         )
         stream.set_loop(loop, 0)
-        serial = survey.facts.serial or ""
-        serial = serial if _SERIAL.fullmatch(serial) else _NO_SERIAL
+        serial = survey.serial
         module = Module(Identity(serial=serial), _chip(recording, survey, warn))
         device = Device(module, stream, LosslessOutbox())
-        played.append(PlayedRadar(name=name, serial=serial, device=device, stream=stream))
+        played.append(PlayedRadar(name=port_name, serial=serial, device=device, stream=stream))
     return tuple(played)
 
 
@@ -458,16 +453,20 @@ class _Survey:
     """What one reading of a radar's recording shows, before anything is played."""
 
     def __init__(
-        self, recording: Path, facts: RadarFacts, on_fault: Callable[[RecordingFault], None]
+        self,
+        recording: Path,
+        name: str | None,
+        about: Mapping[str, Any],
+        on_fault: Callable[[RecordingFault], None],
     ) -> None:
-        self.facts = facts
+        self.name = name
+        self.serial, self.area_m = _described(about)
         self.messages = 0
         self.plays = False
         self.first_ns: int | None = None
         self.lasts_ns = 0
         self.frame_sizes: Counter[int] = Counter()
-        self.area_m = facts.area_m
-        records = read_recording(recording, on_fault, radar=facts.name)
+        records = read_recording(recording, on_fault, radar=name)
         for timed in schedule(self._played(records)):
             self.plays = True
             self.lasts_ns = timed.time_ns
@@ -488,6 +487,25 @@ class _Survey:
                 if not self.plays:
                     self.first_ns = stamp_ns
                 yield message, stamp_ns
+
+
+def _described(about: Mapping[str, Any]) -> tuple[str, tuple[float, float] | None]:
+    """Return serial number and frame area [module metres] in a radar's description, if valid."""
+    try:
+        bin_m = float(about["bin_length_m"])
+        area_m = FrameGeometry(
+            range_start_m=float(about["range_start_m"]),
+            bin_length_m=bin_m,
+            n_bins=int(about["n_bins"]),
+            downconversion=bin_m > 4 * x4.RF_BIN_M,
+        ).area_m
+    except (KeyError, ValueError, TypeError, OverflowError):
+        return _NO_SERIAL, None
+    serial = about.get("serial")
+    return (
+        serial if isinstance(serial, str) and _SERIAL.fullmatch(serial) else _NO_SERIAL,
+        area_m if all(map(math.isfinite, area_m)) else None,
+    )
 
 
 def _check(

@@ -15,12 +15,10 @@ from xethru_protocol.recordings.formats import (
     read_recording,
     recording_facts,
     recording_format,
-    recording_radars,
 )
 from xethru_protocol.recordings.frame_layout import FrameLayout
 from xethru_protocol.recordings.loading import RadarArrays, Recording, TextColumn, load
 from xethru_protocol.recordings.recorded_messages import (
-    RadarFacts,
     RecordingError,
     RecordingFacts,
     RecordingFault,
@@ -40,7 +38,6 @@ __all__ = [
     "Conversion",
     "FrameLayout",
     "RadarArrays",
-    "RadarFacts",
     "Record",
     "Recorder",
     "Recording",
@@ -64,6 +61,5 @@ __all__ = [
     "read_recording",
     "recording_facts",
     "recording_format",
-    "recording_radars",
     "session_directory",
 ]

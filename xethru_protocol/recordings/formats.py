@@ -1,12 +1,10 @@
 """Every kind of recording: which kind a path is, its messages, its summary."""
 
-import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import starmap
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from xethru_protocol.recordings import wire_capture
 from xethru_protocol.recordings.array_files import is_array_file
@@ -17,7 +15,6 @@ from xethru_protocol.recordings.recorded_messages import (
     RERUN_MAGIC,
     WIRE_MAGIC,
     FaultHandler,
-    RadarFacts,
     RecordingContent,
     RecordingError,
     RecordingFacts,
@@ -35,7 +32,6 @@ from xethru_protocol.recordings.vendor.reader import (
     vendor_facts,
 )
 from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
-from xethru_protocol.wire.x4 import RF_BIN_M
 
 RecordingFormat = Literal["vendor", "wire", "mcap"]
 
@@ -122,7 +118,7 @@ def read_recording(
         Called with what could not be read; the rest is read all the same. None: what costs
         messages raises, what costs only times passes.
     radar
-        Which radar's, by its name in `recording_radars`; needed where there are several.
+        Which radar's, by its name in `recording_content`; needed where there are several.
     """
     path = Path(path)
     found = recording_format(path)
@@ -144,29 +140,6 @@ def read_recording(
 def refuse_name(path: Path, radar: str | None) -> None:
     if radar is not None:
         raise RecordingError(f"{path} is of one radar and names none; leave the name out")
-
-
-def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
-    """Return the radars of a recording; only a session (MCAP) has several, and names them."""
-    return tuple(starmap(_radar_facts, recording_content(path).radars.items()))
-
-
-def _radar_facts(key: str, info: Mapping[str, Any]) -> RadarFacts:
-    """Read the description of a radar; facts without content if it is invalid."""
-    name = key or None
-    try:
-        start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
-        # the read-back of baseband ends at the last bin, that of RF one behind it
-        steps = int(info["n_bins"]) - (bin_m > 4 * RF_BIN_M)
-        area_m = start_m, start_m + bin_m * steps
-    except (KeyError, ValueError, TypeError, OverflowError):
-        return RadarFacts(name=name)
-    serial = info.get("serial")
-    return RadarFacts(
-        name=name,
-        serial=serial if isinstance(serial, str) and serial else None,
-        area_m=area_m if all(map(math.isfinite, area_m)) else None,
-    )
 
 
 def recording_content(path: Path | str) -> RecordingContent:

@@ -153,19 +153,6 @@ TimedMessages = Iterator[Timed]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RadarFacts:
-    """Facts about one radar of a recording; None where unknown.
-
-    ``area_m`` is the frame area as the module read it back [module metres]. A recording of one
-    module has no ``name`` for it.
-    """
-
-    name: str | None = None
-    serial: str | None = None
-    area_m: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingContent:
     """The radars of a recording by name, and lines of other sensors, each with its time [ns].
 

@@ -20,7 +20,8 @@ from emulator.playback import (
 from hil_tests.unit.emulator.doubles import BareHost
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.recordings import RecordingError, read_recording, recording_radars
+from xethru_protocol.recordings import RecordingError, read_recording
+from xethru_protocol.recordings.formats import recording_content
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, pack_array, pack_string
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import InfoItem, X4Setting
@@ -267,7 +268,7 @@ def test_a_name_that_would_be_a_strange_file_is_not_used(name: str, tmp_path: Pa
 def test_one_radar_of_a_session_is_read_by_its_name(tmp_path: Path) -> None:
     session(tmp_path)
     path = tmp_path / "session.mcap"
-    assert [facts.name for facts in recording_radars(path)] == ["left", "right"]
+    assert list(recording_content(path).radars) == ["left", "right"]
     read = list(read_recording(path, radar="right"))
     assert [message for message, _ in read] == [
         m.DataFloat(info=counter, values=samples(1, counter)) for counter in range(6)
@@ -286,5 +287,10 @@ def test_an_info_that_makes_no_sense_costs_only_itself(tmp_path: Path) -> None:
             writer.add_message(about, 0, data, 0)
         writer.add_message(frames, 0, pack_array(FLOAT_ARRAY, samples(0, 0)), 0)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
-    (facts,) = recording_radars(tmp_path / "x.mcap")
-    assert (facts.name, facts.serial, facts.area_m) == ("a", None, None)
+    warned: list[str] = []
+    (radar,) = played_radars(
+        tmp_path / "x.mcap", on_fault=lambda fault: pytest.fail(fault.reason), warn=warned.append
+    )
+    assert radar.serial == "0" * 12
+    (line,) = warned
+    assert "does not say where its radar frames lie" in line

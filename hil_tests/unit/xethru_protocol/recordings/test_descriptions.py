@@ -9,9 +9,10 @@ import pytest
 from emulator.chip import Pace
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
+from emulator.playback import played_radars
 from emulator.scene.scene import load_scene
 from emulator.x4m300 import radar_device
-from hil_tests.unit.emulator.doubles import IDENTITY
+from hil_tests.unit.emulator.doubles import IDENTITY, BareHost
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from hil_tests.unit.xethru_protocol.recordings.messages import MS, frame
 from xethru_protocol.cli import main
@@ -23,8 +24,9 @@ from xethru_protocol.recordings import (
     convert,
     load,
     read_recording,
-    recording_radars,
 )
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.x4 import real_frame_rate
 
 ABOUT = "xethru_radar.json"
@@ -62,8 +64,10 @@ def test_a_recorder_keeps_what_the_driver_knew(
     check(directory, area_m)
     (file,) = directory.glob("xethru_datafloat_*")
     check(file, area_m)
-    (facts,) = recording_radars(directory)
-    assert facts.area_m == pytest.approx(area_m, abs=1e-6), "a player sets its module up so"
+    (played,) = played_radars(directory, on_fault=lambda fault: pytest.fail(fault.reason))
+    answer = BareHost(played.device).ask(m.X4DriverGet(setting=X4Setting.FRAMEAREA))
+    assert isinstance(answer, m.ReplyFloat)
+    assert answer.values == pytest.approx(area_m, abs=1e-6)
 
 
 @pytest.mark.parametrize(
