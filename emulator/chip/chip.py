@@ -719,7 +719,7 @@ def _largest_counter(capture: CaptureSettings) -> int:
     return pulses * (capture.dac_max - capture.dac_min + 1)
 
 
-def _normalisation(settings: ChipSettings) -> x4.Normalisation:
+def normalisation(settings: ChipSettings | CaptureSettings) -> x4.Normalisation:
     """Return counts to values (protocol reference 9.7); without pulses nothing is counted."""
     if settings.iterations * settings.pulses_per_step == 0:
         return x4.Normalisation(quantum=0.0, dac_offset=0.0, max_counter=0)
@@ -735,8 +735,8 @@ def _normalisation(settings: ChipSettings) -> x4.Normalisation:
 def _rf_values(
     raw: NDArray[np.int64], settings: ChipSettings, area: x4.FrameArea
 ) -> NDArray[np.float32]:
-    normalisation = _normalisation(settings)
-    quantum, middle = np.float32(normalisation.quantum), np.float32(normalisation.dac_offset)
+    unit = normalisation(settings)
+    quantum, middle = np.float32(unit.quantum), np.float32(unit.dac_offset)
     return raw.astype(np.float32) * quantum - middle
 
 
@@ -747,7 +747,7 @@ def _baseband_values(
     i_raw, q_raw = downconvert(raw, taps, area.first_index % 2)
     # the driver multiplies both factors first, each step in float32
     per_sum = np.float32(1.0) / np.float32(taps.absolute_sum)
-    factor = np.float32(_normalisation(settings).quantum) * per_sum
+    factor = np.float32(normalisation(settings).quantum) * per_sum
     i_values = i_raw.astype(np.float32) * factor
     q_values = -(q_raw.astype(np.float32) * factor)
     return np.concatenate([i_values, q_values], axis=1)

@@ -60,7 +60,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.chip.chip import CaptureSettings
+from emulator.chip.chip import CaptureSettings, normalisation
 from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.scene.philox import (
     UNITS_PER_SIGMA,
@@ -547,13 +547,7 @@ class Receiver:
         -------
         Shape (n_frames, capture.n_samples), int64, clipped to [0, largest counter].
         """
-        normalisation = x4.Normalisation.of(
-            iterations=capture.iterations,
-            pulses_per_step=capture.pulses_per_step,
-            dac_min=capture.dac_min,
-            dac_max=capture.dac_max,
-            dac_step=capture.dac_step,
-        )
+        unit = normalisation(capture)
         self._clutter.add_to(signal, scene_times_ns, capture, gain)
         units = frame_noise_units(indices, capture.n_samples, seed=self._seed, stream=self._stream)
         per_unit = noise_sigma(self._noise, capture) / UNITS_PER_SIGMA
@@ -564,10 +558,10 @@ class Receiver:
             part = slice(first, first + _FRAMES_AT_ONCE)
             counts = units[part] * per_unit
             counts += signal[part]
-            counts += normalisation.dac_offset
+            counts += unit.dac_offset
             counts *= per_count
             np.rint(counts, out=counts)
             np.maximum(counts, 0, out=counts)
-            np.minimum(counts, normalisation.max_counter, out=counts)
+            np.minimum(counts, unit.max_counter, out=counts)
             counters[part] = counts
         return counters

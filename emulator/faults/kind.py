@@ -31,10 +31,9 @@ from xethru_protocol.wire.framing import (
     NO_ESCAPE_HEADER_BYTES,
     NO_ESCAPE_START,
     START,
-    encode_no_escape,
     unescape,
 )
-from xethru_protocol.wire.messages import Command, Response
+from xethru_protocol.wire.messages import Command, DataFloat, Response
 
 RfSamples = NDArray[np.float32]
 
@@ -44,7 +43,6 @@ SEEN_IN_TIMES = "nothing; the arrival times show it"
 NO_TIME_IN_FRAMES = "Frames carry no time; only when they arrive shows it."
 
 _FRAME = struct.Struct("<4sIxBBIII")
-_PAYLOAD = struct.Struct("<BBIII")
 _REPLIES = frozenset(
     {
         ResponseCode.XTS_SPR_PONG,
@@ -92,7 +90,7 @@ def frame_counter(packet: bytes) -> int | None:
     is_frame = (
         magic == NO_ESCAPE_START
         and (code, kind, content_id) == (ResponseCode.XTS_SPR_DATA, ElementType.XTS_SPRD_FLOAT, 0)
-        and length == len(packet) - NO_ESCAPE_HEADER_BYTES == _PAYLOAD.size + 4 * count
+        and len(packet) == NO_ESCAPE_HEADER_BYTES + length == _FRAME.size + 4 * count
     )
     return counter if is_frame else None
 
@@ -104,14 +102,7 @@ def frame_samples(packet: bytes) -> RfSamples:
 
 def frame_packet(counter: int, samples: RfSamples) -> bytes:
     """Return a radar frame in NoEscape framing; the counter wraps at 2**32."""
-    head = _PAYLOAD.pack(
-        ResponseCode.XTS_SPR_DATA,
-        ElementType.XTS_SPRD_FLOAT,
-        0,
-        counter % COUNTERS,
-        samples.size,
-    )
-    return encode_no_escape(head + samples.astype("<f4", copy=False).tobytes())
+    return response_bytes(DataFloat(info=counter % COUNTERS, values=samples))
 
 
 def normal_payload(packet: bytes) -> bytes | None:

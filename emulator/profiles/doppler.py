@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from emulator.chip.chip import Chip, EchoSource
 from emulator.scene.scene import NoiseSpec
+from xethru_protocol.processing.doppler import hann
 from xethru_protocol.processing.downconversion import CHANNELS
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import MatrixInstance, X4Setting
@@ -157,12 +158,6 @@ class Matrix:
         return -(self.pulses // 2) * self.step_hz
 
     @property
-    def window(self) -> NDArray[np.float64]:
-        """Hann window, shape (pulses,)."""
-        angle = 2 * np.pi * np.arange(self.pulses) / self.pulses
-        return np.asarray(0.5 - 0.5 * np.cos(angle), dtype=np.float64)
-
-    @property
     def moving(self) -> NDArray[np.bool_]:
         """Which frequencies are movement, shape (pulses,)."""
         return np.abs(np.arange(self.pulses) - self.pulses // 2) > self.notch
@@ -178,7 +173,8 @@ class SlowTime:
 
     def __init__(self, matrix: Matrix) -> None:
         self._matrix = matrix
-        self._window = matrix.window[:, np.newaxis] / matrix.window.sum()
+        window = hann(matrix.pulses)
+        self._window = window[:, np.newaxis] / window.sum()
         self.clear()
 
     def clear(self) -> None:
@@ -291,7 +287,7 @@ def default_noise_map(n_bins: int, tx_center_frequency: int) -> NoiseMap:
     variance = 2 * gain * NoiseSpec().rf_sigma ** 2
     power = {}
     for matrix in MATRICES:
-        window = matrix.window
+        window = hann(matrix.pulses)
         # the power at one frequency of white noise of variance 1 per frame
         noise_gain = float((window**2).sum() / window.sum() ** 2) / matrix.decimation
         power[matrix.instance] = np.full((n_bins, matrix.pulses), variance * noise_gain)

@@ -42,6 +42,7 @@ from emulator.profiles.doppler import (
     ProfileSweep,
     SlowTime,
 )
+from xethru_protocol.processing.doppler import hann
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import MatrixInstance, PresenceDirection, PresenceState
 from xethru_protocol.wire.x4 import SPEED_OF_LIGHT_MPS
@@ -189,7 +190,7 @@ def _mean_power(frames: NDArray[np.complex128]) -> NDArray[np.float64]:
 
 def _frame_noise(noise_map: NoiseMap) -> NDArray[np.float64]:
     """Return the noise power of one frame per bin, from the map at moving frequencies."""
-    window = FAST.window
+    window = hann(FAST.pulses)
     per_cell = noise_map.power[MatrixInstance.FAST][:, FAST.moving].mean(axis=1)
     scale = float(window.sum() ** 2 / (window**2).sum())
     return np.asarray(per_cell * scale, dtype=np.float64)

@@ -40,6 +40,7 @@ from emulator.profiles.presence import (
     movement_share,
     signal_quality,
 )
+from xethru_protocol.processing.doppler import hann
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import PresenceDirection, PresenceState, RespirationState
@@ -120,8 +121,8 @@ def breathing_rate_hz(
 
     None if it is not clear.
     """
-    window = 0.5 - 0.5 * np.cos(math.tau * np.arange(len(chest_m)) / len(chest_m))
-    power = np.abs(np.fft.rfft((chest_m - chest_m.mean()) * window, _SPECTRUM)) ** 2
+    weighted = (chest_m - chest_m.mean()) * hann(len(chest_m))
+    power = np.abs(np.fft.rfft(weighted, _SPECTRUM)) ** 2
     frequency_hz = np.fft.rfftfreq(_SPECTRUM, 1 / sampling_hz)
     breaths = np.flatnonzero((frequency_hz >= SLOWEST_HZ) & (frequency_hz <= FASTEST_HZ))
     peak = int(breaths[np.argmax(power[breaths])])
