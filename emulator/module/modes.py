@@ -1,12 +1,12 @@
 """The mode machine of an X4M300, and which commands it takes in which state.
 
-``python -m emulator.module.modes`` prints `TRANSITIONS` as a Mermaid state diagram, and the table
-of commands. Assumed: MANUAL and REG unload the profile (their GETs answer as if none were loaded);
-IDLE pauses a profile that was loaded but never run, and is refused like RUN when none is loaded.
+``python -m emulator.module.modes`` prints `TRANSITIONS` as a Mermaid state diagram. Assumed: MANUAL
+and REG unload the profile (their GETs answer as if none were loaded); IDLE pauses a profile that
+was loaded but never run, and is refused like RUN when none is loaded.
 
-Rows and columns of the table are those of protocol reference 8.3, with columns for certification
-mode (as MANUAL), the bare base firmware (2) and the bootloader added, whose own commands
-`emulator.module.bootloader` answers.
+Rows and columns of `PERMISSIONS` are those of protocol reference 8.3, with columns for
+certification mode (as MANUAL), the bare base firmware (2) and the bootloader added, whose own
+commands `emulator.module.bootloader` answers.
 
 Source: protocol reference 2, 4.2, 4.3, 8.2, 8.3 and 8.5.
 """
@@ -322,17 +322,5 @@ def check_permission(command: m.Message, state: ModuleState, options: DeviceOpti
     raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
 
 
-def permission_table() -> str:
-    """Return the table as Markdown, a row per group and a column per state."""
-    lines = [
-        "| Commands | " + " | ".join(state.name for state in _ORDER) + " |",
-        "|" + "---|" * (len(_ORDER) + 1),
-    ]
-    for group, verdicts in PERMISSIONS.items():
-        cells = (verdicts[state].value for state in _ORDER)
-        lines.append(f"| {group.value} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
 if __name__ == "__main__":
-    print(state_diagram() + "\n\n" + permission_table())  # noqa: T201 - this is what running the module is for
+    print(state_diagram())  # noqa: T201 - this is what running the module is for
