@@ -188,7 +188,13 @@ class OdometryTrack(PoseTrack):
     Iterating gives the samples as they came.
     """
 
-    def __init__(self, samples: Iterable[TumSample], *, may_restart: bool = True) -> None:
+    def __init__(
+        self,
+        samples: Iterable[TumSample],
+        *,
+        may_restart: bool = True,
+        may_be_empty: bool = False,
+    ) -> None:
         super().__init__(may_restart=may_restart)
         self._qz, self._qw = array("d"), array("d")  # the quaternion of each sample
         # Of each sample the nine numbers of `noise_at`, if all samples have covariances
@@ -196,7 +202,7 @@ class OdometryTrack(PoseTrack):
         self._n_forgotten = 0
         for sample in samples:
             self.append(sample)
-        if not self._stamps_ns:
+        if not self._stamps_ns and not may_be_empty:
             raise OdometryError("odometry: the source sent no pose")
 
     def __iter__(self) -> Iterator[TumSample]:

@@ -21,7 +21,6 @@ from enum import StrEnum
 from importlib import import_module
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.app.errors import UsageError
 from slam.geometry import MOST_M
@@ -51,7 +50,7 @@ _MOST_WARNINGS = 5
 _ROUNDED = 1e-9  # of the largest eigenvalue, for covariances without full rank
 
 
-class LiveOdometry:
+class LiveOdometry(OdometryTrack):
     """Turns lines into poses, and reports what is wrong with them.
 
     `name` is that of the source in messages, `clock` its clock against the host's, if known; None:
@@ -70,29 +69,17 @@ class LiveOdometry:
     def __init__(
         self, name: str, clock: ClockLine | None = None, *, has_covariance: bool = False
     ) -> None:
+        super().__init__((), may_be_empty=True)
         self._name = name
         self._has_covariance = has_covariance
         self._fixed = clock
         self._envelope = LowerEnvelope()
-        self._track: OdometryTrack | None = None
         self._newest_host_ns: int | None = None  # host time of the newest pose taken
         self._trouble = ""  # why the lines since then were refused
         self._n_warnings = 0
         self.n_refused = 0
         self.ended = False
         self.trouble = ""
-
-    @property
-    def has_pose(self) -> bool:
-        return self._track is not None
-
-    @property
-    def first_ns(self) -> int:
-        return self._whole().first_ns
-
-    @property
-    def last_ns(self) -> int:
-        return self._whole().last_ns
 
     @property
     def drift_ppm(self) -> float | None:
@@ -122,8 +109,8 @@ class LiveOdometry:
             trouble = _covariance_rejection(sample.velocity_covariance)
         if trouble:
             return None, self._refuse(trouble)
-        if self._track is not None and sample.t_ns <= self._track.last_ns:
-            back_s = (self._track.last_ns - sample.t_ns) / NS_PER_S
+        if self and sample.t_ns <= self.last_ns:
+            back_s = (self.last_ns - sample.t_ns) / NS_PER_S
             return None, self._refuse(
                 f"its stamps jumped back by {back_s:.3f} s"
                 if back_s
@@ -136,11 +123,11 @@ class LiveOdometry:
         return sample, warning
 
     def _accept(self, sample: TumSample) -> str:
-        if self._track is None:
-            self._track = OdometryTrack([sample])
+        if not self:
+            self.append(sample)
             return ""
-        before = self._track.last
-        is_restart = self._track.append(sample)
+        before = self.last
+        is_restart = self.append(sample)
         warnings = []
         if self._trouble:
             warnings.append("its lines are sound again")
@@ -174,7 +161,7 @@ class LiveOdometry:
         return ""
 
     def end(self, trouble: str) -> None:
-        if not trouble and self._track is None:
+        if not trouble and not self:
             trouble = f"odometry from {self._name}: ended before its first pose"
             trouble += f": {self._trouble}" if self._trouble else ""
         self.ended, self.trouble = True, trouble
@@ -206,29 +193,7 @@ class LiveOdometry:
         )
 
     def covers(self, t_ns: int) -> bool:
-        return self._track is not None and t_ns <= self._track.last_ns
-
-    def is_known(self, t_ns: int) -> bool:
-        """Return whether the pose at this time lies between two samples close enough."""
-        return self._track is not None and self._track.is_known(t_ns)
-
-    def forget_before(self, t_ns: int) -> None:
-        """Forget what no pose from a session time on depends on."""
-        self._whole().forget_before(t_ns)
-
-    def pose_at(self, t_ns: int) -> NDArray[np.float64]:
-        return self._whole().pose_at(t_ns)
-
-    def noise_at(self, t_ns: int) -> NDArray[np.float64]:
-        return self._whole().noise_at(t_ns)
-
-    def frame_at(self, t_ns: int) -> NDArray[np.float64]:
-        return self._whole().frame_at(t_ns)
-
-    def _whole(self) -> OdometryTrack:
-        if self._track is None:
-            raise OdometryError(f"odometry from {self._name}: no pose came")
-        return self._track
+        return bool(self) and t_ns <= self.last_ns
 
 
 def _rejection(sample: TumSample) -> str:

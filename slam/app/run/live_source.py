@@ -255,11 +255,11 @@ class LiveSource:
             ]
             if silent and waited_s > START_LIMIT_S:
                 raise AppError(f"radar {', '.join(silent)}: no frame in {START_LIMIT_S:g} s")
-            if self._odometry.ended and not self._odometry.has_pose:
+            if self._odometry.ended and not self._odometry:
                 raise AppError(self._odometry.trouble)
             if text := self._odometry.silence(now_ns, self._began_ns):
                 raise AppError(text)
-            if silent or not self._odometry.has_pose:
+            if silent or not self._odometry:
                 continue
             ready_ns = now_ns if ready_ns is None else ready_ns
             if now_ns - ready_ns < SETTLE_S * NS_PER_S:
@@ -378,7 +378,7 @@ class LiveSource:
         self.lost_frames += 0 if last is None else frames_between(last, frame)
         self._last_frames[radar] = frame
         taken_ns = self.clocks[radar].stamp_ns(frame.counter, frame.arrival_ns, frame.stream)
-        if not self._odometry.has_pose:
+        if not self._odometry:
             return  # session time is unknown until then
         made = radar_frame(radar, frame, self._odometry.session_ns(taken_ns), limits=self._limits)
         came_ns = self._odometry.session_ns(frame.arrival_ns)

@@ -296,7 +296,7 @@ def test_where_a_covariance_is_asked_for_lines_without_a_good_one_are_refused(
 ) -> None:
     odometry = LiveOdometry("a test", has_covariance=True)
     assert words in odometry.take(line(1.0) + triangle, 0)[1]
-    assert not odometry.has_pose
+    assert not odometry
     sample, warning = odometry.take(line(1.0) + " 0.01 0 0 0 0 0.02", 0)  # no sideways error at all
     assert sample is not None
     assert sample.velocity_covariance == (0.01, 0.0, 0.0, 0.0, 0.0, 0.02)
