@@ -7,8 +7,9 @@ odom    (n, 3)           pose by the wheels: x, y [mm], heading [rad]
 obsLHS  (n, m, 2)        fixes of the two left radars: distance [mm], bearing [rad], from the body's
 obsRHS  (n, m, 2)        origin and counter-clockwise from forward; of the right ones, unwrapped to
                          pi and more; rows of zeros are empty
-R1..R4  (n, n_bins)      raw frames of the four radars; rows of zeros are missing
 ======  ===============  ========================================================================
+
+Raw frames, which such a file may hold, too, are not read.
 
 Their fixes are points; SLAM here takes ranges. A fix determines the two ranges it is made of, since
 it is where the circles around the two radars of its side meet. A session gets these ranges, each
@@ -30,19 +31,16 @@ from scipy.io import loadmat
 from slam.app.convert.imported_head import imported_info, imported_radar
 from slam.app.convert.rosbag import authors_rig
 from slam.app.session.writer import SessionLog
-from slam.frames import RadarFrame
 from slam.geometry import Mount, RadarPair, Rig
 from slam.live.errors import AppError
-from slam.live.frame_sources import recorded_frame
 from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
 from slam.live.session.reader import describe_kind
-from slam.live.session_records import RadarInfo, Scan
+from slam.live.session_records import Scan
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.validation import reason_of
 
 _MM = 1e-3
 _POSE_UNITS = np.array([_MM, _MM, 1.0])
-_RADARS = range(1, 5)
 
 Array = NDArray[np.float64]
 
@@ -57,14 +55,11 @@ class MatDrive:
         Shape (n, 3): x [m], y [m], heading [rad], odometry frame.
     left, right
         For each state the fixes of that side, shape (k, 2): x [m], y [m], body frame.
-    frames
-        Raw frames by the number of the radar, 1 to 4, shape (n, n_bins), float32; zeros: none.
     """
 
     odometry: Array
     left: tuple[Array, ...]
     right: tuple[Array, ...]
-    frames: dict[int, NDArray[np.float32]]
 
 
 def read_mat(path: Path) -> MatDrive:
@@ -89,16 +84,10 @@ def read_mat(path: Path) -> MatDrive:
         raise AppError(f"{path}: odom is empty, there is no state")
     left = _variable(path, table, "obsLHS", (None, 2), n_states)
     right = _variable(path, table, "obsRHS", (None, 2), n_states)
-    frames = {
-        number: _variable(path, table, f"R{number}", (None,), n_states).astype(np.float32)
-        for number in _RADARS
-        if f"R{number}" in table
-    }
     return MatDrive(
         odometry=odometry * _POSE_UNITS,
         left=tuple(map(_points_of, left)),
         right=tuple(map(_points_of, right)),
-        frames=frames,
     )
 
 
@@ -173,10 +162,10 @@ def convert_mat(
             replace(mount, range_offset_m=0.0),
             range_start_m=0.0,
             bin_length_m=_BIN_M,
-            n_bins=drive.frames[number].shape[1] if number in drive.frames else 0,
+            n_bins=0,
             rate_hz=rate_hz,
         )
-        for number, mount in zip(_RADARS, rig.mounts, strict=True)
+        for mount in rig.mounts
     )
     info = imported_info(mat, radars, preset, time_base="states", has_detections=True)
     poses = [
@@ -194,7 +183,7 @@ def convert_mat(
                     ranges_m = _ranges(points, rig.mounts[radar])
                     n_ranges += len(ranges_m)
                     log.on_detections(radar, t_ns, ranges_m)
-            log.on_scan(Scan(counter=row, t_ns=t_ns, frames=_frames(drive, radars, row, t_ns)))
+            log.on_scan(Scan(counter=row, t_ns=t_ns, frames=()))
     finally:
         log.close()
     return (
@@ -221,13 +210,3 @@ def _ranges(points: Array, mount: Mount) -> Array:
     ranges_m = np.sort(np.hypot(points[:, 0] - mount.x_m, points[:, 1] - mount.y_m))
     new = np.diff(ranges_m, prepend=-math.inf) > _SAME_RANGE_M
     return ranges_m[new]
-
-
-def _frames(
-    drive: MatDrive, radars: tuple[RadarInfo, ...], row: int, t_ns: int
-) -> tuple[RadarFrame, ...]:
-    return tuple(
-        recorded_frame(number - 1, radars[number - 1], rows[row], t_ns=t_ns, counter=row)
-        for number, rows in sorted(drive.frames.items())
-        if rows[row].any()
-    )

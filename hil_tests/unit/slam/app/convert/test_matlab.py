@@ -37,8 +37,7 @@ def authors_table() -> dict[str, Any]:
     left[2, 1] = math.hypot(100.0, 700.0), math.atan2(700.0, 100.0)
     # as of a robot turned by pi, to which pi is added: at (0.2, -0.9) m from ours
     right[2, 0] = math.hypot(200.0, 900.0), math.pi + math.atan2(900.0, -200.0)
-    frames = {f"R{k}": np.zeros((N_STATES, 500), dtype=np.float32) for k in range(1, 5)}
-    frames["R3"][4] = np.linspace(-1e-3, 1e-3, 500)
+    frames = {f"R{k}": np.ones((N_STATES, 500), dtype=np.float32) for k in range(1, 5)}
     return {"odom": odometry, "obsLHS": left, "obsRHS": right} | frames
 
 
@@ -55,7 +54,6 @@ def test_the_authors_fixes_are_points_in_the_body_frame(authors_file: Path) -> N
     np.testing.assert_allclose(drive.right[2], [[0.2, -0.9]], atol=1e-12)
     assert [len(points) for points in drive.left] == [0, 0, 2, 0, 0, 0]
     np.testing.assert_allclose(drive.odometry[3], [0.015, 0.0, 0.03], atol=1e-8)
-    assert drive.frames[3][4, -1] == np.float32(1e-3)
 
 
 def test_a_session_gets_the_ranges_that_the_fixes_are_made_of(
@@ -86,8 +84,7 @@ def test_a_session_gets_the_ranges_that_the_fixes_are_made_of(
     assert set(of_radar) == set(expected)
     for radar, ranges in expected.items():
         np.testing.assert_allclose(of_radar[radar], ranges, atol=1e-12)
-    frames = [frame for one in session.scans() for frame in one.frames]
-    assert [(frame.radar, frame.counter, len(frame.samples)) for frame in frames] == [(2, 4, 500)]
+    assert [one.frames for one in session.scans()] == [()] * N_STATES  # raw ones are left out
 
 
 def test_it_is_replayed(
