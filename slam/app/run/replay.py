@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Unpack
 
@@ -24,7 +25,6 @@ from slam.app.publish.sinks import Publishing
 from slam.app.run.maps import MapOptions, MapSaver, MapUse, map_use, recorded_use
 from slam.app.run.output import RunProgress, note
 from slam.app.run.result_files import SESSION, VIEW, finish, hold_folder, saying_what_is_left
-from slam.app.run.rows_by_time import RowsByTime
 from slam.app.run.runner import (
     LinkLog,
     LostFrames,
@@ -50,6 +50,7 @@ from slam.live.session_records import (
     Snapshot,
 )
 from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
+from slam.robust.solver.growing_arrays import PackedRows
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
 
@@ -90,12 +91,15 @@ class RecordedScans:
 
     def __init__(self, session: RecordedSession, stop: StopFlag) -> None:
         self._session, self._stop = session, stop
-        self._truth = RowsByTime(np.dtype(np.float64), 3)
+        self._stamps_ns = PackedRows(np.dtype(np.int64))
+        self._truth = PackedRows(np.dtype(np.float64), 3)
         self.lost = LostFrames()
         self.link_log = LinkLog()
 
     def truth_at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        return np.array([self._truth.at(t_ns) for t_ns in stamps_ns.tolist()]).reshape(-1, 3)
+        """Return the truth of scans by their times, which do not fall."""
+        after = np.searchsorted(self._stamps_ns.rows, stamps_ns, side="right")
+        return self._truth.rows[after - 1]
 
     def __iter__(self) -> Iterator[Scan]:
         for record in self._session.played():
@@ -104,7 +108,8 @@ class RecordedScans:
                 self.link_log.pass_on(record)
             elif isinstance(record, Scan):
                 truth = record.truth
-                self._truth.put(record.t_ns, np.full(3, np.nan) if truth is None else truth)
+                self._stamps_ns.append(record.t_ns)
+                self._truth.append(np.full(3, np.nan) if truth is None else truth)
                 self.lost.on_scan(record)
                 yield record
 
@@ -318,9 +323,9 @@ class Comparison(SessionObserver):
 
     def __init__(self, different: Sequence[str] = ()) -> None:
         self._different = different
-        # Of each recorded state its digest, and whether it came again
-        kind = np.dtype([("digest", np.void, _DIGEST_BYTES), ("same", np.bool_)])
-        self._expected = RowsByTime(kind)
+        # Of the recorded states the digests by time, and the times of those that came again
+        self._expected: dict[int, bytes] = {}
+        self._same = set[int]()
         self._gaps: list[Gap] = []
         self._n_before_gap: int | None = None
         self._first_other_ns: int | None = None
@@ -331,7 +336,7 @@ class Comparison(SessionObserver):
     def expect(self, record: Snapshot | SmoothedRun | Gap) -> None:
         """Take what was recorded; what comes after a gap was recorded behind it."""
         if isinstance(record, Snapshot):
-            self._expected.put(record.t_ns, (_state_digest(record), False))
+            self._expected[record.t_ns] = _state_digest(record)
         elif isinstance(record, SmoothedRun):
             self._smoothed = _smoothed_digest(record)
         else:
@@ -340,13 +345,13 @@ class Comparison(SessionObserver):
                 self._n_before_gap = len(self._expected)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        expected = self._expected.at(snapshot.t_ns)
+        expected = self._expected.get(snapshot.t_ns)
         if expected is None:
             return
         # Older sessions have no lagged poses.
         digests = {_state_digest(snapshot), _digest(state_row(snapshot))}
-        if expected["digest"].tobytes() in digests:
-            expected["same"] = True
+        if expected in digests:
+            self._same.add(snapshot.t_ns)
         elif self._first_other_ns is None:
             self._first_other_ns = snapshot.t_ns
 
@@ -388,7 +393,7 @@ class Comparison(SessionObserver):
         return f"; the smoothed path did not: {self._reason()}"
 
     def _n_same(self, n_first: int) -> int:
-        return int(self._expected.rows["same"][:n_first].sum())
+        return sum(t_ns in self._same for t_ns in islice(self._expected, n_first))
 
     def _verdict_on(self, n_expected: int, which: str) -> str:
         n_same = self._n_same(n_expected)

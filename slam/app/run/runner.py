@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 import time
+from array import array
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -17,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.app.run.rows_by_time import RowsByTime
 from slam.frames import RadarFrame, StepInputError
 from slam.geometry import Rig
 from slam.library.evaluation import TrueAssociationNis, true_range_nis
@@ -360,14 +361,14 @@ def run_slam(
     """
     recorder = RunRecorder(true_landmarks_m)
     observers = [recorder, *observers]
-    counters = RowsByTime(np.dtype(np.int64))
+    stamps_ns, counters = array("q"), array("q")  # of the scans
 
     def take(new: Iterable[StepResult]) -> None:
         for result in new:
             assert world_from_map is not None
             snapshot = snapshot_of_step(
                 result,
-                counter=int(counters.at(result.t_ns)),
+                counter=counters[bisect_right(stamps_ns, result.t_ns) - 1],
                 truth=truth_at(np.array([result.t_ns]))[0],
                 world_from_map=world_from_map,
                 wall_spans_m=slam.wall_spans_m(),
@@ -390,7 +391,8 @@ def run_slam(
                     scan = replace(scan, odom_frame=odometry.frame_at(scan.t_ns))
                     if world_from_map is None:
                         world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
-                    counters.put(scan.t_ns, scan.counter)
+                    stamps_ns.append(scan.t_ns)
+                    counters.append(scan.counter)
                     frames = [
                         less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames
                     ]
