@@ -221,21 +221,15 @@ class OdometryTrack(PoseTrack):
     def last(self) -> TumSample:
         return self._sample(-1)
 
-    def gap_ns(self, t_ns: int) -> float:
-        """Return how far apart the two samples around a time are; infinite outside of all.
-
-        At a sample's own time the gap is 0.
-        """
-        after = bisect_left(self._stamps_ns, t_ns)
-        if after == len(self._stamps_ns) or (after == 0 and self._stamps_ns[0] != t_ns):
-            return math.inf
-        if self._stamps_ns[after] == t_ns:
-            return 0.0
-        return self._stamps_ns[after] - self._stamps_ns[after - 1]
-
     def is_known(self, t_ns: int) -> bool:
-        """Return whether the pose at this time lies between two samples close enough."""
-        return self.gap_ns(t_ns) <= MOST_GAP_NS
+        """Return whether the pose at this time is a sample's or lies between two close enough."""
+        after = bisect_left(self._stamps_ns, t_ns)
+        if after == len(self):
+            return False
+        after_ns = self._stamps_ns[after]
+        return t_ns == after_ns or (
+            after > 0 and after_ns - self._stamps_ns[after - 1] <= MOST_GAP_NS
+        )
 
     def append(self, sample: TumSample) -> bool:
         """Take a sample; OdometryError if it is not later than all before it.
