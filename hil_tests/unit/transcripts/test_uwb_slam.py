@@ -101,7 +101,7 @@ TABLES: dict[str, dict[str, object]] = {
     "no_states": AUTHORS | {"odom": np.zeros((0, 3))},
     "five": AUTHORS | {"obsLHS": np.zeros((5, 5, 2))},
     "not_finite": AUTHORS | {"obsRHS": np.full((STATES, 5, 2), np.nan)},
-    "cube": AUTHORS | {"R2": np.zeros((STATES, 5, 2))},
+    "cube": AUTHORS | {"obsLHS": np.zeros((STATES, 5, 3))},
     "words": AUTHORS | {"odom": "text"},
     "detections": AUTHORS,
 }
