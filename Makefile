@@ -19,10 +19,11 @@ ON_ALL_CORES := -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) +
 test: $(VENV)/installed-test
 	$(PYTEST) $(ON_ALL_CORES) --dist loadfile --no-loadscope-reorder
 
-# What the default suite shows of one case only, because it takes long and seldom breaks: after a change
-# of documents, of sweeps, benchmarks or the plugin, and before a push.
+# What the default suite shows of one case only, because it takes long and seldom breaks, and all
+# examples of each property, of which the default suite has a third: after a change of documents, of
+# sweeps, benchmarks or the plugin, and before a push.
 test-rare: $(VENV)/installed-test
-	$(PYTEST) $(ON_ALL_CORES) --dist worksteal -m 'rare and not thorough'
+	HYPOTHESIS_PROFILE=rare $(PYTEST) $(ON_ALL_CORES) --dist worksteal -m '(rare or hypothesis) and not thorough'
 
 # About a minute: the bytes of the protocol, the driver and the mathematics of SLAM.
 test-quick: $(VENV)/installed-test

@@ -36,7 +36,9 @@ if importlib.util.find_spec("hypothesis") is not None:
     # CI repeats its examples, but for constants, which Hypothesis takes from the modules loaded so
     # far. What `make test-explore` finds becomes an @example beside the test.
     settings.register_profile("thorough", timeless, derandomize=True, print_blob=True)
-    settings.register_profile("ci", settings.get_profile("thorough"), max_examples=60)
+    # The default suite has the first third of the examples; `make test-rare` has them all.
+    settings.register_profile("ci", settings.get_profile("thorough"), max_examples=20)
+    settings.register_profile("rare", settings.get_profile("thorough"), max_examples=60)
     settings.register_profile(
         "explore", timeless, derandomize=False, print_blob=True, max_examples=2000
     )

@@ -25,8 +25,8 @@ def commands(*words: str) -> str:
 
 
 def test_only_exploration_is_random() -> None:
-    names = ("ci", "thorough", "explore")
-    assert [settings.get_profile(name).derandomize for name in names] == [True, True, False]
+    names = ("ci", "rare", "thorough", "explore")
+    assert [settings.get_profile(name).derandomize for name in names] == [True, True, True, False]
     assert settings.get_profile("explore").print_blob
 
 
@@ -42,8 +42,8 @@ def test_the_seed_is_printed_used_and_new_each_time() -> None:
     assert "--hypothesis-seed=7 " in commands("test-explore", "SEED=7")
 
 
-def test_ci_does_not_explore() -> None:
-    """CI runs `.ci/run`, and that two targets of make."""
+def test_ci_does_not_explore_and_has_all_examples() -> None:
+    """CI runs `.ci/run`, and that two targets of make, the second with all examples."""
     script = (REPOSITORY / ".ci" / "run").read_text()
     targets = re.findall(r"^(?:exec )?make ([\w-]+)$", script, re.MULTILINE)
     assert targets == ["check", "test-rare"]
@@ -51,6 +51,10 @@ def test_ci_does_not_explore() -> None:
         printed = commands(target)
         assert "-m pytest" in printed
         assert not re.search(r"explore|hypothesis-seed", printed)
+    assert "HYPOTHESIS_PROFILE=rare " in printed
+    assert "-m '(rare or hypothesis) and not thorough'" in printed
+    shares = [settings.get_profile(name).max_examples for name in ("ci", "rare")]
+    assert shares == [20, 60]
     for workflow in (REPOSITORY / ".github" / "workflows").iterdir():
         assert not re.search(r"explore|HYPOTHESIS", workflow.read_text())
 

@@ -13,6 +13,7 @@ from emulator.echo.paths import Scatterers
 from emulator.echo.walls import faces_of, passing, spread
 from emulator.scene.people import PersonSpec
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M, ObjectSpec, TargetSpec, WallSpec
+from hil_tests.property.examples import examples
 from hil_tests.unit.emulator.rooms import WAVELENGTH_M, heard, radar_at
 
 Point = tuple[float, float]
@@ -80,7 +81,7 @@ def moved(at: Point, turn: float, by: Sequence[float]) -> Point:
     return cosine * at[0] - sine * at[1] + by[0], sine * at[0] + cosine * at[1] + by[1]
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(
     mount=st.tuples(coordinate, coordinate, angle_deg),
     walls=walls_st,
@@ -133,7 +134,7 @@ def test_a_rigid_motion_of_everything_changes_nothing(
     assert after == pytest.approx(before, rel=1e-6, abs=1e-7)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(mount=st.tuples(coordinate, coordinate, angle_deg), walls=walls_st, target=target_st)
 @example(  # the second wall lies behind the first: nothing of it is left but a rounding error
     (0.0, 0.0, 0.0),

@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hil_tests.property.examples import examples
 from hil_tests.property.trilateration_oracles import distance, off_boresight
 from slam.geometry import (
     PAPERS_FIELD,
@@ -156,7 +157,7 @@ def placeable(point: Array, mounts: tuple[Mount, Mount], field: FieldOfView) -> 
     return in_range and seen and not image_seen and crosses
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(
     mounts_of_any_yaw,
     mounts_of_any_yaw,

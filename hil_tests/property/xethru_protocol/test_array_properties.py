@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from hil_tests.property.examples import examples
 from hil_tests.unit.xethru_protocol.recordings.messages import write_capture
 from xethru_protocol import load
 from xethru_protocol.recordings.array_files import (
@@ -54,7 +55,7 @@ def known_frames(draw: st.DrawFn) -> tuple[Frames, npt.NDArray[np.generic]]:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".mat", ".npz"])
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(drawn=known_frames())
 def test_files_of_arrays_give_back_what_was_written(
     suffix: str, drawn: tuple[Frames, npt.NDArray[np.generic]]
@@ -76,7 +77,7 @@ def test_files_of_arrays_give_back_what_was_written(
             assert after.tobytes() == before.tobytes()
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(
     lengths=st.lists(st.sampled_from([377, 379, 381]), min_size=1, max_size=12),
     n_frames=st.integers(1, 13),

@@ -39,7 +39,7 @@ def decoder_of(cls: type[Message]) -> Callable[[bytes], Message]:
 
 
 @pytest.mark.parametrize("cls", ROWS, ids=lambda cls: cls.__name__)
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(st.data(), st.booleans())
 def test_every_row_survives_the_wire(cls: type[Message], data: st.DataObject, bulk: bool) -> None:
     message = data.draw(of_type(cls))

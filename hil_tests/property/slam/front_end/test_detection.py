@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import find_peaks, savgol_filter
 
+from hil_tests.property.examples import examples
 from hil_tests.unit.slam.simulation import BIN_LENGTH_M, frame_of
 from slam.config import BackgroundFilter, DetectionConfig, PeakPosition
 from slam.frames import RadarFrame
@@ -132,7 +133,7 @@ def test_leakage_raises_the_mean_only_where_the_background_filter_uses_it() -> N
     assert np.array_equal(without, detectors[1].smooth(frame(samples).samples)[far])
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(st.floats(0.4, 1.3), st.floats(0, 6))
 def test_least_width_removes_the_ripple_of_strong_echoes(range_m: float, phase: float) -> None:
     samples = pulse(range_m, 0.4, phase)

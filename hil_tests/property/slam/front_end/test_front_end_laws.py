@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hil_tests.property.examples import examples
 from hil_tests.property.slam.front_end.test_detection import N_BINS, frame, pulse
 from hil_tests.unit.slam.simulation import BIN_LENGTH_M
 from slam.config import DetectionConfig, FrontEnd, MatchedFilterConfig, PeakPosition, SlamConfig
@@ -80,7 +81,7 @@ def test_batch_holds_the_bits_of_single_frames(name: FrontEnd, position: PeakPos
     assert detector.detect_many([], []) == []
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(st.floats(0.6, 6.0), st.floats(0.012, 0.05), st.floats(0, 6), st.integers(1, 60))
 @pytest.mark.parametrize("name", WITH_PULSE)
 def test_delay_of_whole_bins_moves_an_echo_by_whole_bins(
@@ -94,7 +95,7 @@ def test_delay_of_whole_bins_moves_an_echo_by_whole_bins(
     assert math.remainder(there.phase_rad - here.phase_rad, math.tau) == pytest.approx(0, abs=1e-6)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(st.floats(0.6, 6.0), st.floats(0.012, 0.05), st.floats(0, 6))
 @pytest.mark.parametrize("name", WITH_PULSE)
 def test_echo_without_noise_is_told_to_a_fraction_of_a_bin(
@@ -106,7 +107,7 @@ def test_echo_without_noise_is_told_to_a_fraction_of_a_bin(
     assert math.remainder(detection.phase_rad - phase, math.tau) == pytest.approx(0, abs=1e-3)
 
 
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.125, 0.5, 2.0, 8.0]))
 @pytest.mark.parametrize("told_sigma", [0.0, NOISE_SIGMA])
 @pytest.mark.parametrize("name", FRONT_ENDS)
@@ -120,7 +121,7 @@ def test_amplitude_and_thresholds_scale_together(
     assert [d.amplitude for d in there] == pytest.approx([k * d.amplitude for d in here], rel=1e-5)
 
 
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(st.integers(0, 2**32 - 1))
 @pytest.mark.parametrize("name", WITH_PULSE)
 def test_reversed_sign_turns_phases_by_half_a_turn_and_nothing_else(

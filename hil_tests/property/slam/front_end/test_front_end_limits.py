@@ -11,6 +11,7 @@ from scipy.special import eval_genlaguerre
 from scipy.stats import ncx2
 
 from hil_tests.paths import study
+from hil_tests.property.examples import examples
 from hil_tests.unit.slam.simulation import BIN_LENGTH_M as BIN_M
 from hil_tests.unit.slam.simulation import frame_of
 from slam.config import SlamConfig, load_preset, override
@@ -216,7 +217,7 @@ def echoes(values: Array) -> Array:
     return total
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(st.floats(0.5, 4.0), st.floats(0.2, 1.0), st.floats(0.0, math.tau), st.floats(0.0, math.tau))
 def test_pair_bound_is_that_of_the_whole_fisher_matrix(
     apart: float, ratio: float, one: float, other: float

@@ -9,6 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hil_tests.property.examples import examples
 from slam.front_end import kernels
 from slam.front_end.kernels import (
     CLIMB,
@@ -70,7 +71,7 @@ def turn(one: float, other: float) -> float:
     return abs(math.remainder(one - other, math.tau))
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(clusters())
 def test_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, Array]) -> None:
     positions, amplitudes, phases = cluster
@@ -80,7 +81,7 @@ def test_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, Array])
     assert max(turn(f.phase_rad, p) for f, p in zip(fits, phases, strict=True)) < 1e-4
 
 
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(clusters(), st.integers(1, 20), st.integers(0, 2**32 - 1))
 def test_whole_bins_of_delay_shift_the_echoes_and_nothing_else(
     cluster: tuple[Array, Array, Array], shift: int, seed: int
@@ -108,7 +109,7 @@ def test_whole_bins_of_delay_shift_the_echoes_and_nothing_else(
         assert turn(after.phase_rad, before.phase_rad) < 0.05
 
 
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(clusters(), st.floats(1e-4, 1e4), st.integers(0, 2**32 - 1))
 def test_amplitudes_scale_with_the_samples_and_positions_do_not(
     cluster: tuple[Array, Array, Array], scale: float, seed: int
@@ -121,7 +122,7 @@ def test_amplitudes_scale_with_the_samples_and_positions_do_not(
     assert [f.amplitude / scale for f in scaled] == pytest.approx([f.amplitude for f in plain])
 
 
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(clusters(), st.floats(-math.pi, math.pi))
 def test_a_common_phase_turns_every_echo_and_moves_none(
     cluster: tuple[Array, Array, Array], phase: float
@@ -134,7 +135,7 @@ def test_a_common_phase_turns_every_echo_and_moves_none(
         assert turn(after.phase_rad - before.phase_rad, phase) < 1e-4
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from(["nothing", "flat", "noise", "one bin", "step", "tone", "huge", "tiny"]),
@@ -171,7 +172,7 @@ def test_whatever_the_samples_no_nan_and_no_more_echoes_than_asked(
     assert positions == sorted(positions)
 
 
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(clusters(), st.floats(1e-3, 0.03))
 def test_sigma_is_the_bound_of_the_whole_fisher_matrix(
     cluster: tuple[Array, Array, Array], noise_sigma: float
@@ -314,7 +315,7 @@ def fit_whole(
     return [EchoFit(*row) for row in table[:, :4].tolist()]
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(whole_clusters())
 def test_whole_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, Array]) -> None:
     fits = fit_whole(whole_signal(*cluster), 1e-3, SplitTest(model_error=0.0))
@@ -328,7 +329,7 @@ def test_whole_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, A
     assert max(turns) < 2e-3
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(whole_clusters(), st.floats(1e-3, 0.1), st.integers(0, 2**32 - 1))
 def test_the_closed_form_finds_what_the_samples_tell(
     cluster: tuple[Array, Array, Array], sigma: float, seed: int
@@ -375,7 +376,7 @@ def window(samples: Array) -> kernels.ComplexArray:
     return columns
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(whole_clusters(), st.floats(-3, 3))
 @pytest.mark.parametrize("of", [polynomials, window])
 def test_gradient_and_information_are_derivatives_of_what_is_explained(

@@ -29,6 +29,7 @@ from hil_tests.property.ekf_oracles import (
     relative_error,
     turn_between,
 )
+from hil_tests.property.examples import examples
 from slam.config import Assignment, AssociationConfig
 from slam.geometry import compose
 from slam.paper import ekf as ekf_slam
@@ -116,7 +117,7 @@ def test_new_landmark_is_the_limit_of_a_vague_prior(belief: Belief, r: float, ph
     assert relative_error(born.covariance, np.linalg.inv(information)) <= 1e-5
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(st.integers(0, 2**32 - 1), st.integers(20, 40))
 def test_landmark_never_surer_than_the_start(seed: int, n_steps: int) -> None:
     """Dissanayake 2001: no observation makes a landmark surer than the pose was at the start."""

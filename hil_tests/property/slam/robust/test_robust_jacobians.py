@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hil_tests.property.ekf_oracles import complex_step
+from hil_tests.property.examples import examples
 from hil_tests.property.robust_oracles import (
     N_RADARS,
     Array,
@@ -40,7 +41,7 @@ from slam.robust.solver.smoother import measurement_residuals, motion_residuals
 from slam.robust.state import Layout, calibrated_motion, left_jacobian, predict, rotation
 
 WHEELS = WheelNoise(walk_per_sqrt_m=0.0)
-few = settings(max_examples=40, deadline=None)
+few = settings(max_examples=examples(40), deadline=None)
 
 
 @few

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hil_tests.property.examples import examples
 from hil_tests.property.robust_oracles import (
     N_RADARS,
     Array,
@@ -30,7 +31,7 @@ ANTENNAS = Antennas(
     nominal_m=PLACES,
     turns_rad=np.zeros(4),
 )
-few = settings(max_examples=30, deadline=None)
+few = settings(max_examples=examples(30), deadline=None)
 
 
 def go(state: State, increment: Array) -> None:

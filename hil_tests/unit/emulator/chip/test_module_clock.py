@@ -15,6 +15,7 @@ from emulator.echo.echo import SceneEcho, echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene
 from emulator.x4m300 import radar_device
+from hil_tests.property.examples import examples
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from hil_tests.unit.emulator.rooms import PAPER, radar_at, room, target
 from xethru_protocol.driver.frames import Frame
@@ -104,7 +105,7 @@ def test_the_phase_of_a_frame_turns_all_of_its_echoes() -> None:
     assert not np.array_equal(two[0], source.echo(CAPTURE, np.array([0]))[0])
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(st.floats(-1000, 1000), st.integers(0, 10**10), st.integers(0, 10**13), st.integers(2, 300))
 @example(ppm=0.0, skew_ns=0, start_ns=1, fps=2)
 def test_in_real_time_a_stream_begins_with_the_first_frame_still_ahead(

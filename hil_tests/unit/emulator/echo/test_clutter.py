@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from emulator.chip.chip import CaptureSettings, downconvert
 from emulator.echo.receiver import GRIDS, ClutterField
 from emulator.scene.scene import ClutterSpec
+from hil_tests.property.examples import examples
 from hil_tests.unit.emulator.rooms import PAPER
 from xethru_protocol.processing.downconversion import CHANNELS, TAP_COUNT
 from xethru_protocol.wire.x4 import BASEBAND_DECIMATION, CARRIER_HZ, RF_BIN_M, SAMPLING_RATE_HZ
@@ -97,7 +98,7 @@ def test_its_memory_is_the_scenes_correlation_time() -> None:
     assert sum(share for _, share in GRIDS) == pytest.approx(1.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     cuts=st.lists(st.integers(1, 39), max_size=6, unique=True),
     step_ns=st.sampled_from([2_500_000, 58_823_529, 200_000_000, 7_000_000_000]),

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import slam as library
+from hil_tests.property.examples import examples
 from slam import (
     ConfigError,
     Detection,
@@ -162,7 +163,7 @@ OF_PAPER: dict[str, Callable[[Slam, int], object]] = {
 CASES = [("robust", name) for name in REFUSED] + [("paper", name) for name in REFUSED | OF_PAPER]
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(12), deadline=None)
 @given(case=st.sampled_from(CASES), at=st.integers(2, 24), more=st.integers(1, 4))
 def test_after_a_refused_step_all_is_as_without_it(
     case: tuple[str, str], at: int, more: int

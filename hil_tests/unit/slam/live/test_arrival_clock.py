@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from hil_tests.property.examples import examples
 from slam.live.arrival_clock import ArrivalClock, ClockLine, LowerEnvelope
 from xethru_protocol.wire.x4 import frame_time_ns, real_frame_rate
 
@@ -18,7 +19,7 @@ def taken_ns(counter: int, ppm: float, zero_ns: int = 7 * NS_PER_S) -> int:
     return zero_ns + round(frame_time_ns(counter, RATE_HZ) / (1 + ppm * 1e-6))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(
     st.lists(st.integers(0, 20_000_000), min_size=2, max_size=40),
     st.floats(-200.0, 200.0),
@@ -145,7 +146,7 @@ def test_frames_that_arrive_at_once_have_stamps_one_after_the_other() -> None:
     assert stamps_ns == [arrival_ns, arrival_ns + 1, arrival_ns + 2]
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.floats(-500.0, 500.0), st.integers(0, 10**13), st.integers(0, 10**13))
 def test_a_line_there_and_back(ppm: float, origin_ns: int, nominal_ns: int) -> None:
     line = ClockLine(origin_ns=origin_ns, slope=ppm * 1e-6)

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from hil_tests.property.examples import examples
 from hil_tests.unit.slam.app.convert.authors_mat import write_fixes
 from hil_tests.unit.slam.app.sessions import run, session_info
 from slam.app.cli import main
@@ -99,7 +100,7 @@ def test_it_is_replayed(
 LEFT = st.tuples(st.floats(-0.1, 0.1), st.floats(0.51, 1.5))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(left=st.lists(LEFT, min_size=1, max_size=3), right=st.lists(LEFT, max_size=3))
 def test_ranges_pair_to_the_fixes_they_came_from(
     tmp_path_factory: pytest.TempPathFactory,

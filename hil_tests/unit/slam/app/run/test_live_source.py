@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from emulator.scene.scene import load_scene
 from hil_tests.patience import seconds
+from hil_tests.property.examples import examples
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.run.virtual_rig import (
     Drive,
@@ -199,7 +200,7 @@ def streams(draw: st.DrawFn) -> list[list[int]]:
     return made
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(streams(), st.integers(0, 400_000_000))
 def test_every_frame_is_in_one_scan_and_scans_are_in_order(
     stamps: list[list[int]], latency_ns: int

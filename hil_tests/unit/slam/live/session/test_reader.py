@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from hil_tests.property.examples import examples
 from hil_tests.unit.slam.app.sessions import (
     FRAME_NS,
     odometry,
@@ -151,7 +152,7 @@ def test_states_come_back_to_the_last_bit(session_file: Path) -> None:
         assert found.landmark_covariances_m2.tolist() == sent.landmark_covariances_m2.tolist()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(
     numbers=st.lists(st.floats(allow_nan=False), min_size=21, max_size=21),
     landmarks=st.lists(
