@@ -53,6 +53,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+class DoctestsWhereExamplesAre:
+    """Leaves doctest the files with examples: it searches the attributes of all for seconds.
+
+    A plugin of its own, since hooks of this file are not asked about files outside of its folder.
+    """
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_collect_file(
+        self, file_path: Path, parent: pytest.Collector
+    ) -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
+        option, wanted = parent.config.option, parent.config.option.doctestmodules
+        option.doctestmodules = wanted and b">>>" in file_path.read_bytes()
+        try:
+            return (yield)
+        finally:
+            option.doctestmodules = wanted
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Register the one marker that tests outside the plugin use; let signals end what tests start.
 
@@ -67,6 +85,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if IN_SOURCE_TREE:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         sys.dont_write_bytecode = False
+    config.pluginmanager.register(DoctestsWhereExamplesAre(), "doctests-where-examples-are")
     if IN_SOURCE_TREE and getattr(config.option, "numprocesses", None):
         _compile_once()  # workers load what is compiled; each would compile all
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
