@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import sys
 
 import pytest
 from hypothesis import settings
@@ -19,6 +20,7 @@ def commands(*words: str) -> str:
     if shutil.which("make") is None:
         pytest.skip("make is not installed")
     make = ["make", "--dry-run", "--always-make", "--no-print-directory"]
+    make.append("PYTHON=" + sys.executable)  # else it looks for one before each command
     return subprocess.run(
         [*make, *words], cwd=REPOSITORY, capture_output=True, text=True, check=True
     ).stdout
