@@ -92,6 +92,7 @@ def test_asap_all_frames_are_bit_identical(served_asap: Served, downconversion: 
     assert len({content[10] for content in contents}) == 4, "each radar sees its own"
 
 
+@pytest.mark.rare  # those without a clock are compared above
 def test_realtime_those_that_arrive_are_bit_identical() -> None:
     config = RawConfig(iterations=16, pulses_per_step=10)
     with emulator("serve", SCENE, "--seed", str(SEED), "--pace", "realtime") as served:

@@ -4,7 +4,7 @@ import pytest
 
 from hil_tests.system.emulator.command_sequences import COMMANDS, run
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.rare]  # test_extreme_commands.py has more commands
 
 
 def test_a_module_is_never_silent_for_long_and_ends_at_once() -> None:

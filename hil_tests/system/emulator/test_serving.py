@@ -239,6 +239,7 @@ def ctl(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*CTL, *words], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.rare  # test_detected.py has every kind of fault in this process
 def test_what_the_driver_counts_is_what_the_truth_log_says(tmp_path: Path, scenario: str) -> None:
     truth = tmp_path / "truth.jsonl"
     arguments = ("serve", "--bare", "--faults", scenario, "--truth", truth)

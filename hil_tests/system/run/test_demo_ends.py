@@ -135,7 +135,7 @@ def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     "step",
     [
         pytest.param("summarise", marks=pytest.mark.thorough),
-        "write_trajectories",
+        pytest.param("write_trajectories", marks=pytest.mark.rare),
         pytest.param("print_result", marks=pytest.mark.thorough),
     ],
 )

@@ -163,8 +163,9 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
 
 @pytest.mark.parametrize(
     ("which", "code"),
-    [(signal.SIGINT, 130), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.rare)],
+    [(signal.SIGINT, 130), (signal.SIGKILL, -9)],
 )
+@pytest.mark.rare  # a run that ends by itself is replayed above
 def test_a_signal_leaves_a_session_that_replays(
     which: signal.Signals,
     code: int,

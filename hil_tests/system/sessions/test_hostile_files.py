@@ -217,7 +217,11 @@ def test_text_of_a_session_reaches_no_terminal_with_control_characters(
 
 @pytest.mark.parametrize(
     "field",
-    ["config", "table", *(pytest.param(each, marks=pytest.mark.thorough) for each in THOROUGH)],
+    [
+        "table",
+        pytest.param("config", marks=pytest.mark.rare),
+        *(pytest.param(each, marks=pytest.mark.thorough) for each in THOROUGH),
+    ],
 )
 def test_errors_about_a_session_hold_no_control_characters(
     field: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
