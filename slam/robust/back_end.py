@@ -77,11 +77,12 @@ from slam.robust.parameters import BackEndParameters
 from slam.robust.proposals.slips import SlipDetector
 from slam.robust.solver.beacons import Waiting, initialise_beacon, is_heard_where_it_is
 from slam.robust.solver.revision import (
+    adopt,
     is_due,
-    is_one,
     noisier,
     relinearise,
     solve_whole_run,
+    solved_as_one,
 )
 from slam.robust.solver.run_log import RunLog
 from slam.robust.state import (
@@ -1073,7 +1074,8 @@ class RobustBackEnd:
         """
         state, pairs = self.state, tuple(pairs)
         ids = named_pairs(state, pairs)
-        if not is_one(self._log, state, pairs, self.parameters):
+        found = solved_as_one(self._log, state, pairs, self.parameters)
+        if found is None:
             self._refused[ids] = self._n_updates
             return False
         state.added_sigmas_m |= noisier(state, {gone: kept for kept, gone in ids})
@@ -1086,5 +1088,6 @@ class RobustBackEnd:
         self._settled = {merged.get(id_, id_) for id_ in self._settled}
         labels = self._landmark_of_label.items()
         self._landmark_of_label = {label: merged.get(id_, id_) for label, id_ in labels}
-        self.relinearise()
+        self._log.since_solved = 0
+        adopt(self._log, state, *found, self.parameters)
         return True

@@ -10,10 +10,19 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from slam.geometry import align_se2, transform
 from slam.robust.association import Pairs
 from slam.robust.map import MERGE_SIGMA_M, apply_merge
 from slam.robust.parameters import SIGMA_PER_MEDIAN, TAIL_PROBABILITY, BackEndParameters
-from slam.robust.solver.run_log import Estimate, Problem, RunLog, all_poses
+from slam.robust.solver.run_log import (
+    Estimate,
+    Problem,
+    RunLog,
+    all_poses,
+    chain_of,
+    motion_covariances,
+    turned,
+)
 from slam.robust.solver.smoother import (
     Smoother,
     Solution,
@@ -28,6 +37,8 @@ from slam.robust.state import (
 
 _LEAST_SHARE, _MOST_SHARE = 0.5, 1000.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
+# By what the noise of measurements is multiplied where the start is far from the solution
+_VAGUER = (30.0, 8.0)
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
 
 
@@ -69,8 +80,10 @@ def _solved(
     return smoother.solve(min(log.starts(state, problem), key=smoother.cost))
 
 
-def is_one(log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameters) -> bool:
-    """Return whether the whole run allows that landmarks, by row, are one, in pairs.
+def solved_as_one(
+    log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameters
+) -> tuple[Problem, Solution] | None:
+    """Solve for the whole run with landmarks, by row, as one, in pairs; None if it is against that.
 
     The run is solved for with them as two and as one, their ranges having the noise of the noisier
     one. The cost may rise by what chance explains, the quantile of chi-square with two degrees of
@@ -84,19 +97,105 @@ def is_one(log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameter
     apply_merge(one, pairs, MERGE_SIGMA_M)
     problem = log.problem(two, parameters)
     apart = _solved(log, two, problem, parameters)
+    if apart is None:
+        return None
     merged = log.problem(one, parameters, same)
-    together = _solved(log, one, merged, parameters)
-    if apart is None or together is None or not is_determined(together.information):
-        return False
+    smoother = Smoother(merged, parameters.relinearisation)
+    bent = brought_together(problem, apart.estimate, pairs)
+    start = min(*log.starts(one, merged), bent, key=smoother.cost)
+    together = smoother.solve(_eased(merged, start, parameters) if start is bent else start)
+    if together is None or not is_determined(together.information):
+        return None
     limit = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
     if together.cost - apart.cost > limit:
-        return False
+        return None
     # The cost of a range is bounded: few of them could lie anywhere.
     residual = measurement_residuals(merged, together.estimate).residual[: len(merged.ranges_m)]
     fits = np.abs(residual) <= parameters.relinearisation.outlier_sigmas
     of_rows = [fits[problem.range_landmarks == row] for pair in pairs for row in pair]
     # Those of a map may have none in this run.
-    return all(np.mean(of_row) > 0.5 for of_row in of_rows if len(of_row))
+    if all(np.mean(of_row) > 0.5 for of_row in of_rows if len(of_row)):
+        return merged, together
+    return None
+
+
+def brought_together(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimate:
+    """Return an estimate with the second landmark of each pair, by row, where the first one is.
+
+    All poses since the first of the second ones was seen are moved as one. The motions between that
+    and the last sight of a first one share the correction in proportion to their variances: turns,
+    then what is left of the way (G. Dubbelman and B. Browning, "COP-SLAM", IEEE Transactions on
+    Robotics 31(5), 2015). Features move with the pose that saw them first.
+    """
+    kept, gone = np.array(pairs, dtype=np.intp).T
+    layout, at, seen_from = problem.layout, problem.range_landmarks, problem.range_poses
+    values = np.concatenate([np.zeros(HEAD_SIZE), apart.fixed])
+    landmarks = values[layout.landmarks].reshape(-1, layout.landmark_size)
+    walls = values[layout.walls].reshape(-1, 2)
+    motion = align_se2(landmarks[gone, :2], landmarks[kept, :2])
+    last = len(apart.poses) - 1
+    begin = int(seen_from[np.isin(at, gone)].min(initial=last))
+    end = int(seen_from[np.isin(at, kept) & (seen_from < begin)].max(initial=0))
+    chain = chain_of(problem.steps, problem.keys, apart.calibration[:last])
+    variances = motion_covariances(chain, problem.step_covariances)[end:begin]
+    poses, turns, between = apart.poses.copy(), np.zeros(last + 1), slice(end + 1, begin + 1)
+    turns[between] = motion[2] * _shares(variances[:, 2, 2])
+    turns[begin:] = motion[2]
+    ways = turned(np.diff(apart.poses[end : begin + 1, :2], axis=0), turns[end:begin])
+    poses[between, :2] = poses[end, :2] + np.cumsum(ways, axis=0)
+    missed = transform(motion, apart.poses[begin, :2]) - poses[begin, :2]
+    poses[between, :2] += _shares(variances[:, 0, 0] + variances[:, 1, 1])[:, None] * missed
+    poses[begin:, :2] = transform(motion, apart.poses[begin:, :2])
+    poses[:, 2] += turns
+    first = np.full(layout.n_landmarks + layout.n_walls, last)
+    np.minimum.at(first, at, seen_from)
+    first[np.bincount(at, minlength=len(first)) == 0] = 0  # of a map
+    of_landmark, of_wall = np.split(first, [layout.n_landmarks])
+    away = landmarks[:, :2] - apart.poses[of_landmark, :2]
+    landmarks[:, :2] = poses[of_landmark, :2] + turned(away, turns[of_landmark])
+    # n . q = d for the places q of a wall, before and behind
+    walls[:, 1] -= _along(walls[:, 0], apart.poses[of_wall, :2])
+    walls[:, 0] += turns[of_wall]
+    walls[:, 1] += _along(walls[:, 0], poses[of_wall, :2])
+    constants = apart.fixed[: layout.landmarks.start - HEAD_SIZE]
+    fixed = np.concatenate([constants, np.delete(landmarks, gone, axis=0).ravel(), walls.ravel()])
+    return replace(apart, poses=poses, fixed=fixed)
+
+
+def _eased(problem: Problem, start: Estimate, parameters: BackEndParameters) -> Estimate:
+    """Return the solution from a start with measurements that count for little, then for more.
+
+    Far from the solution, precise ranges hold Gauss-Newton steps back, and the path stays bent.
+    Radii stay as they are: with vague ranges their prior would take all landmarks for thin.
+    """
+    layout = problem.layout
+    radii = np.arange(layout.size)[layout.radii if layout.has_radii else slice(0, 0)] - HEAD_SIZE
+    for factor in _VAGUER:
+        vague = replace(
+            problem,
+            range_sigmas_m=factor * problem.range_sigmas_m,
+            range_bearing_sigmas_rad=factor * problem.range_bearing_sigmas_rad,
+        )
+        solution = Smoother(vague, parameters.relinearisation).solve(start)
+        if solution is None:
+            return start
+        fixed = solution.estimate.fixed.copy()
+        fixed[radii] = start.fixed[radii]
+        start = replace(solution.estimate, fixed=fixed)
+    return start
+
+
+def _shares(variances: Array) -> Array:
+    """Return which part of a sum errors of some variances have reached, from one to the next."""
+    reached = np.cumsum(variances + _LEAST_VARIANCE_M2)
+    return np.asarray(reached / reached[-1:])
+
+
+def _along(directions_rad: Array, places_m: Array) -> Array:
+    """Return how far places (k, 2) are along directions (k,)."""
+    return np.asarray(
+        np.cos(directions_rad) * places_m[:, 0] + np.sin(directions_rad) * places_m[:, 1]
+    )
 
 
 def noisier(state: State, same: Mapping[int, int]) -> dict[int, float]:

@@ -153,7 +153,7 @@ def chain_of(steps: Array, keys: Indices, calibration: Array) -> Chain:
     lengths = np.hypot(d[:, 0], d[:, 1])
     turns = (steps[:, 2] - kappa * lengths) / (1.0 + w)
     headings = _before(turns, first, segment)
-    moved = _turned(d, headings)
+    moved = turned(d, headings)
     after = _before(moved, first, segment) + moved
     return Chain(
         first=first,
@@ -166,7 +166,7 @@ def chain_of(steps: Array, keys: Indices, calibration: Array) -> Chain:
     )
 
 
-def _turned(points: Array, angles_rad: Array) -> Array:
+def turned(points: Array, angles_rad: Array) -> Array:
     """Return points (k, 2), each turned by its own angle."""
     c, s = np.cos(angles_rad), np.sin(angles_rad)
     x, y = points.T
@@ -431,7 +431,7 @@ class RunLog:
         """
         ranges = self._ranges.rows[self._ranges.rows["landmark"] == landmark_id]
         poses = self._causal.rows[ranges["pose"]]
-        antennas = poses[:, :2] + _turned(ranges["antenna"], poses[:, 2])
+        antennas = poses[:, :2] + turned(ranges["antenna"], poses[:, 2])
         return ranges["range_m"].copy(), ranges["sigma_m"].astype(np.float64), antennas
 
     def _keys(self, rule: RelinearisationRule) -> Indices:
@@ -466,7 +466,7 @@ class RunLog:
         chain = chain_of(steps, keys, state.calibration[None, :])
         key, place, turn = _from_keyframes(chain, keys)
         pose = ranges["pose"]
-        antennas = place[pose] + _turned(ranges["antenna"], turn[pose])
+        antennas = place[pose] + turned(ranges["antenna"], turn[pose])
         layout = replace(state.layout, n_past=0)  # past poses are keyframes
         prior_mean = np.zeros(layout.size)
         of_landmark = prior_mean[layout.landmarks].reshape(-1, layout.landmark_size)
@@ -568,7 +568,7 @@ def _from_keyframes(chain: Chain, keys: Indices) -> tuple[Indices, Array, Array]
     key[1:] = chain.segment + from_end
     heading = chain.headings + chain.turns
     end = ends[chain.segment]
-    back = _turned(chain.after - end[:, :2], -end[:, 2])
+    back = turned(chain.after - end[:, :2], -end[:, 2])
     place[1:] = np.where(from_end[:, None], back, chain.after)
     turn[1:] = np.where(from_end, heading - end[:, 2], heading)
     return key, place, turn
@@ -585,7 +585,7 @@ def all_poses(
     chain = chain_of(problem.steps, problem.keys, calibration[: len(problem.keys) - 1])
     begin, end, at = estimate.poses[:-1], estimate.poses[1:], chain.segment
     gone = end - begin
-    missed = np.column_stack([_turned(gone[:, :2], -begin[:, 2]), gone[:, 2]]) - chain.ends
+    missed = np.column_stack([turned(gone[:, :2], -begin[:, 2]), gone[:, 2]]) - chain.ends
     missed[:, 2] = wrap_angles(missed[:, 2])
     way = _way(chain)
     share = way / np.maximum(way[problem.keys[1:] - 1][at], _LEAST_WAY_M)

@@ -1,0 +1,103 @@
+"""A run whose landmarks are one is solved for from a path that is bent to where they are."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam.geometry import between, compose, transform
+from slam.robust.solver.revision import brought_together
+from slam.robust.solver.run_log import Estimate, Problem
+from slam.robust.state import Layout
+
+Array = NDArray[np.float64]
+
+N_RADARS, SLIP, BEGIN = 2, 6, 8  # the wheels slip in step 6; what is new is seen from pose 8 on
+MARKS = np.array([[1.0, 1.0], [2.5, -1.0], [0.5, -1.2]])
+PATH = np.array([[0.25 * i, 0.1 * math.sin(0.5 * i), 0.2 * math.cos(0.5 * i)] for i in range(14)])
+HIDDEN = np.array([0.1, -0.05, 0.6])  # what the wheels did not report
+
+
+def bent_run(slip_sigma: float, other_sigma: float) -> tuple[Problem, Estimate, Estimate]:
+    """Return a run with a slip, its solution if nothing is known twice, and the truth.
+
+    Landmarks 0 and 1 and the first wall are seen before the slip, 2 to 4 and the second wall behind
+    it: of these the first two are landmarks 0 and 1.
+    """
+    steps = np.array([between(*pair) for pair in pairwise(PATH)])
+    steps[SLIP] = compose(steps[SLIP], between(HIDDEN, np.zeros(3)))
+    wheels = [PATH[0]]
+    for step in steps:
+        wheels.append(compose(wheels[-1], step))
+    variances = np.full(len(steps), other_sigma**2)
+    variances[SLIP] = slip_sigma**2
+    layout = Layout(N_RADARS, 5, 2, has_radii=True)
+    seen = [(k, row) for k in range(len(PATH)) for row in ((0, 1, 5) if k < SLIP else ())]
+    seen += [(k, row) for k in range(BEGIN, len(PATH)) for row in (2, 3, 4, 6)]
+    poses, rows = np.array(seen).T
+    values = np.zeros(len(seen))
+    problem = Problem(
+        layout=layout,
+        prior_mean=np.zeros(layout.size),
+        prior_sigmas=np.ones(layout.size),
+        steps=steps,
+        step_covariances=variances[:, None, None] * np.eye(3),
+        walks=np.zeros((len(steps), 3)),
+        keys=np.arange(len(PATH)),
+        range_poses=poses,
+        range_radars=np.zeros(len(seen), dtype=np.intp),
+        range_landmarks=rows,
+        range_antennas=np.zeros((len(seen), 2)),
+        range_turns=values,
+        ranges_m=values + 1.0,
+        range_sigmas_m=values + 1.0,
+        range_bearings_rad=values,
+        range_bearing_sigmas_rad=values + 1.0,
+    )
+    away = compose(wheels[-1], between(PATH[-1], np.zeros(3)))
+    walls = np.array([[0.3, 2.0], [1.2, 3.0]])
+    n = np.array([math.cos(walls[1, 0]), math.sin(walls[1, 0])])
+    turned = transform(np.array([0.0, 0.0, away[2]]), n)
+    moved_wall = [walls[1, 0] + away[2], walls[1, 1] + float(turned @ away[:2])]
+    offsets, radii = np.array([0.01, -0.02]), np.array([0.1, 0.2, 0.3, 0.4, 0.5])
+    apart = np.vstack([MARKS[:2], transform(away, MARKS)])
+    calibration = np.zeros((1, 3))
+    fixed = [offsets, np.column_stack([apart, radii]).ravel(), walls[0], moved_wall]
+    true = [offsets, np.column_stack([MARKS, radii[[0, 1, 4]]]).ravel(), walls.ravel()]
+    return (
+        problem,
+        Estimate(poses=np.array(wheels), calibration=calibration, fixed=np.concatenate(fixed)),
+        Estimate(poses=PATH, calibration=calibration, fixed=np.concatenate(true)),
+    )
+
+
+def test_a_path_that_a_slip_has_bent_is_bent_back_where_it_slipped() -> None:
+    problem, apart, truth = bent_run(slip_sigma=0.3, other_sigma=0.0)
+    found = brought_together(problem, apart, ((0, 2), (1, 3)))
+    np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
+    np.testing.assert_allclose(found.fixed, truth.fixed, atol=1e-9)
+
+
+def test_motions_share_what_is_missed_as_their_variances_are() -> None:
+    """Landmarks are last seen before pose 6 and found again from pose 8 on: steps 5, 6 and 7."""
+    problem, apart, truth = bent_run(slip_sigma=0.3, other_sigma=0.1)
+    found = brought_together(problem, apart, ((0, 2), (1, 3)))
+    np.testing.assert_allclose(found.poses[:SLIP], apart.poses[:SLIP])
+    np.testing.assert_allclose(found.poses[BEGIN:], truth.poses[BEGIN:], atol=1e-9)
+    np.testing.assert_allclose(found.fixed, truth.fixed, atol=1e-9)
+    turned = found.poses[:, 2] - apart.poses[:, 2]
+    whole = turned[BEGIN]
+    assert turned[SLIP : BEGIN + 1] / whole == pytest.approx([1 / 11, 10 / 11, 1.0])
+
+
+def test_of_one_pair_what_is_new_is_shifted() -> None:
+    """One landmark says nothing of the heading."""
+    problem, apart, _ = bent_run(slip_sigma=0.3, other_sigma=0.0)
+    found = brought_together(problem, apart, ((0, 2),))
+    np.testing.assert_allclose(found.poses[:, 2], apart.poses[:, 2])
+    before = apart.fixed[N_RADARS : N_RADARS + 15].reshape(-1, 3)
+    behind = found.fixed[N_RADARS : N_RADARS + 12].reshape(-1, 3)
+    shift = MARKS[0] - before[2, :2]
+    np.testing.assert_allclose(behind[2:, :2] - before[3:, :2], [shift, shift])
