@@ -52,11 +52,18 @@ def _slow(radar: X4M300, command: Command[Any]) -> None:
     radar.request(command, SLOW_TIMEOUT_S)
 
 
-def _value(radar: X4M300, command: Command[Any]) -> Any:
+def _values(radar: X4M300, command: Command[Any], count: int) -> Any:
+    """Return the first values of an answer, at least so many of which there must be."""
     values = radar.request(command).values
-    if not values:
-        raise ModuleConnectorError(f"{radar.port} answers {type(command).__name__} without a value")
-    return values[0]
+    if len(values) < count:
+        raise ModuleConnectorError(
+            f"{radar.port} answers {type(command).__name__} with {len(values)} values, not {count}"
+        )
+    return values[:count]
+
+
+def _value(radar: X4M300, command: Command[Any]) -> Any:
+    return _values(radar, command, 1)[0]
 
 
 def _x4_set(setting: X4Setting, kind: Callable[[Any], Any] = int) -> Callable[..., None]:
@@ -71,7 +78,7 @@ def _x4_get(setting: X4Setting) -> Callable[[X4M300], Any]:
 
 
 def _frame_area(radar: X4M300) -> Data:
-    start, end = radar.request(m.X4DriverGet(setting=X4Setting.FRAMEAREA)).values
+    start, end = _values(radar, m.X4DriverGet(setting=X4Setting.FRAMEAREA), 2)
     return CLASSES["FrameArea"](start=start, end=end)
 
 
@@ -106,18 +113,18 @@ def _set_sensor_mode(radar: X4M300, mode: int, param: int = 0) -> None:
 
 
 def _zone(radar: X4M300) -> Data:
-    start, end = radar.request(m.GetDetectionZone()).values
+    start, end = _values(radar, m.GetDetectionZone(), 2)
     return CLASSES["DetectionZone"](start=start, end=end)
 
 
 def _zone_limits(radar: X4M300) -> Data:
-    start, end, step = radar.request(m.GetDetectionZoneLimits()).values
+    start, end, step = _values(radar, m.GetDetectionZoneLimits(), 3)
     return CLASSES["DetectionZoneLimits"](start=start, end=end, step=step)
 
 
 def _periodic_store(radar: X4M300) -> Data:
-    values = radar.request(m.NoiseMapGetPeriodicStore()).values
-    return CLASSES["PeriodicNoisemapStore"](interval_minutes=values[0])
+    interval = _value(radar, m.NoiseMapGetPeriodicStore())
+    return CLASSES["PeriodicNoisemapStore"](interval_minutes=interval)
 
 
 def _pin_control(radar: X4M300, pin_id: int) -> Data:

@@ -274,6 +274,36 @@ def test_file_data_that_do_not_come_end_with_an_error(answered: bytes) -> None:
         mc.get_xep().get_file_data(0x80000000, 5, 7, 1000)
 
 
+@pytest.mark.parametrize(
+    ("call", "command", "answer", "says"),
+    [
+        ("get_detection_zone", m.GetDetectionZone, m.ReplyFloat(values=(0.4,)), "1 values, not 2"),
+        (
+            "get_detection_zone_limits",
+            m.GetDetectionZoneLimits,
+            m.ReplyFloat(values=()),
+            "0 values, not 3",
+        ),
+        (
+            "get_periodic_noisemap_store",
+            m.NoiseMapGetPeriodicStore,
+            m.ReplyInt(values=()),
+            "0 values, not 1",
+        ),
+    ],
+)
+def test_an_answer_with_too_few_values_ends_with_an_error(
+    call: str, command: type[m.Message], answer: m.Response, says: str
+) -> None:
+    plain = PlainModule(instead={command: [answer]})
+    with (
+        PtyModule(plain) as module,
+        create_mc(module.path) as mc,
+        pytest.raises(RuntimeError, match=f"answers {command.__name__} with {says}"),
+    ):
+        getattr(mc.get_x4m300(), call)()
+
+
 def test_auto_finds_emulated_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert [port for port in legacy.auto() if "ttyACM" not in port and "ttyUSB" not in port] == []
