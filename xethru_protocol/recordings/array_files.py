@@ -108,8 +108,6 @@ class Frames:
         Of the settings; None if unknown.
     inferred
         Whether ``kind`` is a conclusion from the samples.
-    message
-        Name of the message that they came in; "" of a file of arrays.
     """
 
     about: str
@@ -123,7 +121,6 @@ class Frames:
     frame_rate_hz: float | None
     settings: Settings
     inferred: bool = False
-    message: str = ""
 
 
 _NUMBERS: Mapping[FrameKind, str] = {"rf": "real numbers", "iq": "numbers"}

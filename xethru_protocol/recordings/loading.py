@@ -459,7 +459,6 @@ class _Messages:
             frame_rate_hz=rate_hz,
             settings=settings,
             inferred=inferred,
-            message=layout.message,
         )
 
     def _chunks(self, layout: _ArrayLayout, kind: FrameKind | None) -> Iterator[Samples]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import select
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from slam.app.view.frames import BLOCK_FRAMES, chart_style, send_bscan, send_charts
 from slam.app.view.rerun_recording import DEVICE_TIME, RerunRecording, RowTimes, rr, rrb
 from xethru_protocol.cli.recordings import message_line
+from xethru_protocol.driver.frames import complex_of
 from xethru_protocol.operating_system import one_line
 from xethru_protocol.recordings import RecordingFault, read_recording
-from xethru_protocol.recordings.formats import recording_facts, recording_format
-from xethru_protocol.recordings.loading import RadarArrays, load
-from xethru_protocol.recordings.recorded_messages import NO_TIME_NS
+from xethru_protocol.recordings.formats import message_name, recording_facts, recording_format
+from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayouts
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.table import Response
 from xethru_protocol.wire.x4 import BASEBAND_BIN_M, RF_BIN_M
@@ -54,10 +54,7 @@ day that was recorded.
 def draw(
     path: Path, *, recording_id: str | None, application_id: str, entity_path_prefix: str
 ) -> Faults:
-    """Draw a recording on standard output: its log, then its frames.
-
-    Return what could not be read.
-    """
+    """Draw a recording on standard output as it is read; return what could not be read."""
     facts, kind = recording_facts(path), recording_format(path)
     faults = Faults()
     messages = read_recording(path, faults)
@@ -74,18 +71,22 @@ def draw(
         name=name,
         start_ns=0 if first is None else first[1] or 0,
     )
-    log = _Log(recording, f"{prefix}log")
-    for message, t_ns in chain([first] if first else [], messages):
-        log.take(message, t_ns)
-        faults.name_new(log)
-    faults.name_new(log)
-    n_frames = _draw_frames(path, recording, prefix, log)
-    log.send()
+    drawing = _Drawing(recording, prefix)
+    is_closed = select.poll()
+    is_closed.register(sys.stdout.fileno(), select.POLLERR)
+    for number, (message, t_ns) in enumerate(chain([first] if first else [], messages)):
+        drawing.take(message, t_ns)
+        faults.name_new(drawing)
+        if number % BLOCK_FRAMES == 0 and is_closed.poll(0):
+            break  # the viewer is gone
+    faults.name_new(drawing)
+    drawing.finish()
     about = _ABOUT.format(
         name=one_line(name),
         format="Recording of ModuleConnector" if kind == "vendor" else "Wire capture",
         session=f", session {one_line(facts.session_id)}" if facts.session_id else "",
-        kinds=", ".join(f"{count} {entity}" for entity, count in n_frames.items()) or "none",
+        kinds=", ".join(f"{count} {entity}" for entity, count in drawing.n_frames.items())
+        or "none",
         block=BLOCK_FRAMES,
     )
     document = rr.TextDocument(about, media_type=rr.MediaType.MARKDOWN)
@@ -111,9 +112,9 @@ class Faults:
             self._named += 1
             self._new.append(fault)
 
-    def name_new(self, log: _Log) -> None:
+    def name_new(self, drawing: _Drawing) -> None:
         for fault in self._new:
-            log.add(str(fault), "WARN")
+            drawing.log(str(fault), "WARN")
         self._new.clear()
 
 
@@ -132,134 +133,186 @@ def bscan(samples: Samples) -> NDArray[np.float32]:
     return np.abs(moving).astype(np.float32)
 
 
-class _Log:
-    """Sends every message that is no frame as a line."""
+@dataclass(slots=True, kw_only=True)
+class _UnsentFrames:
+    """Frames of one kind and layout that wait to be sent together.
 
-    def __init__(self, recording: RerunRecording, entity: str) -> None:
-        self._recording, self._entity = recording, entity
+    Where bins lie [module metres], and whether a frame's values are RF or all I and then all Q, may
+    be unknown until the block is sent for the first time: `bin_m` is 0 and `is_complex` None then.
+    """
+
+    entity: str
+    is_complex: bool | None
+    is_placed: bool
+    start_m: float = 0.0
+    bin_m: float = 0.0
+    is_shown: bool = False
+    stamps: RowTimes = field(default_factory=RowTimes)
+    samples: list[Samples] = field(default_factory=list)
+
+    @property
+    def charts(self) -> tuple[str, ...]:
+        return ("amplitude", "phase") if self.is_complex else ("amplitude",)
+
+
+class _Drawing:
+    """Sends messages to Rerun: frames in blocks, everything else as lines of a log."""
+
+    def __init__(self, recording: RerunRecording, prefix: str) -> None:
+        self._recording = recording
+        self._prefix = prefix
+        self._layouts, self._geometries = FrameLayouts(), FrameGeometries()
+        self._blocks: dict[tuple[object, ...], _UnsentFrames] = {}
+        self._kinds: Counter[str] = Counter()
         self._lines: list[tuple[str, str]] = []
-        self._stamps = RowTimes()
+        self._line_stamps = RowTimes()
         self._t_ns: int | None = None
         self._counter = 0
+        self.n_frames: Counter[str] = Counter()
 
     def take(self, message: Response, t_ns: int | None) -> None:
-        """Log one message; one without a time is shown at that of the message before."""
+        """Draw one message; one without a time is drawn at that of the message before."""
         if t_ns is not None:
             if self._t_ns is None:
                 self._recording.epoch_ns = t_ns
             self._t_ns = t_ns
+        self._layouts.take(message)
+        self._geometries.take(message)
         match message:
-            case m.DataFloat(content_id=0, info=counter):
-                self._counter = counter
+            case m.DataFloat(content_id=0, values=values):
+                self._counter = message.info
+                geometry = self._geometries.of(message)
+                if geometry is None:
+                    self._add(message, values, None, None, t_ns)
+                    return
+                place = (geometry.range_start_m, geometry.bin_length_m)
+                samples = complex_of(*np.split(values, 2)) if geometry.downconversion else values
+                self._add(message, samples, geometry.downconversion, place, t_ns)
             case m.BasebandIq() | m.BasebandAp() | m.RadarMessage():
                 self._counter = message.counter
+                samples = _samples_of(message)
+                place = (message.range_offset_m, message.bin_length_m)
+                self._add(message, samples, np.iscomplexobj(samples), place, t_ns)
             case _:
-                self.add(message_line(message, with_samples=False), "INFO", t_ns)
+                self.log(message_line(message, with_samples=False), "INFO", t_ns)
 
-    def add(self, text: str, level: str, t_ns: int | None = None) -> None:
-        # Before any time is known: 0 is before the epoch, where the view begins.
-        self._stamps.add(self._t_ns or 0, self._counter, t_ns)
+    def log(self, text: str, level: str, t_ns: int | None = None) -> None:
+        self._stamp(self._line_stamps, t_ns)
         self._lines.append((one_line(text), level))
         if len(self._lines) == _LINES:
-            self.send()
+            self._send_lines()
 
-    def send(self) -> None:
+    def finish(self) -> None:
+        for block in list(self._blocks.values()):
+            self._send(block)
+        self._send_lines()
+
+    def _stamp(self, stamps: RowTimes, t_ns: int | None) -> None:
+        # Before any time is known: 0 is before the epoch, where the view begins.
+        stamps.add(self._t_ns or 0, self._counter, t_ns)
+
+    def _add(
+        self,
+        message: Response,
+        samples: Samples,
+        is_complex: bool | None,
+        place: tuple[float, float] | None,
+        t_ns: int | None,
+    ) -> None:
+        """Add a frame to the block of its kind and layout; frames of too many are left out."""
+        if not len(samples):
+            return
+        name = message_name(message)
+        key = (name, len(samples), is_complex, place)
+        if key not in self._blocks:
+            self._kinds[name] += 1
+            if self._kinds[name] > _MOST_LAYOUTS:
+                if self._kinds[name] == _MOST_LAYOUTS + 1:
+                    self.log(f"{name}: frames of further layouts are not drawn", "WARN")
+                return
+            number = f"_{self._kinds[name]}" if self._kinds[name] > 1 else ""
+            block = _UnsentFrames(
+                entity=self._prefix + name.lower().replace(" ", "_") + number,
+                is_complex=is_complex,
+                is_placed=place is not None,
+            )
+            if place is not None:
+                block.start_m, block.bin_m = place
+            self._blocks[key] = block
+        block = self._blocks[key]
+        self._stamp(block.stamps, t_ns)
+        block.samples.append(samples)
+        if len(block.samples) == BLOCK_FRAMES:
+            self._send(block)
+
+    def _send(self, block: _UnsentFrames) -> None:
+        if not block.samples:
+            return
+        samples: NDArray[Any] = np.stack(block.samples)
+        if block.is_complex is None:
+            layout = self._layouts.layouts()[samples.shape[1]]
+            block.is_complex = bool(layout.downconversion)
+        if block.is_complex and not np.iscomplexobj(samples):
+            i, q = np.split(samples, 2, axis=1)
+            samples = complex_of(i.ravel(), q.ravel()).reshape(i.shape)
+        ranges_m = self._ranges_m(block, samples.shape[1])
+        values = (np.abs(samples), np.angle(samples)) if block.is_complex else (samples,)
+        charts = dict(zip(block.charts, values, strict=True))
+        send_charts(self._recording, block.entity, block.stamps, charts)
+        picture = bscan(samples)
+        send_bscan(
+            self._recording,
+            block.entity,
+            block.stamps,
+            picture,
+            lasted_ns=block.stamps.t_ns[-1] - block.stamps.t_ns[0],
+            ends_m=(ranges_m[0], ranges_m[-1]),
+            brightest=_brightest(picture),
+            counted_from="" if block.is_placed else " from the first bin",
+        )
+        self.n_frames[block.entity] += len(samples)
+        block.stamps, block.samples = RowTimes(), []
+
+    def _ranges_m(self, block: _UnsentFrames, n_bins: int) -> NDArray[np.float64]:
+        """Return where bins lie; at the first time, make room for the block's views."""
+        if not block.is_placed:
+            block.bin_m = BASEBAND_BIN_M if block.is_complex else RF_BIN_M
+        ranges_m = block.start_m + block.bin_m * np.arange(n_bins, dtype=np.float64)
+        if block.is_shown:
+            return ranges_m
+        block.is_shown = True
+        if not block.is_placed:
+            self.log(
+                f"DATA FLOAT: where the first of {n_bins} bins lies is not recorded; "
+                "ranges are counted from it",
+                "WARN",
+            )
+        for chart in block.charts:
+            style = chart_style(abscissa=ranges_m.astype(np.float32), bar_m=abs(block.bin_m) or 1.0)
+            self._recording.static(f"{block.entity}/{chart}", style)
+        shown = [each for each in self._blocks.values() if each.is_shown]
+        self._recording.arrange(_blueprint(shown, self._prefix))
+        return ranges_m
+
+    def _send_lines(self) -> None:
         if self._lines:
             texts, levels = zip(*self._lines, strict=True)
             columns = rr.TextLog.columns(text=list(texts), level=list(levels))
-            self._recording.rows(self._entity, self._stamps, columns)
-        self._lines, self._stamps = [], RowTimes()
+            self._recording.rows(f"{self._prefix}log", self._line_stamps, columns)
+        self._lines, self._line_stamps = [], RowTimes()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Frames:
-    """Frames of one kind and layout, and where they are drawn."""
-
-    entity: str
-    arrays: RadarArrays
-
-    @property
-    def charts(self) -> tuple[str, ...]:
-        return ("amplitude", "phase") if self.arrays.kind == "iq" else ("amplitude",)
-
-
-def _draw_frames(path: Path, recording: RerunRecording, prefix: str, log: _Log) -> dict[str, int]:
-    """Draw the frames of each kind and layout; return how many, by their entities."""
-    is_closed = select.poll()
-    is_closed.register(sys.stdout.fileno(), select.POLLERR)
-    drawn: list[_Frames] = []
-    for frames in _frames_of(path, prefix, log):
-        drawn.append(frames)
-        recording.arrange(_blueprint(drawn, prefix))
-        for _ in _draw_blocks(recording, frames, log):
-            if is_closed.poll(0):
-                break  # the viewer is gone
-    return {each.entity: each.arrays.n_frames for each in drawn}
-
-
-def _draw_blocks(recording: RerunRecording, frames: _Frames, log: _Log) -> Iterator[None]:
-    """Draw frames block by block, and yield behind each."""
-    arrays, is_complex = frames.arrays, frames.arrays.kind == "iq"
-    ranges_m, counted_from = arrays.ranges_m, ""
-    if ranges_m is None:
-        ranges_m = (BASEBAND_BIN_M if is_complex else RF_BIN_M) * np.arange(float(arrays.n_bins))
-        counted_from = " from the first bin"
-        log.add(
-            f"DATA FLOAT: where the first of {arrays.n_bins} bins lies is not recorded; "
-            "ranges are counted from it",
-            "WARN",
-        )
-    bar_m = float(np.ptp(ranges_m[:2])) or 1.0
-    for chart in frames.charts:
-        style = chart_style(abscissa=ranges_m.astype(np.float32), bar_m=bar_m)
-        recording.static(f"{frames.entity}/{chart}", style)
-    last_ns = 0  # before the epoch, where the view begins
-    for block in arrays.blocks(BLOCK_FRAMES):
-        samples = block.iq if is_complex else block.rf
-        assert samples is not None
-        assert block.counter is not None
-        stamps = RowTimes()
-        times_ns = [NO_TIME_NS] * block.n_frames if block.t_ns is None else block.t_ns.tolist()
-        for t_ns, counter in zip(times_ns, block.counter.tolist(), strict=True):
-            is_known = t_ns != NO_TIME_NS
-            last_ns = t_ns if is_known else last_ns
-            stamps.add(last_ns, counter, t_ns if is_known else None)
-        values = [samples.real] if not is_complex else [np.abs(samples), np.angle(samples)]
-        charts = dict(zip(frames.charts, values, strict=True))
-        send_charts(recording, frames.entity, stamps, charts)
-        picture = bscan(samples)
-        send_bscan(
-            recording,
-            frames.entity,
-            stamps,
-            picture,
-            lasted_ns=stamps.t_ns[-1] - stamps.t_ns[0],
-            ends_m=(float(ranges_m[0]), float(ranges_m[-1])),
-            brightest=_brightest(picture),
-            counted_from=counted_from,
-        )
-        yield
-
-
-def _frames_of(path: Path, prefix: str, log: _Log) -> Iterator[_Frames]:
-    """Yield the frames of each kind and layout; those of too many are left out."""
-    kinds: Counter[str] = Counter()
-    radars = load(path, lambda fault: None).radars.values()  # faults are in the log already
-    for arrays in chain.from_iterable(radar.parts for radar in radars):
-        found = arrays.frames
-        if not found.n_bins:
-            continue
-        kinds[found.message] += 1
-        number = kinds[found.message]
-        if number > _MOST_LAYOUTS:
-            if number == _MOST_LAYOUTS + 1:
-                log.add(f"{found.message}: frames of further layouts are not drawn", "WARN")
-            continue
-        if found.kind is None:  # drawn as it came
-            as_rf = replace(found, kind="rf")
-            arrays = RadarArrays(arrays.name, partial(tuple, (as_rf,)), str(path))
-        name = found.message.lower().replace(" ", "_")
-        yield _Frames(entity=f"{prefix}{name}{f'_{number}' if number > 1 else ''}", arrays=arrays)
+def _samples_of(message: m.BasebandIq | m.BasebandAp | m.RadarMessage) -> Samples:
+    match message:
+        case m.BasebandAp():
+            return np.asarray(message.amplitude * np.exp(1j * message.phase), dtype=np.complex64)
+        case m.BasebandIq():
+            return complex_of(message.i, message.q)
+        case m.RadarBasebandFloat() | m.RadarBasebandQ15():
+            return message.iq
+        case m.RadarRf() | m.RadarRfNormalized():
+            return message.samples.astype(np.float32)
+    raise AssertionError(message)
 
 
 def _brightest(picture: NDArray[np.float32]) -> float:
@@ -268,11 +321,11 @@ def _brightest(picture: NDArray[np.float32]) -> float:
     return max(float(np.quantile(known, 0.999)), 1e-12) if len(known) else 1.0
 
 
-def _blueprint(drawn: Sequence[_Frames], prefix: str) -> rrb.Blueprint:
+def _blueprint(blocks: Sequence[_UnsentFrames], prefix: str) -> rrb.Blueprint:
     """Return the layout: B-scans, below them the newest frame, beside them the log."""
     scans: list[rrb.View] = []
     charts: list[rrb.View] = []
-    for block in drawn:
+    for block in blocks:
         name = block.entity.removeprefix(prefix)
         scans.append(
             rrb.TensorView(
@@ -289,9 +342,9 @@ def _blueprint(drawn: Sequence[_Frames], prefix: str) -> rrb.Blueprint:
     log = rrb.TextLogView(name="Log", origin=f"/{prefix}log")
     about = rrb.TextDocumentView(name="What you see", origin=f"/{prefix}about")
     texts = rrb.Vertical(about, log)
-    beside = rrb.Vertical(rrb.Tabs(*scans), rrb.Tabs(*charts), row_shares=[3, 2])
+    drawn = rrb.Vertical(rrb.Tabs(*scans), rrb.Tabs(*charts), row_shares=[3, 2])
     return rrb.Blueprint(
-        rrb.Horizontal(beside, texts, column_shares=[3, 2]) if scans else texts,
+        rrb.Horizontal(drawn, texts, column_shares=[3, 2]) if scans else texts,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=DEVICE_TIME),
