@@ -36,7 +36,7 @@ if importlib.util.find_spec("hypothesis") is not None:
     # CI repeats its examples, but for constants, which Hypothesis takes from the modules loaded so
     # far. What `make test-explore` finds becomes an @example beside the test.
     settings.register_profile("thorough", timeless, derandomize=True, print_blob=True)
-    # The default suite has the first third of the examples; `make test-rare` has them all.
+    # The default suite has a third as many examples as `make test-rare`.
     settings.register_profile("ci", settings.get_profile("thorough"), max_examples=20)
     settings.register_profile("rare", settings.get_profile("thorough"), max_examples=60)
     settings.register_profile(
@@ -54,7 +54,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 class DoctestsWhereExamplesAre:
-    """Leaves doctest the files with examples: it searches the attributes of all for seconds.
+    """Lets doctest collect only files with examples: to search all of them takes seconds.
 
     A plugin of its own, since hooks of this file are not asked about files outside of its folder.
     """
@@ -64,7 +64,9 @@ class DoctestsWhereExamplesAre:
         self, file_path: Path, parent: pytest.Collector
     ) -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
         option, wanted = parent.config.option, parent.config.option.doctestmodules
-        option.doctestmodules = wanted and b">>>" in file_path.read_bytes()
+        option.doctestmodules = (
+            wanted and file_path.suffix == ".py" and b">>>" in file_path.read_bytes()
+        )
         try:
             return (yield)
         finally:

@@ -1,4 +1,4 @@
-"""How many examples a law gets, which has a number of its own."""
+"""The number of examples of a law that sets one of its own."""
 
 import os
 

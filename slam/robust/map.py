@@ -3,7 +3,7 @@
 The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
 merging after a loop bends the trajectory back, and everything correlated with it. It is proposed
 late, when one merge stands out from all competitors; whether it is made, the solution over the
-whole run decides (`slam.robust.solver.revision.is_one`).
+whole run decides (`slam.robust.solver.revision.solved_as_one`).
 """
 
 from __future__ import annotations

@@ -484,8 +484,8 @@ class _Messages:
                     layout = _ArrayLayout(
                         message_name(message),
                         message.num_bins,
-                        message.range_offset_m,
-                        message.bin_length_m,
+                        _length_m(message.range_offset_m),
+                        _length_m(message.bin_length_m),
                         None,
                     )
                     if isinstance(message, RadarMessage):

@@ -97,9 +97,10 @@ class RecordedScans:
         self.link_log = LinkLog()
 
     def truth_at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the truth of scans by their times, which do not fall."""
-        after = np.searchsorted(self._stamps_ns.rows, stamps_ns, side="right")
-        return self._truth.rows[after - 1]
+        """Return the truth of scans by their times, which do not fall; NaN at other times."""
+        at = np.searchsorted(self._stamps_ns.rows, stamps_ns, side="right") - 1
+        is_scan = self._stamps_ns.rows[at] == stamps_ns
+        return np.where(is_scan[:, None], self._truth.rows[at], np.nan)
 
     def __iter__(self) -> Iterator[Scan]:
         for record in self._session.played():

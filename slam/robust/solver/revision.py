@@ -37,8 +37,8 @@ from slam.robust.state import (
 
 _LEAST_SHARE, _MOST_SHARE = 0.5, 1000.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
-# By what the noise of measurements is multiplied where the start is far from the solution
-_VAGUER = (30.0, 8.0)
+# Of the noise of measurements, where the start is far from the solution
+_NOISE_FACTORS = (30.0, 8.0)
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
 
 
@@ -83,7 +83,9 @@ def _solved(
 def solved_as_one(
     log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameters
 ) -> tuple[Problem, Solution] | None:
-    """Solve for the whole run with landmarks, by row, as one, in pairs; None if it is against that.
+    """Solve for the whole run with landmarks, by row, as one, in pairs.
+
+    None if the run does not allow it.
 
     The run is solved for with them as two and as one, their ranges having the noise of the noisier
     one. The cost may rise by what chance explains, the quantile of chi-square with two degrees of
@@ -101,31 +103,41 @@ def solved_as_one(
         return None
     merged = log.problem(one, parameters, same)
     smoother = Smoother(merged, parameters.relinearisation)
-    bent = brought_together(problem, apart.estimate, pairs)
-    start = min(*log.starts(one, merged), bent, key=smoother.cost)
-    together = smoother.solve(_eased(merged, start, parameters) if start is bent else start)
-    if together is None or not is_determined(together.information):
-        return None
-    limit = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
-    if together.cost - apart.cost > limit:
-        return None
-    # The cost of a range is bounded: few of them could lie anywhere.
-    residual = measurement_residuals(merged, together.estimate).residual[: len(merged.ranges_m)]
-    fits = np.abs(residual) <= parameters.relinearisation.outlier_sigmas
-    of_rows = [fits[problem.range_landmarks == row] for pair in pairs for row in pair]
-    # Those of a map may have none in this run.
-    if all(np.mean(of_row) > 0.5 for of_row in of_rows if len(of_row)):
+    of_rows = [problem.range_landmarks == row for pair in pairs for row in pair]
+
+    def is_allowed(together: Solution, least: float) -> bool:
+        limit = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
+        if together.cost - least > limit or not is_determined(together.information):
+            return False
+        # The cost of a range is bounded: few of them could lie anywhere.
+        residual = measurement_residuals(merged, together.estimate).residual[: len(merged.ranges_m)]
+        fits = np.abs(residual) <= parameters.relinearisation.outlier_sigmas
+        # Those of a map may have none in this run.
+        return all(np.mean(fits[mine]) > 0.5 for mine in of_rows if mine.any())
+
+    # Most pairs are near enough to be solved for from where the filter has them.
+    together = smoother.solve(min(log.starts(one, merged), key=smoother.cost))
+    if together is not None and is_allowed(together, apart.cost):
         return merged, together
-    return None
+    closed = with_closed_loop(problem, apart.estimate, pairs)
+    together = smoother.solve(_annealed(merged, closed, parameters))
+    if together is None or not is_allowed(together, apart.cost):
+        return None
+    # The search went further than that for the solution with them as two: so does this one.
+    doubled = with_doubled(problem, together.estimate, pairs)
+    again = Smoother(problem, parameters.relinearisation).solve(doubled)
+    least = apart.cost if again is None else min(apart.cost, again.cost)
+    return (merged, together) if is_allowed(together, least) else None
 
 
-def brought_together(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimate:
+def with_closed_loop(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimate:
     """Return an estimate with the second landmark of each pair, by row, where the first one is.
 
     All poses since the first of the second ones was seen are moved as one. The motions between that
     and the last sight of a first one share the correction in proportion to their variances: turns,
     then what is left of the way (G. Dubbelman and B. Browning, "COP-SLAM", IEEE Transactions on
-    Robotics 31(5), 2015). Features move with the pose that saw them first.
+    Robotics 31(5), 2015). Features move with the pose that saw them first, but for the first
+    landmarks of the pairs and those of a map.
     """
     kept, gone = np.array(pairs, dtype=np.intp).T
     layout, at, seen_from = problem.layout, problem.range_landmarks, problem.range_poses
@@ -149,28 +161,50 @@ def brought_together(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimat
     poses[:, 2] += turns
     first = np.full(layout.n_landmarks + layout.n_walls, last)
     np.minimum.at(first, at, seen_from)
-    first[np.bincount(at, minlength=len(first)) == 0] = 0  # of a map
-    of_landmark, of_wall = np.split(first, [layout.n_landmarks])
-    away = landmarks[:, :2] - apart.poses[of_landmark, :2]
-    landmarks[:, :2] = poses[of_landmark, :2] + turned(away, turns[of_landmark])
+    is_of_map = np.isin(layout.first_columns(np.arange(len(first))), problem.known_at)
+    stays = is_of_map | np.isin(np.arange(len(first)), kept)
+    moved, moved_walls = np.split(
+        np.flatnonzero(~stays), [int(np.sum(~stays[: layout.n_landmarks]))]
+    )
+    by = first[moved]
+    away = landmarks[moved, :2] - apart.poses[by, :2]
+    landmarks[moved, :2] = poses[by, :2] + turned(away, turns[by])
     # n . q = d for the places q of a wall, before and behind
-    walls[:, 1] -= _along(walls[:, 0], apart.poses[of_wall, :2])
-    walls[:, 0] += turns[of_wall]
-    walls[:, 1] += _along(walls[:, 0], poses[of_wall, :2])
+    by, moved_walls = first[moved_walls], moved_walls - layout.n_landmarks
+    walls[moved_walls, 1] -= _along(walls[moved_walls, 0], apart.poses[by, :2])
+    walls[moved_walls, 0] += turns[by]
+    walls[moved_walls, 1] += _along(walls[moved_walls, 0], poses[by, :2])
     constants = apart.fixed[: layout.landmarks.start - HEAD_SIZE]
     fixed = np.concatenate([constants, np.delete(landmarks, gone, axis=0).ravel(), walls.ravel()])
     return replace(apart, poses=poses, fixed=fixed)
 
 
-def _eased(problem: Problem, start: Estimate, parameters: BackEndParameters) -> Estimate:
-    """Return the solution from a start with measurements that count for little, then for more.
+def with_doubled(problem: Problem, together: Estimate, pairs: Pairs) -> Estimate:
+    """Return an estimate with the second landmark of each pair, by row, where they are as one.
 
-    Far from the solution, precise ranges hold Gauss-Newton steps back, and the path stays bent.
-    Radii stay as they are: with vague ranges their prior would take all landmarks for thin.
+    ``problem`` is that of them as two.
+    """
+    kept, gone = np.array(pairs, dtype=np.intp).T
+    layout = problem.layout
+    n_constants, size = layout.landmarks.start - HEAD_SIZE, layout.landmark_size
+    own = np.delete(np.arange(layout.n_landmarks), gone)
+    constants, rest = np.split(together.fixed, [n_constants])
+    landmarks = np.zeros((layout.n_landmarks, size))
+    landmarks[own] = rest[: size * len(own)].reshape(-1, size)
+    landmarks[gone] = landmarks[kept]
+    fixed = np.concatenate([constants, landmarks.ravel(), rest[size * len(own) :]])
+    return replace(together, fixed=fixed)
+
+
+def _annealed(problem: Problem, start: Estimate, parameters: BackEndParameters) -> Estimate:
+    """Return the solution from a start with much more noise of measurements, then with less.
+
+    Far from the solution, Gauss-Newton steps with precise ranges end in another minimum. Radii stay
+    as they are: with vague ranges their prior would take all landmarks for thin.
     """
     layout = problem.layout
     radii = np.arange(layout.size)[layout.radii if layout.has_radii else slice(0, 0)] - HEAD_SIZE
-    for factor in _VAGUER:
+    for factor in _NOISE_FACTORS:
         vague = replace(
             problem,
             range_sigmas_m=factor * problem.range_sigmas_m,

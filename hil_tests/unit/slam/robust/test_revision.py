@@ -1,6 +1,7 @@
 """A run whose landmarks are one is solved for from a path that is bent to where they are."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.geometry import between, compose, transform
-from slam.robust.solver.revision import brought_together
+from slam.robust.solver.revision import with_closed_loop, with_doubled
 from slam.robust.solver.run_log import Estimate, Problem
 from slam.robust.state import Layout
 
@@ -75,7 +76,7 @@ def bent_run(slip_sigma: float, other_sigma: float) -> tuple[Problem, Estimate, 
 
 def test_a_path_that_a_slip_has_bent_is_bent_back_where_it_slipped() -> None:
     problem, apart, truth = bent_run(slip_sigma=0.3, other_sigma=0.0)
-    found = brought_together(problem, apart, ((0, 2), (1, 3)))
+    found = with_closed_loop(problem, apart, ((0, 2), (1, 3)))
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
     np.testing.assert_allclose(found.fixed, truth.fixed, atol=1e-9)
 
@@ -83,7 +84,7 @@ def test_a_path_that_a_slip_has_bent_is_bent_back_where_it_slipped() -> None:
 def test_motions_share_what_is_missed_as_their_variances_are() -> None:
     """Landmarks are last seen before pose 6 and found again from pose 8 on: steps 5, 6 and 7."""
     problem, apart, truth = bent_run(slip_sigma=0.3, other_sigma=0.1)
-    found = brought_together(problem, apart, ((0, 2), (1, 3)))
+    found = with_closed_loop(problem, apart, ((0, 2), (1, 3)))
     np.testing.assert_allclose(found.poses[:SLIP], apart.poses[:SLIP])
     np.testing.assert_allclose(found.poses[BEGIN:], truth.poses[BEGIN:], atol=1e-9)
     np.testing.assert_allclose(found.fixed, truth.fixed, atol=1e-9)
@@ -95,9 +96,36 @@ def test_motions_share_what_is_missed_as_their_variances_are() -> None:
 def test_of_one_pair_what_is_new_is_shifted() -> None:
     """One landmark says nothing of the heading."""
     problem, apart, _ = bent_run(slip_sigma=0.3, other_sigma=0.0)
-    found = brought_together(problem, apart, ((0, 2),))
+    found = with_closed_loop(problem, apart, ((0, 2),))
     np.testing.assert_allclose(found.poses[:, 2], apart.poses[:, 2])
     before = apart.fixed[N_RADARS : N_RADARS + 15].reshape(-1, 3)
     behind = found.fixed[N_RADARS : N_RADARS + 12].reshape(-1, 3)
     shift = MARKS[0] - before[2, :2]
     np.testing.assert_allclose(behind[2:, :2] - before[3:, :2], [shift, shift])
+
+
+def test_what_is_known_before_stays_where_it_is() -> None:
+    """Of the first landmarks of the pairs one has later ranges only; another one is of a map."""
+    problem, apart, truth = bent_run(slip_sigma=0.3, other_sigma=0.0)
+    later = problem.range_poses + BEGIN * (problem.range_landmarks == 1)
+    column = problem.layout.first_columns(np.array([4]))
+    of_map = replace(
+        problem,
+        range_poses=later,
+        known_at=np.append(column, column + 1),
+        known_information=np.eye(2),
+    )
+    found = with_closed_loop(of_map, apart, ((0, 2), (1, 3)))
+    own, before = found.fixed[N_RADARS:].reshape(-1), apart.fixed[N_RADARS:]
+    np.testing.assert_allclose(own[:6], truth.fixed[N_RADARS : N_RADARS + 6], atol=1e-9)
+    np.testing.assert_allclose(own[6:9], before[12:15])
+
+
+def test_doubled_landmarks_are_where_the_one_is() -> None:
+    problem, apart, truth = bent_run(slip_sigma=0.3, other_sigma=0.0)
+    doubled = with_doubled(problem, truth, ((0, 2), (1, 3)))
+    own = doubled.fixed[N_RADARS : N_RADARS + 15].reshape(-1, 3)
+    np.testing.assert_array_equal(own[:, :2], MARKS[[0, 1, 0, 1, 2]])
+    np.testing.assert_array_equal(doubled.fixed[-4:], truth.fixed[-4:])
+    assert len(doubled.fixed) == len(apart.fixed)
+    np.testing.assert_array_equal(doubled.poses, truth.poses)

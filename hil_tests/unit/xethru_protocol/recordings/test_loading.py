@@ -5,6 +5,7 @@ read here with numpy by their layout alone, or are put into the messages here.
 """
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -139,6 +140,17 @@ def test_a_frame_area_that_was_changed_makes_two_parts(tmp_path: Path) -> None:
     starts_m = [np.asarray(part.ranges_m)[0] for part in recording.parts]
     assert starts_m == [0.5, 0.5, 2.0]
     assert [np.asarray(part.iq).shape for part in recording.parts] == [(3, 9), (1, 12), (1, 9)]
+
+
+def test_a_damaged_range_makes_a_part_of_unknown_ranges(tmp_path: Path) -> None:
+    """No number is equal to NaN, also not that of the same frame when it is read again."""
+    sent = [baseband(1, 9), baseband(2, 9, math.nan), baseband(3, 9), baseband(4, 9, math.nan)]
+    write_capture(tmp_path / "a.xtwire", [(one, at * MS) for at, one in enumerate(sent)])
+    known, damaged = load(tmp_path / "a.xtwire").parts
+    assert [np.asarray(part.counter).tolist() for part in (known, damaged)] == [[1, 3], [2, 4]]
+    assert np.asarray(damaged.iq).shape == (2, 9)
+    assert damaged.ranges_m is None
+    assert sum(block.n_frames for block in damaged.blocks()) == 2
 
 
 def test_the_modules_answers_give_ranges_and_settings(tmp_path: Path) -> None:

@@ -169,7 +169,9 @@ def odometry_until(end_s: float) -> LiveOdometry:
 
 
 def begun(n_radars: int, odometry: LiveOdometry | None = None) -> TickAssembler:
-    assembler = TickAssembler(n_radars, PERIOD_NS, odometry or odometry_until(12.0))
+    assembler = TickAssembler(
+        n_radars, PERIOD_NS, odometry_until(12.0) if odometry is None else odometry
+    )
     assembler.begin(START_NS)
     return assembler
 
