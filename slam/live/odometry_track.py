@@ -290,8 +290,8 @@ class OdometryTrack(PoseTrack):
         before = self._noise_of(after - 1)
         return before + part * (self._noise_of(after) - before)
 
-    @classmethod
-    def from_lines(cls, lines: Iterable[str]) -> OdometryTrack:
+    @staticmethod
+    def from_lines(lines: Iterable[str]) -> OdometryTrack:
         """Parse TUM lines; OdometryError if one is malformed or not later, or there is none."""
         samples = []
         for number, line in enumerate(lines, start=1):
@@ -299,7 +299,7 @@ class OdometryTrack(PoseTrack):
                 samples.append(parse_tum_line(line))
             except TumError as error:
                 raise OdometryError(f"odometry, line {number}: {error}") from None
-        return cls(samples)
+        return OdometryTrack(samples)
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
         """Return the pose at a session time; see `PoseTrack`.
