@@ -39,6 +39,10 @@ VAGUE_RADIUS: Annotated[float, Origin.CHOSEN] = 3.0
 """How many times the least standard deviation of such radii may be, for a radius to count."""
 THICK_SIGMAS: Annotated[float, Origin.CHOSEN] = 3.0
 """From how many standard deviations on a radius is that of a thick thing."""
+FIRST_NOISE_FACTOR: Annotated[float, Origin.CHOSEN] = 30.0
+"""By what the noise of measurements is multiplied first, where a solution starts far away."""
+SECOND_NOISE_FACTOR: Annotated[float, Origin.CHOSEN] = 8.0
+"""By what it is multiplied then, before the solution with the noise as it is."""
 SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 

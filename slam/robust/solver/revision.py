@@ -13,7 +13,13 @@ from scipy.special import chdtri
 from slam.geometry import align_se2, transform
 from slam.robust.association import Pairs
 from slam.robust.map import MERGE_SIGMA_M, apply_merge
-from slam.robust.parameters import SIGMA_PER_MEDIAN, TAIL_PROBABILITY, BackEndParameters
+from slam.robust.parameters import (
+    FIRST_NOISE_FACTOR,
+    SECOND_NOISE_FACTOR,
+    SIGMA_PER_MEDIAN,
+    TAIL_PROBABILITY,
+    BackEndParameters,
+)
 from slam.robust.solver.run_log import (
     Estimate,
     Problem,
@@ -37,8 +43,6 @@ from slam.robust.state import (
 
 _LEAST_SHARE, _MOST_SHARE = 0.5, 1000.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
-# Of the noise of measurements, where the start is far from the solution
-_NOISE_FACTORS = (30.0, 8.0)
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
 
 
@@ -133,11 +137,13 @@ def solved_as_one(
 def with_closed_loop(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimate:
     """Return an estimate with the second landmark of each pair, by row, where the first one is.
 
-    All poses since the first of the second ones was seen are moved as one. The motions between that
-    and the last sight of a first one share the correction in proportion to their variances: turns,
-    then what is left of the way (G. Dubbelman and B. Browning, "COP-SLAM", IEEE Transactions on
-    Robotics 31(5), 2015). Features move with the pose that saw them first, but for the first
-    landmarks of the pairs and those of a map.
+    ``problem`` and ``apart`` are of them as two; the estimate has no second landmarks. Poses are
+    (k + 1, 3) [m, m, rad], landmarks (n, 2) [m], map frame. All poses since the first of the second
+    ones was seen are moved as one. The motions between that and the last sight of a first one share
+    the correction in proportion to their variances: turns, then what is left of the way
+    (G. Dubbelman and B. Browning, "COP-SLAM", IEEE Transactions on Robotics 31(5), 2015). Features
+    move with the pose that saw them first, but for the first landmarks of the pairs and those of a
+    map.
     """
     kept, gone = np.array(pairs, dtype=np.intp).T
     layout, at, seen_from = problem.layout, problem.range_landmarks, problem.range_poses
@@ -150,13 +156,13 @@ def with_closed_loop(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimat
     end = int(seen_from[np.isin(at, kept) & (seen_from < begin)].max(initial=0))
     chain = chain_of(problem.steps, problem.keys, apart.calibration[:last])
     variances = motion_covariances(chain, problem.step_covariances)[end:begin]
-    poses, turns, between = apart.poses.copy(), np.zeros(last + 1), slice(end + 1, begin + 1)
-    turns[between] = motion[2] * _shares(variances[:, 2, 2])
+    poses, turns, sharing = apart.poses.copy(), np.zeros(last + 1), slice(end + 1, begin + 1)
+    turns[sharing] = motion[2] * _shares(variances[:, 2, 2])
     turns[begin:] = motion[2]
     ways = turned(np.diff(apart.poses[end : begin + 1, :2], axis=0), turns[end:begin])
-    poses[between, :2] = poses[end, :2] + np.cumsum(ways, axis=0)
+    poses[sharing, :2] = poses[end, :2] + np.cumsum(ways, axis=0)
     missed = transform(motion, apart.poses[begin, :2]) - poses[begin, :2]
-    poses[between, :2] += _shares(variances[:, 0, 0] + variances[:, 1, 1])[:, None] * missed
+    poses[sharing, :2] += _shares(variances[:, 0, 0] + variances[:, 1, 1])[:, None] * missed
     poses[begin:, :2] = transform(motion, apart.poses[begin:, :2])
     poses[:, 2] += turns
     first = np.full(layout.n_landmarks + layout.n_walls, last)
@@ -180,9 +186,9 @@ def with_closed_loop(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimat
 
 
 def with_doubled(problem: Problem, together: Estimate, pairs: Pairs) -> Estimate:
-    """Return an estimate with the second landmark of each pair, by row, where they are as one.
+    """Return an estimate with the second landmark of each pair, by row, where the first one is [m].
 
-    ``problem`` is that of them as two.
+    ``problem`` is of them as two, ``together`` a solution with them as one, map frame.
     """
     kept, gone = np.array(pairs, dtype=np.intp).T
     layout = problem.layout
@@ -204,7 +210,7 @@ def _annealed(problem: Problem, start: Estimate, parameters: BackEndParameters) 
     """
     layout = problem.layout
     radii = np.arange(layout.size)[layout.radii if layout.has_radii else slice(0, 0)] - HEAD_SIZE
-    for factor in _NOISE_FACTORS:
+    for factor in (FIRST_NOISE_FACTOR, SECOND_NOISE_FACTOR):
         vague = replace(
             problem,
             range_sigmas_m=factor * problem.range_sigmas_m,
@@ -220,13 +226,13 @@ def _annealed(problem: Problem, start: Estimate, parameters: BackEndParameters) 
 
 
 def _shares(variances: Array) -> Array:
-    """Return which part of a sum errors of some variances have reached, from one to the next."""
+    """Return which part of their sum variances (k,) have reached after each, shape (k,)."""
     reached = np.cumsum(variances + _LEAST_VARIANCE_M2)
     return np.asarray(reached / reached[-1:])
 
 
 def _along(directions_rad: Array, places_m: Array) -> Array:
-    """Return how far places (k, 2) are along directions (k,)."""
+    """Return how far places (k, 2) [m] are along directions (k,) [rad], shape (k,) [m]."""
     return np.asarray(
         np.cos(directions_rad) * places_m[:, 0] + np.sin(directions_rad) * places_m[:, 1]
     )
