@@ -19,13 +19,12 @@ commands wait for each other, and what one task reads reaches the others.
 import asyncio
 import inspect
 import itertools
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from typing import Self, TypeVarTuple
 
 from xethru_protocol.driver import raw_mode, reconnect
-from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame
+from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
     Awaited,
@@ -44,13 +43,12 @@ from xethru_protocol.driver.link import (
     T,
     Write,
 )
-from xethru_protocol.driver.matching import Observer
 from xethru_protocol.driver.profiles import (
     MESSAGE_TIMEOUT_S,
     MessageT,
     wait_for_message,
 )
-from xethru_protocol.driver.radar import RadarState, known_ports, reentry
+from xethru_protocol.driver.radar import RadarState, reentry
 from xethru_protocol.transport import (
     AsyncSerialTransport,
     AsyncTransport,
@@ -64,7 +62,7 @@ _LONGEST_WAIT_S = 86400.0
 Ts = TypeVarTuple("Ts")
 
 
-class AsyncX4M300(RadarState[Awaited]):
+class AsyncX4M300(RadarState[Awaited, AsyncTransport]):
     """One module at the other end of a transport of asyncio; all members as of `X4M300`.
 
     A chip setting has coroutines: ``await radar.x4.iterations.get()``, ``.set(8)``.
@@ -73,30 +71,9 @@ class AsyncX4M300(RadarState[Awaited]):
     _is_awaited = True
     _make_gate = asyncio.Event
     _port_type = staticmethod(AsyncSerialTransport)
-    _transport: AsyncTransport
+    _usual_sleep = staticmethod(asyncio.sleep)
 
-    def __init__(
-        self,
-        transport: AsyncTransport,
-        *,
-        clock: Callable[[], int] = time.monotonic_ns,
-        observer: Observer | None = None,
-        queue_frames: int = DEFAULT_FRAMES,
-        reconnect_s: float = 0.0,
-        open_port: Callable[[str, int], AsyncTransport] = AsyncSerialTransport,
-        candidates: Callable[[], Sequence[str]] = known_ports,
-        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
-    ) -> None:
-        super().__init__(
-            transport,
-            clock=clock,
-            observer=observer,
-            queue_frames=queue_frames,
-            reconnect_s=reconnect_s,
-            candidates=candidates,
-        )
-        self._open_port = open_port
-        self._sleep = sleep
+    def _make_locks(self) -> None:
         self._one_at_a_time = asyncio.Lock()
         self._reading: asyncio.Future[None] | None = None
         self._at_work = False  # never while a task waits

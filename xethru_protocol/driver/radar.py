@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Generic, Literal, Self, TypeVar
 
 from xethru_protocol.driver import profiles, raw_mode, reconnect
 from xethru_protocol.driver.board import Diagnostics, Pins
@@ -78,7 +78,10 @@ def reentry(name: str) -> LocalProtocolError:
     )
 
 
-class RadarState(Part[KindT]):
+LineT = TypeVar("LineT", bound=Transport | AsyncTransport)
+
+
+class RadarState(Part[KindT], Generic[KindT, LineT]):
     """What both drivers have: methods, counters and settings.
 
     A listener, observer or other callback must not call the driver: `LocalProtocolError`.
@@ -86,23 +89,28 @@ class RadarState(Part[KindT]):
 
     _is_awaited: ClassVar[bool] = False
     _make_gate: ClassVar[type[Gate]]
-    _port_type: "ClassVar[staticmethod[[str, int], Transport | AsyncTransport]]"
-    _open_port: Callable[[str, int], Transport | AsyncTransport]
+    _port_type: Callable[[str, int], LineT]
+    _usual_sleep: Callable[[float], Any]
 
     def __init__(
         self,
-        transport: Transport | AsyncTransport,
+        transport: LineT,
         *,
-        clock: Callable[[], int],
-        observer: Observer | None,
-        queue_frames: int,
-        reconnect_s: float,
+        clock: Callable[[], int] = time.monotonic_ns,
+        observer: Observer | None = None,
+        queue_frames: int = DEFAULT_FRAMES,
+        reconnect_s: float = 0.0,
+        open_port: Callable[[str, int], LineT] | None = None,
         candidates: Callable[[], Sequence[str]] = known_ports,
+        sleep: Callable[[float], Any] | None = None,
     ) -> None:
         if not hasattr(transport, "write"):
             name = type(self).__name__
             raise TypeError(f"{name} needs an open line; {name}.open({transport!r}) opens a port")
         self._transport = transport
+        self._open_port = open_port or self._port_type
+        self._sleep = sleep or self._usual_sleep
+        self._make_locks()
         self._link = Link(
             transport.name,
             clock=clock,
@@ -122,6 +130,10 @@ class RadarState(Part[KindT]):
         self.postprocessing: Postprocessing[KindT] = Postprocessing(self)
         self.diagnostics: Diagnostics[KindT] = Diagnostics(self)
         self._link.bytes_per_s = capacity_bytes_per_s(transport)
+
+    def _make_locks(self) -> None:
+        """Make what keeps callers of this driver apart."""
+        raise NotImplementedError
 
     def __del__(self) -> None:
         link = getattr(self, "_link", None)  # missing if the driver could not be made
@@ -478,12 +490,12 @@ class RadarState(Part[KindT]):
 
     # --- carrying out steps ---
 
-    def _use(self, transport: Transport | AsyncTransport) -> None:
+    def _use(self, transport: LineT) -> None:
         self._transport = transport
         self._link.bytes_per_s = capacity_bytes_per_s(transport)
 
 
-class X4M300(RadarState[Blocking]):
+class X4M300(RadarState[Blocking, Transport]):
     """One radar module on a port: X4M300, X4M200, or any other with XeThru's X4 firmware.
 
     Raw frames, a sample per range bin::
@@ -546,39 +558,18 @@ class X4M300(RadarState[Blocking]):
         How long to look for a module that vanished, on this port and others, before a call
         fails; what was configured is restored. 0: a vanished module is `Disconnected` at once.
     open_port
-        Opens a line after a reconnect, from its path and baud rate.
+        Opens a line after a reconnect, from its path and baud rate; None: as `open` does.
     candidates
         Ports at which a module that vanished may come back.
     sleep
-        Waits [s] while the line is closed.
+        Waits [s] while the line is closed; None: by the clock of this machine.
     """
 
     _make_gate = threading.Event
     _port_type = staticmethod(open_line)
-    _transport: Transport
+    _usual_sleep = staticmethod(time.sleep)
 
-    def __init__(
-        self,
-        transport: Transport,
-        *,
-        clock: Callable[[], int] = time.monotonic_ns,
-        observer: Observer | None = None,
-        queue_frames: int = DEFAULT_FRAMES,
-        reconnect_s: float = 0.0,
-        open_port: Callable[[str, int], Transport] = open_line,
-        candidates: Callable[[], Sequence[str]] = known_ports,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        super().__init__(
-            transport,
-            clock=clock,
-            observer=observer,
-            queue_frames=queue_frames,
-            reconnect_s=reconnect_s,
-            candidates=candidates,
-        )
-        self._open_port = open_port
-        self._sleep = sleep
+    def _make_locks(self) -> None:
         self._one_at_a_time = threading.Lock()
         # Held while the driver's state is used, not while a thread waits for the line.
         self._lock = threading.Lock()

@@ -86,14 +86,14 @@ DriverOn = Callable[..., Scripted]
 @contextlib.contextmanager
 def driver_factory(kind: str) -> Iterator[DriverOn]:
     """Give a maker of drivers; at the end they count as closed, whatever their modules do."""
-    made: list[RadarState[Any]] = []
+    made: list[RadarState[Any, Any]] = []
     with asyncio.Runner() as runner:
         yield _maker(kind, runner, made)
     for radar in made:
         radar._link.closed = True
 
 
-def _maker(kind: str, runner: asyncio.Runner, made: list[RadarState[Any]]) -> DriverOn:
+def _maker(kind: str, runner: asyncio.Runner, made: list[RadarState[Any, Any]]) -> DriverOn:
     def driver_on(
         answer: Answer | None = None,
         *,
