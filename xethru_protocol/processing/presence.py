@@ -28,13 +28,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from xethru_protocol.processing.doppler import CARRIER_HZ, SPEED_OF_LIGHT_MPS, range_doppler
-from xethru_protocol.processing.window import Window, checked
+from xethru_protocol.processing.window import Monitor, checked
 
 LEAST_PHASE_RAD = 0.1
 """Three times the phase's deviation of a strong reflector in a recording of a real module."""
@@ -134,7 +135,7 @@ def _threshold(frequencies: int, probability: float) -> float:
     return (1 - 1 / (9 * shape) + z / (3 * math.sqrt(shape))) ** 3
 
 
-class PresenceMonitor:
+class PresenceMonitor(Monitor[Presence]):
     """Presence from frames as they come: `presence` of the newest window.
 
     Parameters
@@ -145,11 +146,6 @@ class PresenceMonitor:
         Seconds that are looked back on.
     every_s
         Seconds from one answer to the next.
-
-    Attributes
-    ----------
-    presence
-        The latest answer; None until the window is full.
     """
 
     def __init__(
@@ -162,29 +158,10 @@ class PresenceMonitor:
         false_alarm_rate: float = 1e-3,
         carrier_hz: float = CARRIER_HZ,
     ) -> None:
-        self._ranges_m: NDArray[np.float64] = np.array(ranges_m, dtype=np.float64)
-        self._frame_rate_hz = frame_rate_hz
-        self._false_alarm_rate = false_alarm_rate
-        self._carrier_hz = carrier_hz
-        self._window = Window(
-            len(self._ranges_m), frame_rate_hz, window_s=window_s, every_s=every_s
-        )
-        self.presence: Presence | None = None
+        compute = partial(presence, false_alarm_rate=false_alarm_rate, carrier_hz=carrier_hz)
+        super().__init__(compute, ranges_m, frame_rate_hz, window_s=window_s, every_s=every_s)
 
-    def reset(self) -> None:
-        """Forget all frames, as when the radar was moved or frames are missing."""
-        self._window.clear()
-        self.presence = None
-
-    def update(self, iq_frame: ArrayLike) -> Presence | None:
-        """Take one frame, shape (n_bins,), complex; return the latest answer."""
-        window = self._window.add(iq_frame)
-        if window is not None:
-            self.presence = presence(
-                window,
-                self._ranges_m,
-                self._frame_rate_hz,
-                false_alarm_rate=self._false_alarm_rate,
-                carrier_hz=self._carrier_hz,
-            )
-        return self.presence
+    @property
+    def presence(self) -> Presence | None:
+        """The latest answer; None until the window is full."""
+        return self.newest

@@ -48,12 +48,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from xethru_protocol.processing.doppler import CARRIER_HZ, SPEED_OF_LIGHT_MPS, hann, range_doppler
-from xethru_protocol.processing.window import Window, checked
+from xethru_protocol.processing.window import Monitor, checked
 
 SLOWEST_BPM, FASTEST_BPM = 6.0, 40.0
 """Rates that are looked for, breaths per minute."""
@@ -508,7 +509,7 @@ def _highest(power: NDArray[np.float64], frequency: NDArray[np.float64]) -> int 
     return int(peaks[np.argmax(power[peaks])]) if len(peaks) else None
 
 
-class BreathingMonitor:
+class BreathingMonitor(Monitor[Breathing | None]):
     """Breathing from frames as they come: `breathing_rate` of the newest window.
 
     Parameters
@@ -519,11 +520,6 @@ class BreathingMonitor:
         Seconds that are looked back on.
     every_s
         Seconds from one answer to the next.
-
-    Attributes
-    ----------
-    breathing
-        The latest answer: None until the window is full, and while there is none.
     """
 
     def __init__(
@@ -537,24 +533,10 @@ class BreathingMonitor:
     ) -> None:
         if window_s < SHORTEST_S:
             raise ValueError(f"window_s {window_s:g}: must be at least {SHORTEST_S:g}")
-        self._ranges_m = np.array(ranges_m, dtype=np.float64)
-        self._frame_rate_hz = frame_rate_hz
-        self._carrier_hz = carrier_hz
-        self._window = Window(
-            len(self._ranges_m), frame_rate_hz, window_s=window_s, every_s=every_s
-        )
-        self.breathing: Breathing | None = None
+        compute = partial(breathing_rate, carrier_hz=carrier_hz)
+        super().__init__(compute, ranges_m, frame_rate_hz, window_s=window_s, every_s=every_s)
 
-    def reset(self) -> None:
-        """Forget all frames, as when the radar was moved or frames are missing."""
-        self._window.clear()
-        self.breathing = None
-
-    def update(self, iq_frame: ArrayLike) -> Breathing | None:
-        """Take one frame, shape (n_bins,), complex; return the latest answer."""
-        window = self._window.add(iq_frame)
-        if window is not None:
-            self.breathing = breathing_rate(
-                window, self._ranges_m, self._frame_rate_hz, carrier_hz=self._carrier_hz
-            )
-        return self.breathing
+    @property
+    def breathing(self) -> Breathing | None:
+        """The latest answer: None until the window is full, and while there is none."""
+        return self.newest

@@ -1,54 +1,70 @@
-"""The newest frames of a stream, and when they are looked at again."""
+"""Answers from the newest frames of a stream, computed again now and then."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+AnswerT = TypeVar("AnswerT")
+Compute = Callable[[NDArray[np.complex64], NDArray[np.float64], float], AnswerT]
 
-class Window:
-    """The newest frames, for what is computed from a window of them now and then.
 
-    Attributes
-    ----------
-    n_frames
-        Frames of a window.
+class Monitor(Generic[AnswerT]):
+    """What is computed of the newest window of frames as they come.
+
+    ``compute`` gets the window, a view that later frames overwrite, the ranges and the frame rate;
+    ``newest`` is its latest answer.
     """
 
+    newest: AnswerT | None = None
+
     def __init__(
-        self, n_bins: int, frame_rate_hz: float, *, window_s: float, every_s: float
+        self,
+        compute: Compute[AnswerT],
+        ranges_m: ArrayLike,
+        frame_rate_hz: float,
+        *,
+        window_s: float,
+        every_s: float,
     ) -> None:
         check_rate(frame_rate_hz)
         for name, seconds in (("window_s", window_s), ("every_s", every_s)):
             if not 0 < seconds < math.inf:
                 raise ValueError(f"{name} {seconds:g}: must be above 0")
-        self.n_frames = math.ceil(window_s * frame_rate_hz)
+        self._compute = compute
+        self._ranges_m: NDArray[np.float64] = np.array(ranges_m, dtype=np.float64)
+        self._frame_rate_hz = frame_rate_hz
+        self._n_frames = math.ceil(window_s * frame_rate_hz)
         self._every = max(round(every_s * frame_rate_hz), 1)
         # twice, so that the newest window is one piece
-        self._ring = np.zeros((2 * self.n_frames, n_bins), dtype=np.complex64)
+        self._ring = np.zeros((2 * self._n_frames, len(self._ranges_m)), dtype=np.complex64)
         self._taken = 0
 
-    def clear(self) -> None:
+    def reset(self) -> None:
+        """Forget all frames, as when the radar was moved or frames are missing."""
         self._taken = 0
+        self.newest = None
 
-    def add(self, iq_frame: ArrayLike) -> NDArray[np.complex64] | None:
-        """Take one frame, shape (n_bins,); return the window if it is due, else None.
+    def update(self, iq_frame: ArrayLike) -> AnswerT | None:
+        """Take one frame, shape (n_bins,), complex; return the latest answer.
 
-        It is due when it is first full, and then every ``every_s``. The array is a view that later
-        frames overwrite.
+        There is a new one when the window is first full, and then every ``every_s``.
         """
         frame = np.asarray(iq_frame)
         if frame.shape != self._ring.shape[1:]:
             raise ValueError(f"a frame of shape {frame.shape}: must be {self._ring.shape[1:]}")
-        place = self._taken % self.n_frames
-        self._ring[place] = self._ring[place + self.n_frames] = frame
+        place = self._taken % self._n_frames
+        self._ring[place] = self._ring[place + self._n_frames] = frame
         self._taken += 1
-        beyond = self._taken - self.n_frames
-        if beyond < 0 or beyond % self._every:
-            return None
-        return self._ring[place + 1 : place + 1 + self.n_frames]
+        beyond = self._taken - self._n_frames
+        if beyond >= 0 and beyond % self._every == 0:
+            window = self._ring[place + 1 : place + 1 + self._n_frames]
+            self.newest = self._compute(window, self._ranges_m, self._frame_rate_hz)
+        return self.newest
 
 
 def check_rate(frame_rate_hz: float) -> None:
