@@ -334,38 +334,15 @@ def _numbers(line: str) -> tuple[float, ...]:
         return ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Given:
-    """What a caller knows about the frames of a recording; None: what the recording says."""
-
-    area_m: tuple[float, float] | None = None
-    range_start_m: float | None = None
-    bin_length_m: float | None = None
-    downconversion: bool | None = None
-
-    def __post_init__(self) -> None:
-        steps = (self.range_start_m, self.bin_length_m)
-        if self.area_m is not None and steps != (None, None):
-            raise RecordingError("give area_m, or range_start_m and bin_length_m, not both")
-        if (self.range_start_m is None) != (self.bin_length_m is None):
-            raise RecordingError("range_start_m and bin_length_m are given together")
-        for value in (*(self.area_m or ()), *steps):
-            if value is not None and not math.isfinite(value):
-                raise RecordingError(f"a range cannot be {value}")
-
-    def ranges_m(self, n_bins: int, kind: FrameKind | None) -> npt.NDArray[np.float64] | None:
-        """Return the range of each bin, shape (n_bins,), as given; None if it is not."""
-        if self.area_m is not None and kind is not None:
-            return FrameGeometry.from_read_back(
-                area_m=self.area_m, n_bins=n_bins, downconversion=kind == "iq"
-            ).ranges_m
-        if self.range_start_m is not None and self.bin_length_m is not None:
-            return steps_m(self.range_start_m, self.bin_length_m, n_bins)
+def _ranges_in(
+    area_m: tuple[float, float] | None, n_bins: int, kind: FrameKind | None
+) -> npt.NDArray[np.float64] | None:
+    """Return the range of each bin, shape (n_bins,), by a frame area; None without one."""
+    if area_m is None or kind is None:
         return None
-
-
-def steps_m(start_m: float, bin_m: float, n_bins: int) -> npt.NDArray[np.float64]:
-    return start_m + np.arange(n_bins, dtype=np.float64) * bin_m
+    return FrameGeometry.from_read_back(
+        area_m=area_m, n_bins=n_bins, downconversion=kind == "iq"
+    ).ranges_m
 
 
 class _ArrayLayout(NamedTuple):
@@ -396,22 +373,29 @@ class _FrameColumns:
 class _Messages:
     """Frames among the messages of one radar of a recording.
 
-    ``info`` is what an MCAP file says about the radar: see `RecordingContent`.
+    ``area_m`` and ``downconversion`` are as of `load`; ``info`` is what an MCAP file says about the
+    radar: see `RecordingContent`.
     """
 
     def __init__(
-        self, path: Path, radar: str | None, given: Given, info: Mapping[str, Any]
+        self,
+        path: Path,
+        radar: str | None,
+        info: Mapping[str, Any],
+        *,
+        area_m: tuple[float, float] | None,
+        downconversion: bool | None,
     ) -> None:
         self._path = path
         self._radar = radar
-        self._given = given
+        self._area_m, self._downconversion = area_m, downconversion
         self._info = info if info.get("length_unit") == MODULE_METRES else {}
         self._settings: dict[str, Any] = {}
 
     def find(self, on_fault: FaultHandler) -> list[Frames]:
         """Read the recording once for what describes its frames."""
         columns: dict[_ArrayLayout, _FrameColumns] = {}
-        layouts = FrameLayouts(self._given.downconversion)
+        layouts = FrameLayouts(self._downconversion)
         for row in self._rows(on_fault, layouts):
             column = columns.get(row.layout)
             if column is None:
@@ -431,13 +415,13 @@ class _Messages:
         if layout.message == _RAW:
             downconversion = found[n_bins].downconversion
             inferred = found[n_bins].inferred and layout.downconversion is None
-            if self._given.downconversion is None and layout.downconversion is not None:
+            if self._downconversion is None and layout.downconversion is not None:
                 downconversion = layout.downconversion
             kind = None if downconversion is None else "iq" if downconversion else "rf"
             n_bins = n_bins // 2 if downconversion else n_bins
-        ranges_m = self._given.ranges_m(n_bins, kind)
+        ranges_m = _ranges_in(self._area_m, n_bins, kind)
         if ranges_m is None and layout.start_m is not None and layout.bin_m is not None:
-            ranges_m = steps_m(layout.start_m, layout.bin_m, n_bins)
+            ranges_m = layout.start_m + np.arange(n_bins, dtype=np.float64) * layout.bin_m
         t_ns = np.array(column.t_ns, np.int64)
         # the first frames come before the answer that gives their rate
         running = {value for value in column.fps if real_frame_rate(value)}
@@ -622,14 +606,12 @@ def load(
     on_fault: FaultHandler | None = None,
     *,
     area_m: tuple[float, float] | None = None,
-    range_start_m: float | None = None,
-    bin_length_m: float | None = None,
     downconversion: bool | None = None,
 ) -> Recording:
     """Return a recording as arrays, which are read when they are first used.
 
-    What a recording does not say is None in the result, and can be given: where the bins lie, by
-    ``area_m`` or by the other two, and what its frames are.
+    What a recording does not say is None in the result, and can be given: where the bins lie, and
+    what its frames are.
 
     Parameters
     ----------
@@ -643,8 +625,6 @@ def load(
     area_m
         Frame area as the module read it back: range of the first bin, and of the last one of
         baseband or the one behind the last of RF [module metres]. Protocol reference 9.4.
-    range_start_m, bin_length_m
-        Range of the first bin, and from bin to bin [module metres].
     downconversion
         Whether radar frames are baseband, which recordings of the vendor's format do not say: it
         is inferred from how smooth frames are over range.
@@ -663,14 +643,16 @@ def load(
         plt.plot(recording.true_ranges_m, power)
     """
     path = Path(path)
-    given = Given(
-        area_m=area_m,
-        range_start_m=range_start_m,
-        bin_length_m=bin_length_m,
-        downconversion=downconversion,
-    )
+    for limit_m in area_m or ():
+        if not math.isfinite(limit_m):
+            raise RecordingError(f"a range cannot be {limit_m}")
     if is_array_file(path):
-        find = _of_file(path, given, on_fault)
+
+        def find() -> Sequence[Frames]:
+            frames = read_array_file(path, on_fault, downconversion=downconversion)
+            ranges_m = _ranges_in(area_m, frames.n_bins, frames.kind)
+            return [frames if ranges_m is None else replace(frames, ranges_m=ranges_m)]
+
         return Recording(path, {"": RadarArrays("", find, str(path))}, {})
     content = recording_content(path)
     reported: set[RecordingFault] = set()
@@ -686,7 +668,7 @@ def load(
             raise RecordingError(f"{error}; load(path, print) reads the rest") from None
 
     def radar(name: str, info: Mapping[str, Any]) -> RadarArrays:
-        messages = _Messages(path, name or None, given, info)
+        messages = _Messages(path, name or None, info, area_m=area_m, downconversion=downconversion)
         return RadarArrays(name, lambda: messages.find(note), str(path))
 
     radars = {name: radar(name, info) for name, info in sorted(content.radars.items())}
@@ -699,14 +681,3 @@ def load(
         for name, lines in content.texts.items()
     }
     return Recording(path, radars, texts)
-
-
-def _of_file(
-    path: Path, given: Given, on_fault: FaultHandler | None
-) -> Callable[[], Sequence[Frames]]:
-    def find() -> Sequence[Frames]:
-        frames = read_array_file(path, on_fault, downconversion=given.downconversion)
-        ranges_m = given.ranges_m(frames.n_bins, frames.kind)
-        return [frames if ranges_m is None else replace(frames, ranges_m=ranges_m)]
-
-    return find

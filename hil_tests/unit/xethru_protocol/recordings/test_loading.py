@@ -326,17 +326,9 @@ def test_a_recording_without_frames_says_so() -> None:
         _ = recording.iq
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"area_m": (1, 2), "range_start_m": 1.0, "bin_length_m": 0.1},
-        {"range_start_m": 1.0},
-        {"area_m": (1.0, float("nan"))},
-    ],
-)
-def test_ranges_that_make_no_sense_are_refused(given: Mapping[str, Any]) -> None:
+def test_ranges_that_make_no_sense_are_refused() -> None:
     with pytest.raises(RecordingError):
-        load(RECORDINGS / "iq", **given)
+        load(RECORDINGS / "iq", area_m=(1.0, float("nan")))
 
 
 # --- files of arrays ----------------------------------------------------------------------------
@@ -385,7 +377,7 @@ def test_files_of_others_are_read(tmp_path: Path) -> None:
     t_ns = load(tmp_path / "a.mat").t_ns
     assert t_ns is not None
     assert t_ns.tolist() == [1, -(2**63), 3]
-    other = load(tmp_path / "b.npz", range_start_m=1.0, bin_length_m=0.5)
+    other = load(tmp_path / "b.npz", area_m=(1.0, 1.5))
     np.testing.assert_array_equal(other.iq, values * 1j)
     np.testing.assert_array_equal(other.ranges_m, [1.0, 1.5])
     convert(tmp_path / "b.npz", tmp_path / "b.csv")
