@@ -108,7 +108,7 @@ class Files(Part[KindT]):
             SLOW_TIMEOUT_S,
         )
         whole = m.SetFileData(file_type=file_type, identifier=identifier, offset=0, data=data)
-        body = _write_chunks(link, whole, on_progress)
+        body = write_chunks(link, whole, on_progress)
         try:
             yield from _then_close(link, file_type, identifier, body)
         except GeneratorExit:
@@ -134,7 +134,7 @@ class Files(Part[KindT]):
         """Write into a file that exists, from ``offset`` on; it does not grow."""
         part = m.SetFileData(file_type=file_type, identifier=identifier, offset=offset, data=data)
         yield from _open(link, file_type, identifier)
-        body = _write_chunks(link, part, None)
+        body = write_chunks(link, part)
         yield from _then_close(link, file_type, identifier, body)
 
     @sends_once
@@ -161,7 +161,7 @@ class Files(Part[KindT]):
         """Read what the firmware left when it crashed last; empty if it did not."""
         total = yield from _length(link, m.GetCrashDumpLength(), "its crash dump's length")
         chunk = m.GetCrashDump(offset=0, length=0)
-        return (yield from _read_chunks(link, chunk, total, on_progress))
+        return (yield from read_chunks(link, chunk, total, on_progress))
 
     @sends_once
     def clear_crash_dump(link: Link) -> Steps[None]:
@@ -176,7 +176,7 @@ def _file_length(link: Link, file_type: int, identifier: int) -> Steps[int]:
 
 def _read(link: Link, part: m.GetFileData, on_progress: OnProgress | None = None) -> Steps[bytes]:
     yield from _open(link, part.file_type, part.identifier)
-    body = _read_chunks(link, part, part.length, on_progress)
+    body = read_chunks(link, part, part.length, on_progress)
     return (yield from _then_close(link, part.file_type, part.identifier, body))
 
 
@@ -204,9 +204,13 @@ def _open(link: Link, file_type: int, identifier: int) -> Steps[None]:
         yield from link.request(command)
 
 
-def _read_chunks(
-    link: Link, chunk: m.GetFileData | m.GetCrashDump, total: int, on_progress: OnProgress | None
+def read_chunks(
+    link: Link,
+    chunk: m.GetFileData | m.GetCrashDump,
+    total: int,
+    on_progress: OnProgress | None = None,
 ) -> Steps[bytes]:
+    """Read ``total`` bytes from where ``chunk`` begins, of a file that is open."""
     data = bytearray()
     while True:
         if on_progress is not None:
@@ -223,21 +227,24 @@ def _read_chunks(
         data += got
 
 
-def _write_chunks(link: Link, part: m.SetFileData, on_progress: OnProgress | None) -> Steps[None]:
+def write_chunks(
+    link: Link, part: m.SetFileData, on_progress: OnProgress | None = None
+) -> Steps[None]:
+    """Write a part of a file that is open."""
     total = len(part.data)
     done = 0
     while done < total:
         if on_progress is not None:
             on_progress(done, total)
         data = bytes(part.data[done : done + CHUNK_BYTES])
-        piece = receivable(replace(part, offset=part.offset + done, data=data))
+        piece = _receivable(replace(part, offset=part.offset + done, data=data))
         yield from link.request(piece, SLOW_TIMEOUT_S)
         done += len(piece.data)
     if on_progress is not None:
         on_progress(total, total)
 
 
-def receivable(piece: m.SetFileData) -> m.SetFileData:
+def _receivable(piece: m.SetFileData) -> m.SetFileData:
     """Return as much of a piece as a module does not misread."""
     begin = piece.data.find(NO_ESCAPE_START)
     if begin >= 0:

@@ -15,7 +15,7 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any, Final
 
-from xethru_protocol.driver.files import CHUNK_BYTES, receivable
+from xethru_protocol.driver.files import read_chunks, write_chunks
 from xethru_protocol.driver.link import SLOW_TIMEOUT_S
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.legacy.connection import (
@@ -156,32 +156,15 @@ def _all_files(radar: X4M300) -> Data:
 
 
 def _get_file_data(radar: X4M300, type: int, identifier: int, offset: int, length: int) -> Vector:
-    data = b""
-    while len(data) < length:
-        at, wanted = offset + len(data), min(CHUNK_BYTES, length - len(data))
-        command = m.GetFileData(
-            file_type=type & _ID, identifier=identifier, offset=at, length=wanted
-        )
-        got = radar.request(command).values
-        if not 0 < len(got) <= wanted:
-            raise ModuleConnectorError(
-                f"get_file_data: {radar.port} sent {len(got)} bytes from {at} on, not {wanted}"
-            )
-        data += got
-    return Vector(data)
+    part = m.GetFileData(file_type=type & _ID, identifier=identifier, offset=offset, length=length)
+    return Vector(radar._call_once(read_chunks, part, length))
 
 
 def _set_file_data(radar: X4M300, type: int, identifier: int, offset: int, data: Any) -> None:
-    content, at = _bytes(data), 0
-    while at < len(content):
-        piece = content[at : at + CHUNK_BYTES]
-        command = receivable(
-            m.SetFileData(
-                file_type=type & _ID, identifier=identifier, offset=offset + at, data=piece
-            )
-        )
-        _slow(radar, command)
-        at += len(command.data)
+    part = m.SetFileData(
+        file_type=type & _ID, identifier=identifier, offset=offset, data=_bytes(data)
+    )
+    radar._call_once(write_chunks, part)
 
 
 def _bytes(data: Any) -> bytes:
