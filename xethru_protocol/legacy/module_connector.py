@@ -16,7 +16,7 @@ from importlib.metadata import version
 from typing import Any, Final
 
 from xethru_protocol.driver.files import read_chunks, write_chunks
-from xethru_protocol.driver.link import SLOW_TIMEOUT_S
+from xethru_protocol.driver.link import CONFIG_SETTINGS, SLOW_TIMEOUT_S
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.legacy.connection import (
     MessageQueues,
@@ -38,6 +38,7 @@ from xethru_protocol.wire.codes import (
 )
 from xethru_protocol.wire.errors import DeviceError, XeThruError
 from xethru_protocol.wire.table import Command, Response
+from xethru_protocol.wire.x4 import LIMITS
 
 Rows = Mapping[str, Callable[..., Any]]
 
@@ -187,8 +188,13 @@ _BOTH: Rows = {
     "get_iopin_value": lambda radar, pin_id: int(radar.pins.read(pin_id)),
 }
 
+# the DAC's are not in every release of ModuleConnector, but in scripts of its makers
+_WHOLE_NUMBERS = {name: one for name, one in CONFIG_SETTINGS.items() if one in LIMITS}
+
 _XEP: Rows = {
     **_BOTH,
+    **{f"x4driver_set_{name}": _x4_set(setting) for name, setting in _WHOLE_NUMBERS.items()},
+    **{f"x4driver_get_{name}": _x4_get(setting) for name, setting in _WHOLE_NUMBERS.items()},
     "set_normalization": _set_processing(FramePostprocessing.NORMALISATION),
     "get_normalization": _get_processing(FramePostprocessing.NORMALISATION),
     "set_phase_noise_correction": lambda radar, enable, correction_distance: (
@@ -207,21 +213,6 @@ _XEP: Rows = {
     "x4driver_set_enable": _x4_set(X4Setting.ENABLE),
     "x4driver_set_fps": _x4_set(X4Setting.FPS, float),
     "x4driver_get_fps": _x4_get(X4Setting.FPS),
-    "x4driver_set_iterations": _x4_set(X4Setting.ITERATIONS),
-    "x4driver_get_iterations": _x4_get(X4Setting.ITERATIONS),
-    "x4driver_set_pulses_per_step": _x4_set(X4Setting.PULSESPERSTEP),
-    "x4driver_get_pulses_per_step": _x4_get(X4Setting.PULSESPERSTEP),
-    # not in every release of ModuleConnector, but in scripts of its makers
-    "x4driver_set_dac_step": _x4_set(X4Setting.DACSTEP),
-    "x4driver_get_dac_step": _x4_get(X4Setting.DACSTEP),
-    "x4driver_set_dac_min": _x4_set(X4Setting.DACMIN),
-    "x4driver_get_dac_min": _x4_get(X4Setting.DACMIN),
-    "x4driver_set_dac_max": _x4_set(X4Setting.DACMAX),
-    "x4driver_get_dac_max": _x4_get(X4Setting.DACMAX),
-    "x4driver_set_tx_power": _x4_set(X4Setting.TXPOWER),
-    "x4driver_get_tx_power": _x4_get(X4Setting.TXPOWER),
-    "x4driver_set_downconversion": _x4_set(X4Setting.DOWNCONVERSION),
-    "x4driver_get_downconversion": _x4_get(X4Setting.DOWNCONVERSION),
     "x4driver_get_frame_bin_count": _x4_get(X4Setting.FRAMEBINCOUNT),
     "x4driver_set_frame_area": lambda radar, start, end: _x4_set(X4Setting.FRAMEAREA, tuple)(
         radar, (float(start), float(end))
@@ -229,10 +220,6 @@ _XEP: Rows = {
     "x4driver_get_frame_area": _frame_area,
     "x4driver_set_frame_area_offset": _x4_set(X4Setting.FRAMEAREAOFFSET, float),
     "x4driver_get_frame_area_offset": _x4_get(X4Setting.FRAMEAREAOFFSET),
-    "x4driver_set_tx_center_frequency": _x4_set(X4Setting.TXCENTERFREQUENCY),
-    "x4driver_get_tx_center_frequency": _x4_get(X4Setting.TXCENTERFREQUENCY),
-    "x4driver_set_prf_div": _x4_set(X4Setting.PRFDIV),
-    "x4driver_get_prf_div": _x4_get(X4Setting.PRFDIV),
     "x4driver_set_spi_register": _set_register(X4Setting.SPIREGISTER),
     "x4driver_get_spi_register": _get_register(X4Setting.SPIREGISTER),
     "x4driver_set_pif_register": _set_register(X4Setting.PIFREGISTER),
