@@ -515,7 +515,7 @@ class ModuleConnector:
     def get_data_recorder(self) -> DataRecorder:
         if self._recorder is None:
             self._recorder = DataRecorder()
-            self.connection.listeners.append(self._recorder.take)
+            self.connection.listeners.append(self._recorder.listeners)
             # with the port, so that the files of a script that forgets its recorder are complete
             self.connection.on_close.append(self._recorder.stop_all)
         return self._recorder

@@ -8,19 +8,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from xethru_protocol.driver.matching import Listeners
 from xethru_protocol.legacy.connection import ModuleConnectorError, Taker, report
 from xethru_protocol.legacy.data import CLASSES, Data, Vector, not_implemented
 from xethru_protocol.recordings import (
+    Recorder,
     RecordingError,
     RecordingReader,
-    RecordingWriter,
     Split,
     WriterOptions,
-    session_directory,
 )
 from xethru_protocol.recordings.recorded_messages import MS_NS
 from xethru_protocol.recordings.vendor.layouts import ALL_BITS, KIND_OF_MESSAGE, KIND_OF_TYPE
-from xethru_protocol.recordings.vendor.writer import new_session_id
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import decode_response, encode
 from xethru_protocol.wire.errors import XeThruError
@@ -131,49 +130,19 @@ class RecordingOptions:
 # --- DataRecorder -------------------------------------------------------------------------------
 
 
-class _RunningRecording:
-    """One recording that is being written, of some types of messages."""
-
-    def __init__(self, kinds: frozenset[MessageType], writer: RecordingWriter) -> None:
-        self.kinds = kinds
-        self.writer = writer
-
-    def close(self) -> None:
-        now_ns = time.time_ns()
-        self.writer.close(stopped_ns=now_ns, closed_ns=now_ns)
-
-
 class DataRecorder:
     """Records what the module sends, in directories as ModuleConnector makes them.
 
-    It does not switch anything on in the module.
+    It does not switch anything on in the module. ``listeners`` get what the module sends.
     """
 
     def __init__(self) -> None:
-        self._sessions: list[_RunningRecording] = []
-        self._since_1970_ns = time.time_ns() - time.monotonic_ns()
+        self.listeners = Listeners[Response, int]()
+        self._recorders: list[Recorder] = []
         self._on_file: list[tuple[int, OnFile]] = []
         self._on_meta_file: OnMetaFile | None = None
         self._on_error: Callable[[str], object] | None = None
         self._basenames: dict[MessageType, str] = {}
-        # a script's thread starts and stops it while another receives
-        self._lock = threading.RLock()
-
-    def take(self, message: Response, arrival_ns: int) -> None:
-        """Store a message in the recordings that want its type."""
-        self._store(message, arrival_ns + self._since_1970_ns)
-
-    def _store(self, message: Response, t_ns: int) -> bool:
-        stored = False
-        with self._lock:
-            for session in tuple(self._sessions):
-                if type(message) in session.kinds:
-                    try:
-                        stored |= session.writer.write(message, t_ns)
-                    except RecordingError as error:
-                        self._sessions.remove(session)
-                        self._fail(error)
-        return stored
 
     def _fail(self, error: XeThruError) -> None:
         if self._on_error is not None:
@@ -189,48 +158,38 @@ class DataRecorder:
         Why it failed goes to the error callback, else to standard error.
         """
         kinds = _kinds(data_types)
+        if twice := [kind for kind in kinds if self._recorder_of(kind)]:
+            names = ", ".join(sorted(kind.__name__ for kind in twice))
+            self._fail(RecordingError(f"{names} is being recorded already"))
+            return 1
         chosen = (options or RecordingOptions()).writer_options()
-        with self._lock:
-            if twice := [kind for kind in kinds if self._session_of(kind)]:
-                names = ", ".join(sorted(kind.__name__ for kind in twice))
-                self._fail(RecordingError(f"{names} is being recorded already"))
-                return 1
-            session_id = chosen["session_id"] = chosen.get("session_id") or new_session_id()
-            chosen["basenames"] = {
-                kind: self._basenames[kind] for kind in kinds & {*self._basenames}
-            }
-            chosen["on_file"] = self._file_done
-            chosen["on_meta_file"] = self._meta_file_done
-            try:
-                writer = RecordingWriter(
-                    session_directory(Path(directory), session_id, time.time_ns()), **chosen
-                )
-            except RecordingError as error:
-                self._fail(error)
-                return 1
-            self._sessions.append(_RunningRecording(kinds, writer))
+        chosen["basenames"] = {kind: self._basenames[kind] for kind in kinds & {*self._basenames}}
+        chosen["on_file"] = self._file_done
+        chosen["on_meta_file"] = self._meta_file_done
+        recorder = Recorder(self, directory, kinds=kinds, on_error=self._fail, **chosen)
+        try:
+            recorder.start()
+        except RecordingError as error:
+            self._fail(error)
+            return 1
+        self._recorders.append(recorder)
         return 0
 
     def stop_recording(self, data_types: int) -> None:
-        wanted = _kinds(data_types)
-        with self._lock:
-            for session in tuple(self._sessions):
-                session.kinds -= wanted
-                if not session.kinds:
-                    self._sessions.remove(session)
-                    try:
-                        session.close()
-                    except RecordingError as error:
-                        self._fail(error)
+        for recorder in self._recorders:
+            recorder.kinds = (recorder.kinds or frozenset()) - _kinds(data_types)
+            if not recorder.kinds:
+                recorder.stop(at_ns=time.time_ns())
+        self._recorders = [recorder for recorder in self._recorders if recorder.kinds]
 
     def stop_all(self) -> None:
         self.stop_recording(ALL_BITS)
 
     def is_recording(self, data_type: int) -> bool:
-        return self._session_of(_kind(data_type)) is not None
+        return self._recorder_of(_kind(data_type)) is not None
 
-    def _session_of(self, kind: MessageType) -> _RunningRecording | None:
-        return next((session for session in self._sessions if kind in session.kinds), None)
+    def _recorder_of(self, kind: MessageType) -> Recorder | None:
+        return next((one for one in self._recorders if one.is_recording(kind)), None)
 
     def process(self, data_type: int, data: Any) -> bool:
         """Store a record of data made elsewhere; whether it was stored."""
@@ -238,7 +197,12 @@ class DataRecorder:
         prefix = getattr(layout, "prefix", None)
         if prefix is None:
             not_implemented("DataRecorder.process of a text file")
-        return self._store(decode_response(prefix + bytes(data)), time.time_ns())
+        stored = self._stored()
+        self.listeners(decode_response(prefix + bytes(data)), time.monotonic_ns())
+        return self._stored() > stored
+
+    def _stored(self) -> int:
+        return sum(recorder.messages for recorder in self._recorders)
 
     def subscribe_to_file_available(self, data_types: int, callback: OnFile) -> int:
         self._on_file.append((data_types, callback))
@@ -281,11 +245,12 @@ class DataRecorder:
 
     def get_recording_directory(self, session_or_type: str | int) -> str:
         """Return the directory of a session id or a DataType; empty if it is not recorded."""
-        for session in self._sessions:
-            if session_or_type == session.writer.session_id or (
-                isinstance(session_or_type, int) and _kinds(session_or_type) & session.kinds
+        for recorder in self._recorders:
+            if session_or_type == recorder.session_id or (
+                isinstance(session_or_type, int)
+                and any(map(recorder.is_recording, _kinds(session_or_type)))
             ):
-                return str(session.writer.directory)
+                return str(recorder.directory)
         return ""
 
     @staticmethod

@@ -57,6 +57,10 @@ class Recorder:
 
     Attributes
     ----------
+    kinds
+        As given.
+    session_id
+        Of the recording, empty before `start`.
     directory
         Of the recording, None before `start`.
     messages
@@ -86,13 +90,14 @@ class Recorder:
         clock: Callable[[], int] = time.monotonic_ns,
         **options: Unpack[WriterOptions],
     ) -> None:
+        self.session_id = ""
         self.directory: Path | None = None
         self.messages = 0
         self.failure: RecordingError | None = None
         self._radar = radar
         self._folder = Path(folder)
-        self._kinds = None if kinds is None else frozenset(kinds)
-        for kind in self._kinds or ():
+        self.kinds = None if kinds is None else frozenset(kinds)
+        for kind in self.kinds or ():
             if kind not in KIND_OF_MESSAGE:
                 raise RecordingError(f"a recording has no file of {kind.__name__}")
         self._on_error = on_error
@@ -116,22 +121,25 @@ class Recorder:
             raise RecordingError(f"{self.directory} is being recorded already")
         self._since_1970_ns = time.time_ns() - self._clock()
         options = self._options.copy()
-        options["session_id"] = session_id = options.get("session_id") or new_session_id()
+        options["session_id"] = self.session_id = options.get("session_id") or new_session_id()
         self.directory = session_directory(
-            self._folder, session_id, time.time_ns(), options.get("timezone")
+            self._folder, self.session_id, time.time_ns(), options.get("timezone")
         )
         self._writer = RecordingWriter(self.directory, **options)
         self._radar.listeners.add(self._take)
 
-    def stop(self) -> None:
-        """Complete the files; calling it again does nothing."""
+    def stop(self, *, at_ns: int | None = None) -> None:
+        """Complete the files; calling it again does nothing.
+
+        ``at_ns`` is when the recording ends [ns since 1970]; None: with the last message.
+        """
         with self._lock:
             writer, self._writer = self._writer, None
             if writer is None:
                 return
             self._radar.listeners.remove(self._take)
             try:
-                writer.close()
+                writer.close(stopped_ns=at_ns, closed_ns=at_ns)
             except RecordingError as error:
                 self._fail(error)
 
@@ -142,7 +150,7 @@ class Recorder:
         return kind is None or self._is_wanted(kind)
 
     def _is_wanted(self, kind: type[Response]) -> bool:
-        return kind in KIND_OF_MESSAGE and (self._kinds is None or kind in self._kinds)
+        return kind in KIND_OF_MESSAGE and (self.kinds is None or kind in self.kinds)
 
     def _take(self, message: Response, arrival_ns: int) -> None:
         with self._lock:
