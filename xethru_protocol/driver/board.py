@@ -54,7 +54,7 @@ class Pins(Part[KindT]):
     @sends
     def control(link: Link, pin: int) -> Steps[PinControl]:
         """Ask what a pin does."""
-        setup, feature = yield from _numbers(link, m.IoPinGetControl(pin_id=pin), 2)
+        setup, feature = yield from link.numbers(m.IoPinGetControl(pin_id=pin), 2)
         return PinControl(setup=IoPinSetup(setup), feature=feature)
 
     @sends
@@ -65,15 +65,8 @@ class Pins(Part[KindT]):
     @sends
     def read(link: Link, pin: int) -> Steps[bool]:
         """Ask whether a pin is high."""
-        (value,) = yield from _numbers(link, m.IoPinGetValue(pin_id=pin), 1)
+        (value,) = yield from link.numbers(m.IoPinGetValue(pin_id=pin), 1)
         return bool(value)
-
-
-def _numbers(link: Link, command: m.Command[m.ReplyInt], wanted: int) -> Steps[tuple[int, ...]]:
-    values = (yield from link.request(command)).values
-    if len(values) != wanted:
-        raise RemoteProtocolError(f"{link.name} answers a question about a pin with {values}")
-    return values
 
 
 class Diagnostics(Part[KindT]):

@@ -192,12 +192,8 @@ class PostprocessingRow(Setting[int]):
 
 
 def _postprocessing(link: Link, setting: FramePostprocessing) -> Steps[float]:
-    values = (yield from link.request(m.FramePostprocessingGet(setting=setting))).values
-    if len(values) != 1:
-        raise RemoteProtocolError(
-            f"{link.name} reads back {len(values)} values of {setting.name}, not one"
-        )
-    return values[0]
+    value: float = (yield from link.numbers(m.FramePostprocessingGet(setting=setting), 1))[0]
+    return value
 
 
 def _flag(answer: m.X4Value) -> bool:
@@ -353,12 +349,8 @@ class Registers(Part[KindT]):
     def read(link: Link, space: RegisterSpace, address: int) -> Steps[int]:
         """Read one register, 0 ... 255, of the space ``"spi"``, ``"pif"`` or ``"xif"``."""
         command = m.X4DriverGet(setting=_space(space), address=_byte("address", address))
-        values = (yield from link.request(command)).values
-        if len(values) != 1:
-            raise RemoteProtocolError(
-                f"{link.name} reads {len(values)} values of {space} register {address}, not one"
-            )
-        return int(values[0])
+        (value,) = yield from link.numbers(command, 1)
+        return int(value)
 
     @sends
     def write(link: Link, space: RegisterSpace, address: int, value: int) -> Steps[None]:

@@ -629,6 +629,16 @@ class Link:
             return reply.values[0], reply.values[1]
         return values[0]
 
+    def numbers(self, command: Command[Any], count: int) -> Steps[Any]:
+        """Ask for so many values; `RemoteProtocolError` if there are more or fewer."""
+        values = (yield from self.request(command)).values
+        if len(values) != count:
+            raise RemoteProtocolError(
+                f"{self.name} answers {summary(command)} with {values}, where {count} numbers were "
+                "expected"
+            )
+        return values
+
     def set_mode_if_known(self, mode: SensorMode) -> Steps[None]:
         """Change the mode; firmware without modes is always as in MANUAL."""
         try:

@@ -374,18 +374,14 @@ def _profile_id(link: Link) -> Steps[int]:
 
 def _zone_limits(link: Link) -> Steps[ZoneLimits]:
     yield from _need_profile(link)
-    values = (yield from link.request(m.GetDetectionZoneLimits())).values
-    if len(values) != 3:
-        raise RemoteProtocolError(f"{link.path} reports zone limits {values}, not three numbers")
-    return ZoneLimits(min_m=values[0], max_m=values[1], step_m=values[2])
+    min_m, max_m, step_m = yield from link.numbers(m.GetDetectionZoneLimits(), 3)
+    return ZoneLimits(min_m=min_m, max_m=max_m, step_m=step_m)
 
 
 def _zone(link: Link) -> Steps[tuple[float, float]]:
     yield from _need_profile(link)
-    values = (yield from link.request(m.GetDetectionZone())).values
-    if len(values) != 2:
-        raise RemoteProtocolError(f"{link.path} reports detection zone {values}, not two numbers")
-    return values[0], values[1]
+    start_m, end_m = yield from link.numbers(m.GetDetectionZone(), 2)
+    return start_m, end_m
 
 
 def _output(link: Link, question: m.OutputGetControl | m.DebugOutputGetControl) -> Steps[int]:
