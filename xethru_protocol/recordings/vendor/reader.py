@@ -786,7 +786,9 @@ class RecordingReader:
     @property
     def kinds(self) -> frozenset[type[Response]]:
         """Types of the messages that the recording holds."""
-        return frozenset(KIND_OF_TYPE[int(bit)].message for bit in np.unique(self._data_type))
+        return frozenset(
+            KIND_OF_TYPE[int(bit)].message for bit in np.unique(self._entries["data_type"])
+        )
 
     @property
     def filter(self) -> frozenset[type[Response]]:
@@ -802,7 +804,7 @@ class RecordingReader:
             if kind not in KIND_OF_MESSAGE:
                 raise RecordingError(f"a recording holds no {kind.__name__}")
         bits = [KIND_OF_MESSAGE[kind].data_type for kind in kinds]
-        self._wanted = np.isin(self._data_type, bits) if kinds else None
+        self._wanted = np.isin(self._entries["data_type"], bits) if kinds else None
         self._filter = frozenset(kinds)
 
     @property
@@ -852,40 +854,29 @@ class RecordingReader:
 
     def _build_index(self, directories: list[Path], metas: list[Meta]) -> None:
         """Join the indexes of all meta files: records in order, without headers."""
-        columns: list[tuple[npt.NDArray[np.int64], ...]] = []
+        kept, t_ms, ends = [], [], []
         self.size_bytes = 0
         self.largest_record_bytes = 0
-        for part, meta in enumerate(metas):
+        for directory, meta in zip(directories, metas, strict=True):
             all_of = np.frombuffer(meta.index, ENTRY)
             records = all_of[(all_of["kind"] != CLOSED) & (all_of["size"] > 0)]
             if (np.maximum(records["begin"], records["end"]) > _FURTHEST).any():
                 raise RecordingError(
-                    f"the index of {directories[part]} is damaged: it has a record beyond "
+                    f"the index of {directory} is damaged: it has a record beyond "
                     f"byte {_FURTHEST}; read_recording does without"
                 )
-            known = np.isin(records["data_type"], list(KIND_OF_TYPE))
-            known &= ~_are_titles(records)
-            kept = records[known]
-            end = kept["end"].astype(np.int64) + self.size_bytes
-            columns.append(
-                (
-                    kept["ms"].astype(np.int64) + meta.start_ms,
-                    kept["data_type"].astype(np.int64),
-                    kept["file"].astype(np.int64),
-                    kept["begin"].astype(np.int64),
-                    kept["size"].astype(np.int64),
-                    end,
-                    np.full(len(kept), part),
-                )
-            )
+            known = np.isin(records["data_type"], list(KIND_OF_TYPE)) & ~_are_titles(records)
+            kept.append(records[known])
+            t_ms.append(kept[-1]["ms"].astype(np.int64) + meta.start_ms)
+            ends.append(kept[-1]["end"].astype(np.int64) + self.size_bytes)
             if len(records):
                 self.size_bytes += int(records["end"].max())
                 self.largest_record_bytes = max(
                     self.largest_record_bytes, int(records["size"].max())
                 )
-        joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
-        (self._t_ms, self._data_type, self._file, self._begin, self._size, self._end,
-         self._in_part) = joined  # fmt: skip
+        self._entries = np.concatenate(kept)
+        self._in_part = np.repeat(np.arange(len(kept)), [len(entries) for entries in kept])
+        self._t_ms, self._end = np.concatenate(t_ms), np.concatenate(ends)
 
     def _counters(self) -> Iterator[tuple[str, int] | None]:
         for at in range(len(self)):
@@ -908,13 +899,14 @@ class RecordingReader:
         )
 
     def _read(self, at: int) -> tuple[Response, bytes]:
-        data_type, size = int(self._data_type[at]), int(self._size[at])
-        path, kind = self._files[int(self._in_part[at])][data_type, int(self._file[at])]
+        entry = self._entries[at]
+        size = int(entry["size"])
+        path, kind = self._files[self._in_part[at]][int(entry["data_type"]), int(entry["file"])]
         with reading(path):
             stream = self._streams.get(path)
             if stream is None:
                 stream = self._streams[path] = self._exits.enter_context(path.open("rb"))
-            stream.seek(int(self._begin[at]))
+            stream.seek(int(entry["begin"]))
             data = stream.read(size)
         return _message(path, kind, data, size), data
 
