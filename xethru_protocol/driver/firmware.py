@@ -270,14 +270,18 @@ def _core_id(link: Link) -> Steps[str | None]:
     return (yield from link.info_text(InfoItem.XTID_SSIC_SYSTEMCOREID)) or None
 
 
-def _leave_application(link: Link) -> Steps[None]:
-    """Start the bootloader; older firmware has another key."""
+def ask_for_bootloader(link: Link) -> Steps[None]:
+    """Have the application start the bootloader; older firmware has another key."""
     try:
         yield from link.request(m.StartBootloader(key=BootloaderKey.CURRENT))
     except DeviceError as error:
         if error.code != ErrorCode.XTS_SPRE_NOT_RECOGNIZED:
             raise
         yield from link.request(m.StartBootloader(key=BootloaderKey.OLD))
+
+
+def _leave_application(link: Link) -> Steps[None]:
+    yield from ask_for_bootloader(link)
     _forget_application(link)
     if link.baudrate != POWER_UP_BAUD:
         yield SetLineRate(POWER_UP_BAUD)

@@ -16,6 +16,7 @@ from importlib.metadata import version
 from typing import Any, Final
 
 from xethru_protocol.driver.files import read_chunks, write_chunks
+from xethru_protocol.driver.firmware import ask_for_bootloader
 from xethru_protocol.driver.link import CONFIG_SETTINGS, SLOW_TIMEOUT_S
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.legacy.connection import (
@@ -29,14 +30,12 @@ from xethru_protocol.legacy.recordings import DataPlayer, DataRecorder, PlayerSo
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
-    BootloaderKey,
-    ErrorCode,
     FramePostprocessing,
     IoPinSetup,
     SensorMode,
     X4Setting,
 )
-from xethru_protocol.wire.errors import DeviceError, XeThruError
+from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.table import Command, Response
 from xethru_protocol.wire.x4 import LIMITS
 
@@ -137,15 +136,6 @@ def _run_test(radar: X4M300, testcode: int, data: list[int]) -> int:
     result = radar.diagnostics.run_test(testcode)
     data[:] = result.data
     return int(not result.passed)
-
-
-def _start_bootloader(radar: X4M300) -> None:
-    try:
-        _slow(radar, m.StartBootloader(key=BootloaderKey.CURRENT))
-    except DeviceError as error:
-        if error.code != ErrorCode.XTS_SPRE_NOT_RECOGNIZED:
-            raise
-        _slow(radar, m.StartBootloader(key=BootloaderKey.OLD))  # firmware 1.0.7
 
 
 def _all_files(radar: X4M300) -> Data:
@@ -266,7 +256,7 @@ _SENSOR: Rows = {
     **_BOTH,
     "set_debug_level": lambda radar, level: radar.diagnostics.set_debug_level(level),
     "reset_to_factory_preset": lambda radar: _slow(radar, m.FactoryPreset()),
-    "start_bootloader": _start_bootloader,
+    "start_bootloader": lambda radar: radar._call_once(ask_for_bootloader),
     "inject_frame": lambda radar, frame_counter, frame_length, frame: (
         radar.diagnostics.inject_frame(frame_counter, frame[: 2 * frame_length])
     ),
