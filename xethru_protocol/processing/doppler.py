@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from xethru_protocol.processing.window import check_rate
+from xethru_protocol.processing.monitor import check_rate
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 CARRIER_HZ = 7.29e9

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from xethru_protocol.processing.doppler import CARRIER_HZ, SPEED_OF_LIGHT_MPS, range_doppler
-from xethru_protocol.processing.window import Monitor, checked
+from xethru_protocol.processing.monitor import Monitor, checked
 
 LEAST_PHASE_RAD = 0.1
 """Three times the phase's deviation of a strong reflector in a recording of a real module."""

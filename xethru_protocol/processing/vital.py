@@ -54,7 +54,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from xethru_protocol.processing.doppler import CARRIER_HZ, SPEED_OF_LIGHT_MPS, hann, range_doppler
-from xethru_protocol.processing.window import Monitor, checked
+from xethru_protocol.processing.monitor import Monitor, checked
 
 SLOWEST_BPM, FASTEST_BPM = 6.0, 40.0
 """Rates that are looked for, breaths per minute."""
