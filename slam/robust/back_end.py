@@ -171,8 +171,9 @@ class RobustBackEnd:
         self.lagged: list[PastPose] = []
         """The past poses that became final with the newest motion, with all updates before it."""
         self._slips = SlipDetector(parameters.slips, parameters.relinearisation.outlier_sigmas)
-        self.may_have_slipped = False
-        """Whether the wheels may have slipped in the steps before the newest one."""
+        self.slipped: Array | None = None
+        """Covariance (3, 3) of what the pose may be off by, map frame, if the wheels may have
+        slipped in the steps before the newest one."""
         self._landmark_of_label: dict[int, int] = {}
         if saved is not None:
             for landmark in saved.landmarks:
@@ -369,7 +370,7 @@ class RobustBackEnd:
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
         self._log.add_motion(increment, motion, is_loose=is_loose)
         self._move(motion)
-        self.may_have_slipped = False
+        self.slipped = None
         if is_loose or elapsed_s is None:
             self._slips.begin_anew()
         else:
@@ -390,7 +391,6 @@ class RobustBackEnd:
         slip = self._slips.take(motion, elapsed_s)
         if slip is None:
             return
-        self.may_have_slipped = True
         first = self._log.n_poses - slip.n_since - len(slip.covariances)
         for pose, covariance in enumerate(slip.covariances, start=first):
             self._log.loosen(pose, covariance)
@@ -399,6 +399,7 @@ class RobustBackEnd:
         n_sure = sum(number < first for number in self.state.past_numbers)
         self._marginalise_past(slice(n_sure, None))
         self._move(slip.since)
+        self.slipped = turned_covariance(slip.since.covariance, self.state.heading_rad)
         self._unassigned.clear()
 
     def _leave_pose(self, increment: Array) -> None:

@@ -60,16 +60,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import chdtri, expit
+from scipy.special import expit
 
-from slam.geometry import Rig, compose, has_moved, transform
+from slam.geometry import Rig, compose, has_moved
 from slam.results import SavedMap, StartOnMap, UpdateReport
 from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import Question
 from slam.robust.parameters import (
     MARGIN_NATS,
-    TAIL_PROBABILITY,
     BackEndParameters,
     BranchRule,
     RangeNoise,
@@ -82,7 +81,13 @@ from slam.robust.proposals.constellation import (
     find_placements,
     stands_out,
 )
-from slam.robust.proposals.doubts import Doubt, doubted_covariance, seen_ranges
+from slam.robust.proposals.doubts import (
+    Doubt,
+    SeenRanges,
+    covering,
+    doubted_covariance,
+    seen_ranges,
+)
 from slam.robust.solver.one_blas_thread import one_blas_thread
 from slam.robust.state import Array
 
@@ -377,7 +382,8 @@ class Branches:
         self._carry: Carry | None = None
         self._judged = 0  # the evidence of the steps before it has been judged
         self._recognised_ids: set[int] = set()  # new landmarks that were searched for
-        self._doubts: list[Doubt] = []
+        self._doubts: list[Doubt] = []  # of carries
+        self._slips: list[Doubt] = []
         self._solution_rule = parameters.relinearisation
         self._solving: Solving | None = None
         self._is_on_map = saved is not None
@@ -410,10 +416,15 @@ class Branches:
     def doubted_covariance(self) -> Array:
         """Return what doubts and undecided slips add to the covariance of the pose, (3, 3).
 
-        The map frame is that of ``main``.
+        The map frame is that of ``main``. Of a slip the filter has the covariance until ranges
+        reduce it, which they do also where they are taken for those of another landmark.
         """
-        carries = doubted_covariance(self._doubts, self.main.state.position_m)
-        return carries + self.main.undecided_covariance
+        position_m = self.main.state.position_m
+        added = doubted_covariance(self._doubts, position_m) + self.main.undecided_covariance
+        if self._slips:
+            slips = np.sum([one.at(position_m) for one in self._slips], axis=0)
+            added += covering(self.main.pose_covariance, slips)
+        return added
 
     def predict(
         self,
@@ -500,43 +511,58 @@ class Branches:
             self._solving = Solving(main=self.main, since=self._now, solution=solution)
 
     def _doubt(self, step: Step, report: UpdateReport, position_m: Array) -> None:
-        """Keep the doubt whether the robot was carried, until the pose is confirmed."""
-        rule = self._rule
-        looks = self._now % self._look_every == 0
-        doubts: list[Doubt] = []
-        seen = seen_ranges(report, self.main.pose, rule) if self._doubts else None
-        for one in self._doubts:
-            one.take(step.evidence, rule)
-            if seen is not None:
-                one.measure(seen)
-            if not looks or not (self._is_on_few(one) or self._is_confirmed(one)):
-                doubts.append(one)
+        """Keep the doubts whether the robot was carried, or slipped, until the pose is confirmed.
+
+        The robot may have been carried at ``position_m``.
+        """
+        rule, n_known, slip = self._rule, self._n_reported(0), self.main.slipped
+        knew_few = n_known < rule.least_landmarks and not self._is_on_map
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
-        n_known = self._n_reported(0)
+        newest = Doubt(
+            next_id=step.next_id,
+            knew_few=knew_few,
+            position_m=position_m,
+            probability=carried,
+            covariance=carried * np.diag(rule.lost_variances),
+            motion=np.diag(rule.lost_variances),
+        )
         # An empty map begins where the robot first drives.
-        if carried > 0.0 and (n_known or self._now):
-            variances = np.array(rule.lost_variances)
-            newest = Doubt(
-                next_id=step.next_id,
-                knew_few=n_known < rule.least_landmarks and not self._is_on_map,
-                position_m=position_m,
-                probability=carried,
-                covariance=carried * np.diag(variances),
-                variances=variances,
-            )
-            doubts.append(newest)
+        is_possible = carried > 0.0 and bool(n_known or self._now)
+        slipped = None
+        if slip is not None:
+            slipped = replace(newest, probability=1.0, covariance=slip, motion=slip)
+        seen = None
+        if self._doubts or self._slips:
+            seen = seen_ranges(report, self.main.pose, rule)
+        self._doubts = self._kept(self._doubts, step, seen, newest if is_possible else None)
+        self._slips = self._kept(self._slips, step, seen, slipped)
+
+    def _kept(
+        self, doubts: Sequence[Doubt], step: Step, seen: SeenRanges | None, newest: Doubt | None
+    ) -> list[Doubt]:
+        """Return the doubts that a step leaves, with the newest one."""
+        looks = self._now % self._look_every == 0
+        left: list[Doubt] = []
+        for one in doubts:
+            one.take(step.evidence, self._rule)
+            if seen is not None:
+                one.measure(seen)
+            if not looks or not (self._is_on_few(one) or self._is_confirmed(one)):
+                left.append(one)
+        if newest is not None:
+            left.append(newest)
         # Those with the same evidence end together: they are one, so a long run needs few.
-        self._doubts = doubts[:1]
-        for one in doubts[1:]:
-            last = self._doubts[-1]
-            if (one.next_id, one.nats) == (last.next_id, last.nats):
-                last.add(one)
+        kept = left[:1]
+        for one in left[1:]:
+            if (one.next_id, one.nats) == (kept[-1].next_id, kept[-1].nats):
+                kept[-1].add(one)
             else:
-                self._doubts.append(one)
-        while len(self._doubts) > rule.most_doubts:
-            self._doubts[0].join(self._doubts.pop(1))
+                kept.append(one)
+        while len(kept) > self._rule.most_doubts:
+            kept[0].join(kept.pop(1))
+        return kept
 
     def _is_on_few(self, doubt: Doubt) -> bool:
         """Return whether a doubt knew too few landmarks to be confirmed, and has enough since.
@@ -565,12 +591,9 @@ class Branches:
         fitting = frozenset(ids[nats > 0.0].tolist()), int(nats.sum() // self._rule.most_for)
         if fitting == doubt.alike:
             return True
-        limit = float(chdtri(3, TAIL_PROBABILITY))
 
         def is_possible(placement: Placement) -> bool:
-            away_m = transform(placement.motion, doubt.position_m) - doubt.position_m
-            turn_rad = math.remainder(float(placement.motion[2]), math.tau)
-            return float(np.sum(np.array([*away_m, turn_rad]) ** 2 / doubt.variances)) <= limit
+            return doubt.allows(placement.motion, self._rule.model_sigma_m)
 
         totals = np.column_stack([ids, nats])
         is_alike = not self._stand_out(self.main, totals, doubt.next_id, is_possible)

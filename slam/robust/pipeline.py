@@ -207,7 +207,7 @@ class RobustSlam:
         branches.predict(between(self._pose, pose), elapsed_s, stood_s, covariance)
         imaged = {frame.radar for frame in frames} if self._patches is not None else set[int]()
         scans = [*self._scans(detections, sigmas_m, moved, imaged), *given]
-        if self._patches is not None and branches.main.may_have_slipped:
+        if self._patches is not None and branches.main.slipped is not None:
             self._patches.begin_anew()
         elif self._patches is not None and not branches.main.undecided_covariance.any():
             scans += self._patches.scans(self.back_end.state.calibration)

@@ -13,11 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import chdtri
 
 from slam.geometry import transform
 from slam.results import UpdateReport
 from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
 from slam.robust.state import Array, quarter_turn
+
+_NOTHING = 1e-9  # share of the largest variance, below which a direction is not in doubt
+_LEAST_VARIANCE = 1e-12  # keeps the covariance of a pose that is exact regular
 
 
 def covered_share(probability: float) -> float:
@@ -75,7 +79,8 @@ class Doubt:
     # shape (3, 3), of x, y [m] and heading for a pose at the position: the probability times the
     # variances, added up
     covariance: Array
-    variances: Array  # shape (3,), of x, y [m] and heading if they happened, at the position
+    # shape (3, 3), covariance of x, y [m] and heading if they happened, at the position
+    motion: Array
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
     # shape (3, 3), of the ranges since about such a motion, at the position
     information: Array = field(default_factory=_nothing)
@@ -104,9 +109,21 @@ class Doubt:
         """Return whether known landmarks fit the pose, and leave no such motion open."""
         if sum(self.nats.values()) <= rule.price_nats:
             return False
-        sigmas = np.sqrt(self.variances)
-        gained = np.linalg.eigvalsh(sigmas[:, None] * self.information * sigmas)
+        variances, axes = np.linalg.eigh(self.motion)
+        is_open = variances > _NOTHING * variances[-1]
+        root = axes[:, is_open] * np.sqrt(variances[is_open])
+        gained = np.linalg.eigvalsh(root.T @ self.information @ root)
         return bool(1.0 / (1.0 + gained[0]) < rule.open_share)
+
+    def allows(self, motion: Array, model_sigma_m: float) -> bool:
+        """Return whether a motion (3,) [m, m, rad] of the map is one of those in doubt.
+
+        ``model_sigma_m`` is how far the places that show it may be off; for the turn, at a metre.
+        """
+        away_m = transform(motion, self.position_m) - self.position_m
+        away = np.array([*away_m, math.remainder(float(motion[2]), math.tau)])
+        covariance = self.motion + model_sigma_m**2 * np.eye(3)
+        return float(away @ np.linalg.solve(covariance, away)) <= float(chdtri(3, TAIL_PROBABILITY))
 
     def at(self, position_m: Array) -> Array:
         """Return the covariance (3, 3) for a pose at a position (2,)."""
@@ -117,7 +134,7 @@ class Doubt:
     def add(self, newer: Doubt) -> None:
         """Add a doubt with the same evidence; what is measured of the newer one counts."""
         self.covariance = self.at(newer.position_m) + newer.covariance
-        self.variances = self.variances + newer.variances
+        self.motion = self.motion + newer.motion
         self.probability += newer.probability
         self.knew_few &= newer.knew_few
         self.position_m, self.information = newer.position_m, newer.information
@@ -148,3 +165,16 @@ def doubted_covariance(doubts: Sequence[Doubt], position_m: Array) -> Array:
         carries += doubt.at(position_m) * (share / doubt.probability)
         lost_share += share
     return carries / max(lost_share, 1.0)
+
+
+def covering(covariance: Array, other: Array) -> Array:
+    """Return what a covariance (k, k) needs in addition to be nowhere less than another one.
+
+    The sum is the least that covers both, in each direction in which they can be compared: with
+    ``covariance`` = L L^T, those are the eigenvectors of L^-1 ``other`` L^-T.
+    """
+    root = np.linalg.cholesky(covariance + _LEAST_VARIANCE * np.eye(len(covariance)))
+    scaled = np.linalg.solve(root, np.linalg.solve(root, other).T)
+    ratios, axes = np.linalg.eigh(scaled)
+    missing = root @ axes
+    return np.asarray(missing * np.maximum(ratios - 1.0, 0.0) @ missing.T)

@@ -19,6 +19,7 @@ from slam.robust.parameters import (
     SIGMA_PER_MEDIAN,
     TAIL_PROBABILITY,
     BackEndParameters,
+    is_plausible,
 )
 from slam.robust.solver.run_log import (
     Estimate,
@@ -44,6 +45,7 @@ from slam.robust.state import (
 _LEAST_SHARE, _MOST_SHARE = 0.5, 1000.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
+_LEAST_VARIANCE = 1e-12  # keeps the covariance of a pose that is exact regular
 
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
@@ -80,8 +82,28 @@ def adopt(
 def _solved(
     log: RunLog, state: State, problem: Problem, parameters: BackEndParameters
 ) -> Solution | None:
+    """Solve from the start of the least cost.
+
+    If that moves the pose by more than its covariance allows, the other starts are tried, too: of
+    the filter's path a jump costs much, as where a landmark corrects the pose at once, although it
+    is the better one.
+    """
     smoother = Smoother(problem, parameters.relinearisation)
-    return smoother.solve(min(log.starts(state, problem), key=smoother.cost))
+    found: list[Solution] = []
+    for start in sorted(log.starts(state, problem), key=smoother.cost):
+        solution = smoother.solve(start)
+        if solution is not None:
+            found.append(solution)
+            if _is_expected(solution, state):
+                break
+    return min(found, key=lambda each: each.cost, default=None)
+
+
+def _is_expected(solution: Solution, state: State) -> bool:
+    away = solution.estimate.poses[-1] - state.pose
+    away[2] = math.remainder(float(away[2]), math.tau)
+    covariance = state.pose_covariance() + _LEAST_VARIANCE * np.eye(3)
+    return is_plausible(float(away @ np.linalg.solve(covariance, away)), 3)
 
 
 def solved_as_one(
@@ -120,7 +142,7 @@ def solved_as_one(
         return all(np.mean(fits[mine]) > 0.5 for mine in of_rows if mine.any())
 
     # Most pairs are near enough to be solved for from where the filter has them.
-    together = smoother.solve(min(log.starts(one, merged), key=smoother.cost))
+    together = _solved(log, one, merged, parameters)
     if together is not None and is_allowed(together, apart.cost):
         return merged, together
     closed = with_closed_loop(problem, apart.estimate, pairs)

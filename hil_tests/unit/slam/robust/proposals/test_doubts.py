@@ -13,6 +13,7 @@ from slam.robust.proposals.doubts import (
     Doubt,
     SeenRanges,
     covered_share,
+    covering,
     doubted_covariance,
     seen_ranges,
 )
@@ -31,7 +32,7 @@ def doubtful(x_m: float, probability: float = 1.0) -> Doubt:
         position_m=np.array([x_m, 0.0]),
         probability=probability,
         covariance=probability * CARRY,
-        variances=np.array(RULE.hidden_variances),
+        motion=np.diag(RULE.hidden_variances),
     )
 
 
@@ -119,7 +120,7 @@ def test_doubts_that_are_joined_need_what_both_need() -> None:
     older.join(newer)
     assert (older.next_id, older.nats) == (3, {1: 2.0})
     np.testing.assert_array_equal(older.information, np.zeros((3, 3)))
-    np.testing.assert_allclose(older.variances, 2.0 * np.array(RULE.hidden_variances))
+    np.testing.assert_allclose(older.motion, 2.0 * np.diag(RULE.hidden_variances))
 
 
 def test_one_that_knew_too_few_is_confirmed_with_the_one_that_it_is_joined_to() -> None:
@@ -170,6 +171,53 @@ def test_a_doubt_ends_where_ranges_leave_no_motion_open(
         doubt.take(np.array([[0, MUCH], [1, MUCH], [2, MUCH]]), RULE)
         doubt.measure(seen_from(pose, points_m, 0.0))
     assert doubt.is_confirmed(RULE) is ends
+
+
+@pytest.mark.parametrize(
+    ("way", "ends"), [((0.0, 0.1, 0.0), True), ((0.1, 0.0, 0.0), False)], ids=["across", "along"]
+)
+def test_a_doubt_ends_where_the_one_motion_that_may_have_been_is_measured(
+    way: tuple[float, float, float], ends: bool
+) -> None:
+    """Landmarks abeam tell of a slip across the course, whatever they leave open besides."""
+    doubt = doubtful(0.0)
+    doubt.motion = np.outer(way, way)
+    for _ in range(20):
+        doubt.take(np.array([[0, MUCH], [1, MUCH], [2, MUCH]]), RULE)
+        doubt.measure(seen_from(np.zeros(3), [(LEVER_M, 0.9), (LEVER_M, -0.8)], 0.0))
+    assert doubt.is_confirmed(RULE) is ends
+
+
+@pytest.mark.parametrize(
+    ("motion", "is_allowed"),
+    [
+        ((0.2, 0.0, 0.0), True),
+        ((0.5, 0.0, 0.0), False),  # five standard deviations
+        ((0.0, 0.2, 0.0), False),  # across what may have been
+        # A turn about the place is none of the place
+        ((1.0 - math.cos(0.2), -math.sin(0.2), 0.2), False),
+    ],
+    ids=str,
+)
+def test_a_doubt_allows_motions_that_may_have_been(
+    motion: tuple[float, float, float], is_allowed: bool
+) -> None:
+    doubt = doubtful(1.0)
+    doubt.motion = np.diag([0.1**2, 0.0, 0.0])
+    assert doubt.allows(np.array(motion), 0.01) is is_allowed
+
+
+def test_a_covariance_is_made_to_cover_another_one() -> None:
+    """In the axes of both, by closed form; the sum is nowhere less than either of the two."""
+    added = covering(np.diag([4.0, 1.0, 0.0]), np.diag([1.0, 9.0, 2.0]))
+    np.testing.assert_allclose(added, np.diag([0.0, 8.0, 2.0]), atol=1e-9)
+    rng = np.random.default_rng(5)
+    of_filter, of_slip = (root @ root.T for root in rng.standard_normal((2, 3, 3)))
+    added = covering(of_filter, of_slip)
+    np.testing.assert_allclose(added, added.T, atol=1e-12)
+    assert np.linalg.eigvalsh(added).min() > -1e-9
+    missing = np.linalg.eigvalsh(of_filter + added - of_slip)
+    assert missing.min() == pytest.approx(0.0, abs=1e-9)
 
 
 def test_landmarks_known_before_end_a_doubt_and_new_ones_do_not() -> None:

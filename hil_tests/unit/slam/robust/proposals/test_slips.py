@@ -375,7 +375,7 @@ def n_in_view(run: Run, step: int) -> int:
 def test_corners_are_no_slips(run: Run) -> None:
     branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
     for _ in follow(branches, run.increments, [[]] * len(run.increments)):
-        assert not branches.main.may_have_slipped
+        assert branches.main.slipped is None
 
 
 def test_a_slip_in_a_corner_leaves_its_own_step_uncertain(run: Run) -> None:
@@ -389,7 +389,7 @@ def test_a_slip_in_a_corner_leaves_its_own_step_uncertain(run: Run) -> None:
         back_end.predict(increment, elapsed_s=0.2)
         back_end.update([])
         sigmas_rad.append(math.sqrt(back_end.pose_covariance[2, 2]))
-    assert back_end.may_have_slipped
+    assert back_end.slipped is not None
     assert sigmas_rad[-2] < 0.03
     # If the robot had begun to turn already, the other way, it is off by that, too
     error_rad = 0.2 + abs(run.increments[corner, 2])
@@ -433,7 +433,7 @@ def test_a_slip_in_sight_of_landmarks_is_corrected_by_their_ranges(run: Run) -> 
     branches, end = Branches(paper_rig(), parameters_for(LAB, SIGMA_M)), step + 60
     found = []
     for k, _ in enumerate(follow(branches, slipped(run, step)[:end], run.scans[:end])):
-        found += [k] if branches.main.may_have_slipped else []
+        found += [k] if branches.main.slipped is not None else []
         if k == step:
             truth = run.poses[k + 1]
             turn = math.remainder(branches.main.pose[2] - truth[2], math.tau)
@@ -443,6 +443,21 @@ def test_a_slip_in_sight_of_landmarks_is_corrected_by_their_ranges(run: Run) -> 
     truth, back_end = run.poses[end], branches.main
     assert abs(math.remainder(back_end.pose[2] - truth[2], math.tau)) < math.radians(1.5)
     assert math.hypot(*(back_end.pose - truth)[:2]) < 0.02
+
+
+def test_a_filter_that_is_sure_behind_a_slip_leaves_it_in_doubt(run: Run) -> None:
+    """It may have taken a landmark for another one."""
+    step, at_once = max(straight_steps(run), key=lambda k: n_in_view(run, k)), list[float]()
+    branches = Branches(paper_rig(), parameters_for(LAB, SIGMA_M))
+    end = step + 2
+    for k, _ in enumerate(follow(branches, slipped(run, step)[:end], run.scans[:end])):
+        if k == step + 1:
+            sure = branches.main.copy()
+            sure.state.set_pose(sure.pose, 1e-8 * np.eye(3))
+            filtered, branches.main = branches.main, sure
+            at_once = np.sqrt(branches.doubted_covariance.diagonal()).tolist()
+            branches.main = filtered
+    assert at_once[2] == pytest.approx(math.sqrt(0.5) * SLIP[2], rel=0.1)
 
 
 def test_of_a_slip_in_sight_of_nothing_the_pose_is_that_of_the_wheels(run: Run) -> None:
@@ -467,7 +482,7 @@ def test_poses_kept_in_a_slip_are_given_up_and_those_before_stay(run: Run) -> No
     for _ in follow(branches, slipped(run, 20)[:22], [[]] * 22):
         pass
     # The slip leads to pose 21; the step after it to 22
-    assert branches.main.may_have_slipped
+    assert branches.main.slipped is not None
     assert branches.main.state.past_numbers == list(range(1, 21))
 
 
