@@ -26,8 +26,8 @@ Revision
     The back end that stayed goes on beside the one that is adopted. When the advantage of the place
     is gone, and more is missed there, the adoption is taken back.
 Doubt
-    A carry that is possible during a stop adds to the reported covariance until landmarks known
-    before confirm the pose.
+    A carry that is possible during a stop, or a possible slip of the wheels, adds to the reported
+    covariance until landmarks known before confirm the pose.
     Those that a possible motion lays on others of the map confirm nothing
     (`slam.robust.proposals.constellation.stands_out`), nor do they place a carried robot.
 
@@ -520,29 +520,31 @@ class Branches:
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
-        newest = Doubt(
-            next_id=step.next_id,
-            knew_few=knew_few,
-            position_m=position_m,
-            probability=carried,
-            covariance=carried * np.diag(rule.lost_variances),
-            motion=np.diag(rule.lost_variances),
-        )
+
+        def doubt(probability: float, motion_covariance: Array) -> Doubt:
+            return Doubt(
+                next_id=step.next_id,
+                knew_few=knew_few,
+                position_m=position_m,
+                probability=probability,
+                covariance=probability * motion_covariance,
+                motion_covariance=motion_covariance,
+            )
+
         # An empty map begins where the robot first drives.
         is_possible = carried > 0.0 and bool(n_known or self._now)
-        slipped = None
-        if slip is not None:
-            slipped = replace(newest, probability=1.0, covariance=slip, motion=slip)
+        carries = [doubt(carried, np.diag(rule.lost_variances))] if is_possible else []
+        slips = [] if slip is None else [doubt(1.0, slip)]
         seen = None
         if self._doubts or self._slips:
             seen = seen_ranges(report, self.main.pose, rule)
-        self._doubts = self._kept(self._doubts, step, seen, newest if is_possible else None)
-        self._slips = self._kept(self._slips, step, seen, slipped)
+        self._doubts = self._left(self._doubts, step, seen, carries)
+        self._slips = self._left(self._slips, step, seen, slips)
 
-    def _kept(
-        self, doubts: Sequence[Doubt], step: Step, seen: SeenRanges | None, newest: Doubt | None
+    def _left(
+        self, doubts: Sequence[Doubt], step: Step, seen: SeenRanges | None, new: Sequence[Doubt]
     ) -> list[Doubt]:
-        """Return the doubts that a step leaves, with the newest one."""
+        """Return the doubts that a step leaves, and those that are new with it."""
         looks = self._now % self._look_every == 0
         left: list[Doubt] = []
         for one in doubts:
@@ -551,8 +553,7 @@ class Branches:
                 one.measure(seen)
             if not looks or not (self._is_on_few(one) or self._is_confirmed(one)):
                 left.append(one)
-        if newest is not None:
-            left.append(newest)
+        left += new
         # Those with the same evidence end together: they are one, so a long run needs few.
         kept = left[:1]
         for one in left[1:]:

@@ -70,6 +70,8 @@ HEADING = 0
 POSITION = slice(1, 3)
 CALIBRATION = slice(3, 6)
 HEAD_SIZE = 6
+# Keeps the covariance of a pose that is exact regular [m^2, rad^2]
+LEAST_VARIANCE = 1e-12
 _SMALL_RAD = 1e-4
 
 

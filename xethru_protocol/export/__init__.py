@@ -1,1 +1,1 @@
-"""The message table as a Kaitai Struct file, a Wireshark dissector and a page of Markdown."""
+"""The message table as a Kaitai Struct file and a Wireshark dissector."""

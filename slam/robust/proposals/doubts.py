@@ -1,9 +1,10 @@
-"""Doubts: carries that may have happened, until known landmarks confirm the pose.
+"""Doubts: carries and slips that may have happened, until known landmarks confirm the pose.
 
-A carry that is possible during a stop adds to the reported covariance. The pose itself stays where
-it is. A doubt ends when landmarks known before it fit the pose, and their ranges leave no direction
-of the motion open: two landmarks abeam of the robot say nothing of where it is along its course.
-Where too few were known before it, the doubt ends once enough are known since.
+A carry that is possible during a stop, or a possible slip of the wheels, adds to the reported
+covariance. The pose itself stays where it is. A doubt ends when landmarks known before it fit the
+pose, and their ranges leave no direction of the motion open: two landmarks abeam of the robot say
+nothing of where it is along its course. Where too few were known before it, the doubt ends once
+enough are known since.
 """
 
 from __future__ import annotations
@@ -15,13 +16,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri
 
-from slam.geometry import transform
+from slam.geometry import transform, wrap_angle
 from slam.results import UpdateReport
 from slam.robust.parameters import TAIL_PROBABILITY, BranchRule
-from slam.robust.state import Array, quarter_turn
+from slam.robust.state import LEAST_VARIANCE, Array, quarter_turn
 
-_NOTHING = 1e-9  # share of the largest variance, below which a direction is not in doubt
-_LEAST_VARIANCE = 1e-12  # keeps the covariance of a pose that is exact regular
+_LEAST_SHARE = 1e-9  # of the largest variance: a direction with less is not in doubt
 
 
 def covered_share(probability: float) -> float:
@@ -70,7 +70,7 @@ def _nothing() -> Array:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Doubt:
-    """Carries that the wheels did not report, if they happened."""
+    """Motions that the wheels did not report, carries or slips, if they happened."""
 
     next_id: int  # landmarks known before them have smaller ids
     knew_few: bool  # whether these were fewer than place a robot
@@ -80,7 +80,7 @@ class Doubt:
     # variances, added up
     covariance: Array
     # shape (3, 3), covariance of x, y [m] and heading if they happened, at the position
-    motion: Array
+    motion_covariance: Array
     nats: dict[int, float] = field(default_factory=dict)  # evidence since, by landmark
     # shape (3, 3), of the ranges since about such a motion, at the position
     information: Array = field(default_factory=_nothing)
@@ -109,8 +109,8 @@ class Doubt:
         """Return whether known landmarks fit the pose, and leave no such motion open."""
         if sum(self.nats.values()) <= rule.price_nats:
             return False
-        variances, axes = np.linalg.eigh(self.motion)
-        is_open = variances > _NOTHING * variances[-1]
+        variances, axes = np.linalg.eigh(self.motion_covariance)
+        is_open = variances > _LEAST_SHARE * variances[-1]
         root = axes[:, is_open] * np.sqrt(variances[is_open])
         gained = np.linalg.eigvalsh(root.T @ self.information @ root)
         return bool(1.0 / (1.0 + gained[0]) < rule.open_share)
@@ -121,8 +121,8 @@ class Doubt:
         ``model_sigma_m`` is how far the places that show it may be off; for the turn, at a metre.
         """
         away_m = transform(motion, self.position_m) - self.position_m
-        away = np.array([*away_m, math.remainder(float(motion[2]), math.tau)])
-        covariance = self.motion + model_sigma_m**2 * np.eye(3)
+        away = np.array([*away_m, wrap_angle(float(motion[2]))])
+        covariance = self.motion_covariance + model_sigma_m**2 * np.eye(3)
         return float(away @ np.linalg.solve(covariance, away)) <= float(chdtri(3, TAIL_PROBABILITY))
 
     def at(self, position_m: Array) -> Array:
@@ -134,7 +134,7 @@ class Doubt:
     def add(self, newer: Doubt) -> None:
         """Add a doubt with the same evidence; what is measured of the newer one counts."""
         self.covariance = self.at(newer.position_m) + newer.covariance
-        self.motion = self.motion + newer.motion
+        self.motion_covariance = self.motion_covariance + newer.motion_covariance
         self.probability += newer.probability
         self.knew_few &= newer.knew_few
         self.position_m, self.information = newer.position_m, newer.information
@@ -168,12 +168,13 @@ def doubted_covariance(doubts: Sequence[Doubt], position_m: Array) -> Array:
 
 
 def covering(covariance: Array, other: Array) -> Array:
-    """Return what a covariance (k, k) needs in addition to be nowhere less than another one.
+    """Return what is to be added to a covariance (k, k) for it to be nowhere less than another one.
 
-    The sum is the least that covers both, in each direction in which they can be compared: with
-    ``covariance`` = L L^T, those are the eigenvectors of L^-1 ``other`` L^-T.
+    The sum is the least that covers both: with ``covariance`` = L L^T, the eigenvalues of
+    L^-1 ``other`` L^-T that are larger than one count, in the directions of their eigenvectors.
+    Shape (k, k), units of the covariances.
     """
-    root = np.linalg.cholesky(covariance + _LEAST_VARIANCE * np.eye(len(covariance)))
+    root = np.linalg.cholesky(covariance + LEAST_VARIANCE * np.eye(len(covariance)))
     scaled = np.linalg.solve(root, np.linalg.solve(root, other).T)
     ratios, axes = np.linalg.eigh(scaled)
     missing = root @ axes

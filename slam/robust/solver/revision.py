@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from slam.geometry import align_se2, transform
+from slam.geometry import align_se2, transform, wrap_angle
 from slam.robust.association import Pairs
 from slam.robust.map import MERGE_SIGMA_M, apply_merge
 from slam.robust.parameters import (
@@ -38,6 +38,7 @@ from slam.robust.solver.smoother import (
 )
 from slam.robust.state import (
     HEAD_SIZE,
+    LEAST_VARIANCE,
     Array,
     State,
 )
@@ -45,7 +46,6 @@ from slam.robust.state import (
 _LEAST_SHARE, _MOST_SHARE = 0.5, 1000.0  # keep `RangeErrors.variance_share` finite
 _UNKNOWN = 100.0  # standard deviation of what is not determined
 _LEAST_VARIANCE_M2 = 1e-18  # keeps the noise of ranges that the front end gave from vanishing
-_LEAST_VARIANCE = 1e-12  # keeps the covariance of a pose that is exact regular
 
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
@@ -84,9 +84,9 @@ def _solved(
 ) -> Solution | None:
     """Solve from the start of the least cost.
 
-    If that moves the pose by more than its covariance allows, the other starts are tried, too: of
-    the filter's path a jump costs much, as where a landmark corrects the pose at once, although it
-    is the better one.
+    If that fails, or moves the pose by more than its covariance allows, the other starts are tried,
+    too, and the best solution counts. Where a landmark has corrected the pose at once, the filter's
+    path has a jump: its cost is large, although it leads to the better solution.
     """
     smoother = Smoother(problem, parameters.relinearisation)
     found: list[Solution] = []
@@ -100,9 +100,10 @@ def _solved(
 
 
 def _is_expected(solution: Solution, state: State) -> bool:
+    """Return whether a solution moves the pose by no more than its covariance allows."""
     away = solution.estimate.poses[-1] - state.pose
-    away[2] = math.remainder(float(away[2]), math.tau)
-    covariance = state.pose_covariance() + _LEAST_VARIANCE * np.eye(3)
+    away[2] = wrap_angle(float(away[2]))
+    covariance = state.pose_covariance() + LEAST_VARIANCE * np.eye(3)
     return is_plausible(float(away @ np.linalg.solve(covariance, away)), 3)
 
 

@@ -1,4 +1,4 @@
-"""A run whose landmarks are one is solved for from a path that is bent to where they are."""
+"""Where solutions of the whole run start: from either path, or from one that is bent."""
 
 import math
 from dataclasses import replace
@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slam.config import WheelNoise
 from slam.geometry import between, compose, transform
+from slam.robust.parameters import BackEndParameters
+from slam.robust.solver import revision
 from slam.robust.solver.revision import with_closed_loop, with_doubled
-from slam.robust.solver.run_log import Estimate, Problem
-from slam.robust.state import Layout
+from slam.robust.solver.run_log import Estimate, Problem, RunLog
+from slam.robust.solver.smoother import Eliminated, Solution
+from slam.robust.state import Layout, State
 
 Array = NDArray[np.float64]
 
@@ -129,3 +133,61 @@ def test_doubled_landmarks_are_where_the_one_is() -> None:
     np.testing.assert_array_equal(doubled.fixed[-4:], truth.fixed[-4:])
     assert len(doubled.fixed) == len(apart.fixed)
     np.testing.assert_array_equal(doubled.poses, truth.poses)
+
+
+# The final pose [m, m, rad] and the cost of the solution from each start; the pose before it is
+# the origin, with standard deviations of 0.1
+SOLVED = {
+    "near": ((0.1, -0.1, 0.1), 50.0),
+    "far": ((0.9, 0.0, 0.0), 200.0),
+    "far and good": ((0.9, 0.0, 0.0), 10.0),
+    "failed": None,
+    # An angle of -0.1 rad
+    "wrapped": ((0.0, 0.0, math.tau - 0.1), 50.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("starts", "tried", "best"),
+    [
+        (("near", "far and good"), ["near"], 50.0),
+        (("wrapped", "far and good"), ["wrapped"], 50.0),
+        (("far", "near"), ["far", "near"], 50.0),
+        (("far and good", "near"), ["far and good", "near"], 10.0),
+        (("failed", "far"), ["failed", "far"], 200.0),
+        (("failed", "failed"), ["failed", "failed"], None),
+    ],
+    ids=str,
+)
+def test_another_start_is_tried_where_a_solution_moves_the_pose_too_far(
+    monkeypatch: pytest.MonkeyPatch, starts: tuple[str, str], tried: list[str], best: float | None
+) -> None:
+    """What counts is the cost of the solutions, and not that of the starts."""
+    problem, apart, _ = bent_run(0.1, 0.1)
+    log = RunLog(WheelNoise(), 10)
+    state = State((0.0,) * 3, (0.0,) * N_RADARS)
+    state.set_pose(np.zeros(3), 0.1**2 * np.eye(3))
+    seen: list[str] = []
+
+    class Solver:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def cost(self, start: str) -> float:
+            return float(starts.index(start))
+
+        def solve(self, start: str) -> Solution | None:
+            seen.append(start)
+            found = SOLVED[start]
+            if found is None:
+                return None
+            poses = np.vstack([apart.poses[:-1], found[0]])
+            eliminated = Eliminated.__new__(Eliminated)
+            return Solution(
+                estimate=replace(apart, poses=poses), eliminated=eliminated, cost=found[1]
+            )
+
+    monkeypatch.setattr(revision, "Smoother", Solver)
+    monkeypatch.setattr(RunLog, "starts", lambda *_: starts[::-1])
+    solution = revision._solved(log, state, problem, BackEndParameters())
+    assert (seen, solution and solution.cost) == (tried, best)

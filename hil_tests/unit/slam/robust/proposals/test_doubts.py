@@ -32,7 +32,7 @@ def doubtful(x_m: float, probability: float = 1.0) -> Doubt:
         position_m=np.array([x_m, 0.0]),
         probability=probability,
         covariance=probability * CARRY,
-        motion=np.diag(RULE.hidden_variances),
+        motion_covariance=np.diag(RULE.hidden_variances),
     )
 
 
@@ -120,7 +120,7 @@ def test_doubts_that_are_joined_need_what_both_need() -> None:
     older.join(newer)
     assert (older.next_id, older.nats) == (3, {1: 2.0})
     np.testing.assert_array_equal(older.information, np.zeros((3, 3)))
-    np.testing.assert_allclose(older.motion, 2.0 * np.diag(RULE.hidden_variances))
+    np.testing.assert_allclose(older.motion_covariance, 2.0 * np.diag(RULE.hidden_variances))
 
 
 def test_one_that_knew_too_few_is_confirmed_with_the_one_that_it_is_joined_to() -> None:
@@ -181,7 +181,7 @@ def test_a_doubt_ends_where_the_one_motion_that_may_have_been_is_measured(
 ) -> None:
     """Landmarks abeam tell of a slip across the course, whatever they leave open besides."""
     doubt = doubtful(0.0)
-    doubt.motion = np.outer(way, way)
+    doubt.motion_covariance = np.outer(way, way)
     for _ in range(20):
         doubt.take(np.array([[0, MUCH], [1, MUCH], [2, MUCH]]), RULE)
         doubt.measure(seen_from(np.zeros(3), [(LEVER_M, 0.9), (LEVER_M, -0.8)], 0.0))
@@ -194,7 +194,7 @@ def test_a_doubt_ends_where_the_one_motion_that_may_have_been_is_measured(
         ((0.2, 0.0, 0.0), True),
         ((0.5, 0.0, 0.0), False),  # five standard deviations
         ((0.0, 0.2, 0.0), False),  # across what may have been
-        # A turn about the place is none of the place
+        # The position stays, but the heading turns
         ((1.0 - math.cos(0.2), -math.sin(0.2), 0.2), False),
     ],
     ids=str,
@@ -203,7 +203,7 @@ def test_a_doubt_allows_motions_that_may_have_been(
     motion: tuple[float, float, float], is_allowed: bool
 ) -> None:
     doubt = doubtful(1.0)
-    doubt.motion = np.diag([0.1**2, 0.0, 0.0])
+    doubt.motion_covariance = np.diag([0.1**2, 0.0, 0.0])
     assert doubt.allows(np.array(motion), 0.01) is is_allowed
 
 
