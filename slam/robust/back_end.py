@@ -1090,5 +1090,6 @@ class RobustBackEnd:
         labels = self._landmark_of_label.items()
         self._landmark_of_label = {label: merged.get(id_, id_) for label, id_ in labels}
         self._log.since_solved = 0
-        adopt(self._log, state, *found, self.parameters)
+        self._log.leave_out_rows(found.left_out)
+        adopt(self._log, state, found.problem, found.solution, self.parameters)
         return True

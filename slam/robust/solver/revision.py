@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
@@ -40,6 +40,7 @@ from slam.robust.state import (
     HEAD_SIZE,
     LEAST_VARIANCE,
     Array,
+    Indices,
     State,
 )
 
@@ -107,9 +108,53 @@ def _is_expected(solution: Solution, state: State) -> bool:
     return is_plausible(float(away @ np.linalg.solve(covariance, away)), 3)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Merged:
+    """The whole run, solved for with landmarks as one."""
+
+    problem: Problem
+    solution: Solution
+    left_out: Indices  # shape (k,): rows of the log's ranges that are of nothing then
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Trial:
+    """The whole run with the landmarks of pairs, by row, as two and as one."""
+
+    two: Problem
+    one: Problem
+    pairs: Pairs
+    most_rise: float  # of the cost, from two to one
+    parameters: BackEndParameters
+
+    def allows(self, together: Solution, least: float) -> bool:
+        """Return whether a solution with them as one is good enough; ``least`` is that as two."""
+        if together.cost - least > self.most_rise or not is_determined(together.information):
+            return False
+        # The cost of a range is bounded: few of them could lie anywhere.
+        rows = measurement_residuals(self.one, together.estimate)
+        residual = rows.residual[: len(self.one.ranges_m)]
+        fits = np.abs(residual) <= self.parameters.relinearisation.outlier_sigmas
+        of_rows = [self.two.range_landmarks == row for pair in self.pairs for row in pair]
+        # Those of a map may have none in this run.
+        return all(np.mean(fits[mine]) > 0.5 for mine in of_rows if mine.any())
+
+    def solved_from(self, closed: Estimate, apart_cost: float) -> Solution | None:
+        """Return the solution as one from far off, None if the run does not allow it."""
+        rule = self.parameters.relinearisation
+        together = Smoother(self.one, rule).solve(_annealed(self.one, closed, self.parameters))
+        if together is None or not self.allows(together, apart_cost):
+            return None
+        # The search went further than that for the solution with them as two: so does this one.
+        doubled = with_doubled(self.two, together.estimate, self.pairs)
+        again = Smoother(self.two, rule).solve(doubled)
+        least = apart_cost if again is None else min(apart_cost, again.cost)
+        return together if self.allows(together, least) else None
+
+
 def solved_as_one(
     log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameters
-) -> tuple[Problem, Solution] | None:
+) -> Merged | None:
     """Solve for the whole run with landmarks, by row, as one, in pairs.
 
     None if the run does not allow it.
@@ -117,6 +162,10 @@ def solved_as_one(
     The run is solved for with them as two and as one, their ranges having the noise of the noisier
     one. The cost may rise by what chance explains, the quantile of chi-square with two degrees of
     freedom for each pair, and most ranges of each landmark must fit where it is then.
+
+    Behind a slip the robot may have taken one thing for another. So if all that fails, passages
+    that are far off where the loop is closed are left out of both solutions. Each landmark that
+    they were taken for costs as much as one may say against a place.
     """
     ids = state.landmark_ids
     same = {ids[gone]: ids[kept] for kept, gone in pairs}
@@ -124,37 +173,54 @@ def solved_as_one(
     two.added_sigmas_m = state.added_sigmas_m | noisier(state, same)
     one.added_sigmas_m |= noisier(state, same)
     apply_merge(one, pairs, MERGE_SIGMA_M)
-    problem = log.problem(two, parameters)
-    apart = _solved(log, two, problem, parameters)
+
+    def trial(left_out: Indices, n_mistaken: int = 0) -> _Trial:
+        return _Trial(
+            two=log.problem(two, parameters, without=left_out),
+            one=log.problem(one, parameters, same, left_out),
+            pairs=pairs,
+            most_rise=float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
+            - 2.0 * parameters.branches.most_against * n_mistaken,
+            parameters=parameters,
+        )
+
+    nothing = np.zeros(0, dtype=np.intp)
+    every = trial(nothing)
+    apart = _solved(log, two, every.two, parameters)
     if apart is None:
         return None
-    merged = log.problem(one, parameters, same)
-    smoother = Smoother(merged, parameters.relinearisation)
-    of_rows = [problem.range_landmarks == row for pair in pairs for row in pair]
-
-    def is_allowed(together: Solution, least: float) -> bool:
-        limit = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
-        if together.cost - least > limit or not is_determined(together.information):
-            return False
-        # The cost of a range is bounded: few of them could lie anywhere.
-        residual = measurement_residuals(merged, together.estimate).residual[: len(merged.ranges_m)]
-        fits = np.abs(residual) <= parameters.relinearisation.outlier_sigmas
-        # Those of a map may have none in this run.
-        return all(np.mean(fits[mine]) > 0.5 for mine in of_rows if mine.any())
-
     # Most pairs are near enough to be solved for from where the filter has them.
-    together = _solved(log, one, merged, parameters)
-    if together is not None and is_allowed(together, apart.cost):
-        return merged, together
-    closed = with_closed_loop(problem, apart.estimate, pairs)
-    together = smoother.solve(_annealed(merged, closed, parameters))
-    if together is None or not is_allowed(together, apart.cost):
+    together = _solved(log, one, every.one, parameters)
+    if together is not None and every.allows(together, apart.cost):
+        return Merged(problem=every.one, solution=together, left_out=nothing)
+    closed = with_closed_loop(every.two, apart.estimate, pairs)
+    together = every.solved_from(closed, apart.cost)
+    if together is not None:
+        return Merged(problem=every.one, solution=together, left_out=nothing)
+    rows, passages = log.passages(one, same)
+    off = far_off(every.one, closed, passages, parameters.relinearisation.outlier_sigmas)
+    is_off = np.isin(passages, off)
+    left_out = rows[is_off]
+    some = trial(left_out, len(np.unique(every.one.range_landmarks[is_off])))
+    if not len(off) or some.most_rise <= 0.0:
         return None
-    # The search went further than that for the solution with them as two: so does this one.
-    doubled = with_doubled(problem, together.estimate, pairs)
-    again = Smoother(problem, parameters.relinearisation).solve(doubled)
-    least = apart.cost if again is None else min(apart.cost, again.cost)
-    return (merged, together) if is_allowed(together, least) else None
+    again = Smoother(some.two, parameters.relinearisation).solve(apart.estimate)
+    together = None if again is None else some.solved_from(closed, again.cost)
+    if together is None:
+        return None
+    return Merged(problem=some.one, solution=together, left_out=left_out)
+
+
+def far_off(
+    problem: Problem, estimate: Estimate, passages: Indices, outlier_sigmas: float
+) -> Indices:
+    """Return the passages most ranges of which are too far off to be solved for, shape (k,).
+
+    ``passages`` (m,) are those of the ranges.
+    """
+    residual = measurement_residuals(problem, estimate).residual[: len(passages)]
+    is_far = np.abs(residual) > SECOND_NOISE_FACTOR * outlier_sigmas
+    return np.flatnonzero(np.bincount(passages, is_far) > 0.5 * np.bincount(passages))
 
 
 def with_closed_loop(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimate:

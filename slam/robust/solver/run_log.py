@@ -395,6 +395,32 @@ class RunLog:
         bad = since & np.isin(ranges["landmark"], ranges["landmark"][~since])
         ranges["landmark"][bad & ~np.isin(ranges["landmark"], names)] = _OF_NOTHING
 
+    def leave_out_rows(self, rows: Indices) -> None:
+        """Leave out ranges by their rows, as `passages` has them."""
+        self._ranges.rows_to_write()["landmark"][rows] = _OF_NOTHING
+
+    def passages(
+        self, state: State, same: Mapping[int, int] | None = None
+    ) -> tuple[Indices, Indices]:
+        """Return the row in the log of each range of `problem`, and its passage, shape (m,) each.
+
+        Of one feature, ranges that are more than the gap apart are of two passages.
+        """
+        of_range = self._features_of_ranges(state, same)
+        rows = np.flatnonzero(of_range >= 0)
+        features, poses = of_range[rows], self._ranges.rows["pose"][rows]
+        order = np.lexsort([poses, features])
+        begins = np.diff(features[order], prepend=-1) != 0
+        begins |= np.diff(poses[order], prepend=0) > self._gap_poses
+        passages = np.empty(len(rows), dtype=np.intp)
+        passages[order] = np.cumsum(begins) - 1
+        return rows, passages
+
+    def _features_of_ranges(self, state: State, same: Mapping[int, int] | None) -> Indices:
+        """Return the row of each range's feature in the state, -1 of those that it has not."""
+        rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
+        return _rows_of(self._ranges.rows["landmark"], self._names | dict(same or {}), rows)
+
     def seen_from(self, poses: Collection[int]) -> Counter[int]:
         """Return from how many of some poses each landmark was seen with a bearing, by its id."""
         ranges = self._ranges.rows
@@ -444,17 +470,21 @@ class RunLog:
         return np.flatnonzero(wanted)
 
     def problem(
-        self, state: State, parameters: BackEndParameters, same: Mapping[int, int] | None = None
+        self,
+        state: State,
+        parameters: BackEndParameters,
+        same: Mapping[int, int] | None = None,
+        without: Indices | None = None,
     ) -> Problem:
         """Return all measurements of the landmarks the state has now.
 
-        ``same`` maps the id of a landmark to that of the one that it is taken for.
+        ``same`` maps the id of a landmark to that of the one that it is taken for; ``without`` (k,)
+        are rows of ranges, as `passages` has them, to be left out.
         """
-        rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
-        names = self._names | dict(same or {})
-        ranges = self._ranges.rows
-        of_range = _rows_of(ranges["landmark"], names, rows)
-        ranges, of_range = ranges[of_range >= 0], of_range[of_range >= 0]
+        of_range = self._features_of_ranges(state, same)
+        if without is not None:
+            of_range[without] = -1
+        ranges, of_range = self._ranges.rows[of_range >= 0], of_range[of_range >= 0]
         sigmas_m = ranges["sigma_m"].astype(np.float64)
         if state.added_sigmas_m:
             sigmas_m = np.hypot(sigmas_m, state.feature_added_sigmas_m[of_range])

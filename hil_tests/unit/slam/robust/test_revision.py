@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import between, compose, transform
-from slam.robust.parameters import BackEndParameters
+from slam.robust.parameters import SECOND_NOISE_FACTOR, BackEndParameters
 from slam.robust.solver import revision
-from slam.robust.solver.revision import with_closed_loop, with_doubled
+from slam.robust.solver.revision import far_off, with_closed_loop, with_doubled
 from slam.robust.solver.run_log import Estimate, Problem, RunLog
 from slam.robust.solver.smoother import Eliminated, Solution
 from slam.robust.state import Layout, State
@@ -133,6 +133,59 @@ def test_doubled_landmarks_are_where_the_one_is() -> None:
     np.testing.assert_array_equal(doubled.fixed[-4:], truth.fixed[-4:])
     assert len(doubled.fixed) == len(apart.fixed)
     np.testing.assert_array_equal(doubled.poses, truth.poses)
+
+
+def test_passages_of_one_landmark_are_more_than_the_gap_apart() -> None:
+    log, state = RunLog(WheelNoise(), 3), State((0.0,) * 3, (0.0,) * N_RADARS)
+    for _ in range(2):
+        size = state.layout.landmark_size
+        state.augment(np.zeros(2), np.zeros((state.P.size, size)), np.eye(size))
+    first, second = state.landmark_ids
+    gone, unknown = second + 1, second + 2
+    # Pose, landmark, and the passage; of landmarks that the state has not there is none
+    seen = [
+        (0, first, 0),
+        (0, second, 2),
+        (3, first, 0),
+        (4, unknown, None),
+        (7, first, 1),
+        (3, gone, 2),  # which is taken for the second one
+        (7, second, 3),
+    ]
+    for pose, landmark, _ in seen:
+        log.add_range(pose, 0, landmark, antenna=(0.0, 0.0), range_m=1.0, sigma_m=0.01)
+    rows, passages = log.passages(state, {gone: second})
+    expected = [(row, passage) for row, (*_, passage) in enumerate(seen) if passage is not None]
+    assert list(zip(rows.tolist(), passages.tolist(), strict=True)) == expected
+    log.leave_out_rows(rows[passages == 2])
+    assert log.passages(state, {gone: second})[0].tolist() == [0, 2, 4, 6]
+
+
+def test_a_passage_is_far_off_if_most_of_its_ranges_are() -> None:
+    """They are taken from the origin, of landmarks at 1 m, with standard deviations of 1 mm."""
+    layout = Layout(N_RADARS, 2, 0, has_radii=False)
+    rows = np.repeat([0, 0, 1], [4, 3, 4])
+    passages = np.repeat([0, 1, 2], [4, 3, 4])
+    limit_m = 4e-3 * SECOND_NOISE_FACTOR
+    off_m = limit_m * np.array([1.1, 1.1, -1.1, 0.9, 1.1, 0.9, 0.0, 1.1, 1.1, 0.9, 0.9])
+    problem, apart, _ = bent_run(0.1, 0.1)
+    values = np.zeros(len(rows))
+    problem = replace(
+        problem,
+        layout=layout,
+        range_poses=np.zeros(len(rows), dtype=np.intp),
+        range_radars=np.zeros(len(rows), dtype=np.intp),
+        range_landmarks=rows,
+        range_antennas=np.zeros((len(rows), 2)),
+        range_turns=values,
+        ranges_m=1.0 + off_m,
+        range_sigmas_m=values + 1e-3,
+        range_bearings_rad=np.full(len(rows), math.nan),
+        range_bearing_sigmas_rad=np.full(len(rows), math.nan),
+    )
+    fixed = np.concatenate([np.zeros(N_RADARS), [1.0, 0.0], [0.0, 1.0]])
+    estimate = replace(apart, poses=np.zeros_like(apart.poses), fixed=fixed)
+    assert far_off(problem, estimate, passages, outlier_sigmas=4.0).tolist() == [0]
 
 
 # The final pose [m, m, rad] and the cost of the solution from each start; the pose before it is
