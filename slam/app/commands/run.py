@@ -7,8 +7,8 @@ import gc
 import re
 import signal
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from functools import partial
 from importlib import import_module
@@ -120,7 +120,8 @@ def run_rig(
             )
         hold_folder(out, held)
         publishing = held.enter_context(Publishing(publish))
-        requests = held.enter_context(SmoothingRequests(out))
+        requests = SmoothingRequests(out)
+        held.enter_context(requests.caught())
         view = held.enter_context(LiveView(rerun, stop)) if rerun is not None else None
         links = open_modules(
             rig_file,
@@ -290,8 +291,7 @@ class PromptSlam(WrappedSlam):
 class SmoothingRequests(SessionObserver):
     """Answers SIGUSR1 with the path smoothed so far: `smoothed.tum` in a folder.
 
-    Other sinks, as the session and a live view, get it, too. The scans wait for the solution. The
-    signal is caught while this is entered, in the main thread.
+    Other sinks, as the session and a live view, get it, too. The scans wait for the solution.
     """
 
     def __init__(self, out: Path) -> None:
@@ -299,15 +299,17 @@ class SmoothingRequests(SessionObserver):
         self._is_asked = False
         self._asked_s: float | None = None
 
-    def __enter__(self) -> Self:
-        self._previous = signal.signal(signal.SIGUSR1, self._ask)
-        return self
+    @contextmanager
+    def caught(self) -> Iterator[None]:
+        """Catch the signal meanwhile, in the main thread.
 
-    def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGUSR1, self._previous)
-
-    def close(self) -> None:
-        """Leave the signal caught: results are written after the sinks are closed."""
+        Longer than sinks are open: results are written after they are closed.
+        """
+        previous = signal.signal(signal.SIGUSR1, self._ask)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGUSR1, previous)
 
     def asked(self) -> bool:
         """Return whether a signal came since the last call."""

@@ -16,9 +16,10 @@ from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
 from slam.app.run.live_source import LiveLog
-from slam.app.run.runner import run_slam, unknown_truth
+from slam.app.run.runner import RunSource, execute, run_slam, unknown_truth
 from slam.app.session.writer import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
+from slam.geometry import paper_rig
 from slam.live.odometry_track import OdometryTrack, TumSample, read_tum
 from slam.live.session.reader import open_session
 from slam.live.session_records import Scan
@@ -138,12 +139,19 @@ def test_sigusr1_writes_the_path_smoothed_so_far(
             yield scan(number)
 
     before = signal.getsignal(signal.SIGUSR1)
-    with SmoothingRequests(tmp_path) as requests:
-        track = OdometryTrack([pose(0), pose(10**10)])
-        asked = requests.asked
-        record = run_slam(
-            scans(), track, Smooths(0.0), unknown_truth, [requests], smoothing_asked=asked
+    requests = SmoothingRequests(tmp_path)
+    with requests.caught():
+        source = RunSource(
+            info=session_info(),
+            rig=paper_rig(),
+            slam=Smooths(0.0),
+            scans=scans(),
+            odometry=OdometryTrack([pose(0), pose(10**10)]),
+            smoothing_asked=requests.asked,
         )
+        record = execute(source, [requests])
+        caught = signal.getsignal(signal.SIGUSR1)
+    assert caught not in {before, signal.SIG_DFL}  # while results are written
     assert signal.getsignal(signal.SIGUSR1) is before
     assert record.smoothed is made
     written = read_tum(tmp_path / "smoothed.tum")
