@@ -6,9 +6,6 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-from numpy.typing import NDArray
-
 from emulator.scene.wheels import scene_odometry
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.rig.emulated import (
@@ -23,7 +20,7 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.runner import RunRecord, run_slam
+from slam.app.run.runner import RunRecord, RunSource, execute, unknown_truth
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
 from slam.library.slam import make_slam
@@ -106,17 +103,19 @@ def _record(
             started_unix_ns=None if has_truth else STARTED_UNIX_NS,
             odometry_clock="" if has_truth else "monotonic",
         )
-        truth = trajectory.poses if has_truth else _unknown
+        truth = trajectory.poses if has_truth else unknown_truth
         log = SessionLog(path, info, odometry, truth_at=truth if has_truth else None)
         scans = source.scans(end_tick(trajectory.duration_ns), StopFlag())
         slam = make_slam(config, rig_of(scene), wheels_of(scene), rules=rules)
-        record = run_slam(_damaged(scans, log, info), odometry, slam, truth, [log])
-        log.close()
-    return record
-
-
-def _unknown(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    return np.full((len(stamps_ns), 3), np.nan)
+        run = RunSource(
+            info=info,
+            rig=rig_of(scene),
+            slam=slam,
+            scans=_damaged(scans, log, info),
+            odometry=odometry,
+            truth_at=truth,
+        )
+        return execute(run, [log])
 
 
 def _damaged(scans: Iterator[Scan], log: SessionLog, info: SessionInfo) -> Iterator[Scan]:

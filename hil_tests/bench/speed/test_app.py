@@ -14,7 +14,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
+from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot, source_of_scans
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -24,7 +24,7 @@ from slam.app.rig.emulated import (
     scene_and_config,
 )
 from slam.app.run.radar_image import RollingImage
-from slam.app.run.runner import execute, run_slam
+from slam.app.run.runner import execute
 from slam.app.session.writer import SessionLog
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.session_view import RerunView
@@ -64,7 +64,8 @@ def test_whole_pipeline_without_synthesis(benchmark: BenchmarkFixture, tmp_path:
     )
 
     def run() -> float:
-        record = run_slam(scans, track, UwbRadarSlam(config, rig_of(scene)), poses)
+        slam = UwbRadarSlam(config, rig_of(scene))
+        record = execute(source_of_scans(scans, track, slam, poses, source.radars))
         return record.duration_ns / 1e9 / record.wall_s
 
     benchmark.extra_info["times_real_time"] = repeat(benchmark, run)

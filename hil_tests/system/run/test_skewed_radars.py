@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene, TargetSpec
 from emulator.scene.wheels import odometry_times_ns, tum_line
+from hil_tests.unit.slam.app.sessions import source_of_scans
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -25,7 +26,7 @@ from slam.app.rig.emulated import (
     open_ports,
     rig_of,
 )
-from slam.app.run.runner import run_slam
+from slam.app.run.runner import execute
 from slam.app.sweep.run import StepKeeper
 from slam.config import FrontEnd, SampleTime, load_preset, override
 from slam.live.odometry_track import OdometryTrack
@@ -101,7 +102,7 @@ def results_of(
         scans = without_some(scans) if lose else scans
         kept = StepKeeper()
         slam = UwbRadarSlam(config, rig_of(scene))
-        run_slam(scans, track, slam, trajectory.poses, [kept])
+        execute(source_of_scans(scans, track, slam, trajectory.poses, source.radars), [kept])
         return tuple(kept.steps)
 
 

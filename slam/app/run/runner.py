@@ -39,8 +39,6 @@ from slam.robust.solver.growing_arrays import PackedRows
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.matching import ProtocolRecord
 
-_NO_LANDMARKS_M = np.empty((0, 2))
-
 
 class WrappedSlam:
     """Passes everything but `step` on to another pipeline; subclasses define that."""
@@ -304,53 +302,11 @@ class RunRecorder(SessionObserver):
 def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunRecord:
     """Run a source through SLAM into sinks, and close these in their order.
 
-    Raises
-    ------
-    OdometryError
-        Odometry does not cover the time of a scan.
-    """
-    observers = [*sinks, source.link_log]
-    with ExitStack() as closing:
-        for observer in reversed(observers):
-            closing.enter_context(observer)
-        closing.callback(source.close)
-        source.link_log.attach(*sinks)
-        return run_slam(
-            source.scans,
-            source.odometry,
-            source.slam,
-            source.truth_at,
-            [source.link_log, *sinks],
-            gains_db=[radar.gain_db for radar in source.info.radars],
-            true_landmarks_m=source.info.true_landmarks_m,
-            smoothing_asked=source.smoothing_asked,
-            world_from_map=None
-            if source.map_file is None or source.map_file.world_from_map is None
-            else np.array(source.map_file.world_from_map),
-        )
-
-
-def run_slam(
-    scans: Iterable[Scan],
-    odometry: Odometry,
-    slam: Pipeline,
-    truth_at: TruthAt,
-    observers: Sequence[SessionObserver] = (),
-    *,
-    gains_db: Sequence[float] = (),
-    true_landmarks_m: NDArray[np.float64] = _NO_LANDMARKS_M,
-    smoothing_asked: Callable[[], bool] = lambda: False,
-    world_from_map: NDArray[np.float64] | None = None,
-) -> RunRecord:
-    """Feed scans to SLAM as they come, and scans and states to the observers.
-
-    A scan that is not `used` goes to the observers only, and so does the truth. One whose step SLAM
-    gave up, at the end of a run, counts as not used, and nothing is smoothed then. Observers get
-    the smoothed run at the end, and after a scan when `smoothing_asked` returns True. BLAS runs on
-    one thread, as everywhere else, so that results are the same bits. Observers get frames as
-    received, SLAM gets them without each radar's gain, if `gains_db` has any. `true_landmarks_m`,
-    shape (m, 2), world frame, is for the record only; `world_from_map` is the pose of the map frame
-    if that does not begin with the truth's first pose.
+    A scan that is not `used` goes to the sinks only, and so does the truth. One whose step SLAM
+    gave up, at the end of a run, counts as not used, and nothing is smoothed then. Sinks get the
+    smoothed run at the end, and after a scan when `smoothing_asked` returns True. BLAS runs on one
+    thread, as everywhere else, so that results are the same bits. Sinks get frames as received,
+    SLAM gets them without each radar's gain.
 
     Raises
     ------
@@ -359,8 +315,22 @@ def run_slam(
     AppError
         SLAM cannot be stepped with a scan, such as one that is before the last one.
     """
-    recorder = RunRecorder(true_landmarks_m)
-    observers = [recorder, *observers]
+    with ExitStack() as closing:
+        for observer in reversed([*sinks, source.link_log]):
+            closing.enter_context(observer)
+        closing.callback(source.close)
+        source.link_log.attach(*sinks)
+        recorder = RunRecorder(source.info.true_landmarks_m)
+        _run(source, [recorder, source.link_log, *sinks])
+        return recorder.record()
+
+
+def _run(source: RunSource, observers: Sequence[SessionObserver]) -> None:
+    """Feed scans to SLAM as they come, and scans and states to the observers."""
+    slam, truth_at, radars = source.slam, source.truth_at, source.info.radars
+    world_from_map: NDArray[np.float64] | None = None
+    if source.map_file is not None and source.map_file.world_from_map is not None:
+        world_from_map = np.array(source.map_file.world_from_map)
     stamps_ns, counters = array("q"), array("q")  # of the scans
 
     def take(new: Iterable[StepResult]) -> None:
@@ -384,19 +354,17 @@ def run_slam(
 
     with threadpool_limits(limits=1):
         given_up = False
-        for scan in scans:
+        for scan in source.scans:
             results: tuple[StepResult, ...] = ()
             try:
                 if scan.used:
-                    scan = replace(scan, odom_frame=odometry.frame_at(scan.t_ns))
+                    scan = replace(scan, odom_frame=source.odometry.frame_at(scan.t_ns))
                     if world_from_map is None:
                         world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
                     stamps_ns.append(scan.t_ns)
                     counters.append(scan.counter)
-                    frames = [
-                        less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames
-                    ]
-                    results = slam.step(frames, odometry.pose_at, scan.t_ns)
+                    frames = [less_gain(f, radars[f.radar].gain_db) for f in scan.frames]
+                    results = slam.step(frames, source.odometry.pose_at, scan.t_ns)
             except StepGivenUpError:
                 given_up, scan = True, replace(scan, used=False)
             except StepInputError as error:
@@ -405,12 +373,11 @@ def run_slam(
                 for observer in observers:
                     observer.on_scan(scan)
             take(results)
-            if not given_up and smoothing_asked():
+            if not given_up and source.smoothing_asked():
                 smooth()
         if not given_up:  # SLAM is in the middle of a step then
             take(slam.flush())
             smooth()
-    return recorder.record()
 
 
 def snapshot_of_step(

@@ -1,6 +1,7 @@
 """A made-up session for the tests of logs and viewers: known frames, poses and landmarks."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,18 @@ from mcap.reader import NonSeekingReader
 from numpy.typing import NDArray
 
 from slam.app.cli import main
-from slam.app.run.runner import RunRecord, RunRecorder, snapshot_of_step
+from slam.app.run.runner import (
+    Odometry,
+    RunRecord,
+    RunRecorder,
+    RunSource,
+    snapshot_of_step,
+    unknown_truth,
+)
 from slam.app.session.writer import SessionLog
 from slam.config import load_preset
 from slam.frames import Detection, RadarFrame
+from slam.geometry import paper_rig
 from slam.live.odometry_track import OdometryTrack, format_tum_line
 from slam.live.session_records import (
     LogLine,
@@ -22,8 +31,9 @@ from slam.live.session_records import (
     SessionInfo,
     SessionObserver,
     Snapshot,
+    TruthAt,
 )
-from slam.results import PoseAt, SmoothedRun, StepResult
+from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
 
 FRAME_NS = 199_261_498
 N_BINS = 1431
@@ -65,6 +75,25 @@ def session_info(n_radars: int = 2) -> SessionInfo:
         radars=radars,
         true_landmarks_m=np.array([[1.0, 0.5], [-0.5, 2.0]]),
         versions={"numpy": "2"},
+    )
+
+
+def source_of_scans(
+    scans: Iterable[Scan],
+    odometry: Odometry,
+    slam: Pipeline,
+    truth_at: TruthAt = unknown_truth,
+    radars: tuple[RadarInfo, ...] | None = None,
+) -> RunSource:
+    """Return scans as the source of a run; their radars are those of `session_info` if None."""
+    info = session_info()
+    return RunSource(
+        info=info if radars is None else replace(info, radars=radars),
+        rig=paper_rig(),
+        slam=slam,
+        scans=scans,
+        odometry=odometry,
+        truth_at=truth_at,
     )
 
 

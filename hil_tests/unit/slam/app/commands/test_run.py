@@ -4,22 +4,29 @@ import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hil_tests.patience import seconds
-from hil_tests.unit.slam.app.sessions import Listener, NoSlam, scan, session_info, smoothed_run
+from hil_tests.unit.slam.app.sessions import (
+    Listener,
+    NoSlam,
+    scan,
+    session_info,
+    smoothed_run,
+    source_of_scans,
+)
 from slam.app.commands import run
 from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
 from slam.app.run.live_source import LiveLog
-from slam.app.run.runner import RunSource, execute, run_slam, unknown_truth
+from slam.app.run.runner import execute
 from slam.app.session.writer import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
-from slam.geometry import paper_rig
 from slam.live.odometry_track import OdometryTrack, TumSample, read_tum
 from slam.live.session.reader import open_session
 from slam.live.session_records import Scan
@@ -141,15 +148,9 @@ def test_sigusr1_writes_the_path_smoothed_so_far(
     before = signal.getsignal(signal.SIGUSR1)
     requests = SmoothingRequests(tmp_path)
     with requests.caught():
-        source = RunSource(
-            info=session_info(),
-            rig=paper_rig(),
-            slam=Smooths(0.0),
-            scans=scans(),
-            odometry=OdometryTrack([pose(0), pose(10**10)]),
-            smoothing_asked=requests.asked,
-        )
-        record = execute(source, [requests])
+        track = OdometryTrack([pose(0), pose(10**10)])
+        source = source_of_scans(scans(), track, Smooths(0.0))
+        record = execute(replace(source, smoothing_asked=requests.asked), [requests])
         caught = signal.getsignal(signal.SIGUSR1)
     assert caught not in {before, signal.SIG_DFL}  # while results are written
     assert signal.getsignal(signal.SIGUSR1) is before
@@ -177,7 +178,7 @@ def test_a_step_that_takes_long_after_a_signal_is_given_up_and_its_scan_is_not_u
     began_s = time.monotonic()
     with stop, PromptSlam(slam, stop) as prompt:
         track = OdometryTrack([pose(0), pose(10**10)])
-        run_slam(scans(), track, prompt, unknown_truth, [heard])
+        execute(source_of_scans(scans(), track, prompt), [heard])
     assert time.monotonic() - began_s < seconds(30)
     assert [one.used for one in heard.scans] == [True, used]
     assert prompt.n_given_up == (not used)

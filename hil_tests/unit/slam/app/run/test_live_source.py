@@ -25,13 +25,13 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
     drifting,
     drive_through,
 )
-from hil_tests.unit.slam.app.sessions import FRAME_NS, Listener
+from hil_tests.unit.slam.app.sessions import FRAME_NS, Listener, source_of_scans
 from hil_tests.unit.slam.app.sessions import scan as scan_of
 from hil_tests.unit.slam.simulation import frame_of
 from slam.app.odometry.live import LiveOdometry, parse_source
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.run.live_source import LiveSource, SpacingWarning, read_odometry
-from slam.app.run.runner import LinkLog, RunRecord, run_slam
+from slam.app.run.runner import LinkLog, RunRecord, execute
 from slam.config import load_preset
 from slam.geometry import Mount
 from slam.library.evaluation import ate_rmse_m
@@ -400,7 +400,9 @@ def run(drive: Drive, source: LiveSource, odometry: LiveOdometry) -> tuple[RunRe
     source.settle()
     scene, heard = drive.scene, Listener()
     slam = make_slam(load_preset("robust"), rig_of(scene), wheels_of(scene))
-    return run_slam(source.scans(), odometry, slam, scene.trajectory().poses, [heard]), heard
+    truth_at = scene.trajectory().poses
+    run_source = source_of_scans(source.scans(), odometry, slam, truth_at, drive.infos)
+    return execute(run_source, [heard]), heard
 
 
 def test_through_drift_and_jitter_the_map_is_as_good_as_with_perfect_clocks(drive: Drive) -> None:

@@ -11,10 +11,10 @@ import pytest
 import rerun as rr
 from numpy.typing import NDArray
 
-from hil_tests.unit.slam.app.sessions import FRAME_NS, NoSlam, scan, session_info
+from hil_tests.unit.slam.app.sessions import FRAME_NS, NoSlam, scan, session_info, source_of_scans
 from slam.app.commands.report import _ReportData
 from slam.app.odometry.live import LiveOdometry
-from slam.app.run.runner import run_slam
+from slam.app.run.runner import execute
 from slam.app.session.writer import SessionLog
 from slam.app.view.session_view import RerunView
 from slam.frames import RadarFrame
@@ -98,9 +98,7 @@ def test_what_a_run_keeps_of_a_state_does_not_grow_with_the_map(
     if n_landmarks < 50:  # drawing more takes long, and keeps no more
         sinks.append(RerunView(tmp_path / "session.rrd", info))
     try:
-        record = run_slam(scans(), track, FullMap(n_landmarks), along_x, sinks)
-        for sink in sinks:
-            sink.close()
+        record = execute(source_of_scans(scans(), track, FullMap(n_landmarks), along_x), sinks)
     finally:
         # Behind the end of Rerun's threads: one that frees memory while tracing stops could end
         # the process (CPython issue 128679).
@@ -162,7 +160,7 @@ def test_a_parked_robot_costs_a_run_next_to_nothing() -> None:
 
     tracemalloc.start()
     try:
-        run_slam(scans(), track, NoSlam(), along_x)
+        execute(source_of_scans(scans(), track, NoSlam(), along_x))
     finally:
         tracemalloc.stop()
     early, late = sizes

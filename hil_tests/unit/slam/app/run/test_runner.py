@@ -17,9 +17,10 @@ from hil_tests.unit.slam.app.sessions import (
     scan,
     session_info,
     snapshot,
+    source_of_scans,
 )
 from slam.app.run.output import RunProgress
-from slam.app.run.runner import LinkStates, run_slam, unknown_truth
+from slam.app.run.runner import LinkStates, execute
 from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.frames import RadarFrame
 from slam.geometry import paper_rig
@@ -72,13 +73,8 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
         for counter in (0, 20)
     ]
     listener = Listener()
-    record = run_slam(
-        map(scan, COUNTERS),
-        OdometryTrack(ends),
-        LateSlam(),
-        truth_at,
-        [listener],
-    )
+    source = source_of_scans(map(scan, COUNTERS), OdometryTrack(ends), LateSlam(), truth_at)
+    record = execute(source, [listener])
     assert tuple(scan.counter for scan in listener.scans) == COUNTERS
     assert tuple(snapshot.counter for snapshot in listener.snapshots) == COUNTERS
     states = record.states
@@ -103,7 +99,7 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     ends = [TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0) for t_ns in (0, 20 * FRAME_NS)]
     listener = Listener()
     scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
-    record = run_slam(scans, OdometryTrack(ends), LateSlam(), unknown_truth, [listener])
+    record = execute(source_of_scans(scans, OdometryTrack(ends), LateSlam()), [listener])
     assert tuple(scan.counter for scan in listener.scans) == COUNTERS
     assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
     assert record.n_frames == 2 * 3
@@ -117,7 +113,7 @@ def test_scans_whose_times_fall_end_the_run_and_reach_the_observers(back_end: Ba
     slam = make_slam(SlamConfig(back_end=back_end), paper_rig(), WheelNoise())
     listener = Listener()
     with pytest.raises(AppError):
-        run_slam(map(scan, (5, 4)), OdometryTrack(ends), slam, unknown_truth, [listener])
+        execute(source_of_scans(map(scan, (5, 4)), OdometryTrack(ends), slam), [listener])
     assert [scan.counter for scan in listener.scans] == [5, 4]
 
 
@@ -138,13 +134,9 @@ def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
         float(limit) for limit in (made.frames[1].samples.min(), made.frames[1].samples.max())
     )
     made = replace(made, frames=(made.frames[0], replace(made.frames[1], limits=(low, high))))
-    run_slam(
-        [made],
-        OdometryTrack(ends),
-        Hearing(),
-        unknown_truth,
-        gains_db=[0.0, 20.0 * math.log10(2.0)],
-    )
+    first, second = session_info().radars
+    radars = (first, replace(second, gain_db=20.0 * math.log10(2.0)))
+    execute(source_of_scans([made], OdometryTrack(ends), Hearing(), radars=radars))
     as_it_was, halved = heard
     assert as_it_was is made.frames[0]
     np.testing.assert_allclose(halved.samples, made.frames[1].samples / 2.0, rtol=1e-6)
